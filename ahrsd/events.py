@@ -1,0 +1,91 @@
+"""What the pure core answers: bytes to send, and facts for the log, the viewer and the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.samples import SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Write these bytes to the port."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SamplesSeen:
+    """New samples, raw, with the correction that the newest estimate would apply to them."""
+
+    block: SampleBlock
+    present: Affine
+    proposed: Affine | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimated:
+    """A new estimate. `at_s` is device time."""
+
+    at_s: float
+    host_s: float
+    estimate: Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class GateResult:
+    """One row of the verdict: what was measured, the limit, and what a person can do about it."""
+
+    gate: str
+    value: float
+    limit: float
+    ok: bool
+    since_s: float
+    unit: str
+    advice: str
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """All gates at one instant."""
+
+    at_s: float
+    host_s: float
+    gates: tuple[GateResult, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StateChanged:
+    """The write-back state machine moved."""
+
+    at_s: float
+    host_s: float
+    old: str
+    new: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterWritten:
+    """A register write was sent, verified, refused or undone (`outcome` says which)."""
+
+    at_s: float
+    host_s: float
+    register: int
+    old: tuple[float, ...]
+    new: tuple[float, ...]
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True)
+class Noted:
+    """One line for the log. `level`: "debug", "info", "warning" or "error"."""
+
+    at_s: float
+    host_s: float
+    level: str
+    text: str
+
+
+Event = Send | SamplesSeen | Estimated | Judged | StateChanged | RegisterWritten | Noted

@@ -1,0 +1,100 @@
+"""Everything that can reach the pure core, as values: what `run` records and `replay` feeds again.
+
+The core is a function of this list and of nothing else, which is why a replay yields the same
+decisions. The shell creates inputs (and stamps them with the host's monotonic clock), writes each
+to the capture *before* the core sees it, and sends what the core answers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ahrsd.samples import SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """Bytes from the device, as one read returned them."""
+
+    host_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time passed: the core asked to be woken at `host_ns` and nothing else had come by then."""
+
+    host_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LinkOpened:
+    """A port was opened. `latency_ms` is the USB adapter's latency timer where it has one."""
+
+    host_ns: int
+    port: str
+    baud: int
+    latency_ms: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LinkLost:
+    """The port went away (unplugged, error) or was closed."""
+
+    host_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Interlock:
+    """The vehicle's word whether a write is safe now; absent or old counts as no."""
+
+    host_ns: int
+    safe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """A person's command: "approve" (argument: candidate hash), "lock", "unlock", "rollback"."""
+
+    host_ns: int
+    verb: str
+    argument: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RegistersKnown:
+    """Registers that were in force, for recordings in which nobody asked the device for them."""
+
+    host_ns: int
+    values: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Samples from a table recording: there are no bytes behind them."""
+
+    host_ns: int
+    block: SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Shut down: undo what was changed for the session, then finish."""
+
+    host_ns: int
+    reason: str
+
+
+Input = (
+    Received
+    | Tick
+    | LinkOpened
+    | LinkLost
+    | Interlock
+    | Operator
+    | RegistersKnown
+    | Samples
+    | Stop
+)

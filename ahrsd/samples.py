@@ -1,0 +1,43 @@
+"""Samples as arrays: the one shape in which sensor data travels behind the driver.
+
+A block never spans a gap: the rows follow each other at the stream's own rate, and `gap_before`
+says whether the first row follows the last row of the previous block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleBlock:
+    """N consecutive samples in the sensor frame, before any user calibration.
+
+    time_s:        (N,) device time since its start-up, strictly increasing
+    dt_s:          (N,) length of the step that ends at the sample; nan where unknown (after a gap)
+    host_s:        (N,) host time (monotonic seconds) of the same instants by the clock model
+    raw_b_gauss:   (N, 3) field as the sensor read it, register 23 undone
+    gyro_b_rad_s:  (N, 3) rate as the sensor read it, register 84 undone
+    accel_b_m_s2:  (N, 3) specific force, nan where the stream has none
+    covariates:    further columns by name (`temperature_c`, `pressure_kpa`, ...), each (N,)
+    epoch:         number of the register epoch in force (changes when registers 23/26/84 change)
+    gap_before:    true where the first sample does not follow the previous block's last one
+    """
+
+    time_s: Array
+    dt_s: Array
+    host_s: Array
+    raw_b_gauss: Array
+    gyro_b_rad_s: Array
+    accel_b_m_s2: Array
+    covariates: dict[str, Array] = field(default_factory=dict)
+    epoch: int = 0
+    gap_before: bool = False
+
+    def __len__(self) -> int:
+        return len(self.time_s)

@@ -1,0 +1,1 @@
+"""Device drivers: bytes to SI samples, registers to values; they do not know `ahrsd`."""

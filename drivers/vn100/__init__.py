@@ -1,0 +1,1 @@
+"""The VectorNav VN-100: wire format, registers, session, serial device and emulator."""
