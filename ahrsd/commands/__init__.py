@@ -1,0 +1,45 @@
+"""The command line, one module per command, imported only when that command runs.
+
+Every module here has `command: click.Command`. A command that answers "no" ends with
+`raise SystemExit(EXIT_NO)`; whatever a person can put right is raised as an `AhrsdError`.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+#: name -> what `ahrsd --help` says about it, so that the help imports none of them
+COMMANDS: dict[str, str] = {
+    "demo": "The whole job on an emulated VN-100, no hardware needed.",
+    "run": "The daemon: estimate from the stream, judge, and write back as far as the mode allows.",
+    "emulate": "An emulated VN-100 on a pseudo-terminal.",
+    "capture": "Record what a device sends.",
+    "replay": "The pipeline of `run` over a recording.",
+    "calibrate": "Batch calibration of a recording.",
+    "registers": "Read, compare, write and roll back the device's registers.",
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports `ahrsd.commands.NAME` when NAME is called, and not before."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of a first visit."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command's module."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"ahrsd.commands.{cmd_name}")
+        command = module.command
+        if not isinstance(command, click.Command):
+            raise TypeError(f"ahrsd.commands.{cmd_name}.command is not a click command")
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The command list out of the table above."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
