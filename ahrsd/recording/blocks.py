@@ -1,0 +1,194 @@
+"""The MCAP layout of a capture, block by block; the only module that knows the format.
+
+A file (https://mcap.dev/spec)::
+
+    magic, Header("ahrsd"), Metadata "ahrsd.capture"     who, when, which device
+    Chunk (zstd, CRC32): Channel records, Message*       each can be read alone
+    Metadata "ahrsd.end", DataEnd, Footer, magic         absent after a kill or a power cut
+
+There is no index, so nothing in memory grows with the file and nothing is lost with its end;
+MCAP tools read such files from front to back.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+
+from ahrsd import __version__
+from ahrsd.errors import RecordingError
+
+SEQUENCES = 2**32  # `sequence` wraps here
+_MAGIC = b"\x89MCAP0\r\n"
+_PROFILE = "ahrsd"
+_HEAD_BYTES = 64 * 1024
+_PREFIX = struct.Struct("<BQ")  # of every MCAP record: opcode, length
+
+_ENCODINGS = {
+    "rx": "application/octet-stream",
+    "tx": "application/octet-stream",
+    "input": "json",
+    "event": "json",
+    "registers": "json",
+    "covariate": "json",
+}
+_IDS = {topic: number for number, topic in enumerate(_ENCODINGS, start=1)}
+_TOPICS = {number: topic for topic, number in _IDS.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One record of a capture: `sequence` counts everything that was handed to the writer."""
+
+    topic: str
+    sequence: int
+    host_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A part of the file that cannot be read."""
+
+    what: str
+
+
+def head(metadata: Mapping[str, str]) -> bytes:
+    """How a file begins."""
+    return _MAGIC + _records(
+        Header(profile=_PROFILE, library=f"ahrsd {__version__}"),
+        Metadata(name="ahrsd.capture", metadata=dict(metadata)),
+    )
+
+
+def end(metadata: Mapping[str, str]) -> bytes:
+    """How a file ends that was closed."""
+    return (
+        _records(
+            Metadata(name="ahrsd.end", metadata=dict(metadata)),
+            DataEnd(data_section_crc=0),
+            Footer(summary_start=0, summary_offset_start=0, summary_crc=0),
+        )
+        + _MAGIC
+    )
+
+
+def _records(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def _channel(number: int) -> Channel:
+    topic = _TOPICS[number]
+    encoding = _ENCODINGS[topic]
+    return Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=0)
+
+
+def _message(entry: Entry) -> Message:
+    return Message(
+        channel_id=_IDS[entry.topic],
+        log_time=entry.host_ns,
+        publish_time=entry.host_ns,
+        data=entry.data,
+        sequence=entry.sequence,
+    )
+
+
+def chunk(batch: list[Entry]) -> bytes:
+    """Entries as one block, the channels that they use in front."""
+    numbers = sorted({_IDS[entry.topic] for entry in batch})
+    content = _records(
+        *(_channel(number) for number in numbers),
+        *(_message(entry) for entry in batch),
+    )
+    times = [entry.host_ns for entry in batch]
+    return _records(
+        Chunk(
+            compression="zstd",
+            data=zstandard.compress(content),
+            message_start_time=min(times),
+            message_end_time=max(times),
+            uncompressed_crc=zlib.crc32(content),
+            uncompressed_size=len(content),
+        )
+    )
+
+
+def read_head(path: Path) -> dict[str, str]:
+    """The metadata in front.  Raises RecordingError where there is none of ours."""
+    not_ours = RecordingError(
+        path, "is not a capture of ahrsd", "give the file that `ahrsd capture` or `run` wrote"
+    )
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}", "check the path") from error
+    if not head:
+        raise RecordingError(path, "is empty (0 bytes)", "record again")
+    if not head.startswith(_MAGIC):
+        raise not_ours
+    try:
+        reader = StreamReader(BytesIO(head), record_size_limit=_HEAD_BYTES)
+        for record in itertools.islice(reader.records, 2):
+            if isinstance(record, Header) and record.profile != _PROFILE:
+                raise not_ours
+            if isinstance(record, Metadata):
+                return dict(record.metadata)
+    except (McapError, struct.error, ValueError) as error:
+        raise RecordingError(path, "ends within its header", "record again") from error
+    raise not_ours
+
+
+def read_entries(path: Path) -> Iterator[Entry | Damage]:
+    """Everything in a file in recorded order, and what could not be read of it."""
+    for data in _read_chunks(path):
+        if isinstance(data, Damage):
+            yield data
+        else:
+            yield from _unpack(data)
+
+
+def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
+    opcode, left = 0, path.stat().st_size - len(_MAGIC)
+    with path.open("rb") as file:
+        file.seek(len(_MAGIC))
+        while left >= _PREFIX.size and opcode != Opcode.FOOTER:
+            opcode, length = _PREFIX.unpack(file.read(_PREFIX.size))
+            left -= _PREFIX.size
+            if length > left:
+                break
+            data = file.read(length)
+            left -= length
+            if opcode == Opcode.CHUNK:
+                yield data
+    if opcode != Opcode.FOOTER:
+        tail = f"; its last {left} bytes are half a block" if left else ""
+        yield Damage(f"was not closed (killed, or cut short){tail}")
+
+
+def _unpack(data: bytes) -> list[Entry | Damage]:
+    """The entries of a chunk; of channels that this version does not know, none."""
+    try:
+        records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)
+    except (CRCValidationError, McapError, zstandard.ZstdError, struct.error, ValueError):
+        return [Damage(f"a damaged block of {len(data)} bytes was left out")]
+    return [
+        Entry(_TOPICS[record.channel_id], record.sequence, record.log_time, record.data)
+        for record in records
+        if isinstance(record, Message) and record.channel_id in _TOPICS
+    ]

@@ -1,0 +1,353 @@
+"""Capture files: MCAP, written before any parser sees a byte, read back in the same order.
+
+Channels: `rx`, `tx` raw bytes; `input`, `event`, `registers`, `covariate` JSON.  log_time is the
+host's monotonic clock in ns; `sequence` counts every record that was handed over, so that a gap in
+it is a record that was lost.  The layout of the file is in `blocks`.
+
+Writing is a thread's work.  The caller appends to a queue that is bounded in bytes; when the disk
+is slow or full the queue fills, then records are dropped and counted, and the file goes on where
+it stopped as soon as the disk takes bytes again.  No write ever raises into the caller.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+from ahrsd import __version__
+from ahrsd.errors import CaptureError, RecordingError
+from ahrsd.inputs import Input, Received
+from ahrsd.recording import blocks, inputs_json
+from ahrsd.recording.blocks import SEQUENCES, Damage, Entry
+
+SCHEMA = "ahrsd.capture/1"
+FLUSH_S = 0.25  # a chunk is on its way to the kernel at most this long after its first record
+SYNC_S = 5.0  # a power cut costs at most this much, a kill only FLUSH_S
+CLOSE_S = 5.0  # how long `close` waits for a disk that hangs
+QUEUE_BYTES = 16 * 1024 * 1024  # about two minutes of stream at 800 Hz
+WAKE_BYTES = 256 * 1024  # a chunk is not larger than this and one record
+_OVERHEAD = 200  # bytes that a queued record costs besides its data
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """Bytes that went to the device."""
+
+    host_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureStatus:
+    """How the writing goes. `error` is "" while the disk takes everything."""
+
+    error: str
+    records: int
+    queued_bytes: int
+    lost_records: int
+    lost_bytes: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything handed over so far is or will be in the file."""
+        return self.lost_records == 0
+
+
+def _cost(entry: Entry) -> int:
+    return len(entry.data) + _OVERHEAD
+
+
+def _create(path: Path) -> FileIO:
+    return FileIO(path, "xb")
+
+
+class _File:
+    """Appends whole blocks: after an error the next attempt overwrites what was half written."""
+
+    def __init__(self, raw: FileIO) -> None:
+        self._raw = raw
+        self._synced_s = time.monotonic()
+        self.size = 0
+
+    def append(self, block: bytes) -> None:
+        """Raises OSError; `size` then still is the end of the last whole block."""
+        self._raw.seek(self.size)
+        self._raw.truncate(self.size)
+        view = memoryview(block)
+        while view:
+            view = view[self._raw.write(view) or 0 :]
+        self.size += len(block)
+        if time.monotonic() - self._synced_s > SYNC_S:
+            self.sync()
+
+    def sync(self) -> None:
+        """Survive a power cut up to here (a kill needs no help)."""
+        os.fsync(self._raw.fileno())
+        self._synced_s = time.monotonic()
+
+    def close(self) -> None:
+        self._raw.close()
+
+
+def part_path(path: Path, part: int) -> Path:
+    """The file of part 1, 2, ... of a capture: `x.mcap`, `x.part2.mcap`, ..."""
+    return path if part == 1 else path.with_name(f"{path.stem}.part{part}{path.suffix}")
+
+
+class CaptureWriter:
+    """Records inputs, sent bytes and facts in exactly the order of the calls; see the module.
+
+    path:       created; a file that exists is never overwritten (CaptureError)
+    header:     strings for the file's metadata, for example the device's identity
+    part_bytes: a new part file starts beyond this size; None: one file
+    create:     opens a new file; tests pass one that fails
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: Mapping[str, str],
+        part_bytes: int | None = None,
+        queue_bytes: int = QUEUE_BYTES,
+        create: Callable[[Path], FileIO] = _create,
+    ) -> None:
+        self.path = path
+        self._header = dict(header)
+        self._part_bytes = part_bytes
+        self._queue_bytes = queue_bytes
+        self._create = create
+        self._part = 1
+        self._lock = threading.Lock()
+        self._queue: deque[Entry] = deque()
+        self._queued = 0
+        self._sequence = 0
+        self._stored = 0
+        self._lost_records = 0
+        self._lost_bytes = 0
+        self._error = ""
+        self._wake = threading.Event()
+        self._closing = False
+        try:
+            self._file: _File | None = _File(create(path))
+        except FileExistsError as error:
+            raise CaptureError(f"{path}: exists already; name another file") from error
+        except OSError as error:
+            raise CaptureError(f"{path}: cannot be created: {error.strerror}") from error
+        self._thread = threading.Thread(target=self._work, name="capture", daemon=True)
+        self._thread.start()
+
+    def write(self, item: Input) -> None:
+        """Record an input; call it before the core sees the input."""
+        if isinstance(item, Received):
+            self._put("rx", item.host_ns, item.data)
+        else:
+            self._put("input", item.host_ns, inputs_json.encode(item))
+
+    def write_sent(self, host_ns: int, data: bytes) -> None:
+        """Record bytes that were written to the port."""
+        self._put("tx", host_ns, data)
+
+    def write_event(self, host_ns: int, fact: Mapping[str, object]) -> None:
+        """Record something that happened, for people and tools; a replay does not need it."""
+        self._put("event", host_ns, inputs_json.to_json(fact))
+
+    def write_registers(self, host_ns: int, snapshot: Mapping[str, object]) -> None:
+        """Record a snapshot of the device's registers."""
+        self._put("registers", host_ns, inputs_json.to_json(snapshot))
+
+    def write_covariate(self, host_ns: int, values: Mapping[str, object]) -> None:
+        """Record a side channel (motor current, position, ...), names as in tables."""
+        self._put("covariate", host_ns, inputs_json.to_json(values))
+
+    @property
+    def status(self) -> CaptureStatus:
+        """Counters of this instant."""
+        with self._lock:
+            return CaptureStatus(
+                error=self._error,
+                records=self._stored,
+                queued_bytes=self._queued,
+                lost_records=self._lost_records,
+                lost_bytes=self._lost_bytes,
+            )
+
+    def close(self) -> CaptureStatus:
+        """Store what is queued and end the file; gives up on a disk that hangs for 5 s."""
+        self._closing = True
+        self._wake.set()
+        self._thread.join(CLOSE_S)
+        with self._lock:
+            lost = len(self._queue), sum(len(entry.data) for entry in self._queue)
+        status = self.status
+        return replace(
+            status,
+            queued_bytes=0,
+            lost_records=status.lost_records + lost[0],
+            lost_bytes=status.lost_bytes + lost[1],
+        )
+
+    def __enter__(self) -> CaptureWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _put(self, topic: str, host_ns: int, data: bytes) -> None:
+        with self._lock:
+            entry = Entry(topic, self._sequence, host_ns, data)
+            self._sequence = (self._sequence + 1) % SEQUENCES
+            if self._queued + _cost(entry) > self._queue_bytes or self._closing:
+                self._lost_records += 1
+                self._lost_bytes += len(entry.data)
+                self._error = self._error or "the disk is slower than the stream"
+                return
+            before, self._queued = self._queued, self._queued + _cost(entry)
+            self._queue.append(entry)
+        if before < WAKE_BYTES <= before + _cost(entry):
+            self._wake.set()
+
+    def _work(self) -> None:
+        closing = False
+        while not closing:
+            self._wake.wait(FLUSH_S)
+            self._wake.clear()
+            closing = self._closing  # read before the queue is emptied for the last time
+            try:
+                self._store()
+                if closing:
+                    self._end()
+            except OSError as error:
+                with self._lock:
+                    self._error = f"{error.strerror or error}"
+        if self._file:
+            self._file.close()
+
+    def _store(self) -> None:
+        """Append everything queued; records leave the queue only when they are in the file."""
+        while batch := self._batch():
+            self._ready().append(blocks.chunk(batch))
+            with self._lock:
+                for entry in batch:
+                    self._queue.popleft()
+                    self._queued -= _cost(entry)
+                self._stored += len(batch)
+                self._error = ""
+
+    def _batch(self) -> list[Entry]:
+        batch: list[Entry] = []
+        size = 0
+        with self._lock:
+            for entry in self._queue:
+                batch.append(entry)
+                size += _cost(entry)
+                if size > WAKE_BYTES:
+                    break
+        return batch
+
+    def _ready(self) -> _File:
+        """The file to append to: begun, and not beyond the size of a part."""
+        if self._file and self._part_bytes and self._file.size >= self._part_bytes:
+            self._end()
+            self._part += 1
+        if self._file is None:
+            self._file = _File(self._create(part_path(self.path, self._part)))
+        if self._file.size == 0:
+            self._file.append(self._head())
+        return self._file
+
+    def _head(self) -> bytes:
+        facts = {
+            "schema": SCHEMA,
+            "part": str(self._part),
+            "wall_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "monotonic_ns": str(time.monotonic_ns()),
+            "ahrsd": __version__,
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+        }
+        return blocks.head({**facts, **self._header})
+
+    def _end(self) -> None:
+        """Close the current part; a file without this end is a file of a killed process."""
+        if self._file is None:
+            return
+        if self._file.size == 0:
+            self._file.append(self._head())
+        status = self.status
+        counts = {"lost_records": status.lost_records, "lost_bytes": status.lost_bytes}
+        self._file.append(blocks.end({key: str(value) for key, value in counts.items()}))
+        self._file.sync()
+        self._file.close()
+        self._file = None
+
+
+class CaptureReader:
+    """A capture, part after part, in recorded order; damage is noted, never guessed over.
+
+    Raises RecordingError where the file is no capture of ours.  `header` is the metadata of the
+    first part; `notes` says, once an iteration is through, what is missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self.header = blocks.read_head(path)
+
+    def __iter__(self) -> Iterator[Input | Sent]:
+        """Every input and everything sent, in the order in which the core saw it."""
+        for entry in self._entries():
+            if entry.topic == "rx":
+                yield Received(entry.host_ns, entry.data)
+            elif entry.topic == "tx":
+                yield Sent(entry.host_ns, entry.data)
+            elif entry.topic == "input":
+                yield self._decode(entry.data)
+
+    def _decode(self, data: bytes) -> Input:
+        try:
+            return inputs_json.decode(data)
+        except ValueError as error:
+            writer = self.header.get("ahrsd", "of unknown version")
+            raise RecordingError(
+                self.path, f"{error} (written by ahrsd {writer})", "read it with that version"
+            ) from error
+
+    def facts(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
+        """(host_ns, fact) of a JSON channel: "event", "registers" or "covariate"."""
+        for entry in self._entries():
+            if entry.topic == topic:
+                yield entry.host_ns, json.loads(entry.data)
+
+    def _entries(self) -> Iterator[Entry]:
+        self.notes = []
+        expected: int | None = None
+        for path in _parts(self.path, int(self.header.get("part", "1"))):
+            for entry in blocks.read_entries(path):
+                if isinstance(entry, Damage):
+                    self.notes.append(f"{path.name}: {entry.what}")
+                    continue
+                missing = 0 if expected is None else (entry.sequence - expected) % SEQUENCES
+                if missing:
+                    self.notes.append(f"{path.name}: {missing} records are missing")
+                expected = (entry.sequence + 1) % SEQUENCES
+                yield entry
+
+
+def _parts(path: Path, part: int) -> Iterator[Path]:
+    """The file and the parts that follow it."""
+    stem = path.stem.removesuffix(f".part{part}")
+    first = path.with_name(stem + path.suffix)
+    yield path
+    while part_path(first, part + 1).exists():
+        part += 1
+        yield part_path(first, part)
