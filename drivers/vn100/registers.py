@@ -39,7 +39,32 @@ from drivers.vn100.register_fields import (
     u8,
     xyz,
 )
-from drivers.vn100.registers_system import MEASUREMENT_ROWS, SYSTEM_ROWS
+from drivers.vn100.registers_system import (
+    BINARY_OUTPUT_OFF,
+    BINARY_OUTPUTS,
+    MEASUREMENT_ROWS,
+    SAMPLE_RATE_HZ,
+    SUPPORTED_BAUD,
+    SYSTEM_ROWS,
+)
+
+__all__ = [
+    "BINARY_OUTPUTS",
+    "BINARY_OUTPUT_OFF",
+    "REGISTERS",
+    "SAMPLE_RATE_HZ",
+    "SUPPORTED_BAUD",
+    "Register",
+    "RegisterField",
+    "RegisterValueError",
+    "Values",
+    "as_stored",
+    "check",
+    "format_command",
+    "format_reply",
+    "parse",
+    "same",
+]
 
 ORTHONORMAL_WITHIN = 1e-5  # register 26: what the device still accepts
 
