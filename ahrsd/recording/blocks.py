@@ -65,6 +65,11 @@ class Damage:
     what: str
 
 
+def is_mcap(start: bytes) -> bool:
+    """Whether a file that begins so is MCAP."""
+    return start.startswith(_MAGIC)
+
+
 def head(metadata: Mapping[str, str]) -> bytes:
     """How a file begins."""
     return _MAGIC + _records(

@@ -1,0 +1,136 @@
+"""One way to open any recording: what kind it is, its inputs in order, and what is to be known.
+
+The name decides the kind; where it says nothing, the content does. Every recording yields what
+the core takes and ends in `Stop`, so that `replay` is `run` with another source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+
+from ahrsd.errors import RecordingError
+from ahrsd.inputs import Input, Received, Samples, Stop
+from ahrsd.recording import blocks
+from ahrsd.recording.bytestream import read_chunks, read_received
+from ahrsd.recording.capture import CaptureReader, Sent
+from ahrsd.recording.table import Table, read_table
+
+_END = "end of recording"
+
+
+class Kind(Enum):
+    """Where the samples of a recording come from."""
+
+    CAPTURE = "capture"
+    BYTES = "byte stream"
+    TABLE = "table"
+
+
+_SUFFIXES = {
+    ".mcap": Kind.CAPTURE,
+    **dict.fromkeys((".vnraw", ".vnbin", ".bin", ".log", ".txt"), Kind.BYTES),
+    **dict.fromkeys((".csv", ".parquet"), Kind.TABLE),
+}
+
+
+@dataclass(slots=True)
+class Recording:
+    """An opened recording.
+
+    rate_hz: rate to assume where a byte stream has no device time; None: there is none
+    header:  a capture's metadata
+    notes:   what is missing or was left out; a capture adds to it while its inputs are read
+    """
+
+    path: Path
+    kind: Kind
+    rate_hz: float | None = None
+    header: Mapping[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    table: Table | None = None
+
+    @property
+    def name(self) -> str:
+        """The file's name, for reports."""
+        return self.path.name
+
+    def inputs(self) -> Iterator[Input]:
+        """Everything that the core takes, in order, ending in `Stop`; RecordingError as found."""
+        if self.table is not None:
+            return _table_inputs(self.table)
+        if self.kind is Kind.CAPTURE:
+            return self._capture_inputs()
+        return _byte_inputs(self.path)
+
+    def _capture_inputs(self) -> Iterator[Input]:
+        reader = CaptureReader(self.path)
+        last: Input | None = None
+        received = 0
+        for item in reader:
+            if isinstance(item, Sent):
+                continue
+            received += isinstance(item, Received | Samples)
+            last = item
+            yield item
+        self.notes[:] = reader.notes
+        if not received:
+            raise RecordingError(
+                self.path, "holds nothing that a device sent", "record again with the device on"
+            )
+        if last is not None and not isinstance(last, Stop):
+            yield Stop(last.host_ns, _END)
+
+
+def _byte_inputs(path: Path) -> Iterator[Input]:
+    yield from read_received(path)
+    yield Stop(0, _END)
+
+
+def _table_inputs(table: Table) -> Iterator[Input]:
+    host_ns = 0
+    for block in table.blocks():
+        host_ns = round(float(block.host_s[-1]) * 1e9)
+        yield Samples(host_ns, block)
+    yield Stop(host_ns, _END)
+
+
+def open_recording(path: Path, rate_hz: float | None = None) -> Recording:
+    """Open a capture, a byte stream or a table.
+
+    rate_hz is for byte streams without a device clock and is not used otherwise.
+    Raises RecordingError, one line, where the file is none of the three.
+    """
+    if rate_hz is not None and not rate_hz > 0.0:
+        raise RecordingError(path, f"the rate {rate_hz:g} Hz is not positive", "give --rate in Hz")
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise RecordingError(path, what, "give the path of a recording")
+    suffix = path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
+    kind = _SUFFIXES.get(suffix.lower()) or _by_content(path)
+    if kind is Kind.BYTES:
+        next(read_chunks(path))  # empty or no gzip: say so now, not in the middle of a replay
+        return Recording(path, kind, rate_hz)
+    unused = [] if rate_hz is None else [f"--rate is not used: a {kind.value} has its own time"]
+    if kind is Kind.CAPTURE:
+        header = CaptureReader(path).header
+        return Recording(path, kind, header=header, notes=unused)
+    table = read_table(path)
+    return Recording(path, kind, notes=[*unused, *table.notes], table=table)
+
+
+def _by_content(path: Path) -> Kind:
+    start = next(read_chunks(path))
+    if blocks.is_mcap(start):
+        return Kind.CAPTURE
+    if b"time_s" in start.split(b"\n", 1)[0]:
+        return Kind.TABLE
+    if b"$VN" in start or b"\xfa" in start:
+        return Kind.BYTES
+    raise RecordingError(
+        path,
+        "is no recording by its name nor by its content",
+        f"name it by its kind: {' '.join(_SUFFIXES)}",
+    )
