@@ -1,0 +1,194 @@
+"""The journal: every change of a device's registers, durable before the change is made.
+
+JSON lines, one file per device serial number, append-only::
+
+    {"crc":"9bd3c1a0","kind":"PREPARED","new":{...},"old":{...},"seq":1,"time":"2026-11-03T..."}
+
+`crc` is the CRC32 of the line's canonical JSON (sorted keys, no blanks) without `crc`; `seq`
+counts from 1 without a hole. An append returns after file and folder are fsynced, or raises
+JournalError and leaves the file as it was: then no register may be written.
+
+A last line that is torn (the power went while it was written) was never acknowledged; it is
+reported, and the next append replaces it. Anything else that does not verify makes the journal
+untrustworthy, and opening it fails with the line's number.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from drivers.vn100.sentences import encode
+
+from ahrsd.errors import JournalError
+from drivers.vn100.registers import REGISTERS, as_stored, format_command
+
+_OWN_KEYS = ("seq", "time", "kind", "crc")
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One line. `time` is wall-clock UTC, a label and nothing to compute with."""
+
+    seq: int
+    time: str
+    kind: str
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def journal_path(state_directory: Path, serial: str | int) -> Path:
+    """Where the journal of the device with this serial number is."""
+    return state_directory / f"journal-{serial}.jsonl"
+
+
+def _utc() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def _canonical(body: dict[str, Any]) -> bytes:
+    return json.dumps(body, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _crc(body: dict[str, Any]) -> str:
+    return f"{zlib.crc32(_canonical(body)):08x}"
+
+
+def _line(record: Record) -> bytes:
+    body = {"seq": record.seq, "time": record.time, "kind": record.kind, **record.facts}
+    return _canonical({**body, "crc": _crc(body)}) + b"\n"
+
+
+def _parse(line: bytes) -> Record | None:
+    """The record of a line, None where the line does not verify."""
+    try:
+        body = json.loads(line)
+        crc = body.pop("crc")
+        seq, time, kind = body.pop("seq"), body.pop("time"), body.pop("kind")
+    except (ValueError, AttributeError, KeyError, TypeError):
+        return None
+    record = Record(seq, time, kind, body)
+    return record if _line(record) == line and crc in line.decode() else None
+
+
+class Journal:
+    """The journal of one device; see the module."""
+
+    def __init__(
+        self, path: Path, records: list[Record], size: int, torn: bytes, utc: Callable[[], str]
+    ) -> None:
+        self.path = path
+        self.torn = torn
+        self._records = records
+        self._size = size  # of the verified lines; a torn tail lies behind it
+        self._utc = utc
+
+    @staticmethod
+    def open(path: Path, utc: Callable[[], str] = _utc) -> Journal:
+        """Read and verify.  A file that is not there is an empty journal and is not created.
+
+        Raises JournalError where a line in the middle does not verify or cannot be read.
+        """
+        try:
+            content = path.read_bytes() if path.exists() else b""
+        except OSError as error:
+            raise JournalError(f"{path}: the journal cannot be read: {error.strerror}") from error
+        *lines, torn = content.split(b"\n")
+        if lines and not torn and b"\0" in lines[-1]:  # blocks that never reached the disk
+            torn = lines.pop() + b"\n"
+        records: list[Record] = []
+        for number, line in enumerate(lines, start=1):
+            record = _parse(line + b"\n")
+            if record is None or record.seq != number:
+                raise JournalError(
+                    f"{path}: line {number} of the journal is damaged; nothing will be written to "
+                    "the device; keep a copy, then remove the file or repair the line"
+                )
+            records.append(record)
+        return Journal(path, records, len(content) - len(torn), torn, utc)
+
+    def records(self) -> list[Record]:
+        """All records, oldest first."""
+        return list(self._records)
+
+    def last(self, kind: str) -> Record | None:
+        """The newest record of this kind."""
+        return next((r for r in reversed(self._records) if r.kind == kind), None)
+
+    def append(self, kind: str, **facts: object) -> Record:
+        """Add a record and return when it is on the disk.
+
+        Facts are JSON values; register values go as {"23": [12 numbers]}. Raises JournalError
+        where the record cannot be made durable: then it is not in the journal.
+        """
+        if taken := [key for key in _OWN_KEYS if key in facts]:
+            raise ValueError(f"{taken[0]} is the journal's own key")
+        line = _line(Record(len(self._records) + 1, self._utc(), kind, dict(facts)))
+        record = _parse(line)  # what a reader will see: tuples are lists, keys are text
+        if record is None:
+            raise ValueError(f"the facts of {kind} do not survive JSON: {facts}")
+        try:
+            self._write(line)
+        except OSError as error:
+            raise JournalError(
+                f"{self.path}: the journal cannot be written ({error.strerror}); "
+                "nothing will be written to the device until it can"
+            ) from error
+        self._records.append(record)
+        self._size += len(line)
+        self.torn = b""
+        return record
+
+    def _write(self, line: bytes) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            if os.fstat(descriptor).st_size != self._size + len(self.torn):
+                raise JournalError(
+                    f"{self.path}: another program wrote into the journal; start again to read it"
+                )
+            os.ftruncate(descriptor, self._size)
+            try:
+                _write_all(descriptor, line, self._size)
+                os.fsync(descriptor)
+            except OSError:
+                os.ftruncate(descriptor, self._size)
+                self.torn = b""
+                raise
+        finally:
+            os.close(descriptor)
+        _sync_directory(self.path.parent)
+
+
+def _write_all(descriptor: int, data: bytes, offset: int) -> None:
+    while data:
+        count = os.pwrite(descriptor, data, offset)
+        data, offset = data[count:], offset + count
+
+
+def _sync_directory(path: Path) -> None:
+    """A new file's name is durable only when its folder is."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def register_values(record: Record, which: str = "old") -> dict[int, tuple[float | int | str, ...]]:
+    """The registers that a record holds under `which`: "old" or "new"."""
+    return {int(number): tuple(values) for number, values in record.facts.get(which, {}).items()}
+
+
+def wrg_lines(record: Record, which: str = "old") -> list[str]:
+    """`$VNWRG,23,...*CS` for each register of the record that a person may send from a terminal."""
+    return [
+        encode(f"VNWRG,{format_command(number, as_stored(number, values))}").decode().strip()
+        for number, values in sorted(register_values(record, which).items())
+        if REGISTERS[number].writable
+    ]
