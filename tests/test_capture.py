@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from datetime import UTC, datetime
 from errno import ENOSPC
 from io import FileIO
 from pathlib import Path
@@ -33,6 +34,7 @@ from ahrsd.inputs import (
 )
 from ahrsd.recording import inputs_json
 from ahrsd.recording.capture import CaptureReader, CaptureWriter, Sent, part_path
+from ahrsd.recording.retention import new_capture_path
 from ahrsd.samples import SampleBlock
 
 EVERY_INPUT: list[Input] = [
@@ -145,6 +147,26 @@ def test_a_new_part_begins_beyond_the_size_and_reads_as_one(tmp_path):
     received = list(tail)
     assert received == items[-len(received) :]
     assert 0 < len(received) < len(items)
+
+
+def test_the_oldest_captures_of_the_daemon_go_and_nothing_else(tmp_path):
+    for name, age_s in [("ahrsd-1.mcap", 30), ("ahrsd-2.mcap", 20), ("mine.mcap", 40)]:
+        (tmp_path / name).write_bytes(bytes(100_000))
+        os.utime(tmp_path / name, (1e9 - age_s, 1e9 - age_s))
+    path = new_capture_path(tmp_path, datetime(2026, 11, 3, 12, 0, 0, tzinfo=UTC))
+    assert path.name == "ahrsd-20261103T120000Z.mcap"
+    items: list[Input | Sent] = [Received(k, os.urandom(90_000)) for k in range(12)]
+    write(path, items, part_bytes=200_000, keep_bytes=700_000)
+    names = {file.name for file in tmp_path.iterdir()}
+    assert "mine.mcap" in names
+    assert "ahrsd-1.mcap" not in names
+    assert "ahrsd-2.mcap" not in names
+    assert part_path(path, 4).exists()
+    assert sum(file.stat().st_size for file in tmp_path.glob("ahrsd-*")) <= 1_000_000
+    path.touch()
+    assert new_capture_path(tmp_path, datetime(2026, 11, 3, 12, 0, 0, tzinfo=UTC)).name == (
+        "ahrsd-20261103T120000Z-2.mcap"
+    )
 
 
 KILLED = """

@@ -29,6 +29,7 @@ from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import Input, Received
 from ahrsd.recording import blocks, inputs_json
 from ahrsd.recording.blocks import SEQUENCES, Damage, Entry
+from ahrsd.recording.retention import prune
 
 SCHEMA = "ahrsd.capture/1"
 FLUSH_S = 0.25  # a chunk is on its way to the kernel at most this long after its first record
@@ -110,6 +111,7 @@ class CaptureWriter:
     path:       created; a file that exists is never overwritten (CaptureError)
     header:     strings for the file's metadata, for example the device's identity
     part_bytes: a new part file starts beyond this size; None: one file
+    keep_bytes: the daemon's oldest captures in the folder go beyond this sum; None: all stay
     create:     opens a new file; tests pass one that fails
     """
 
@@ -118,12 +120,14 @@ class CaptureWriter:
         path: Path,
         header: Mapping[str, str],
         part_bytes: int | None = None,
+        keep_bytes: int | None = None,
         queue_bytes: int = QUEUE_BYTES,
         create: Callable[[Path], FileIO] = _create,
     ) -> None:
         self.path = path
         self._header = dict(header)
         self._part_bytes = part_bytes
+        self._keep_bytes = keep_bytes
         self._queue_bytes = queue_bytes
         self._create = create
         self._part = 1
@@ -262,6 +266,8 @@ class CaptureWriter:
         if self._file is None:
             self._file = _File(self._create(part_path(self.path, self._part)))
         if self._file.size == 0:
+            if self._keep_bytes is not None:
+                prune(self.path.parent, self._keep_bytes, part_path(self.path, self._part))
             self._file.append(self._head())
         return self._file
 
