@@ -55,7 +55,7 @@ class Settings:
 
     mag, accel, gyro: (C, B) of 23, 25, 84;  rotation: R (3, 3) of 26;  hsi: (C, B) of 47 or None
     where it is not applied;  mag_reference: of 21, gauss;  windows: ticks of register 85's mean of
-    the magnetometer (uncompensated, compensated)
+    the magnetometer (uncompensated, compensated);  tare: attitude q_nu (4,) that counts as zero
     """
 
     mag: tuple[Array, Array]
@@ -66,6 +66,7 @@ class Settings:
     mag_reference: Array
     windows: tuple[int, int] = (0, 0)
     heading_frozen: bool = False
+    tare: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +104,8 @@ class Outputs:
         turned = np.zeros((BLOCK_TICKS, 3))
         turned[:, 2] = yaw_error
         self.q_nu = product(quaternions(turned), self._true_q_nu())
+        if settings.tare is not None:
+            self.q_nu = product(conjugate(settings.tare[None]), self.q_nu)
         self.R_nu = matrices(self.q_nu)
         self.filter_bias = self._filter_bias()
 

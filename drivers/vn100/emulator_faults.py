@@ -1,6 +1,6 @@
 """What can go wrong with the emulated VN-100, by name, and when.
 
-A schedule is text: `name[=parameter][@start[+duration]]`, times in seconds since the emulator began.
+A schedule is text: `name[=parameter][@start[+duration]]`, times in seconds since the start.
 
     byte_drop                 all the time, with the default parameter
     byte_drop=0.01@30+5       one byte in a hundred, from 30 s for 5 s
@@ -219,7 +219,7 @@ def _noise_insert(message: bytes, rate: float, draw: _Draw) -> bytes:
 
 
 # A packet of 602 bytes by the general tables (seen in a recording, vector bin_false_header_85), and
-# one of 528 bytes that passes the VN-100's own masks: group 17, all of its fields.
+# one of 472 bytes that passes the VN-100's own masks: group 17, all of its fields.
 FALSE_HEADERS = (
     bytes.fromhex("FA60B9006179"),
     bytes.fromhex("FA173D3F9101FF1FFF11"),

@@ -280,6 +280,18 @@ def matrices(quaternion: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion_of(R: Array) -> Array:
+    """The unit quaternion (4,) of one rotation matrix (3, 3).
+
+    Eigenvector of the symmetric K with q' K q = trace(R(q)' R): it exists for every R.
+    """
+    K = np.zeros((4, 4))
+    K[:3, :3] = R + R.T - np.trace(R) * np.eye(3)
+    K[3, :3] = K[:3, 3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    K[3, 3] = np.trace(R)
+    return np.asarray(np.linalg.eigh(K)[1][:, -1])
+
+
 def euler_angles(R_nb: Array) -> Array:
     """Roll, pitch, yaw (N, 3) in rad of R (N, 3, 3): roll and yaw -pi..pi, pitch -pi/2..pi/2."""
     roll = np.arctan2(R_nb[:, 2, 1], R_nb[:, 2, 2])

@@ -1,0 +1,176 @@
+"""What the emulated VN-100 can put into a message, quantity by quantity, and the ASCII messages.
+
+A quantity has a row per tick of the block. The gyro's value is the mean over the output's own step
+(`step_ticks`), as are the increments of angle and velocity. Sources: vn100-protocol 1.3, 2, 4.2, 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.vn100.emulator_chain import Outputs
+from drivers.vn100.emulator_motion import Array
+from drivers.vn100.emulator_physics import BLOCK_TICKS, TICK_HZ
+
+KNOWN_MAGNETIC, KNOWN_ACCELERATION = 0x0800, 0x1000  # VpeStatus, after VNKMD and VNKAD
+GYRO_FULL, MAG_FULL = 0x0004, 0x0040
+
+# ADOR: message, the register with the same values, and the bytes of a line with a 2-digit checksum
+# (vn100-protocol 1.5; VNHVE by the format of register 115).
+ASCII_MESSAGES: dict[int, tuple[str, int, int]] = {
+    1: ("VNYPR", 8, 38),
+    2: ("VNQTN", 9, 51),
+    8: ("VNQMR", 15, 135),
+    10: ("VNMAG", 17, 38),
+    11: ("VNACC", 18, 35),
+    12: ("VNGYR", 19, 44),
+    13: ("VNMAR", 20, 95),
+    14: ("VNYMR", 27, 122),
+    16: ("VNYBA", 239, 95),
+    17: ("VNYIA", 240, 95),
+    19: ("VNIMU", 54, 110),
+    30: ("VNDTV", 80, 75),
+    34: ("VNHVE", 115, 17),
+}
+MEASURED: dict[int, tuple[str, ...]] = {
+    8: ("ypr_deg",),
+    9: ("quaternion",),
+    15: ("quaternion", "mag", "accel", "gyro"),
+    17: ("mag",),
+    18: ("accel",),
+    19: ("gyro",),
+    20: ("mag", "accel", "gyro"),
+    27: ("ypr_deg", "mag", "accel", "gyro"),
+    54: ("uncomp_mag", "uncomp_accel", "uncomp_gyro", "temperature", "pressure"),
+    80: ("delta_time", "delta_theta_deg", "delta_velocity"),
+    115: ("heave",),
+    239: ("ypr_deg", "linear_accel_body", "gyro"),
+    240: ("ypr_deg", "linear_accel_ned", "gyro"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceClock:
+    """TimeStartup: runs from `boot_tick`, `ppm` fast, with resolution of a microsecond."""
+
+    boot_tick: int
+    ppm: float
+    step_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Switches:
+    """What else shows in messages.
+
+    vpe_status:       the bits that commands set;  sync_out_ticks: from one SyncOut pulse to the
+    next, 0 if none;  delta_frame, gyro_bias_out, gravity_out: register 82
+    """
+
+    vpe_status: int = 0
+    sync_out_ticks: int = 0
+    delta_ned: bool = False
+    delta_without_bias: bool = False
+    delta_without_gravity: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """One block as an output with a step of `step_ticks` sees it."""
+
+    outputs: Outputs
+    clock: DeviceClock
+    switches: Switches
+    step_ticks: int
+
+    def column(self, name: str) -> Array:
+        """One quantity, (BLOCK, n). Raises KeyError for a name that is not in `QUANTITIES`."""
+        values = QUANTITIES[name](self)
+        return values[:, None] if values.ndim == 1 else values
+
+    @property
+    def ticks(self) -> Array:
+        """Ticks since the device started, (BLOCK,)."""
+        first = self.outputs.block.first_tick - self.clock.boot_tick
+        return np.arange(first, first + BLOCK_TICKS, dtype=np.float64)
+
+
+def _time_startup(of: Readings) -> Array:
+    seconds = of.ticks / TICK_HZ * (1 + of.clock.ppm * 1e-6) + of.clock.step_s
+    return np.asarray(np.round(seconds + of.outputs.block.jitter_s, 6))
+
+
+def _delta_theta(of: Readings) -> Array:
+    outputs = of.outputs
+    wanted = of.switches.delta_without_bias
+    rates = (outputs.compensated_rates if wanted else outputs.rates)(of.step_ticks)
+    return _delta(of, rates)
+
+
+def _delta_velocity(of: Readings) -> Array:
+    name = "linear_accel_body" if of.switches.delta_without_gravity else "accel"
+    return _delta(of, of.outputs.quantity(name))
+
+
+def _delta(of: Readings, per_second: Array) -> Array:
+    if of.switches.delta_ned:
+        per_second = np.einsum("kij,kj->ki", of.outputs.R_nu, per_second)
+    return np.asarray(per_second * (of.step_ticks / TICK_HZ))
+
+
+def _vpe_status(of: Readings) -> Array:
+    full = of.outputs.saturation().astype(np.int64)
+    bits = np.where(full & 0x1C0, GYRO_FULL, 0) | np.where(full & 0x007, MAG_FULL, 0)
+    return np.asarray(bits | of.switches.vpe_status, dtype=np.float64)
+
+
+def _sync_out_count(of: Readings) -> Array:
+    every = of.switches.sync_out_ticks
+    return np.floor_divide(of.ticks, every) if every else _zeros(1)(of)
+
+
+def _zeros(columns: int) -> Callable[[Readings], Array]:
+    return lambda _: np.zeros((BLOCK_TICKS, columns))
+
+
+def _plain(name: str) -> Callable[[Readings], Array]:
+    return lambda of: of.outputs.quantity(name)
+
+
+def _dcm(of: Readings) -> Array:
+    return of.outputs.R_nu.transpose(0, 2, 1).reshape(BLOCK_TICKS, 9)
+
+
+QUANTITIES: dict[str, Callable[[Readings], Array]] = {
+    "time_startup_s": _time_startup,
+    "time_sync_in_s": _time_startup,  # no SyncIn event ever came: since the start
+    "sync_in_count": _zeros(1),
+    "sync_out_count": _sync_out_count,
+    "ypr_deg": lambda of: np.degrees(of.outputs.quantity("ypr")),
+    "ypr_rad": _plain("ypr"),
+    "quaternion": lambda of: of.outputs.q_nu,
+    "dcm": _dcm,
+    "ypr_uncertainty": _zeros(3),  # zeros in recordings of the real device
+    "uncomp_mag": _plain("uncomp_mag"),
+    "uncomp_accel": _plain("uncomp_accel"),
+    "uncomp_gyro": lambda of: of.outputs.rates(of.step_ticks),
+    "mag": _plain("mag"),
+    "accel": _plain("accel"),
+    "gyro": lambda of: of.outputs.compensated_rates(of.step_ticks),
+    "mag_ned": _plain("mag_ned"),
+    "accel_ned": _plain("accel_ned"),
+    "linear_accel_body": _plain("linear_accel_body"),
+    "linear_accel_ned": _plain("linear_accel_ned"),
+    "temperature": lambda of: of.outputs.block.temperature_c,
+    "pressure": lambda of: of.outputs.block.pressure_kpa,
+    "delta_time": lambda of: np.full(BLOCK_TICKS, of.step_ticks / TICK_HZ),
+    "delta_theta_deg": lambda of: np.degrees(_delta_theta(of)),
+    "delta_theta_rad": _delta_theta,
+    "delta_velocity": _delta_velocity,
+    "vpe_status": _vpe_status,
+    "imu_status": _zeros(1),
+    "sens_sat": lambda of: of.outputs.saturation(),
+    "heave": _zeros(3),  # the emulated vehicle does not heave
+}

@@ -1,0 +1,302 @@
+"""Serves an emulated VN-100 on a pseudo terminal: the only part of the emulator that does I/O.
+
+Two manners:
+
+* as a port is: time passes whoever listens; bytes that nobody has opened the port for vanish, and
+  of a host that reads too slowly `OVERRUN_BYTES` wait, the rest is lost and counted;
+* `lossless`, for runs faster than real time: when the host has not read what was sent, the device's
+  time stands still, so that host and device stay in step and nothing is lost. Time then begins
+  to run when the host begins to read.
+
+A pty has no bit rate of its own. When the rate that the host has set differs from register 5, the
+bytes of both directions are garbled, as they would be on a wire (`check_baud`).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import select
+import struct
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from drivers.vn100.emulator import Emulator
+from drivers.vn100.emulator_faults import garble
+
+TURN_S = 1e-3  # real time between two looks at the line
+CATCH_UP_S = 0.02  # lossless: a stall of the process is not made up for beyond this
+OVERRUN_BYTES = 65536
+UNREAD_BYTES = 512  # lossless: time stands still while the host has left more than this unread
+COOKED_S = 0.2  # a host that has not configured the port for so long is given a raw one
+DESERTED_S = 1.0  # lossless: nobody has read for so long; the port may be opened again
+
+_TCGETS2 = 0x802C542A  # asm-generic: struct termios2, whose speeds are plain numbers
+_TERMIOS2 = struct.Struct("4I20B2I")
+_COOKED = termios.ICANON | termios.ECHO
+
+
+class Line:
+    """One pty: it comes into being when the device is plugged in and goes when it is unplugged.
+
+    hold: keep the host's end open too. The kernel then tells how much the host has not read yet,
+    but not whether there is a host.
+    """
+
+    def __init__(self, link: Path | None, hold: bool) -> None:
+        if link is not None and link.exists() and not link.is_symlink():
+            raise FileExistsError(f"{link} exists and is no symbolic link; choose another --link")
+        self.link = link
+        self._master, self._slave = pty.openpty()
+        self.device = os.ttyname(self._slave)
+        self._hold = hold
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        if not hold:
+            os.close(self._slave)
+        self._poll = select.poll()
+        self._poll.register(self._master, select.POLLIN)
+        if link is not None:
+            self._point(link)
+
+    def _point(self, link: Path) -> None:
+        fresh = link.with_name(f".{link.name}.{os.getpid()}")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(self.device)
+        fresh.replace(link)
+
+    def close(self) -> None:
+        """Unplug: the host's next read fails."""
+        os.close(self._master)
+        if self._hold:
+            os.close(self._slave)
+        link = self.link
+        if link is not None and link.is_symlink() and str(link.readlink()) == self.device:
+            link.unlink()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until bytes come, at most so long. False when no host has the port open."""
+        events = self._poll.poll(seconds * 1000)
+        if any(event & select.POLLHUP for _, event in events):
+            time.sleep(seconds)
+            return False
+        return True
+
+    def read(self) -> bytes:
+        """The host's bytes, if any."""
+        try:
+            return os.read(self._master, 4096)
+        except (BlockingIOError, OSError):  # nothing there, or the host just went away
+            return b""
+
+    def write(self, data: bytes) -> int:
+        """Pass on as much as the line takes; how much that was."""
+        try:
+            return os.write(self._master, data)
+        except BlockingIOError:
+            return 0
+
+    def mode(self) -> tuple[bool, int]:
+        """Whether the host's end is still in line mode, and the bit rate that it has set."""
+        try:
+            raw = fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2.size))
+        except OSError:  # no termios2 on this system
+            return False, 0
+        numbers = _TERMIOS2.unpack(raw)
+        return bool(numbers[3] & _COOKED), numbers[-1]
+
+    def set_raw(self, baud: int) -> None:
+        """Make the host's end raw, at a rate, for hosts that do not (`cat`)."""
+        tty.setraw(self._master)
+        speed = getattr(termios, f"B{baud}", None)
+        if speed is not None:
+            settings = termios.tcgetattr(self._master)
+            settings[4] = settings[5] = speed
+            termios.tcsetattr(self._master, termios.TCSANOW, settings)
+
+    def unread(self) -> int:
+        """Bytes that the host could read now; only where `hold`."""
+        raw = fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4))
+        return int(struct.unpack("i", raw)[0])
+
+    def release(self) -> None:
+        """Undo the exclusive use that a host left behind; only where `hold`."""
+        fcntl.ioctl(self._slave, termios.TIOCNXCL)
+
+
+class PtyEmulator:
+    """Runs an `Emulator` against the clock on a pty, in this thread (`serve`) or in its own.
+
+    link:       symbolic link that always points to the present pty
+    speed:      device seconds per real second, positive
+    lossless:   see above
+    check_baud: garble what passes while the host's bit rate is not the device's
+    report:     called with one line whenever something happens (plugged, reset, faults)
+    overrun_bytes counts what was lost because the host read too slowly.
+    """
+
+    def __init__(
+        self,
+        emulator: Emulator,
+        *,
+        link: Path | None = None,
+        speed: float = 1.0,
+        lossless: bool = False,
+        check_baud: bool = True,
+        report: Callable[[str], None] | None = None,
+    ) -> None:
+        if not speed > 0:
+            raise ValueError(f"speed must be positive, not {speed:g}")
+        self.emulator = emulator
+        self.overrun_bytes = 0
+        self.device_s = 0.0
+        self._link = link
+        self._speed = speed
+        self._lossless = lossless
+        self._check_baud = check_baud
+        self._report = report or (lambda _: None)
+        self._draw = np.random.default_rng(0)
+        self._backlog = bytearray()
+        self._line: Line | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._cooked_since: float | None = None
+        self._read_at = 0.0
+        self._plug()
+
+    @property
+    def path(self) -> str:
+        """What a host opens: the link if there is one, else the pty ("" while unplugged)."""
+        if self._link is not None:
+            return str(self._link)
+        return "" if self._line is None else self._line.device
+
+    def start(self) -> None:
+        """Serve in a thread of its own."""
+        self._thread = threading.Thread(target=self.serve, name="vn100-emulator", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End `serve`, wait for its thread and close the pty. May be called twice."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._unplug()
+
+    def request_stop(self) -> None:
+        """End `serve` soon; for signal handlers."""
+        self._stop.set()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def serve(self) -> None:
+        """Run until `stop`."""
+        last = time.monotonic()
+        while not self._stop.is_set():
+            heard = self._listen()
+            now = time.monotonic()
+            self._pass_time(now - last, now)
+            last = now
+            if heard:
+                self.emulator.receive(heard, self.device_s)
+            self._send(self.emulator.advance(self.device_s))
+            for line in self.emulator.take_log():
+                self._report(f"{self.device_s:9.3f} s  {line}")
+            self._follow_plug()
+
+    def _plug(self) -> None:
+        self._line = Line(self._link, self._lossless)
+        self._present = self._lossless
+        if self._lossless:
+            self._line.set_raw(self.emulator.baud)
+        self._read_at = time.monotonic()
+
+    def _unplug(self) -> None:
+        self._backlog.clear()
+        if self._line is not None:
+            self._line.close()
+            self._line = None
+
+    def _follow_plug(self) -> None:
+        if self.emulator.plugged == (self._line is not None):
+            return
+        if self.emulator.plugged:
+            self._plug()
+            self._report(f"{self.device_s:9.3f} s  port {self.path}")
+        else:
+            self._unplug()
+
+    def _listen(self) -> bytes:
+        """Wait a turn; the host's bytes as the device hears them."""
+        if self._line is None:
+            time.sleep(TURN_S)
+            return b""
+        self._present = self._line.wait(TURN_S)
+        if not self._present:
+            self._backlog.clear()
+            self._cooked_since = None
+            return b""
+        return self._garbled(self._line.read())
+
+    def _garbled(self, data: bytes) -> bytes:
+        if not data or self._line is None or not self._check_baud:
+            return data
+        _, host_baud = self._line.mode()
+        return data if host_baud in (0, self.emulator.baud) else garble(data, self._draw)
+
+    def _pass_time(self, elapsed_s: float, now: float) -> None:
+        if not self._lossless:
+            self.device_s += elapsed_s * self._speed
+            return
+        if self._line is not None and (self._backlog or self._line.unread() > UNREAD_BYTES):
+            if now - self._read_at > DESERTED_S:
+                self._line.release()
+                self._read_at = now
+            return
+        self._read_at = now
+        self.device_s += min(elapsed_s, CATCH_UP_S) * self._speed
+
+    def _send(self, data: bytes) -> None:
+        line = self._line
+        if line is None or not self._present or not self._ready(line):
+            return
+        self._backlog += self._garbled(data)
+        if self._backlog:
+            del self._backlog[: line.write(bytes(self._backlog))]
+        excess = len(self._backlog) - OVERRUN_BYTES
+        if excess > 0 and not self._lossless:
+            del self._backlog[OVERRUN_BYTES:]
+            self.overrun_bytes += excess
+
+    def _ready(self, line: Line) -> bool:
+        """Whether the host has configured the port; before that the kernel would echo our bytes."""
+        cooked, _ = line.mode()
+        if not cooked:
+            self._cooked_since = None
+            return True
+        now = time.monotonic()
+        if self._cooked_since is None:
+            self._cooked_since = now
+        elif now - self._cooked_since > COOKED_S:
+            line.set_raw(self.emulator.baud)
+        return False
