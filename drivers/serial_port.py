@@ -1,0 +1,314 @@
+"""A serial port that is ours alone, and the search for its rate. The only importer of pyserial.
+
+pyserial opens and configures; bytes go through os.read and os.write on its descriptor, which is
+several times cheaper than pyserial's own. Exclusive means all three: flock (programs that ask),
+TIOCEXCL (the kernel refuses other openings, root's excepted) and nobody else in /proc (programs
+that do neither).
+
+Errors::
+
+    PortError                    report it
+    +-- PortAbsent               wait for the device, or the path is wrong
+    +-- PortBusy                 somebody has it: `holders` says who
+    +-- PortUnusable             no permission, no terminal, a rate it cannot do
+    +-- LinkLost                 it was open and is gone: close, open again
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import select
+import struct
+import termios
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import serial
+
+from drivers.port_holders import Holder, holders, is_pty
+from drivers.vn100.decode import Reply, decode
+from drivers.vn100.deframer import Deframer
+from drivers.vn100.sentences import encode
+
+READ_BYTES = 65536
+WRITE_TIMEOUT_S = 2.0
+LISTEN_S = 0.3
+SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
+_TIOCGEXCL = 0x80045440  # Linux asm-generic/ioctls.h; termios does not have it
+_GARBAGE_TOLERATED = 0.5  # part of the bytes at a right rate that may lie outside of messages
+
+
+class PortError(Exception):
+    """A serial port cannot be used; the text is one line for a person."""
+
+
+class PortAbsent(PortError):
+    """There is no such device (now)."""
+
+
+class PortBusy(PortError):
+    """Somebody else has the port; `holders` are those that can be seen."""
+
+    def __init__(self, path: str, others: tuple[Holder, ...]) -> None:
+        who = ", ".join(map(str, others)) or "a process that cannot be seen from here"
+        super().__init__(f"{path} is in use by {who}: stop it first")
+        self.holders = others
+
+
+class PortUnusable(PortError):
+    """The device is there and cannot be opened or configured."""
+
+
+class LinkLost(PortError):
+    """An open port went away: unplugged, hung up, or it takes no more bytes."""
+
+
+class SerialPort:
+    """An open port, 8N1, no flow control, non-blocking. A context manager.
+
+    Raises PortAbsent, PortBusy or PortUnusable. Nothing of the port is touched before it is sure
+    that nobody else has it.
+    """
+
+    def __init__(self, path: str | Path, baud: int) -> None:
+        self.path = str(path)
+        _refuse_if_held(self.path)
+        self._serial = _open(self.path, baud)
+        self._poll = select.poll()
+        self._poll.register(self._serial.fileno(), select.POLLIN)
+        with contextlib.suppress(OSError):  # a port without it has the other two
+            fcntl.ioctl(self._serial.fileno(), termios.TIOCEXCL)
+
+    @property
+    def baud(self) -> int:
+        """Rate that the host side uses."""
+        return int(self._serial.baudrate)
+
+    def fileno(self) -> int:
+        """Descriptor for select and poll."""
+        return int(self._serial.fileno())
+
+    def read(self) -> bytes:
+        """What has arrived, b"" if nothing; never waits. Raises LinkLost."""
+        try:
+            if not self._poll.poll(0):
+                return b""
+            data = os.read(self.fileno(), READ_BYTES)
+        except BlockingIOError:
+            return b""
+        except (OSError, serial.SerialException) as error:
+            raise LinkLost(f"{self.path} is gone: {error}") from error
+        if not data:  # readable without a byte: the other end hung up
+            raise LinkLost(f"{self.path} is gone: hung up")
+        return data
+
+    def write(self, data: bytes, timeout_s: float = WRITE_TIMEOUT_S) -> None:
+        """Write all of `data`, waiting where the port is full. Raises LinkLost."""
+        view, end_s = memoryview(data), time.monotonic() + timeout_s
+        while view:
+            try:
+                view = view[os.write(self.fileno(), view) :]
+            except BlockingIOError:
+                left_s = end_s - time.monotonic()
+                if left_s <= 0:
+                    raise LinkLost(
+                        f"{self.path} took only {len(data) - len(view)} of {len(data)} bytes in "
+                        f"{timeout_s:g} s"
+                    ) from None
+                select.select([], [self.fileno()], [], left_s)
+            except (OSError, serial.SerialException) as error:
+                raise LinkLost(f"{self.path} is gone: {error}") from error
+
+    def set_baud(self, baud: int) -> None:
+        """Change the host's rate and drop what was received at the old one."""
+        try:
+            self._serial.baudrate = baud
+            self._serial.reset_input_buffer()
+        except (ValueError, OSError, termios.error) as error:
+            raise PortUnusable(f"{self.path} cannot do {baud} baud: {error}") from error
+
+    def wait_readable(self, timeout_s: float) -> bool:
+        """Whether bytes (or a hang-up) came within `timeout_s`."""
+        return bool(self._poll.poll(max(0.0, timeout_s) * 1000))
+
+    def close(self) -> None:
+        """Close; safe to call again and after the device is gone."""
+        if self._serial.is_open:
+            with contextlib.suppress(OSError):  # a pty that the other end keeps open remembers it
+                fcntl.ioctl(self._serial.fileno(), termios.TIOCNXCL)
+            self._serial.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+@dataclass(frozen=True, slots=True)
+class RateHeard:
+    """What listening at one rate gave."""
+
+    baud: int
+    received: int
+    messages: int
+
+    def __str__(self) -> str:
+        what = f"{self.received} bytes, no message" if self.received else "silence"
+        return f"{self.baud}: {f'{self.messages} messages' if self.messages else what}"
+
+
+@dataclass(frozen=True, slots=True)
+class BaudFound:
+    """The rate at which valid messages arrive, and why this one was believed."""
+
+    baud: int
+    why: str
+    tried: tuple[RateHeard, ...]
+
+
+class BaudNotFound(PortError):
+    """At no rate was there a valid message; `silent` tells silence from garbage."""
+
+    def __init__(self, path: str, tried: tuple[RateHeard, ...], asked: bool) -> None:
+        self.tried = tried
+        self.silent = not any(heard.received for heard in tried)
+        if self.silent:
+            advice = (
+                "the device does not answer: check power, cable and which of its ports this is"
+                if asked
+                else "the device may be quiet: let it be asked, or give the rate"
+            )
+        else:
+            advice = "bytes arrive but no message: not a VN-100, or a rate that was not tried"
+        super().__init__(f"{path}: {'; '.join(map(str, tried))}. {advice}")
+
+
+def detect_baud(
+    path: str | Path,
+    last_good: int | None = None,
+    configured: int | None = None,
+    listen_s: float = LISTEN_S,
+    *,
+    may_query: bool = False,
+    rates: Iterable[int] = SCANNED_BAUD,
+) -> BaudFound:
+    """The rate that the device talks at. Listens first and never changes the device's rate.
+
+    With `may_query` each rate is then tried with a read of register 1; without, no byte is sent.
+    Order: last good, configured, then 115200 and the others. Raises PortError and BaudNotFound.
+    """
+    preferred = {last_good: "the last good rate", configured: "the configured rate"}
+    order = list(dict.fromkeys(rate for rate in (last_good, configured, *rates) if rate))
+    tried: list[RateHeard] = []
+    with SerialPort(path, order[0]) as port:
+        for attempt in (_listen, _query) if may_query else (_listen,):
+            for baud in order:
+                heard = attempt(port, baud, listen_s)
+                tried.append(heard)
+                if heard.messages:
+                    how = "heard" if attempt is _listen else "an answer came"
+                    reason = preferred.get(baud, "found by trying")
+                    return BaudFound(baud, f"{how} at {baud} baud, {reason}", tuple(tried))
+    raise BaudNotFound(str(path), tuple(tried), may_query)
+
+
+def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
+    """Listen at one rate; messages count only where most bytes belong to them."""
+    port.set_baud(baud)
+    deframer = Deframer()
+    messages = 0
+
+    def enough(chunk: bytes) -> bool:
+        nonlocal messages
+        messages += len(deframer.feed(chunk))
+        return messages >= 2
+
+    received = _collect(port, listen_s, enough)
+    counters = deframer.counters
+    believable = messages and counters.skipped_bytes <= _GARBAGE_TOLERATED * received
+    return RateHeard(baud, received, messages if believable else 0)
+
+
+def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
+    """Ask for the model; only a reply counts. The line end first clears what the device has."""
+    port.set_baud(baud)
+    port.write(b"\r\n" + encode("VNRRG,01"))
+    deframer = Deframer()
+    answers = 0
+
+    def enough(chunk: bytes) -> bool:
+        nonlocal answers
+        replies = [decode(frame) for frame in deframer.feed(chunk)]
+        answers += sum(isinstance(reply, Reply) and reply.register == 1 for reply in replies)
+        return answers > 0
+
+    received = _collect(port, listen_s, enough)
+    return RateHeard(baud, received, answers)
+
+
+def _collect(port: SerialPort, listen_s: float, enough: Callable[[bytes], bool]) -> int:
+    """Read until `enough` says so or the time is over; returns the number of bytes."""
+    end_s = time.monotonic() + listen_s
+    received = 0
+    while (left_s := end_s - time.monotonic()) > 0:
+        if port.wait_readable(left_s):
+            chunk = port.read()
+            received += len(chunk)
+            if enough(chunk):
+                break
+    return received
+
+
+def _refuse_if_held(path: str) -> None:
+    """PortAbsent or PortBusy before anything of the port is changed."""
+    if not Path(path).exists():
+        raise PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
+    others = holders(path)
+    if others:
+        raise PortBusy(path, others)
+    if is_pty(path):  # there the flag outlives its owner, as long as the other end is open
+        return
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        raise _why(path, error) from error
+    try:
+        flag = fcntl.ioctl(descriptor, _TIOCGEXCL, struct.pack("i", 0))
+        if struct.unpack("i", flag)[0]:  # root is not stopped by it, so it must be asked for
+            raise PortBusy(path, ())
+    except OSError:  # an old kernel, or no terminal: the opening will tell
+        return
+    finally:
+        os.close(descriptor)
+
+
+def _open(path: str, baud: int) -> serial.Serial:
+    try:
+        return serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+    except (OSError, ValueError, termios.error) as error:
+        raise _why(path, error) from error
+
+
+def _why(path: str, error: Exception) -> PortError:
+    """What an opening that failed means."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EBUSY, errno.EAGAIN):
+        return PortBusy(path, holders(path))
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
+    if number in (errno.EACCES, errno.EPERM):
+        return PortUnusable(f"{path}: no permission (is the user in the group of the device?)")
+    return PortUnusable(f"{path} cannot be opened as a serial port: {error}")

@@ -1,0 +1,238 @@
+"""What a program may say to a VN-100, how long an answer takes, and what may go wrong.
+
+Only what is in these tables can be constructed. VNFWU (firmware update), VNSBL, VNBLD, VNMCU,
+VNDBS, VNCMD and the other words of vendor tools are not, so no mistake can send them; VNBOM is not,
+because its answer is a measurement and no reply. Source: UM001 "System Commands", "System Error
+Codes".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import TypeVar
+
+from drivers.vn100.decode import Reply
+from drivers.vn100.errors import DeviceRefused, DriverError
+from drivers.vn100.registers import (
+    REGISTERS,
+    RegisterValueError,
+    Values,
+    format_command,
+    parse,
+    same,
+)
+
+WORDS: dict[str, tuple[tuple[int, ...], ...]] = {  # word: the arguments that it takes
+    "VNWNV": ((),),
+    "VNRST": ((),),
+    "VNRFS": ((),),
+    "VNSGB": ((),),
+    "VNTAR": ((),),
+    "VNASY": ((0,), (1,)),
+    "VNKMD": ((0,), (1,)),
+    "VNKAD": ((0,), (1,)),
+}
+
+
+class SessionError(DriverError):
+    """A command sequence could not be carried out; the classes below and DeviceRefused."""
+
+
+class NoReply(SessionError):
+    """The device did not answer `command`, as often as the command may be repeated."""
+
+    def __init__(self, command: Command) -> None:
+        super().__init__(
+            f"no reply to {command}: check the cable, the baud rate and that the device is powered"
+        )
+        self.command = command
+
+
+class LinkGone(SessionError):
+    """The port went away; nothing more can be sent, not even to tidy up."""
+
+    def __init__(self) -> None:
+        super().__init__("the port went away in the middle of a command sequence")
+
+
+class Cancelled(SessionError):
+    """The caller stopped the sequence; what it changed is put back before it ends."""
+
+    def __init__(self) -> None:
+        super().__init__("the command sequence was cancelled")
+
+
+class NotPermitted(SessionError):
+    """The gate of this session (its mode) does not let `command` out; nothing was sent."""
+
+    def __init__(self, command: Command) -> None:
+        super().__init__(f"{command} is not permitted in this mode")
+        self.command = command
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """Read a register; `port` for registers 5 to 7 of the port that is not in use."""
+
+    register: int
+    port: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.register not in REGISTERS:
+            raise ValueError(f"the VN-100 has no register {self.register}")
+        if self.port is not None and (self.register not in (5, 6, 7) or self.port not in (1, 2)):
+            raise ValueError(f"register {self.register} has no port {self.port}")
+
+    @property
+    def body(self) -> str:
+        """What goes between $ and *."""
+        port = "" if self.port is None else f",{self.port}"
+        return f"VNRRG,{self.register:02d}{port}"
+
+    def answered_by(self, reply: Reply) -> bool:
+        """Whether `reply` is one to this: the word, the register, and values that it can have."""
+        values = _values(self.register, "VNRRG", reply)
+        return values is not None and (self.port is None or values[1:] == (self.port,))
+
+    def __str__(self) -> str:
+        return f"read of register {self.register}"
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Write a register in RAM. RegisterValueError where the device would refuse the values."""
+
+    register: int
+    values: Values
+
+    def __post_init__(self) -> None:
+        format_command(self.register, self.values)
+
+    @property
+    def body(self) -> str:
+        """What goes between $ and *."""
+        return f"VNWRG,{format_command(self.register, self.values)}"
+
+    def answered_by(self, reply: Reply) -> bool:
+        """Whether `reply` echoes these values; an echo of others is another program's."""
+        values = _values(self.register, "VNWRG", reply)
+        return values is not None and same(self.register, self.values, values[: len(self.values)])
+
+    def __str__(self) -> str:
+        return f"write of register {self.register}"
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A command that is no register access, such as ``Word("VNASY", (0,))``."""
+
+    word: str
+    arguments: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.arguments not in WORDS.get(self.word, ()):
+            raise ValueError(f"{self.body} is never sent; possible are {', '.join(WORDS)}")
+
+    @property
+    def body(self) -> str:
+        """What goes between $ and *."""
+        return ",".join([self.word, *map(str, self.arguments)])
+
+    def answered_by(self, reply: Reply) -> bool:
+        """Whether `reply` is the echo of this, arguments included."""
+        return (
+            reply.word == self.word
+            and reply.register is None
+            and [token.lstrip("0") for token in reply.tokens]
+            == [str(argument).lstrip("0") for argument in self.arguments]
+        )
+
+    def __str__(self) -> str:
+        return self.body
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Send nothing for a while. The Reply has the names of the layouts that were heard as tokens.
+
+    watch_errors: a VNERR in that time is thrown into the procedure (the window after VNWNV).
+    """
+
+    seconds: float
+    watch_errors: bool = False
+
+
+Command = Read | Write | Word | Pause
+Speech = Read | Write | Word
+RESUME = Word("VNASY", (1,))
+QUIET = Word("VNASY", (0,))
+
+T = TypeVar("T")
+Procedure = Generator[Command, Reply, T]
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long one reply may take (None: the session's own figure) and how often to ask."""
+
+    reply_s: float | None = None
+    tries: int = 3
+
+
+# Never repeated without an answer: a second VNWNV costs flash, a second reset restarts the filter
+# again. Whoever gets NoReply reads registers to see what happened.
+_PATIENCE = {
+    "VNWNV": Patience(2.0, 1),
+    "VNRST": Patience(3.0, 1),
+    "VNRFS": Patience(3.0, 1),
+}
+
+
+def patience(command: Speech) -> Patience:
+    """Timing of a command: UM001 gives none, these are what works in the field."""
+    return _PATIENCE.get(command.word, Patience()) if isinstance(command, Word) else Patience()
+
+
+def reply_time_s(baud: int) -> float:
+    """How long to wait for an ordinary reply: 250 ms, and the device's full transmit buffer."""
+    return 0.25 + 2048 * 10 / baud
+
+
+def confusable(earlier: Speech, later: Speech) -> bool:
+    """Whether a reply to `earlier` could be taken for one to `later`."""
+    if isinstance(earlier, Word) or isinstance(later, Word):
+        return earlier == later
+    return type(earlier) is type(later) and earlier.register == later.register
+
+
+RETRIED_ERRORS = frozenset({0x02, 0x03})  # damaged on the way: nothing was carried out
+FAULTS = frozenset({0x01, 0x0A, 0x0B, 0xFF})  # about the device's own state, at any time
+REFUSALS = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0C})
+
+
+def _values(register: int, word: str, reply: Reply) -> Values | None:
+    """The values of `reply` where it is one of `word` and `register`, else None."""
+    if reply.word != word or reply.register != register:
+        return None
+    try:
+        return parse(register, reply.tokens)
+    except RegisterValueError:
+        return None
+
+
+__all__ = [
+    "Cancelled",
+    "Command",
+    "DeviceRefused",
+    "LinkGone",
+    "NoReply",
+    "NotPermitted",
+    "Pause",
+    "Procedure",
+    "Read",
+    "SessionError",
+    "Speech",
+    "Word",
+    "Write",
+]

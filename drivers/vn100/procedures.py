@@ -1,0 +1,242 @@
+"""Command sequences of a VN-100, as generators for `session.Session`.
+
+A procedure yields commands, is sent their replies and returns its result; `session` carries it out.
+DeviceRefused, NoReply, LinkGone, Cancelled and NotPermitted come out of a `yield` as exceptions.
+Everything that is written lives in RAM until `save_settings`, which saves all of RAM, so session
+settings are put back (`restore`) before it. Source: UM001 "System Commands", the write sequence of
+`write_verified` from the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+from drivers.vn100.commands import (
+    QUIET,
+    RESUME,
+    NoReply,
+    Pause,
+    Procedure,
+    Read,
+    SessionError,
+    Word,
+    Write,
+)
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.firmware import Profile, profile_of
+from drivers.vn100.registers import BINARY_OUTPUT_OFF, BINARY_OUTPUTS, Values, parse, same
+
+T = TypeVar("T")
+
+WRITE_TRIES = 3
+ERROR_WINDOW_S = 1.5  # after VNWNV: the device may still report an error
+INVALID_REGISTER = 0x08
+SESSION_SETTINGS = (*BINARY_OUTPUTS, 7, 6)  # in the order in which `restore` puts them back
+
+# Without one of these nothing can be said about the samples or put back later, so its absence is an
+# error. The others may be missing on some firmware.
+_ESSENTIAL = (5, 6, 7, 23, 26, 30, 44, 47, 75, 76, 77, 84, 85)
+_OPTIONAL = (21, 25, 32, 35, 36, 38, 43, 74, 82, 83)
+CONFIGURATION = tuple(sorted(_ESSENTIAL + _OPTIONAL))
+
+
+class VerifyFailed(SessionError):
+    """The device does not hold what was written: `sent` against `read`, after all tries."""
+
+    def __init__(self, register: int, sent: Values, read: Values) -> None:
+        super().__init__(
+            f"register {register} holds {read} after {WRITE_TRIES} writes of {sent}: "
+            "the device is not as it was asked to be"
+        )
+        self.register, self.sent, self.read = register, sent, read
+
+
+class RestoreFailed(SessionError):
+    """Some settings could not be put back; `errors` says which and why."""
+
+    def __init__(self, errors: Mapping[int, Exception]) -> None:
+        reasons = "; ".join(f"register {number}: {error}" for number, error in errors.items())
+        super().__init__(f"settings not put back: {reasons}")
+        self.errors = dict(errors)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who the device is, from registers 1 to 4."""
+
+    model: str
+    hardware: int
+    serial: int
+    firmware: str
+    profile: Profile
+
+
+def identify() -> Procedure[Identity]:
+    """Registers 1 to 4. What an earlier program left half-sent may spoil the first query."""
+    try:
+        first = yield from read(1)
+    except DeviceRefused:
+        first = yield from read(1)
+    hardware = yield from read(2)
+    serial = yield from read(3)
+    firmware = str((yield from read(4))[0])
+    return Identity(str(first[0]), int(hardware[0]), int(serial[0]), firmware, profile_of(firmware))
+
+
+def read(register: int, port: int | None = None) -> Procedure[Values]:
+    """One register's values."""
+    reply = yield Read(register, port)
+    return parse(register, reply.tokens)
+
+
+def read_registers(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Several registers; DeviceRefused where one does not exist."""
+    values: dict[int, Values] = {}
+    for number in ids:
+        values[number] = yield from read(number)
+    return values
+
+
+def read_configuration(profile: Profile) -> Procedure[dict[int, Values]]:
+    """Every configuration register of this firmware: what must be put back and what un-maps data.
+
+    A register that is not essential and that the device does not have (VNERR 08) is left out, so
+    `missing` can name it.
+    """
+    values: dict[int, Values] = {}
+    for number in CONFIGURATION:
+        if not profile.has(number):
+            continue
+        try:
+            values[number] = yield from read(number)
+        except DeviceRefused as error:
+            if error.code != INVALID_REGISTER or number in _ESSENTIAL:
+                raise
+    return values
+
+
+def missing(profile: Profile, values: Mapping[int, Values]) -> tuple[int, ...]:
+    """Configuration registers that this firmware should have and `values` lacks."""
+    return tuple(n for n in CONFIGURATION if profile.has(n) and n not in values)
+
+
+def write_verified(register: int, values: Values) -> Procedure[Values]:
+    """Write, see the echo, read afresh, compare; up to three times. Returns what was read.
+
+    An echo that never came is no failure as long as the fresh read shows the values. Raises
+    VerifyFailed; ValueError before anything is sent where the device would refuse the values.
+    """
+    command = Write(register, values)
+    back: Values = ()
+    for _ in range(WRITE_TRIES):
+        with suppress(NoReply):  # carried out or not: the read says which
+            yield command
+        back = yield from read(register)
+        if same(register, values, back[: len(values)]):
+            return back
+    raise VerifyFailed(register, values, back)
+
+
+def quiet(procedure: Procedure[T]) -> Procedure[T]:
+    """`procedure` with the asynchronous output paused, and resumed whatever happens.
+
+    Also where VNASY,0 itself got no reply: it may have been carried out. The device cannot be asked
+    whether output was paused before; it is on afterwards.
+    """
+    abandoned = False
+    try:
+        yield QUIET
+        return (yield from procedure)
+    except GeneratorExit:  # dropped without an end: nobody is there to carry out a command
+        abandoned = True
+        raise
+    finally:
+        if not abandoned:
+            yield from resume()
+
+
+def resume() -> Procedure[None]:
+    """Asynchronous output on; asked for twice as often as anything else: silence is no use."""
+    try:
+        yield RESUME
+    except NoReply:
+        yield RESUME
+
+
+def save_settings() -> Procedure[None]:
+    """VNWNV: all of RAM to flash; raises DeviceRefused also for an error shortly behind the echo.
+
+    Sent once: after NoReply nobody knows whether it was carried out, and flash wears. Keep the
+    sensor still, its filter is hardly served for half a second.
+    """
+    yield Word("VNWNV")
+    yield Pause(ERROR_WINDOW_S, watch_errors=True)
+
+
+def restore(saved: Mapping[int, Values], keys: Iterable[int]) -> Procedure[tuple[int, ...]]:
+    """Put the registers `keys` back to `saved`; returns those that had to be written.
+
+    Binary outputs that differ are switched off first, so that the device's check whether all output
+    fits the baud rate cannot refuse an intermediate state; then the rest, the output type (6) last.
+    One that fails does not keep the others from being restored: RestoreFailed at the end.
+    """
+    errors: dict[int, Exception] = {}
+    written: list[int] = []
+    wanted = [number for number in keys if number in saved]
+    order = [n for n in wanted if n not in SESSION_SETTINGS]
+    order += [n for n in SESSION_SETTINGS if n in wanted]
+    for number in order:
+        if number in BINARY_OUTPUTS:
+            yield from _attempted(errors, number, _switch_off(number, saved[number]))
+    for number in order:
+        changed = yield from _attempted(errors, number, _put_back(number, saved[number]))
+        if changed:
+            written.append(number)
+    if errors:
+        raise RestoreFailed(errors)
+    return tuple(written)
+
+
+def differences(
+    saved: Mapping[int, Values], now: Mapping[int, Values]
+) -> dict[int, tuple[Values | None, Values | None]]:
+    """Registers that differ between two readings, with both values; None where one lacks it.
+
+    Both were printed by the device, so they are compared as printed.
+    """
+    result: dict[int, tuple[Values | None, Values | None]] = {}
+    for number in sorted({*saved, *now}):
+        before, after = saved.get(number), now.get(number)
+        if before is None or after is None or not same(number, before, after):
+            result[number] = (before, after)
+    return result
+
+
+def _put_back(number: int, values: Values) -> Procedure[bool]:
+    present = yield from read(number)
+    if same(number, values, present):
+        return False
+    yield from write_verified(number, values)
+    return True
+
+
+def _switch_off(number: int, values: Values) -> Procedure[bool]:
+    present = yield from read(number)
+    if same(number, values, present) or same(number, BINARY_OUTPUT_OFF, present):
+        return False
+    yield from write_verified(number, BINARY_OUTPUT_OFF)
+    return False
+
+
+def _attempted(
+    errors: dict[int, Exception], number: int, procedure: Procedure[bool]
+) -> Procedure[bool]:
+    """`procedure`, its failure noted; a link that is gone or a cancel ends everything."""
+    try:
+        return (yield from procedure)
+    except (DeviceRefused, NoReply, VerifyFailed, ValueError) as error:
+        errors[number] = error
+        return False

@@ -1,0 +1,532 @@
+"""The conversation: which reply answers, what late and foreign ones do, what always goes out.
+
+Lines are the manual's or recorded ones, except in the property test, which computes its own.
+"""
+
+from __future__ import annotations
+
+import pytest
+from drivers.vn100.decode import Measurement, Reply
+from drivers.vn100.errors import DeviceRefused
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.vn100.commands import (
+    QUIET,
+    RESUME,
+    Cancelled,
+    LinkGone,
+    NoReply,
+    NotPermitted,
+    Pause,
+    Read,
+    Word,
+    Write,
+    reply_time_s,
+)
+from drivers.vn100.procedures import VerifyFailed, quiet, read, save_settings, write_verified
+from drivers.vn100.session import DeviceFault, Failed, Finished, Session, Stray
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+OTHER = (1.02, 0.01, 0.0, 0.01, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 0.1)
+READ_23 = b"$VNRRG,23*72\r\n"
+WRITE_23 = b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*76\r\n"
+WRITE_23_OTHER = b"$VNWRG,23,1.02,0.01,0,0.01,0.98,0,0,0,1.01,0.05,-0.03,0.1*6F\r\n"
+REPLY_23 = b"$VNRRG,23,1,0,0,0,1,0,0,0,1,0,0,0*73\r\n"
+REPLY_25 = b"$VNRRG,25,1,0,0,0,1,0,0,0,1,0,0,0*75\r\n"
+REPLY_27 = (
+    b"$VNRRG,27,+006.380,+000.023,-001.953,+1.0640,-0.2531,+3.0614,+00.005,+00.344,-09.758,"
+    b"-0.001222,-0.000450,-0.001218*4F\r\n"
+)
+YMR = (
+    b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"
+    b"-00.000018,+00.001122,-00.000551*69\r\n"
+)
+READ_1, READ_3, READ_4 = b"$VNRRG,01*72\r\n", b"$VNRRG,03*70\r\n", b"$VNRRG,04*77\r\n"
+REPLY_1, REPLY_4 = b"$VNRRG,01,VN-200T-CR*31\r\n", b"$VNRRG,04,3.1.0.0*77\r\n"
+ASY_0, ASY_1, WNV = b"$VNASY,0*4F\r\n", b"$VNASY,1*4E\r\n", b"$VNWNV*57\r\n"
+
+
+def error(code):
+    return {
+        0x01: b"$VNERR,01*70\r\n", 0x02: b"$VNERR,02*73\r\n", 0x03: b"$VNERR,03*72\r\n",
+        0x04: b"$VNERR,04*75\r\n", 0x05: b"$VNERR,05*74\r\n", 0x06: b"$VNERR,06*77\r\n",
+        0x07: b"$VNERR,07*76\r\n", 0x08: b"$VNERR,08*79\r\n", 0x09: b"$VNERR,09*78\r\n",
+        0x0A: b"$VNERR,0A*00\r\n", 0x0B: b"$VNERR,0B*03\r\n", 0x0C: b"$VNERR,0C*02\r\n",
+        0xFF: b"$VNERR,FF*71\r\n",
+    }[code]  # fmt: skip
+
+
+def session(allow=lambda _: True):
+    return Session(allow, reply_timeout_s=0.4)
+
+
+def one(procedure):
+    """A procedure of one command, whose result is the reply."""
+    return (yield procedure)
+
+
+def checksum(body):
+    value = 0
+    for byte in body.encode():
+        value ^= byte
+    return f"${body}*{value:02X}\r\n".encode()
+
+
+def test_a_read_is_asked_in_ascii_and_answered():
+    s = session()
+    assert s.start(read(23), 0.0) == []
+    assert s.take_output() == READ_23
+    assert s.take_output() == b""
+    assert s.busy
+    assert s.deadline_s == pytest.approx(0.4)
+    assert s.receive(REPLY_23[:20], 0.01) == []
+    assert s.receive(REPLY_23[20:], 0.02) == [Finished(IDENTITY)]
+    assert not s.busy
+    assert s.deadline_s is None
+
+
+def test_only_one_procedure_at_a_time():
+    s = session()
+    s.start(read(23), 0.0)
+    with pytest.raises(RuntimeError, match="already running"):
+        s.start(read(25), 0.0)
+
+
+def test_a_measurement_never_answers_a_read_and_keeps_its_place():
+    s = session()
+    s.start(read(27), 0.0)
+    events = s.receive(YMR + REPLY_27 + YMR, 0.1)
+    assert [type(event) for event in events] == [Measurement, Finished, Measurement]
+    assert events[0].layout.name == "VNYMR"
+    assert events[1].result[:3] == (6.38, 0.023, -1.953)
+
+
+def test_a_reply_about_another_register_is_somebody_elses():
+    s = session()
+    s.start(read(23), 0.0)
+    (event,) = s.receive(REPLY_25, 0.1)
+    assert isinstance(event, Stray)
+    assert (event.reply.word, event.reply.register) == ("VNRRG", 25)
+    (event,) = s.receive(WRITE_23, 0.2)
+    assert event == Stray(Reply("VNWRG", 23, tuple("100010001000")))
+    assert s.receive(REPLY_23, 0.3) == [Finished(IDENTITY)]
+
+
+def test_a_reply_with_nonsense_in_it_is_no_reply():
+    s = session()
+    s.start(read(44), 0.0)
+    (event,) = s.receive(checksum("VNRRG,44,0,nan,5"), 0.1)
+    assert isinstance(event, Stray)
+    assert s.busy
+
+
+def test_the_echo_of_a_write_must_be_what_was_sent():
+    s = session()
+    s.start(one(Write(23, IDENTITY)), 0.0)
+    assert s.take_output() == WRITE_23
+    (event,) = s.receive(WRITE_23_OTHER, 0.1)
+    assert isinstance(event, Stray)
+    (event,) = s.receive(WRITE_23, 0.2)
+    assert isinstance(event, Finished)
+
+
+def test_silence_is_asked_three_times_then_no_reply():
+    s = session()
+    s.start(read(23), 0.0)
+    assert s.take_output() == READ_23
+    for now_s in (0.4, 0.8):
+        assert s.tick(now_s - 0.01) == []
+        assert s.take_output() == b""
+        assert s.tick(now_s) == []
+        assert s.take_output() == READ_23
+    (event,) = s.tick(1.21)
+    assert isinstance(event.error, NoReply)
+    assert event.error.command == Read(23)
+    assert "cable" in str(event.error)
+    assert not s.busy
+
+
+@pytest.mark.parametrize("code", [0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0C])
+def test_a_refusal_ends_the_command(code):
+    s = session()
+    s.start(read(23), 0.0)
+    (event,) = s.receive(error(code), 0.1)
+    assert isinstance(event.error, DeviceRefused)
+    assert event.error.code == code
+
+
+@pytest.mark.parametrize("code", [0x02, 0x03])
+def test_a_damaged_command_is_sent_again_at_once(code):
+    s = session()
+    s.start(read(23), 0.0)
+    s.take_output()
+    for _ in range(2):
+        assert s.receive(error(code), 0.1) == []
+        assert s.take_output() == READ_23
+    (event,) = s.receive(error(code), 0.2)
+    assert event.error.code == code
+
+
+@pytest.mark.parametrize("code", [0x01, 0x0A, 0x0B, 0xFF])
+def test_faults_are_events_at_any_time_and_answer_nothing(code):
+    s = session()
+    assert s.receive(error(code), 0.0) == [DeviceFault(code)]
+    s.start(read(23), 0.1)
+    assert s.receive(error(code), 0.2) == [DeviceFault(code)]
+    assert s.receive(REPLY_23, 0.3) == [Finished(IDENTITY)]
+
+
+def test_a_refusal_without_a_command_is_a_fault():
+    assert session().receive(error(0x07), 0.0) == [DeviceFault(0x07)]
+
+
+def test_a_late_reply_answers_the_repeated_command_and_a_barrier_catches_the_second():
+    def twice():
+        first = yield from read(23)
+        second = yield from read(23)
+        return first, second
+
+    s = session()
+    s.start(twice(), 0.0)
+    s.tick(0.4)
+    assert s.take_output() == READ_23 + READ_23
+    assert s.receive(REPLY_23, 0.45) == []
+    assert s.take_output() == READ_1  # not register 23: the other attempt's reply may still come
+    (stale,) = s.receive(REPLY_23, 0.5)
+    assert isinstance(stale, Stray)
+    assert s.receive(REPLY_1, 0.55) == []
+    assert s.take_output() == READ_23
+    fresh = checksum("VNRRG,23,1.02,0.01,0,0.01,0.98,0,0,0,1.01,0.05,-0.03,0.1")
+    assert s.receive(fresh, 0.6) == [Finished((IDENTITY, OTHER))]
+
+
+def test_a_late_reply_with_the_old_values_does_not_verify_a_write():
+    """Read (answered late) ... write other values ... read: the old read's reply is not the new."""
+
+    def sequence():
+        yield from read(23)
+        return (yield from write_verified(23, IDENTITY))
+
+    s = session()
+    s.start(sequence(), 0.0)
+    s.tick(0.4)  # the first attempt's reply is late
+    s.receive(REPLY_23, 0.5)
+    s.take_output()
+    s.receive(REPLY_23, 0.6)  # it comes, with values that the next write happens to have
+    s.receive(REPLY_1, 0.61)
+    assert s.take_output() == WRITE_23
+    s.receive(WRITE_23, 0.62)
+    assert s.take_output() == READ_23
+    kept = checksum("VNRRG,23,1.02,0.01,0,0.01,0.98,0,0,0,1.01,0.05,-0.03,0.1")
+    assert s.receive(kept, 0.63) == []  # the device did not keep the write
+    assert s.take_output() == WRITE_23
+    for now_s in (0.7, 0.8):
+        s.receive(WRITE_23 + kept, now_s)
+    s.receive(b"", 0.9)
+    assert not s.busy
+
+
+def test_errors_during_a_barrier_are_the_earlier_commands():
+    def sequence():
+        with pytest.raises(NoReply):
+            yield Read(85)
+        return (yield from read(23))
+
+    s = session()
+    s.start(sequence(), 0.0)
+    for now_s in (0.4, 0.81, 1.22):
+        s.tick(now_s)
+    assert s.take_output() == b"$VNRRG,85*7E\r\n" * 3 + READ_1
+    assert s.receive(error(0x08), 1.25) == [DeviceFault(0x08)]
+    s.receive(REPLY_1, 1.3)
+    assert s.take_output() == READ_23
+    assert s.receive(REPLY_23, 1.35) == [Finished(IDENTITY)]
+
+
+def test_a_silent_barrier_is_tried_with_another_register_then_the_command_must_be_unmistakable():
+    def sequence():
+        for command in (Read(23), Read(23), Read(25)):
+            with pytest.raises(NoReply):
+                yield command
+        return "end"
+
+    s = session()
+    s.start(sequence(), 0.0)
+    sent, now_s, events = b"", 0.0, []
+    while s.busy:
+        now_s = s.deadline_s
+        events += s.tick(now_s)
+        sent += s.take_output()
+    assert events == [Finished("end")]
+    # the second read of 23 could be answered by the first's late reply: never sent
+    assert sent == READ_23 * 3 + READ_1 + READ_3 + READ_4 + checksum("VNRRG,02") + (
+        checksum("VNRRG,25") * 3
+    )
+
+
+def test_a_late_reply_is_forgotten_after_five_seconds():
+    def sequence():
+        with pytest.raises(NoReply):
+            yield Read(23)
+        yield Pause(6.0)
+        return (yield from read(23))
+
+    s = session()
+    s.start(sequence(), 0.0)
+    for now_s in (0.4, 0.81, 1.22, 7.3):
+        s.tick(now_s)
+    assert s.take_output() == READ_23 * 4
+
+
+def test_the_gate_holds_back_every_command_and_its_repetitions():
+    s = session(allow=lambda command: False)
+    (event,) = s.start(read(23), 0.0)
+    assert isinstance(event.error, NotPermitted)
+    assert str(event.error) == "read of register 23 is not permitted in this mode"
+    assert s.take_output() == b""
+
+    asked = []
+    s = session(allow=lambda command: not asked and asked.append(command) is None)
+    s.start(one(Write(23, IDENTITY)), 0.0)
+    assert s.take_output() == WRITE_23
+    (event,) = s.tick(0.5)
+    assert isinstance(event.error, NotPermitted)
+    assert s.take_output() == b""
+
+
+def test_observing_never_writes_even_to_clean_up():
+    s = session(allow=lambda command: isinstance(command, Read))
+    (event,) = s.start(quiet(write_verified(23, IDENTITY)), 0.0)
+    assert isinstance(event.error, NotPermitted)
+    assert s.take_output() == b""
+
+
+@pytest.mark.parametrize(
+    ("word", "arguments"),
+    [("VNFWU", ()), ("VNSBL", ()), ("VNBLD", ()), ("VNMCU", ()), ("VNDBS", ()), ("VNCMD", ()),
+     ("VNBOM", (1,)), ("VNASY", (2,)), ("VNASY", ()), ("VNWNV", (1,)), ("VNRRG", (23,))],
+)  # fmt: skip
+def test_dangerous_words_cannot_be_constructed(word, arguments):
+    with pytest.raises(ValueError, match="never sent"):
+        Word(word, arguments)
+
+
+def test_impossible_reads_and_writes_cannot_be_constructed():
+    with pytest.raises(ValueError, match="no register 99"):
+        Read(99)
+    with pytest.raises(ValueError, match="no port"):
+        Read(23, 1)
+    with pytest.raises(ValueError, match="read only"):
+        Write(47, IDENTITY)
+    with pytest.raises(ValueError, match="finite"):
+        Write(23, (float("nan"), *IDENTITY[1:]))
+
+
+def test_output_is_paused_and_resumed_around_a_sequence():
+    s = session()
+    s.start(quiet(read(23)), 0.0)
+    assert s.take_output() == ASY_0
+    s.receive(YMR + ASY_0, 0.1)
+    assert s.take_output() == READ_23
+    s.receive(REPLY_23, 0.2)
+    assert s.take_output() == ASY_1
+    assert s.receive(ASY_1, 0.3) == [Finished(IDENTITY)]
+
+
+@pytest.mark.parametrize("how", ["refused", "no reply", "cancelled"])
+def test_output_is_resumed_however_the_sequence_ends(how):
+    s = session()
+    s.start(quiet(read(23)), 0.0)
+    s.receive(ASY_0, 0.1)
+    s.take_output()
+    if how == "refused":
+        events = s.receive(error(0x08), 0.2)
+    elif how == "cancelled":
+        events = s.cancel(0.2)
+        assert s.cancel(0.2) == []
+    else:
+        events = s.tick(0.5) + s.tick(0.91) + s.tick(1.32)
+    assert events == []
+    if how != "refused":  # the read may still be answered
+        assert s.take_output()[-len(READ_1) :] == READ_1
+        s.receive(REPLY_1, 1.4)
+    assert s.take_output() == ASY_1
+    (event,) = s.receive(ASY_1, 1.5)
+    assert type(event.error) is {"refused": DeviceRefused, "cancelled": Cancelled}.get(how, NoReply)
+
+
+def test_output_is_resumed_although_nothing_ever_answers():
+    s = session()
+    s.start(quiet(read(23)), 0.0)
+    sent, events = b"", []
+    while s.busy:
+        events += s.tick(s.deadline_s)
+        sent += s.take_output()
+    assert ASY_1 in sent
+    assert READ_23 not in sent
+    assert isinstance(events[-1].error, NoReply)
+
+
+def test_nothing_is_sent_when_the_link_is_gone():
+    s = session()
+    s.start(quiet(quiet(read(23))), 0.0)
+    s.take_output()
+    (event,) = s.link_lost(0.1)
+    assert isinstance(event.error, LinkGone)
+    assert s.take_output() == b""
+    assert not s.busy
+    assert s.deadline_s is None
+    s.start(one(QUIET), 10.0)
+    assert s.take_output() == ASY_0
+
+
+def test_saving_waits_longer_asks_once_and_watches_for_errors():
+    s = session()
+    s.start(save_settings(), 0.0)
+    assert s.take_output() == WNV
+    assert s.deadline_s == 2.0
+    assert s.receive(WNV, 1.0) == []
+    assert s.deadline_s == 2.5
+    assert s.tick(2.5) == [Finished(None)]
+
+    s.start(save_settings(), 3.0)
+    s.receive(WNV, 4.0)
+    (event,) = s.receive(error(0x07), 4.5)
+    assert event.error.code == 0x07
+
+    s.start(save_settings(), 6.0)
+    s.take_output()
+    (event,) = s.tick(8.0)
+    assert isinstance(event.error, NoReply)
+    assert s.take_output() == b""
+
+
+def test_a_pause_says_what_was_heard():
+    s = session()
+    s.start(one(Pause(0.3)), 0.0)
+    s.receive(YMR + YMR, 0.1)
+    assert s.tick(0.2) == []
+    (event,) = s.tick(0.3)
+    assert event.result.tokens == ("VNYMR",)
+
+
+def test_half_a_message_is_given_up_after_a_silence():
+    s = session()
+    s.receive(YMR[:50], 0.0)
+    assert s.deadline_s == pytest.approx(0.1)
+    s.tick(0.1)
+    assert s.deadline_s is None
+    (event,) = s.receive(YMR, 1.0)
+    assert isinstance(event, Measurement)
+
+
+def test_a_word_is_answered_by_its_own_argument_only():
+    s = session()
+    s.start(one(RESUME), 0.0)
+    assert isinstance(s.receive(ASY_0, 0.1)[0], Stray)
+    assert isinstance(s.receive(ASY_1, 0.1)[0], Finished)
+
+
+def test_a_port_is_asked_for_and_must_be_in_the_reply():
+    s = session()
+    s.start(read(6, 1), 0.0)
+    assert s.take_output() == checksum("VNRRG,06,1")
+    assert isinstance(s.receive(checksum("VNRRG,06,14"), 0.1)[0], Stray)
+    assert isinstance(s.receive(checksum("VNRRG,06,14,2"), 0.1)[0], Stray)
+    assert s.receive(b"$VNRRG,06,1,1*0865\r\n", 0.2) == [Finished((1, 1))]
+
+
+def test_a_slow_line_gets_more_patience():
+    assert reply_time_s(921600) < 0.3 < reply_time_s(115200) < 0.5 < 2.0 < reply_time_s(9600)
+
+
+class Wire:
+    """A device on a line that keeps its order: it stores, loses, is late, and serves a second
+    program. What it holds in register 23 is the truth of the property."""
+
+    def __init__(self, faults):
+        self.register = dict.fromkeys((23, 25), ["9"] * 12)
+        self.faults = faults
+        self.queue = []  # (due_s, bytes), in order
+        self.last_due_s = 0.0
+
+    def command(self, line, now_s):
+        fault = next(self.faults, "none")
+        if fault == "lost on the way there":
+            return
+        if fault == "damaged on the way there":
+            self.say(checksum("VNERR,03"), now_s, "none")
+            return
+        word, number, *values = line[1 : line.index("*")].split(",")
+        reply = f"{word},{number}"
+        if word == "VNWRG" and fault != "not kept":
+            self.register[int(number)] = [f"{float(v):G}" for v in values]
+        if word in ("VNRRG", "VNWRG"):
+            stored = {1: ["VN-100"], 2: ["1"], 3: ["7"], 4: ["3.1.0.0"], **self.register}
+            values = values if fault == "not kept" and word == "VNWRG" else stored[int(number)]
+            reply += "," + ",".join(values)
+        self.say(checksum(reply), now_s, fault)
+
+    def say(self, data, now_s, fault):
+        if fault == "reply lost":
+            return
+        delay_s = {"late": 0.5, "very late": 1.1, "later than all tries": 1.7}.get(fault, 0.004)
+        self.last_due_s = max(self.last_due_s, now_s + delay_s)
+        self.queue.append((self.last_due_s, data))
+
+    def foreign(self, kind, now_s):
+        """Another program on the same line, or noise that happens to be a sentence."""
+        if kind == "read":
+            self.say(checksum("VNRRG,23," + ",".join(self.register[23])), now_s, "none")
+        elif kind == "write 25":
+            self.register[25] = ["1"] * 12
+            self.say(checksum("VNWRG,25," + ",".join(self.register[25])), now_s, "none")
+        elif kind == "error":
+            self.say(checksum("VNERR,07"), now_s, "none")
+        elif kind == "measurement":
+            self.say(YMR, now_s, "none")
+
+
+FAULTS = st.sampled_from(
+    ["none"] * 4
+    + ["lost on the way there", "damaged on the way there", "not kept", "reply lost"]
+    + ["late", "very late", "later than all tries"]
+)
+FOREIGN = st.sampled_from(["nothing"] * 3 + ["read", "write 25", "error", "measurement"])
+VALUES = st.sampled_from([IDENTITY, OTHER])
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    faults=st.lists(FAULTS, max_size=40),
+    foreign=st.lists(FOREIGN, max_size=40),
+    writes=st.lists(VALUES, min_size=1, max_size=4),
+    cut=st.integers(1, 60),
+)
+def test_verified_means_that_the_device_holds_the_values(faults, foreign, writes, cut):
+    wire, s, now_s = Wire(iter(faults)), session(), 0.0
+    strangers, verified = iter(foreign), 0
+    for values in writes:
+        events = s.start(quiet(write_verified(23, values)), now_s)
+        while s.busy:
+            for line in s.take_output().decode().splitlines():
+                wire.command(line, now_s)
+            wire.foreign(next(strangers, "nothing"), now_s)
+            due = [d for d, _ in wire.queue[:1]] + [s.deadline_s]
+            now_s = max(now_s, min(due))
+            if wire.queue and wire.queue[0][0] <= now_s:
+                data = wire.queue.pop(0)[1]
+                events += s.receive(data[:cut], now_s)
+                events += s.receive(data[cut:], now_s)
+            else:
+                events += s.tick(now_s)
+            assert now_s < 200.0
+        end = next(event for event in events if isinstance(event, Finished | Failed))
+        if isinstance(end, Finished):
+            verified += 1
+            assert [float(v) for v in wire.register[23]] == list(values)
+        else:
+            assert isinstance(end.error, NoReply | DeviceRefused | VerifyFailed)
+    if not faults and not foreign:
+        assert verified == len(writes)
