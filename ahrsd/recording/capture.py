@@ -119,6 +119,7 @@ class CaptureWriter:
         self,
         path: Path,
         header: Mapping[str, str],
+        *,
         part_bytes: int | None = None,
         keep_bytes: int | None = None,
         queue_bytes: int = QUEUE_BYTES,

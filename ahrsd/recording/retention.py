@@ -26,11 +26,11 @@ def new_capture_path(directory: Path, now: datetime | None = None) -> Path:
 def prune(directory: Path, keep_bytes: int, keep: Path) -> list[Path]:
     """Remove the oldest captures until all fit into `keep_bytes`; `keep` always stays.
 
-    Returns what was removed. A file that another process removed first is no error.
+    Returns what was removed. A file that cannot be removed is no reason to stop recording.
     """
     files = []
     for path in directory.glob(_PATTERN):
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):
             status = path.stat()
             files.append((status.st_mtime_ns, path, status.st_size))
     total = sum(size for _, _, size in files)
@@ -39,7 +39,8 @@ def prune(directory: Path, keep_bytes: int, keep: Path) -> list[Path]:
         if total <= keep_bytes:
             break
         if path != keep:
-            path.unlink(missing_ok=True)
-            removed.append(path)
-            total -= size
+            with contextlib.suppress(OSError):
+                path.unlink()
+                removed.append(path)
+                total -= size
     return removed
