@@ -15,6 +15,7 @@ from drivers.vn100.emulator_motion import Array
 FADING_S = {1: 90.0, 2: 70.0, 3: 50.0, 4: 30.0, 5: 18.0}  # by ConvergeRate
 SAMPLE_TICKS = 40  # one sample in so many ticks is used
 _PULL = 1e-4  # of the weight of the data
+_STEP_GAUSS = 0.02
 _UNIT_GAUSS = 0.5  # so that the quadric's coefficients are about 1
 
 
@@ -32,13 +33,18 @@ class OnBoardHsi:
         self._sums: Array = np.zeros(9)
         self._weight = 0.0
         self._solution: Array | None = None
+        self._newest: Array | None = None
 
     def add(self, field_gauss: Array, converge_rate: int, period_s: float) -> None:
-        """Use samples (N, 3), one every `period_s`, and solve."""
+        """Use samples (N, 3), one every `period_s`, as far as the field has moved, and solve."""
+        fade = np.exp(-len(field_gauss) * period_s / FADING_S[converge_rate])
+        moved = [sample for sample in field_gauss if self._moved(sample)]
+        if not moved:
+            return
+        field_gauss = np.array(moved)
         x, y, z = (field_gauss / _UNIT_GAUSS).T
         rows = np.column_stack((x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z))
         rows = np.hstack((rows, 2 * field_gauss / _UNIT_GAUSS))
-        fade = np.exp(-len(rows) * period_s / FADING_S[converge_rate])
         self._moments = fade * self._moments + rows.T @ rows
         self._sums = fade * self._sums + rows.sum(axis=0)
         self._weight = fade * self._weight + len(rows)
@@ -46,6 +52,13 @@ class OnBoardHsi:
             power = float(np.mean(np.sum(rows[:, :3], axis=1)))
             self._solution = np.concatenate((np.full(3, 1 / power), np.zeros(6)))
         self._solve(self._solution)
+
+    def _moved(self, sample: Array) -> bool:
+        """Whether this is a new direction: at rest there is nothing to learn but noise."""
+        if self._newest is not None and np.linalg.norm(sample - self._newest) < _STEP_GAUSS:
+            return False
+        self._newest = sample
+        return True
 
     def _solve(self, present: Array) -> None:
         pull = _PULL * self._weight
