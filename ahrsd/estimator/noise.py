@@ -1,0 +1,110 @@
+"""Noise levels from the data: first guess from differences, then from the chain's residuals.
+
+Second differences of white noise have variance 6 s^2 and remove whatever is linear over three
+steps; the median of their size is robust against the rest.
+
+In the steady chain a tangent direction with field information a and motion information b per step
+has the hat value h = 1 / sqrt(1 + 4 b / a) on its field residual and 1 - h on its motion residual
+(inverse of the tridiagonal matrix -b, a + 2 b, -b). So the field residuals of an epoch have
+3 n - sum h degrees of freedom, the motion residuals sum h: both noise levels follow from one pass
+(restricted maximum likelihood at fixed calibration; tests/test_estimator_noise.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.estimator import chain
+from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.samples import Array
+
+_MAD = 1.4826
+_GYRO_LIMIT = 1.5
+_STRENGTH = 100.0  # degrees of freedom by which an epoch's noise is drawn to the usual one
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """Sums of squares of an epoch's residuals in units of the sensors, and their freedom."""
+
+    mag_gauss2: float
+    mag_freedom: float
+    gyro_rad2_s2: float
+    gyro_freedom: float
+
+
+def from_differences(values: Array) -> float:
+    """Standard deviation of white noise on (N, 3) rows by the median of second differences."""
+    second = values[2:] - 2 * values[1:-1] + values[:-2]
+    return float(_MAD * np.median(np.abs(second)) / np.sqrt(6.0))
+
+
+def first_guess(data: chain.Data, parameters: EstimatorParameters) -> chain.Noise:
+    """Noise of an epoch before anything is known about its calibration."""
+    rate = data.angle_b_rad[1:] / data.dt_s[1:, None]
+    return _floored(from_differences(data.field_b_gauss), from_differences(rate), parameters)
+
+
+def residuals(q: chain.Quadratic, data: chain.Data, used: chain.Noise, M: Array) -> Residuals:
+    """What an epoch linearised with the noise levels `used` says about them."""
+    dt = float(np.median(data.dt_s[1:]))
+    a = np.sum(np.square(np.einsum("ij,njk->nik", M, q.tangents)), axis=1) / used.mag_gauss**2
+    b = 1.0 / (used.gyro_rad_s * dt) ** 2
+    hat = float(np.sum(1.0 / np.sqrt(1.0 + 4.0 * b / np.maximum(a, 1e-12))))
+    return Residuals(
+        q.sum_mag * used.mag_gauss**2,
+        max(q.count_mag - hat, 1.0),
+        q.sum_gyro * used.gyro_rad_s**2,
+        max(hat, 1.0),
+    )
+
+
+def pooled(
+    found: Sequence[Residuals], guess: chain.Noise, parameters: EstimatorParameters
+) -> chain.Noise:
+    """The usual noise: all epochs together, without those three times noisier than the median.
+
+    The gyro's noise may not exceed its first guess by more than half: motion between samples makes
+    that guess too large already, and what a wrong calibration leaves over must not be called noise
+    of the gyro.
+    """
+    mag = np.array([(r.mag_gauss2, r.mag_freedom) for r in found])
+    gyro = np.array([(r.gyro_rad2_s2, r.gyro_freedom) for r in found])
+    limit = _GYRO_LIMIT * guess.gyro_rad_s
+    return _floored(_pooled(mag), min(_pooled(gyro), limit), parameters)
+
+
+def median(guesses: Sequence[chain.Noise]) -> chain.Noise:
+    """The middle of several first guesses."""
+    return chain.Noise(
+        float(np.median([g.mag_gauss for g in guesses])),
+        float(np.median([g.gyro_rad_s for g in guesses])),
+    )
+
+
+def shrunk(found: Residuals, usual: chain.Noise, parameters: EstimatorParameters) -> chain.Noise:
+    """An epoch's own noise, drawn to the usual one: a disturbed epoch loses weight by itself."""
+    mag = found.mag_gauss2 + _STRENGTH * usual.mag_gauss**2
+    gyro = found.gyro_rad2_s2 + _STRENGTH * usual.gyro_rad_s**2
+    return _floored(
+        float(np.sqrt(mag / (found.mag_freedom + _STRENGTH))),
+        min(
+            float(np.sqrt(gyro / (found.gyro_freedom + _STRENGTH))), _GYRO_LIMIT * usual.gyro_rad_s
+        ),
+        parameters,
+    )
+
+
+def _pooled(table: Array) -> float:
+    variance = table[:, 0] / table[:, 1]
+    usual = variance <= 9 * np.median(variance)
+    return float(np.sqrt(table[usual, 0].sum() / table[usual, 1].sum()))
+
+
+def _floored(mag: float, gyro: float, parameters: EstimatorParameters) -> chain.Noise:
+    return chain.Noise(
+        max(mag, parameters.mag_noise_floor_gauss), max(gyro, parameters.gyro_noise_floor_rad_s)
+    )

@@ -1,0 +1,37 @@
+"""What a person may set about the estimator; every number with its unit, effect and default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorParameters:
+    """Settings of the estimator (VQF's discipline: what it does, which way it pushes, unit).
+
+    step_rate_hz:      streams faster than this are averaged down to it; higher follows faster
+                       motion and costs more [33 Hz]
+    epoch_steps:       steps per epoch, one GTSAM factor each; larger loses less at the borders of
+                       epochs and answers later [512]
+    window_steps:      steps that are kept to be linearised again; older ones are folded into one
+                       Gaussian factor. Larger is nearer to the batch answer [16384]
+    bias_walk_rad_s_sqrt_s: random walk of the gyro bias; larger follows temperature faster and
+                       averages less [2e-6 rad/s/sqrt(s)]
+    prior_soft_iron:   1-sigma of the soft iron's entries around the device's present value [0.3]
+    prior_hard_iron_gauss: the same for the hard iron [0.5 G]
+    prior_gyro_bias_rad_s: the same for the gyro bias [0.05 rad/s]
+    outlier_sigma:     field residuals beyond this many sigmas lose weight quadratically [4.6, which
+                       Gaussian noise exceeds once in 10^4 samples]
+    mag_noise_floor_gauss, gyro_noise_floor_rad_s: never believe less noise than this
+    """
+
+    step_rate_hz: float = 33.0
+    epoch_steps: int = 512
+    window_steps: int = 16384
+    bias_walk_rad_s_sqrt_s: float = 2e-6
+    prior_soft_iron: float = 0.3
+    prior_hard_iron_gauss: float = 0.5
+    prior_gyro_bias_rad_s: float = 0.05
+    outlier_sigma: float = 4.6
+    mag_noise_floor_gauss: float = 1e-5
+    gyro_noise_floor_rad_s: float = 1e-6

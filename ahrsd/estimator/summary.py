@@ -1,0 +1,74 @@
+"""From the graph's numbers to an `Estimate`: scale as a gauge, sigmas, heading, observability."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.calibration import Observability
+from ahrsd.estimator import chain
+from ahrsd.samples import Array
+
+_NAMES = (
+    *(f"soft iron {i}" for i in ("xx", "xy", "xz", "yy", "yz", "zz")),
+    *(f"hard iron {i}" for i in "xyz"),
+    *(f"gyro bias {i}" for i in "xyz"),
+)
+_SEEN = 0.5  # a direction whose sigma shrank by less than this from the prior is not observed
+_FLOOR = 0.1  # ratio at which the observability score is 1
+
+
+def unit_volume(c: Array) -> tuple[Array, Array, float, Array]:
+    """A (3, 3) with det 1, b (3,), |h|, and d[A (6), b (3)]/d[M (6), b (3)] (9, 9).
+
+    A = M / r with r = det(M)^(1/3), so dA = dM / r - A tr(M^-1 dM) / 3.
+    """
+    M = chain.symmetric(c[:6])
+    r = float(np.cbrt(np.linalg.det(M)))
+    A = M / r
+    inverse = np.linalg.inv(M)
+    J = np.eye(9)
+    for j in range(6):
+        dM = chain.symmetric(np.eye(6)[j])
+        J[:6, j] = chain.upper_triangle(dM / r - A * np.trace(inverse @ dM) / 3)
+    return A, c[6:9].copy(), r, J
+
+
+def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float) -> float:
+    """Worst 1-sigma heading error over 12 headings at the given tilts.
+
+    down_b (K, 3): unit vectors towards the earth, sensor frame. The direction error of a field
+    direction u is the tangential part of M^-1 (dM u + db); its part along (down x u) turns the
+    heading by that over cos(dip).
+    """
+    M = chain.symmetric(c[:6])
+    worst = 0.0
+    psi = np.arange(12) * np.pi / 6
+    for down in down_b:
+        helper = np.eye(3)[int(np.argmin(np.abs(down)))]
+        north = np.cross(helper, down)
+        north /= np.linalg.norm(north)
+        east = np.cross(down, north)
+        level = np.cos(psi)[:, None] * north + np.sin(psi)[:, None] * east
+        u = np.cos(dip_rad) * level + np.sin(dip_rad) * down
+        across = np.cross(down, level)
+        J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
+        row = np.einsum("ni,nij->nj", across @ np.linalg.inv(M).T, J) / np.cos(dip_rad)
+        variance = np.einsum("ni,ij,nj->n", row, covariance[:9, :9], row)
+        worst = max(worst, float(np.max(variance)))
+    return float(np.degrees(np.sqrt(worst)))
+
+
+def observability(covariance: Array, prior_sigma: Array) -> Observability:
+    """Compare the posterior of [M (6), b (3), w_b (3)] with the prior, direction by direction."""
+    scaled = covariance / np.outer(prior_sigma, prior_sigma)
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    ratio = np.sqrt(np.clip(values, 0.0, None))
+    blind = []
+    for k in np.flatnonzero(ratio > _SEEN):
+        v = np.abs(vectors[:, k])
+        blind.append(" + ".join(_NAMES[i] for i in np.argsort(v)[::-1][:3] if v[i] > 0.4))
+    return Observability(
+        prior_ratio=ratio,
+        unobservable=tuple(dict.fromkeys(name for name in blind if name)),
+        score=float(_FLOOR / max(float(ratio[-1]), 1e-9)),
+    )

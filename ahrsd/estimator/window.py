@@ -1,0 +1,282 @@
+"""The window: epochs that can still be linearised again, and the graph that joins them.
+
+Two ways to move the estimate. `track` is a plain Gauss-Newton step in which only what has moved by
+more than a third of a sigma is linearised again: the steady state, whose cost does not depend on
+how long the run has been. `optimise` linearises everything and takes a step only if the true cost
+falls (Levenberg-Marquardt): for the start, and whenever a tracking step would be large.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.estimator import chain, noise
+from ahrsd.estimator.factors import (
+    Factor,
+    Node,
+    Point,
+    bias_prior,
+    chain_step,
+    epoch_factor,
+    gap_factor,
+)
+from ahrsd.estimator.graph import Graph, SingularError
+from ahrsd.estimator.misfit import Misfit
+from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.samples import Array
+
+_STALE = 0.3  # sigmas of movement after which an epoch is linearised again
+_SETTLED = 0.05  # sigmas of movement at which iterating stops
+_LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
+_MAX_STEPS = 30
+_CAREFUL_STEPS = 4
+_MAX_TRACKS = 6
+_GAIN = 0.05  # of log likelihood: less is not worth another step
+_GUESSES = 64  # epochs whose first guess of the noise is remembered
+_SHORTEST_GAP_S = 0.1
+
+
+@dataclass(slots=True, eq=False)
+class Epoch:
+    """One epoch in the window: its data, directions, noise, and its factor's nodes a -> b."""
+
+    data: chain.Data
+    u: Array
+    used: chain.Noise
+    weights: Array | None
+    a: int
+    b: int
+    quadratic: chain.Quadratic
+    factor: Factor
+    residuals: noise.Residuals
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares with the interior directions at their best."""
+        return self.quadratic.cost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Snapshot:
+    c: Array
+    nodes: dict[int, Node]
+    epochs: list[Epoch]
+    factors: list[Factor]
+
+
+class Window:
+    """Epochs and graph. `c` = [M (6), b (3)] in gauss is the calibration as it stands."""
+
+    def __init__(
+        self,
+        parameters: EstimatorParameters,
+        c: Array,
+        sigma_c: Array,
+        first_direction: Array,
+        usual: chain.Noise,
+    ) -> None:
+        self.parameters = parameters
+        self.usual = usual
+        self.epochs: list[Epoch] = []
+        self.misfit = Misfit()
+        self.step_sigmas = np.inf
+        self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
+        node = Node.at(np.zeros(3), first_direction)
+        prior = bias_prior(0, c, node, parameters.prior_gyro_bias_rad_s)
+        self.graph = Graph(c, sigma_c, node, prior)
+
+    # -- growing and forgetting ------------------------------------------------------------------
+
+    def append(self, data: chain.Data) -> None:
+        """A new epoch at the end, linked to the last one unless `data.measures_first`."""
+        self._guesses.append(noise.first_guess(data, self.parameters))
+        graph = self.graph
+        a = graph.last
+        walk = self.parameters.bias_walk_rad_s_sqrt_s
+        u = chain.start_directions(chain.symmetric(graph.c[:6]), graph.c[6:], data.field_b_gauss)
+        if data.measures_first and self.epochs:
+            gap_s = max(float(data.time_s[0] - self.epochs[-1].data.time_s[-1]), _SHORTEST_GAP_S)
+            node = Node.at(graph.nodes[a].bias, u[0])
+            graph.nodes[a + 1] = node
+            graph.factors.append(
+                gap_factor(a, graph.c, graph.nodes[a], node, 1.0 / (walk**2 * gap_s))
+            )
+            a += 1
+        elif data.measures_first:
+            graph.nodes[a] = Node.at(graph.nodes[a].bias, u[0])
+        u[0] = graph.nodes[a].direction
+        graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
+        info = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
+        self.epochs.append(self._linearised(data, u, self.usual, None, a, info))
+        graph.factors.append(self.epochs[-1].factor)
+
+    def fold(self) -> None:
+        """Fold the oldest epochs until the window has its size."""
+        while sum(len(e.data) for e in self.epochs) > self.parameters.window_steps:
+            old = self.epochs.pop(0)
+            self.misfit.remember(old.factor, self.graph)
+            while self.graph.first < self.epochs[0].a:
+                self.graph.fold_oldest()
+
+    # -- linearisation ---------------------------------------------------------------------------
+
+    def _linearised(
+        self,
+        data: chain.Data,
+        u: Array,
+        used: chain.Noise,
+        weights: Array | None,
+        a: int,
+        walk: float,
+    ) -> Epoch:
+        graph = self.graph
+        first, last = graph.nodes[a], graph.nodes[a + 1]
+        u[0], u[-1] = first.direction, last.direction
+        q = chain.linearise(data, u, graph.c, first.bias, used, weights)
+        point = Point(graph.c.copy(), first.copy(), last.copy())
+        factor = epoch_factor(q, a, point, walk)
+        found = noise.residuals(q, data, used, chain.symmetric(graph.c[:6]))
+        return Epoch(data, u, used, weights, a, a + 1, q, factor, found)
+
+    def _replace(self, k: int, u: Array, used: chain.Noise, weights: Array | None) -> None:
+        old = self.epochs[k]
+        new = self._linearised(old.data, u, used, weights, old.a, old.factor.walk)
+        self.graph.factors[self.graph.factors.index(old.factor)] = new.factor
+        self.epochs[k] = new
+
+    def _moved_directions(self, epoch: Epoch) -> Array:
+        graph = self.graph
+        z, _ = epoch.factor.offset(graph.c, graph.nodes[epoch.a], graph.nodes[epoch.b])
+        return chain.move(epoch.u, epoch.quadratic, chain_step(z))
+
+    def refresh(self, which: list[int]) -> None:
+        """Linearise epochs again at the present values, with fresh noise and outlier weights."""
+        for k in which:
+            epoch = self.epochs[k]
+            u = self._moved_directions(epoch)
+            used = noise.shrunk(epoch.residuals, self.usual, self.parameters)
+            weights = chain.robust_weights(
+                epoch.data.field_b_gauss - u @ chain.symmetric(self.graph.c[:6]) - self.graph.c[6:],
+                used.mag_gauss * self.parameters.outlier_sigma,
+            )
+            self._replace(k, u, used, weights)
+        found = [e.residuals for e in self.epochs]
+        self.usual = noise.pooled(found, noise.median(self._guesses), self.parameters)
+
+    # -- moving ----------------------------------------------------------------------------------
+
+    def restart_at(self, c: Array) -> None:
+        """Put the calibration at c, directions from the field alone, noise as first guessed.
+
+        The guess does not depend on c, so costs reached from different starts compare.
+        """
+        graph = self.graph
+        guess = noise.median(self._guesses)
+        graph.c = c.copy()
+        bias = graph.nodes[graph.last].bias
+        for k, epoch in enumerate(self.epochs):
+            u = chain.start_directions(chain.symmetric(c[:6]), c[6:], epoch.data.field_b_gauss)
+            if epoch.data.measures_first or k == 0:
+                graph.nodes[epoch.a] = Node.at(bias, u[0])
+            graph.nodes[epoch.b] = Node.at(bias, u[-1])
+            self._replace(k, u, guess, None)
+
+    def snapshot(self) -> _Snapshot:
+        """The whole state; cheap, because epochs, nodes and factors are replaced, never changed."""
+        graph = self.graph
+        return _Snapshot(graph.c, dict(graph.nodes), list(self.epochs), list(graph.factors))
+
+    def restore(self, kept: _Snapshot) -> None:
+        """Back to a snapshot of the same epochs."""
+        self.graph.c, self.graph.nodes = kept.c, dict(kept.nodes)
+        self.epochs, self.graph.factors = list(kept.epochs), list(kept.factors)
+
+    def cost(self) -> float:
+        """Negative log likelihood of the window plus the prior, up to a constant."""
+        prior, graph = self.graph.prior, self.graph
+        node = graph.nodes[prior.a]
+        z, _ = prior.offset(graph.c, node, node)
+        walks = 0.0
+        for factor in graph.factors:
+            d = graph.nodes[factor.b].bias - graph.nodes[factor.a].bias
+            walks += 0.5 * factor.walk * float(d @ d)
+        prior_cost = float(prior.g[:14] @ z[:14] + 0.5 * z[:14] @ prior.H[:14, :14] @ z[:14])
+        return sum(e.cost for e in self.epochs) + prior_cost + walks + graph.anchor_cost()
+
+    def optimise(self, steps: int = _MAX_STEPS) -> float:
+        """Levenberg-Marquardt over the whole window at fixed noise and weights; returns the cost.
+
+        Stops at the iteration limit or where damping alone no longer finds a lower cost; the
+        window is then at the best point found. Never raises on hopeless data: `step_sigmas` says.
+        """
+        damping, cost = 1e-3, self.cost()
+        for _ in range(steps):
+            kept = self.snapshot()
+            try:
+                dc, dy = self.graph.step(damping)
+                self.graph.move(dc, dy)
+                new = self._cost_here()
+            except SingularError:
+                new = np.inf
+            if new < cost:
+                gain, cost = cost - new, new
+                damping = max(damping / 10, 1e-9)
+                if gain < _GAIN * self.graph.temper:
+                    break
+            else:
+                self.restore(kept)
+                damping *= 100
+                if damping > 1e6:
+                    break
+        return cost
+
+    def _cost_here(self) -> float:
+        """Cost after a step, everything linearised there; infinite where M is not positive."""
+        if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
+            return np.inf
+        directions = [self._moved_directions(e) for e in self.epochs]
+        for k, u in enumerate(directions):
+            self._replace(k, u, self.epochs[k].used, self.epochs[k].weights)
+        return self.cost()
+
+    def track(self, *, everything: bool = False) -> None:
+        """Follow the newest epoch; see the module's docstring."""
+        everyone = list(range(len(self.epochs)))
+        stale = everyone if everything else everyone[-1:]
+        for _ in range(_MAX_TRACKS):
+            self.refresh(stale)
+            self._temper()
+            try:
+                information = np.linalg.inv(self.graph.covariance()[:9, :9]) / self.graph.temper
+                dc, dy = self.graph.step()
+            except (SingularError, np.linalg.LinAlgError):
+                self.step_sigmas = np.inf
+                return
+            self.step_sigmas = _sigmas(dc, information)
+            if self.step_sigmas > _LARGE:
+                self.optimise(_CAREFUL_STEPS)
+                if not everything:
+                    return  # the next epoch goes on from here: the cost per epoch stays bounded
+                stale = everyone
+                continue
+            self.graph.move(dc, dy)
+            if self.step_sigmas < _SETTLED:
+                return
+            moved = [
+                k
+                for k, e in enumerate(self.epochs)
+                if _sigmas(self.graph.c - e.factor.point.c, information) > _STALE
+            ]
+            stale = everyone if everything else (moved or everyone[-1:])
+
+    def _temper(self) -> None:
+        """Let what is believed without data weigh against data that disagree among themselves."""
+        found = self.misfit.value([e.factor for e in self.epochs], self.graph)
+        self.graph.temper = max(1.0, found)
+
+
+def _sigmas(step: Array, information: Array) -> float:
+    return float(np.sqrt(max(step @ information @ step, 0.0) / len(step)))
