@@ -19,8 +19,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.samples import Array
+
+Mask = NDArray[np.bool_]
 
 HULL_POINTS: Final = 64  # a hull of years of samples has far fewer; bounds memory all the same
 WINDOW_HOST_S: Final = 1800.0  # older points are dropped, so that a drifting rate is followed
@@ -204,7 +207,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """What `StreamTimeline` says about N device times.
+    """What `StreamTimeline` says about N device times `time_s`.
 
     keep:     (N,) false for repeated times and for samples marked unusable
     dt_s:     (N,) step that ends at the sample; nan where nothing usable precedes it
@@ -212,9 +215,10 @@ class Steps:
     gaps, restarts: facts of this block
     """
 
-    keep: Array
+    time_s: Array
+    keep: Mask
     dt_s: Array
-    first: Array
+    first: Mask
     gaps: tuple[Gap, ...] = field(default=())
     restarts: int = 0
 
@@ -241,7 +245,7 @@ class StreamTimeline:
             return float(np.median(self._recent))
         return float("nan") if self._nominal_s is None else self._nominal_s
 
-    def extend(self, time_s: Array, usable: Array | None = None) -> Steps:
+    def extend(self, time_s: Array, usable: Mask | None = None) -> Steps:
         """Steps of N further samples at device times (N,).
 
         A repeated time is dropped; a time that falls begins a new run; a step over 1.5 periods is
@@ -265,7 +269,14 @@ class StreamTimeline:
             elif not first[k]:
                 dt_s[k] = step_s
             self._last_used_s = now_s
-        return Steps(keep, dt_s, first, tuple(gaps), self.restarts - before_restarts)
+        return Steps(
+            np.asarray(time_s, float),
+            keep,
+            dt_s,
+            first,
+            tuple(gaps),
+            self.restarts - before_restarts,
+        )
 
     def _advance(self, now_s: float) -> bool:
         """Whether the time is new; a fall cuts the run, a repetition is counted."""
