@@ -12,14 +12,17 @@ and a read's values must be ones that the register can have. Names of measuremen
 ``VNRRG``, so none can be taken for a reply. All other replies come out as `Stray`.
 
 **Late replies.** The device carries out commands in the order of arrival and the wire keeps the
-order of its replies. So what can go wrong is only this: an attempt timed out, its reply is still
-under way (a *ghost*), and it would answer a later command. A repeated attempt of the same command
+order of its replies. So what can go wrong is only this: an attempt timed out (or was ended by a
+VNERR that was not its own), its reply is still under way (a *ghost*), and it would answer a later
+command. A repeated attempt of the same command
 may take it: nothing of ours lay between. Before any *other* command the session therefore reads an
 identity register that is not among the ghosts, a *barrier*: when its reply arrives, every ghost has
 arrived before it or never will. Replies and errors that come during the barrier are the ghosts'.
 Two barriers are tried. If both stay silent, a command that no ghost could answer still goes out
 (the closing VNASY,1 must), one that a ghost could answer fails with NoReply instead. A ghost is
 forgotten after `GHOST_LIFE_S`, far more than a USB adapter or the device can hold a reply back.
+Another program's read of the same register on the same wire cannot be told from ours; its reply is
+a true reading too, and the order of the wire still puts it behind the echo of our last write.
 
 **The gate.** `allow` sees every command before it becomes bytes; there is no other way out.
 """
@@ -240,11 +243,12 @@ class Session:
             self._advance(DeviceRefused(code), now_s, events)
         elif flight is None or flight.waiting is not None:
             events.append(DeviceFault(code))
-        elif code in RETRIED_ERRORS and flight.attempts < patience(flight.command).tries:
-            self._repeat(flight, now_s, events)
-        else:
-            self._flight = None
-            self._advance(DeviceRefused(code), now_s, events)
+        else:  # VNERR names no command, so it may be another one's and the reply may still come
+            self._abandon_flight(now_s)
+            if code in RETRIED_ERRORS and flight.attempts < patience(flight.command).tries:
+                self._repeat(flight, now_s, events)
+            else:
+                self._advance(DeviceRefused(code), now_s, events)
 
     def _unanswered(self, flight: _Flight, now_s: float, events: list[Event]) -> None:
         self._abandon_flight(now_s)

@@ -348,9 +348,8 @@ def test_output_is_resumed_however_the_sequence_ends(how):
     else:
         events = s.tick(0.5) + s.tick(0.91) + s.tick(1.32)
     assert events == []
-    if how != "refused":  # the read may still be answered
-        assert s.take_output()[-len(READ_1) :] == READ_1
-        s.receive(REPLY_1, 1.4)
+    assert s.take_output()[-len(READ_1) :] == READ_1  # the read may still be answered
+    s.receive(REPLY_1, 1.4)
     assert s.take_output() == ASY_1
     (event,) = s.receive(ASY_1, 1.5)
     assert type(event.error) is {"refused": DeviceRefused, "cancelled": Cancelled}.get(how, NoReply)
@@ -497,6 +496,24 @@ FOREIGN = st.sampled_from(["nothing"] * 3 + ["read", "write 25", "error", "measu
 VALUES = st.sampled_from([IDENTITY, OTHER])
 
 
+def converse(s, wire, procedure, now_s, strangers, cut):
+    """Run `procedure` to its end on `wire`; its last event and the time then."""
+    events = s.start(procedure, now_s)
+    while s.busy:
+        for line in s.take_output().decode().splitlines():
+            wire.command(line, now_s)
+        wire.foreign(next(strangers, "nothing"), now_s)
+        now_s = max(now_s, min([due_s for due_s, _ in wire.queue[:1]] + [s.deadline_s]))
+        if wire.queue and wire.queue[0][0] <= now_s:
+            data = wire.queue.pop(0)[1]
+            events += s.receive(data[:cut], now_s)
+            events += s.receive(data[cut:], now_s)
+        else:
+            events += s.tick(now_s)
+        assert now_s < 500.0
+    return next(event for event in events if isinstance(event, Finished | Failed)), now_s
+
+
 @settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     faults=st.lists(FAULTS, max_size=40),
@@ -508,21 +525,8 @@ def test_verified_means_that_the_device_holds_the_values(faults, foreign, writes
     wire, s, now_s = Wire(iter(faults)), session(), 0.0
     strangers, verified = iter(foreign), 0
     for values in writes:
-        events = s.start(quiet(write_verified(23, values)), now_s)
-        while s.busy:
-            for line in s.take_output().decode().splitlines():
-                wire.command(line, now_s)
-            wire.foreign(next(strangers, "nothing"), now_s)
-            due = [d for d, _ in wire.queue[:1]] + [s.deadline_s]
-            now_s = max(now_s, min(due))
-            if wire.queue and wire.queue[0][0] <= now_s:
-                data = wire.queue.pop(0)[1]
-                events += s.receive(data[:cut], now_s)
-                events += s.receive(data[cut:], now_s)
-            else:
-                events += s.tick(now_s)
-            assert now_s < 200.0
-        end = next(event for event in events if isinstance(event, Finished | Failed))
+        procedure = quiet(write_verified(23, values))
+        end, now_s = converse(s, wire, procedure, now_s, strangers, cut)
         if isinstance(end, Finished):
             verified += 1
             assert [float(v) for v in wire.register[23]] == list(values)
@@ -530,3 +534,23 @@ def test_verified_means_that_the_device_holds_the_values(faults, foreign, writes
             assert isinstance(end.error, NoReply | DeviceRefused | VerifyFailed)
     if not faults and not foreign:
         assert verified == len(writes)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    faults=st.lists(FAULTS, max_size=20),
+    foreign=st.lists(FOREIGN.filter(lambda kind: kind != "read"), max_size=20),
+)
+def test_a_read_never_returns_what_was_there_before_it_was_asked(faults, foreign):
+    wire, s, now_s = Wire(iter(faults)), session(), 0.0
+    strangers, answers = iter(foreign), 0
+    for number in range(8):
+        wire.register[23] = [str(number)] * 12  # another program's write, between our reads
+        end, now_s = converse(s, wire, read(23), now_s, strangers, 9)
+        if isinstance(end, Finished):
+            answers += 1
+            assert end.result == (float(number),) * 12
+        else:
+            assert isinstance(end.error, NoReply | DeviceRefused)
+    if not faults and not foreign:
+        assert answers == 8
