@@ -184,20 +184,17 @@ def restore(saved: Mapping[int, Values], keys: Iterable[int]) -> Procedure[tuple
     One that fails does not keep the others from being restored: RestoreFailed at the end.
     """
     errors: dict[int, Exception] = {}
-    written: list[int] = []
     wanted = [number for number in keys if number in saved]
     order = [n for n in wanted if n not in SESSION_SETTINGS]
     order += [n for n in SESSION_SETTINGS if n in wanted]
-    for number in order:
-        if number in BINARY_OUTPUTS:
-            yield from _attempted(errors, number, _switch_off(number, saved[number]))
-    for number in order:
-        changed = yield from _attempted(errors, number, _put_back(number, saved[number]))
-        if changed:
-            written.append(number)
+    written = set()
+    for step in (_switch_off, _put_back):
+        for number in order:
+            if (yield from _attempted(errors, number, step(number, saved[number]))):
+                written.add(number)
     if errors:
         raise RestoreFailed(errors)
-    return tuple(written)
+    return tuple(number for number in order if number in written)
 
 
 def differences(
@@ -224,11 +221,13 @@ def _put_back(number: int, values: Values) -> Procedure[bool]:
 
 
 def _switch_off(number: int, values: Values) -> Procedure[bool]:
+    if number not in BINARY_OUTPUTS:
+        return False
     present = yield from read(number)
     if same(number, values, present) or same(number, BINARY_OUTPUT_OFF, present):
         return False
     yield from write_verified(number, BINARY_OUTPUT_OFF)
-    return False
+    return True
 
 
 def _attempted(
