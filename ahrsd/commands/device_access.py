@@ -1,0 +1,75 @@
+"""How a command reaches the device: the port's rate, one open device, errors in our own words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+from drivers.vn100.errors import DriverError
+
+from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, DeviceError
+from drivers.serial_port import (
+    BaudNotFound,
+    LinkLost,
+    PortAbsent,
+    PortBusy,
+    PortError,
+    SerialPort,
+    detect_baud,
+)
+from drivers.vn100.commands import Command
+from drivers.vn100.device import Device, Tap, reads_only
+from drivers.vn100.procedures import Identity, identify, read_configuration
+from drivers.vn100.registers import Values
+
+_EXIT = {PortAbsent: EXIT_BUSY, PortBusy: EXIT_BUSY, BaudNotFound: EXIT_BUSY, LinkLost: EXIT_BUSY}
+
+
+@contextmanager
+def driver_errors() -> Iterator[None]:
+    """Errors of the driver as DeviceError: 75 busy or absent, 2 no usable port, 1 it said no."""
+    try:
+        yield
+    except PortError as error:
+        raise DeviceError(str(error), _EXIT.get(type(error), EXIT_USAGE)) from error
+    except DriverError as error:
+        raise DeviceError(str(error), EXIT_NO) from error
+
+
+def open_port(path: Path, baud: int | None, *, may_query: bool) -> SerialPort:
+    """The port at the given rate, or at the one that the device is heard at."""
+    if baud is None:
+        found = detect_baud(path, may_query=may_query)
+        click.echo(f"{path}: {found.why}", err=True)
+        baud = found.baud
+    return SerialPort(path, baud)
+
+
+@contextmanager
+def open_device(
+    path: Path,
+    baud: int | None,
+    allow: Callable[[Command], bool] = reads_only,
+    tap: Tap | None = None,
+) -> Iterator[Device]:
+    """A device that may be sent what `allow` lets through; its errors come as DeviceError."""
+    with driver_errors(), Device(open_port(path, baud, may_query=True), allow, tap) as device:
+        yield device
+
+
+def read_all(device: Device) -> tuple[Identity, dict[int, Values]]:
+    """Who it is, and its configuration registers."""
+    identity = device.run(identify())
+    return identity, device.run(read_configuration(identity.profile))
+
+
+def describe(identity: Identity) -> dict[str, str]:
+    """Identity as text, for files."""
+    return {
+        "model": identity.model,
+        "hardware": str(identity.hardware),
+        "serial": str(identity.serial),
+        "firmware": identity.firmware,
+    }

@@ -1,0 +1,107 @@
+"""Changing registers by hand with the same care as the daemon: journal first, verify, undo.
+
+PREPARED        device, old and new values, durable before a byte is sent
+RAM_VERIFIED    written and read back equal
+RAM_FAILED      refused or not equal; what was written is put back, `restored` says whether
+FLASH_SENT      VNWNV is about to be sent
+FLASH_ACKED     the device acknowledged it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.vn100.errors import DriverError
+
+from ahrsd.commands.device_access import describe
+from ahrsd.errors import DeviceError
+from ahrsd.journal import Journal, Record, register_values
+from drivers.serial_port import PortError
+from drivers.vn100.commands import Command, Procedure, Read, Word, Write
+from drivers.vn100.device import Device
+from drivers.vn100.procedures import (
+    Identity,
+    quiet,
+    read_registers,
+    save_settings,
+    write_verified,
+)
+from drivers.vn100.registers import Values, same
+
+Changes = dict[int, Values]
+
+
+def gate(registers: set[int], save: bool) -> Callable[[Command], bool]:
+    """Lets out reads, the pause of the output, and writes of the registers in this set.
+
+    The set is filled when the journal holds their old values, and not before. A failed change is
+    put back, so the number decides and not the value.
+    """
+    words = {"VNASY", "VNWNV"} if save else {"VNASY"}
+
+    def allow(command: Command) -> bool:
+        if isinstance(command, Write):
+            return command.register in registers
+        return isinstance(command, Read) or (isinstance(command, Word) and command.word in words)
+
+    return allow
+
+
+def to_write(present: Changes, wanted: Changes) -> Changes:
+    """The part of `wanted` that the device does not hold already."""
+    return {
+        number: values
+        for number, values in wanted.items()
+        if not same(number, values, present[number][: len(values)])
+    }
+
+
+def apply(
+    device: Device, journal: Journal, identity: Identity, changes: Changes, reason: str
+) -> Record:
+    """Write and verify `changes` in RAM; returns the record that `rollback` goes back to.
+
+    Raises JournalError before anything is sent, DeviceError with the outcome of putting back.
+    """
+    old = device.run(read_registers(changes))
+    prepared = journal.append(
+        "PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), reason=reason
+    )
+    try:
+        device.run(quiet(_write_all(changes)))
+    except (DriverError, PortError) as error:
+        restored = _put_back(device, old)
+        journal.append("RAM_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
+        outcome = f"NOT put back: {restored}" if restored else "the old values are back"
+        raise DeviceError(f"{error}; {outcome}") from error
+    journal.append("RAM_VERIFIED", txn=prepared.seq)
+    return prepared
+
+
+def save_to_flash(device: Device, journal: Journal, prepared: Record) -> None:
+    """VNWNV: everything that is in RAM becomes what the device starts with."""
+    expected = register_values(prepared, "new")
+    present = device.run(read_registers(expected))
+    if changed := to_write(present, expected):
+        raise DeviceError(f"register {min(changed)} no longer holds what was written; not saved")
+    journal.append("FLASH_SENT", txn=prepared.seq)
+    device.run(quiet(save_settings()))
+    journal.append("FLASH_ACKED", txn=prepared.seq)
+
+
+def _write_all(changes: Changes) -> Procedure[None]:
+    for number, values in changes.items():
+        yield from write_verified(number, values)
+
+
+def _put_back(device: Device, old: Changes) -> str:
+    """Write the old values again; "" or why that failed."""
+    try:
+        device.run(quiet(_write_all(old)))
+    except (DriverError, PortError) as error:
+        return str(error)
+    return ""
+
+
+def _texts(values: Changes) -> dict[str, list[float | int | str]]:
+    return {str(number): list(row) for number, row in values.items()}

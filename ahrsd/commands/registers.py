@@ -1,0 +1,268 @@
+"""`ahrsd registers read|diff|write|history|rollback`: the device's registers and their journal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from ahrsd.commands.device_access import describe, open_device
+from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash, to_write
+from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
+from ahrsd.config import default_state_directory
+from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.journal import Journal, Record, journal_path, register_values, wrg_lines
+from drivers.vn100.device import Device
+from drivers.vn100.procedures import Identity, identify, read_configuration, read_registers
+from drivers.vn100.registers import (
+    REGISTERS,
+    RegisterValueError,
+    Values,
+    format_command,
+    format_reply,
+    parse,
+)
+
+_STATE = click.option(
+    "--state-directory", type=click.Path(path_type=Path), default=None,
+    help="Where the journals are; default: that of the daemon.",
+)  # fmt: skip
+_JOURNAL = click.option(
+    "--journal", "journal_file", type=click.Path(path_type=Path, exists=True), default=None,
+    help="A journal file instead of the one of the device's serial number.",
+)  # fmt: skip
+_BAUD = click.option("--baud", type=int, help="The port's rate; without it, it is found.")
+_YES = click.option("--yes", is_flag=True, help="Do it; without, only say what would be done.")
+_SAVE = click.option("--save", is_flag=True, help="Also save all of RAM to flash. Keep it still.")
+
+
+_SHOWN = ("txn", "reason", "error", "restored")  # facts of a record besides its registers
+
+
+class _RegisterNumber(click.ParamType[int]):
+    """A number of the register map."""
+
+    name = "register"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int:
+        if isinstance(value, str) and value.isdecimal() and int(value) in REGISTERS:
+            return int(value)
+        return self.fail(f"{value!r} is no register of the VN-100", param, ctx)
+
+
+@click.group()
+def command() -> None:
+    """Read, compare, write and roll back the device's registers.
+
+    Every write is journaled with the old values first, verified by a fresh read, and lives in RAM
+    until --save.
+    """
+
+
+@command.command()
+@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("ids", nargs=-1, type=_RegisterNumber())
+@_BAUD
+@click.option("--json", "json_path", help="Values as JSON into this file, - for stdout.")
+def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | None) -> None:
+    """Print registers of the device on PORT: those in IDS, else its whole configuration."""
+    with open_device(port, baud) as device:
+        identity = device.run(identify())
+        procedure = read_registers(ids) if ids else read_configuration(identity.profile)
+        values = device.run(procedure)
+    if json_path != "-":
+        click.echo(f"{identity.model}, serial {identity.serial}, firmware {identity.firmware}")
+        for number, row in values.items():
+            click.echo(f"{number:3}  {REGISTERS[number].name:36.36}  {_text(number, row)}")
+    if json_path:
+        registers = {str(number): list(row) for number, row in values.items()}
+        body = {"schema": "ahrsd.registers/1", "device": describe(identity), "registers": registers}
+        text = json.dumps(body, indent=1) + "\n"
+        if json_path == "-":
+            click.echo(text, nl=False)
+        else:
+            Path(json_path).write_text(text, encoding="utf-8")
+
+
+@command.command()
+@click.argument("first")
+@click.argument("second")
+@_STATE
+@_JOURNAL
+@_BAUD
+def diff(
+    *,
+    first: str,
+    second: str,
+    state_directory: Path | None,
+    journal_file: Path | None,
+    baud: int | None,
+) -> None:
+    """Compare two sets of registers; exit 1 where they differ.
+
+    FIRST and SECOND are each a port, a JSON file (of `registers read` or a calibration.json), or a
+    number of the journal: 12 for the values before record 12, 12:new for those after it.
+    """
+    sources = Sources(_state(state_directory), journal_file, baud)
+    before, after = sources.read_pair(first, second)
+    shared = sorted(before.keys() & after.keys())
+    if not shared:
+        raise AhrsdError(f"{first} and {second} have no register in common")
+    different = to_write(
+        {number: after[number] for number in shared}, {number: before[number] for number in shared}
+    )
+    for number in different:
+        click.echo(f"{number:3}  {REGISTERS[number].name}")
+        click.echo(f"  -  {_text(number, before[number])}")
+        click.echo(f"  +  {_text(number, after[number])}")
+    click.echo(f"{len(shared)} registers compared, {len(different)} differ")
+    raise SystemExit(EXIT_NO if different else EXIT_DONE)
+
+
+@command.command(context_settings={"ignore_unknown_options": True})
+@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("number", metavar="ID", type=_RegisterNumber())
+@click.argument("values", nargs=-1, required=True)
+@_YES
+@_SAVE
+@_STATE
+@_BAUD
+def write(
+    *,
+    port: Path,
+    number: int,
+    values: tuple[str, ...],
+    yes: bool,
+    save: bool,
+    state_directory: Path | None,
+    baud: int | None,
+) -> None:
+    """Write register ID of the device on PORT; VALUES in the manual's order, blanks or commas."""
+    tokens = [token for value in values for token in value.split(",") if token]
+    try:
+        wanted = {number: parse(number, tokens)}
+        format_command(number, wanted[number])
+    except RegisterValueError as error:
+        raise click.BadParameter(str(error), param_hint="VALUES") from error
+    state = _state(state_directory)
+    _change(port, baud, lambda *_: (wanted, "registers write"), state, None, yes=yes, save=save)
+
+
+@command.command()
+@_STATE
+@_JOURNAL
+@click.option("--serial", type=int, help="Only the device with this serial number.")
+def history(state_directory: Path | None, journal_file: Path | None, serial: int | None) -> None:
+    """Print the journal: what was written, when, and the lines that put the old values back."""
+    for path in journals(_state(state_directory), journal_file, serial):
+        journal = Journal.open(path)
+        click.echo(f"{path}: {len(journal.records())} records")
+        if journal.torn:
+            click.echo(f"  a torn last line of {len(journal.torn)} bytes was never acknowledged")
+        for record in journal.records():
+            _print_record(record)
+
+
+@command.command()
+@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("number", metavar="[ID]", type=int, required=False)
+@_YES
+@_SAVE
+@_STATE
+@_JOURNAL
+@_BAUD
+def rollback(
+    *,
+    port: Path,
+    number: int | None,
+    yes: bool,
+    save: bool,
+    state_directory: Path | None,
+    journal_file: Path | None,
+    baud: int | None,
+) -> None:
+    """Write the values back that were there before record ID of the journal.
+
+    Without ID: before the newest change whose values the device holds now.
+    """
+
+    def wanted(device: Device, journal: Journal) -> tuple[Changes, str]:
+        if number is not None:
+            record = find(journal, number)
+        else:
+            record = newest_in_force(journal, lambda ids: device.run(read_registers(ids)))
+        return register_values(record), f"rollback of {record.seq}"
+
+    _change(port, baud, wanted, _state(state_directory), journal_file, yes=yes, save=save)
+
+
+def _change(
+    port: Path,
+    baud: int | None,
+    wanted: Callable[[Device, Journal], tuple[Changes, str]],
+    state: Path,
+    journal_file: Path | None,
+    *,
+    yes: bool,
+    save: bool,
+) -> None:
+    """Read, show, and with `yes` journal, write, verify and tell how to go back."""
+    permitted: set[int] = set()
+    with open_device(port, baud, gate(permitted, save=save and yes)) as device:
+        identity = device.run(identify())
+        journal = Journal.open(journal_file or journal_path(state, identity.serial))
+        changes, reason = wanted(device, journal)
+        present = device.run(read_registers(changes))
+        changes = to_write(present, changes)
+        _show(identity, present, changes)
+        if not changes and not save:
+            return
+        if not yes:
+            raise click.UsageError("nothing was written; add --yes to do it")
+        if not identity.profile.writable:
+            raise AhrsdError(f"firmware {identity.firmware} is not known; nothing is written to it")
+        permitted.update(changes)
+        record = apply(device, journal, identity, changes, reason)
+        click.echo(f"written and verified in RAM, journal {journal.path} record {record.seq}")
+        click.echo(f"to go back: ahrsd registers rollback {port} {record.seq} --yes, or send")
+        for line in wrg_lines(record):
+            click.echo(f"  {line}")
+        if save:
+            save_to_flash(device, journal, record)
+            click.echo("saved to flash")
+
+
+def _show(identity: Identity, present: Changes, changes: Changes) -> None:
+    click.echo(f"{identity.model}, serial {identity.serial}, firmware {identity.firmware}")
+    for number, values in present.items():
+        click.echo(f"{number:3}  {REGISTERS[number].name}")
+        click.echo(f"  now  {_text(number, values)}")
+        if number in changes:
+            click.echo(f"  new  {_text(number, changes[number])}")
+        else:
+            click.echo("  holds the wanted values already")
+
+
+def _print_record(record: Record) -> None:
+    facts = record.facts
+    words = [
+        f"{key}={facts[key]}" for key in ("txn", "reason", "error", "restored") if key in facts
+    ]
+    click.echo(f"{record.seq:4}  {record.time}  {record.kind:12}  {' '.join(words)}".rstrip())
+    for which in ("old", "new"):
+        for number, values in register_values(record, which).items():
+            click.echo(f"      {which}  {number:3}  {_text(number, values)}")
+    for line in wrg_lines(record):
+        click.echo(f"      to go back send  {line}")
+
+
+def _text(number: int, values: Values) -> str:
+    return format_reply(number, values).partition(",")[2]
+
+
+def _state(given: Path | None) -> Path:
+    return given or default_state_directory()

@@ -1,0 +1,42 @@
+"""`ahrsd run`: the daemon's options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import click
+
+from ahrsd.config import Config, Mode, load_config
+from ahrsd.config_text import print_config
+
+
+@click.command()
+@click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
+@click.option("--port", type=click.Path(path_type=Path), help="Serial port of the device.")
+@click.option("--mode", type=click.Choice(get_args(Mode)), help="How far the daemon may go.")
+@click.option("--print-config", "print_only", is_flag=True, help="Print the configuration, stop.")
+def command(path: Path | None, port: Path | None, mode: Mode | None, print_only: bool) -> None:
+    """Calibrate the device on a port from its own stream, and write back as far as the mode allows.
+
+    \b
+    passive  sends no byte
+    observe  reads registers, says exactly what it would write (the default)
+    stage    may write RAM
+    commit   may write flash
+    """
+    config = load_config(path) if path else Config()
+    if port:
+        config = config.model_copy(
+            update={"device": config.device.model_copy(update={"port": port})}
+        )
+    if mode:
+        config = config.model_copy(update={"mode": mode})
+    if print_only:
+        click.echo(print_config(config), nl=False)
+        return
+    if config.device.port is None:
+        raise click.UsageError("no port: give --port, or device.port in the configuration")
+    from ahrsd.daemon import run_daemon
+
+    raise SystemExit(run_daemon(config))
