@@ -1,4 +1,4 @@
-"""What a person sees on opening a recording: entity names, their styles, and the layout of the views.
+"""What a person sees on opening a recording: entity names, their styles, the layout of views.
 
 The layout reads from left to right: what the sensor measures (3D), whether a write is allowed
 (gates, states), how sure the estimate is (time series), and what happened (log).
@@ -44,6 +44,7 @@ DEVICE_TIME = "device_time"  # seconds since the device's start-up
 HOST_TIME = "host_time"  # the host's monotonic clock
 SAMPLE = "sample"  # counts samples since the sink was made
 
+POINT_COLOURS = {RAW_POINTS: RAW, CORRECTED_POINTS: CORRECTED}
 SHOWN_POINTS_S = 60.0  # 3D shows the newest minute: at most 3000 points a cloud at 50 a second
 
 STATE_COLOURS: dict[str, Colour] = {

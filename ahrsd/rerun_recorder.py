@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from ahrsd import rerun_blueprint as names
 from ahrsd.calibration import Estimate
@@ -27,6 +28,8 @@ from ahrsd.events import (
     StateChanged,
 )
 from ahrsd.samples import Array
+
+Indices = NDArray[np.signedinteger]
 
 APPLICATION = "ahrsd"
 POINTS_PER_S = 50.0
@@ -100,11 +103,9 @@ class Recorder:
         self._scalars(names.GYRO, rows, first_sample, rows.gyro)
         self._scalars(names.FIELD_NORM, rows, first_sample, norms)
         shown = every[self._thinned(rows.time_s)]
-        self._points(names.RAW_POINTS, rows, first_sample, shown, rows.raw, names.RAW)
+        self._points(names.RAW_POINTS, rows, first_sample, shown, rows.raw)
         known = shown[np.isfinite(rows.corrected[shown]).all(axis=1)]
-        self._points(
-            names.CORRECTED_POINTS, rows, first_sample, known, rows.corrected, names.CORRECTED
-        )
+        self._points(names.CORRECTED_POINTS, rows, first_sample, known, rows.corrected)
 
     def event(self, event: Event, first_sample: int) -> None:
         """Write one event other than samples; `Send` carries nothing for a viewer."""
@@ -131,7 +132,7 @@ class Recorder:
                 self._stream.set_time(timeline, duration=value)
         self._stream.set_time(names.SAMPLE, sequence=sample)
 
-    def _times(self, rows: _Rows, first_sample: int, which: Array) -> list[rr.TimeColumn]:
+    def _times(self, rows: _Rows, first_sample: int, which: Indices) -> list[rr.TimeColumn]:
         columns = [rr.TimeColumn(names.SAMPLE, sequence=first_sample + which)]
         for timeline, values in ((names.DEVICE_TIME, rows.time_s), (names.HOST_TIME, rows.host_s)):
             if np.isfinite(values[which]).all():
@@ -154,13 +155,7 @@ class Recorder:
         return np.asarray(interval != before)
 
     def _points(
-        self,
-        path: str,
-        rows: _Rows,
-        first_sample: int,
-        which: Array,
-        values: Array,
-        colour: names.Colour,
+        self, path: str, rows: _Rows, first_sample: int, which: Indices, values: Array
     ) -> None:
         if not len(which):
             return
@@ -169,7 +164,7 @@ class Recorder:
             self._times(rows, first_sample, which),
             rr.Points3D.columns(
                 positions=values[which],
-                colors=[colour] * len(which),
+                colors=[names.POINT_COLOURS[path]] * len(which),
                 radii=[-2.0] * len(which),  # negative: pixels, readable at any zoom
             ),
         )
@@ -253,7 +248,9 @@ def gate_table(gates: Iterable[GateResult]) -> str:
     """Markdown table of a verdict; the gates that hold the write back come first."""
     rows = sorted(gates, key=lambda gate: gate.ok)
     failing = [gate.gate for gate in rows if not gate.ok]
-    head = f"**Held back by {len(failing)} of {len(rows)} gates**" if failing else "**All gates ok**"
+    head = (
+        f"**Held back by {len(failing)} of {len(rows)} gates**" if failing else "**All gates ok**"
+    )
     lines = [head, "", "| | gate | value | limit | what to do |", "|---|---|---|---|---|"]
     for gate in rows:
         mark, advice = ("ok", "") if gate.ok else ("**NO**", _cell(gate.advice))
@@ -309,9 +306,7 @@ def new_stream(recording_id: str) -> rr.RecordingStream:
     return stream
 
 
-def write_batch(
-    recorders: Sequence[Recorder], batch: Sequence[tuple[int, Event]]
-) -> None:
+def write_batch(recorders: Sequence[Recorder], batch: Sequence[tuple[int, Event]]) -> None:
     """Write (first sample's number, event) pairs; neighbouring samples become one block of rows."""
     start = 0
     while start < len(batch):
@@ -334,9 +329,7 @@ def record(events: Iterable[Event], path: Path, rows: int = 100) -> None:
     """
     stream = new_stream(path.stem)
     try:
-        stream.set_sinks(
-            rr.FileSink(path, write_footer=False), default_blueprint=names.blueprint()
-        )
+        stream.set_sinks(rr.FileSink(path, write_footer=False), default_blueprint=names.blueprint())
     except RuntimeError as error:
         raise OSError(f"{path}: {error}") from error
     recorder = Recorder(stream)
