@@ -90,7 +90,9 @@ class Device:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if self._quiet and not isinstance(error, LinkLost):  # even the tidying was interrupted
+            if self._session.busy:  # even the tidying was interrupted
+                self._drive(time.monotonic() + TIDY_S)
+            if self._quiet:
                 self.run(resume(), TIDY_S)
         finally:
             self._port.close()
@@ -139,5 +141,6 @@ class Device:
         for event in events:
             if isinstance(event, Finished | Failed):
                 self._outcome = event
-            elif self._on_event is not None:
+        for event in events:  # afterwards: it may raise
+            if self._on_event is not None and not isinstance(event, Finished | Failed):
                 self._on_event(event)

@@ -1,0 +1,183 @@
+"""The blocking device on a pty: results, gate, tap, timeouts, Ctrl-C, a port that goes away."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+import tty
+
+import pytest
+from drivers.vn100.decode import Measurement
+
+from drivers.serial_port import LinkLost, SerialPort
+from drivers.vn100.commands import NoReply, NotPermitted, Pause, Word, Write
+from drivers.vn100.device import Device, TookTooLong
+from drivers.vn100.procedures import identify, quiet, read, write_verified
+from drivers.vn100.session import DeviceFault
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+YMR = (
+    b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"
+    b"-00.000018,+00.001122,-00.000551*69\r\n"
+)
+SCRIPT = {
+    b"$VNRRG,04*77": b"$VNRRG,04,3.1.0.0*77\r\n",
+    b"$VNRRG,01*72": b"$VNRRG,01,VN-200T-CR*31\r\n",
+    b"$VNRRG,23*72": b"$VNRRG,23,1,0,0,0,1,0,0,0,1,0,0,0*73\r\n",
+    b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*76": b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*76\r\n",
+    b"$VNASY,0*4F": b"$VNASY,0*4F\r\n",
+    b"$VNASY,1*4E": b"$VNASY,1*4E\r\n",
+}
+
+
+class Scripted(threading.Thread):
+    """Answers from SCRIPT, a measurement before and behind each answer."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.path = os.ttyname(self.slave)
+        self.heard = []
+        self.script = dict(SCRIPT)
+        self.hang_up_on = b"\0"
+
+    def run(self):
+        pending = b""
+        with contextlib.suppress(OSError):
+            while True:
+                *lines, pending = (pending + os.read(self.master, 4096)).split(b"\r\n")
+                for line in lines:
+                    self.heard.append(line)
+                    if line == self.hang_up_on:
+                        self.close()
+                    os.write(self.master, YMR + self.script.get(line, b"") + YMR)
+
+    def close(self):
+        for descriptor in (self.slave, self.master):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+@pytest.fixture
+def scripted():
+    thread = Scripted()
+    thread.start()
+    yield thread
+    thread.close()
+
+
+def everything(command):
+    return True
+
+
+def test_a_read_returns_its_values_and_the_tap_sees_every_byte(scripted):
+    tapped, events = [], []
+    tap = lambda direction, host_ns, data: tapped.append((direction, host_ns, data))  # noqa: E731
+    with Device(SerialPort(scripted.path, 115200), tap=tap, on_event=events.append) as device:
+        assert device.run(read(23)) == IDENTITY
+        assert device.run(read(4)) == ("3.1.0.0",)
+    sent = b"".join(data for direction, _, data in tapped if direction == "tx")
+    assert sent == b"$VNRRG,23*72\r\n$VNRRG,04*77\r\n"
+    received = b"".join(data for direction, _, data in tapped if direction == "rx")
+    assert SCRIPT[b"$VNRRG,23*72"] in received
+    times = [host_ns for _, host_ns, _ in tapped]
+    assert times == sorted(times)
+    assert events
+    assert all(isinstance(event, Measurement) for event in events)
+
+
+def test_by_default_nothing_but_reads_gets_out(scripted):
+    with Device(SerialPort(scripted.path, 115200)) as device:
+        for procedure in (write_verified(23, IDENTITY), quiet(read(23))):
+            with pytest.raises(NotPermitted):
+                device.run(procedure)
+    time.sleep(0.05)
+    assert scripted.heard == []
+
+
+def test_a_verified_write_leaves_the_output_on(scripted):
+    with Device(SerialPort(scripted.path, 115200), everything) as device:
+        assert device.run(quiet(write_verified(23, IDENTITY))) == IDENTITY
+    assert scripted.heard[0] == b"$VNASY,0*4F"
+    assert scripted.heard[-1] == b"$VNASY,1*4E"
+
+
+def test_a_silent_device_is_no_reply(scripted):
+    scripted.script.clear()
+    with (
+        Device(SerialPort(scripted.path, 921600)) as device,
+        pytest.raises(NoReply, match="no reply to read of register 1"),
+    ):
+        device.run(identify())
+
+
+def hang(seconds):
+    yield Pause(seconds)
+
+
+def test_what_takes_too_long_is_cancelled_and_the_output_resumed(scripted):
+    with Device(SerialPort(scripted.path, 115200), everything) as device:
+        begin_s = time.monotonic()
+        with pytest.raises(TookTooLong, match=r"0\.2 s"):
+            device.run(quiet(hang(60.0)), timeout_s=0.2)
+        assert time.monotonic() - begin_s < 5.0
+        assert scripted.heard == [b"$VNASY,0*4F", b"$VNASY,1*4E"]
+        assert device.run(read(4)) == ("3.1.0.0",)
+
+
+def test_ctrl_c_resumes_the_output_before_it_goes_on(scripted):
+    def press(event):
+        if isinstance(event, Measurement) and b"$VNRRG,23*72" in scripted.heard and not pressed:
+            pressed.append(True)
+            raise KeyboardInterrupt
+
+    pressed = []
+    scripted.script[b"$VNRRG,23*72"] = b""
+    with Device(SerialPort(scripted.path, 115200), everything, on_event=press) as device:
+        with pytest.raises(KeyboardInterrupt):
+            device.run(quiet(read(23)))
+        assert scripted.heard[-1] == b"$VNASY,1*4E"
+
+
+def test_even_an_interrupted_clean_up_resumes_the_output_at_the_end(scripted):
+    def impatient(event):
+        if isinstance(event, Measurement) and len(scripted.heard) >= 2 and len(pressed) < 2:
+            pressed.append(True)
+            raise KeyboardInterrupt
+
+    pressed = []
+    scripted.script[b"$VNRRG,23*72"] = b""
+    with (
+        pytest.raises(KeyboardInterrupt),
+        Device(SerialPort(scripted.path, 115200), everything, on_event=impatient) as device,
+    ):
+        device.run(quiet(read(23)))
+    time.sleep(0.05)
+    assert len(pressed) == 2
+    assert scripted.heard[-1] == b"$VNASY,1*4E"
+
+
+def test_a_port_that_goes_away_ends_the_run_at_once(scripted):
+    scripted.hang_up_on = b"$VNRRG,23*72"
+    with (
+        pytest.raises(LinkLost, match="is gone"),
+        Device(SerialPort(scripted.path, 115200), everything) as device,
+    ):
+        device.run(quiet(read(23)))
+    assert scripted.heard == [b"$VNASY,0*4F", b"$VNRRG,23*72"]
+
+
+def test_faults_reach_the_caller(scripted):
+    events = []
+    scripted.script[b"$VNRRG,23*72"] = b"$VNERR,0A*00\r\n" + SCRIPT[b"$VNRRG,23*72"]
+    with Device(SerialPort(scripted.path, 115200), on_event=events.append) as device:
+        device.run(read(23))
+    assert DeviceFault(0x0A) in events
+
+
+def test_a_word_and_a_write_have_names_for_people():
+    assert str(Word("VNASY", (0,))) == "VNASY,0"
+    assert str(Write(23, IDENTITY)) == "write of register 23"
