@@ -20,7 +20,7 @@ from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
 
 _MIN_EPOCH = 64  # a shorter piece before a gap is not worth a factor
-_SEARCH_AT = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # epochs after which new starts may compete
+_SEARCH_AT = (1, 2, 3, 4, 6, 8, 12, 16)  # epochs after which new starts may compete
 _AGREEMENT = 1.0  # of log likelihood: starts that end this close count as one answer
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _TYPICAL_DIP_RAD = np.radians(65.0)  # without gravity: pessimistic for most of the inhabited earth
@@ -130,6 +130,7 @@ class Estimator:
 
     def _search(self, window: Window) -> None:
         """The present answer and fresh starts compete by cost, until they agree on good data."""
+        window.graph.temper = 1.0  # a poor answer must not strengthen the prior that holds it
         data = [e.data for e in window.epochs]
         starts = [window.graph.c, start.linear_start(data), start.sphere_start(_fields(data))]
         reached = []
@@ -140,7 +141,7 @@ class Estimator:
         costs = [cost for cost, _ in reached]
         window.restore(reached[int(np.argmin(costs))][1])
         window.track(everything=True)
-        if max(costs) - min(costs) < _AGREEMENT * window.graph.temper and self._sure(window):
+        if max(costs) - min(costs) < _AGREEMENT and self._sure(window):
             self._searching = False
 
     @staticmethod

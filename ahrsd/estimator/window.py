@@ -31,7 +31,7 @@ from ahrsd.samples import Array
 _STALE = 0.3  # sigmas of movement after which an epoch is linearised again
 _SETTLED = 0.05  # sigmas of movement at which iterating stops
 _LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
-_MAX_STEPS = 30
+_MAX_STEPS = 12
 _CAREFUL_STEPS = 4
 _MAX_TRACKS = 6
 _GAIN = 0.05  # of log likelihood: less is not worth another step
