@@ -35,6 +35,7 @@ import serial
 from drivers.port_holders import Holder, holders, is_pty
 from drivers.vn100.decode import Reply, decode
 from drivers.vn100.deframer import Deframer
+from drivers.vn100.errors import DriverError
 from drivers.vn100.sentences import encode
 
 READ_BYTES = 65536
@@ -45,7 +46,7 @@ _TIOCGEXCL = 0x80045440  # Linux asm-generic/ioctls.h; termios does not have it
 _GARBAGE_TOLERATED = 0.5  # part of the bytes at a right rate that may lie outside of messages
 
 
-class PortError(Exception):
+class PortError(DriverError):
     """A serial port cannot be used; the text is one line for a person."""
 
 

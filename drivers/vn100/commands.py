@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from drivers.vn100.decode import Reply
-from drivers.vn100.errors import DeviceRefused, DriverError
+from drivers.vn100.errors import ERRORS, DriverError, Outcome
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,
@@ -36,7 +36,7 @@ WORDS: dict[str, tuple[tuple[int, ...], ...]] = {  # word: the arguments that it
 
 
 class SessionError(DriverError):
-    """A command sequence could not be carried out; the classes below and DeviceRefused."""
+    """A command sequence could not be carried out; one of the classes below."""
 
 
 class NoReply(SessionError):
@@ -206,8 +206,9 @@ def confusable(earlier: Speech, later: Speech) -> bool:
     return type(earlier) is type(later) and earlier.register == later.register
 
 
-RETRIED_ERRORS = frozenset({0x02, 0x03})  # damaged on the way: nothing was carried out
-FAULTS = frozenset({0x01, 0x0A, 0x0B, 0xFF})  # about the device's own state, at any time
+# Damaged on the way to the device, so nothing was carried out.
+RETRIED_ERRORS = frozenset(code for code, row in ERRORS.items() if row.outcome is Outcome.RETRY)
+# Answers to a command; the others (01, 0A, 0B, FF, unknown ones) are about the device's own state.
 REFUSALS = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0C})
 
 
@@ -219,20 +220,3 @@ def _values(register: int, word: str, reply: Reply) -> Values | None:
         return parse(register, reply.tokens)
     except RegisterValueError:
         return None
-
-
-__all__ = [
-    "Cancelled",
-    "Command",
-    "DeviceRefused",
-    "LinkGone",
-    "NoReply",
-    "NotPermitted",
-    "Pause",
-    "Procedure",
-    "Read",
-    "SessionError",
-    "Speech",
-    "Word",
-    "Write",
-]

@@ -22,6 +22,7 @@ from drivers.vn100.registers import (
     parse,
     same,
 )
+from drivers.vn100.sentences import MESSAGES
 
 VECTORS = Path(__file__).parents[3] / "shared" / "reference" / "vn100-vectors.json"
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -281,3 +282,11 @@ def test_defaults_are_the_manuals():
     assert REGISTERS[44].defaults == {2: (1, 3, 5), 3: (0, 1, 5)}
     assert REGISTERS[5].defaults[3] == (115200,)
     assert (REGISTERS[6].defaults[2], REGISTERS[7].defaults[2]) == ((14,), (40,))
+
+
+def test_measurement_rows_print_as_the_messages_of_the_same_values():
+    for message in MESSAGES.values():
+        if message.register != 115:  # heave: the manual prints no format for it
+            formats = [field.printed for field in REGISTERS[message.register].fields]
+            assert formats == [column.printed for column in message.columns], message.name
+            assert message.output_type in REGISTERS[6].fields[0].allowed
