@@ -88,4 +88,46 @@ class Noted:
     text: str
 
 
-Event = Send | SamplesSeen | Estimated | Judged | StateChanged | RegisterWritten | Noted
+@dataclass(frozen=True, slots=True)
+class OpenJournal:
+    """The device is known: open its journal and answer with `JournalOpened`."""
+
+    serial: int
+
+
+@dataclass(frozen=True, slots=True)
+class JournalAppend:
+    """Make this record durable, then answer with `Journalled`; nothing is sent before."""
+
+    kind: str
+    facts: dict[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class RegistersRead:
+    """A full reading of the device's configuration."""
+
+    host_s: float
+    values: dict[int, tuple[float | int | str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """Everything that had to be put back is; the shell may close the port."""
+
+    reason: str
+
+
+Event = (
+    Send
+    | SamplesSeen
+    | Estimated
+    | Judged
+    | StateChanged
+    | RegisterWritten
+    | Noted
+    | OpenJournal
+    | JournalAppend
+    | RegistersRead
+    | Finished
+)

@@ -80,6 +80,25 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
+class JournalOpened:
+    """The journal of the device with this serial number; `error` where it cannot be trusted."""
+
+    host_ns: int
+    serial: int
+    records: list[dict[str, object]] = field(default_factory=list)
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Journalled:
+    """The record that the core asked for is on the disk, or `error` says why not."""
+
+    host_ns: int
+    kind: str
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Shut down: undo what was changed for the session, then finish."""
 
@@ -96,5 +115,7 @@ Input = (
     | Operator
     | RegistersKnown
     | Samples
+    | JournalOpened
+    | Journalled
     | Stop
 )

@@ -15,6 +15,8 @@ import numpy as np
 from ahrsd.inputs import (
     Input,
     Interlock,
+    JournalOpened,
+    Journalled,
     LinkLost,
     LinkOpened,
     Operator,
@@ -27,7 +29,18 @@ from ahrsd.samples import SampleBlock
 
 _TYPES = {
     kind.__name__: kind
-    for kind in (Tick, LinkOpened, LinkLost, Interlock, Operator, RegistersKnown, Samples, Stop)
+    for kind in (
+        Tick,
+        LinkOpened,
+        LinkLost,
+        Interlock,
+        Operator,
+        RegistersKnown,
+        Samples,
+        JournalOpened,
+        Journalled,
+        Stop,
+    )
 }
 _ARRAYS = ("time_s", "dt_s", "host_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2")
 

@@ -1,0 +1,199 @@
+"""Messages to raw samples: one stream, its clock, its gaps, the registers that were in force.
+
+Rows of one layout are collected until a quarter of a second is together (by count, so that the
+blocks do not depend on how the bytes were cut), then turned into arrays at once.
+
+Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
+the rate, with damaged or skipped bytes before a message counted as lost messages, so that nothing
+is bridged. The rate of such a stream is what the caller says, else register 7, else what the
+arrival times say, else the factory's 40 Hz.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from drivers.vn100.decode import Measurement
+
+from ahrsd.clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
+from ahrsd.samples import SampleBlock
+from ahrsd.unmapping import Extractor, MissingQuantityError, RegisterEpochs, sample_blocks
+
+FACTORY_RATE_HZ = 40.0
+_BLOCK_S = 0.25
+_ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
+
+
+@dataclass(slots=True)
+class StreamFacts:
+    """Counters of a stream. `unusable`: saturated or not finite."""
+
+    samples: int = 0
+    unusable: int = 0
+    expected: float = 0.0
+    layout: str = ""
+    rate_hz: float = float("nan")
+    rate_source: str = ""
+
+
+class NoSamplesError(ValueError):
+    """Messages came, and none that anything can be calibrated from."""
+
+
+class Stream:
+    """Measurements in, `SampleBlock`s out; time is an argument, nothing is read or written."""
+
+    def __init__(self, epochs: RegisterEpochs, rate_hz: float | None = None) -> None:
+        self.epochs = epochs
+        self.clock = DeviceClock()
+        self.facts = StreamFacts()
+        self.gaps: list[Gap] = []
+        self.by_layout: Counter[str] = Counter()
+        self.warnings: dict[str, None] = {}
+        self.refused: dict[str, MissingQuantityError] = {}
+        self.register_rate_hz: float | None = None
+        self._said_rate_hz = rate_hz
+        self._extractor: Extractor | None = None
+        self._timeline = StreamTimeline()
+        self._steps: StepClock | None = None
+        self._rows: list[tuple[float, ...]] = []
+        self._arrivals: list[float] = []
+        self._lost: list[int] = []
+        self._lost_next = 0
+
+    @property
+    def restarts(self) -> int:
+        """How often the device's time fell."""
+        return self._timeline.restarts
+
+    def lost(self, messages: int) -> None:
+        """So many messages are missing before the next one."""
+        self._lost_next += messages
+
+    def forget(self) -> None:
+        """The link was away, or the output was changed: what follows does not follow on."""
+        self._timeline.forget()
+        self._lost_next = max(self._lost_next, 1)
+
+    def take(self, measurement: Measurement, host_s: float) -> list[SampleBlock]:
+        """One message that arrived at host_s (0 for a recording without host time)."""
+        layout = measurement.layout
+        self.by_layout[layout.name] += 1
+        extractor = self._extractor
+        if extractor is None or layout is not extractor.layout:
+            extractor = self._accept(measurement)
+            if extractor is None:
+                return []
+        self._rows.append(measurement.values)
+        self._arrivals.append(host_s)
+        self._lost.append(self._lost_next)
+        self._lost_next = 0
+        return self.flush() if len(self._rows) >= self._wanted(extractor) else []
+
+    def _accept(self, measurement: Measurement) -> Extractor | None:
+        """The first layout that has what is needed is the stream; a better one replaces it."""
+        layout = measurement.layout
+        if layout.name in self.refused:
+            return None
+        try:
+            new = Extractor(layout)
+        except MissingQuantityError as error:
+            self.refused[layout.name] = error
+            return None
+        if self._extractor is not None and not _better(new, self._extractor):
+            return None
+        self._extractor = new
+        self._rows.clear()
+        self._arrivals.clear()
+        self._lost.clear()
+        self.facts.layout = layout.name
+        self.warnings.update(dict.fromkeys(new.warnings))
+        self.forget()
+        return new
+
+    def _wanted(self, extractor: Extractor) -> int:
+        if extractor.has_time:
+            period = self._timeline.period_s
+            return 16 if not np.isfinite(period) else max(1, min(256, int(_BLOCK_S / period)))
+        if self._steps is None and self._rate(len(self._rows)) is None:
+            return len(self._rows) + 1
+        rate = self.facts.rate_hz
+        return max(1, min(256, int(_BLOCK_S * rate))) if np.isfinite(rate) else 1
+
+    def _rate(self, count: int) -> float | None:
+        """Rate of a stream without device time, None while it must still be watched."""
+        said = self._said_rate_hz
+        if said is not None:
+            return self._decide(said, "as given")
+        if self.register_rate_hz is not None:
+            return self._decide(self.register_rate_hz, "register 7")
+        if self._arrivals and self._arrivals[-1] > self._arrivals[0]:
+            if count < _ARRIVALS:
+                return None
+            span = self._arrivals[-1] - self._arrivals[0]
+            return self._decide((count - 1) / span, "arrival times")
+        return self._decide(FACTORY_RATE_HZ, "assumed: the factory's rate")
+
+    def _decide(self, rate_hz: float, source: str) -> float:
+        self.facts.rate_hz, self.facts.rate_source = rate_hz, source
+        self.warnings[
+            f"{self.facts.layout} carries no time: {rate_hz:.4g} Hz ({source}); "
+            "a wrong rate makes the gyro bias and the weights wrong, --rate sets it"
+        ] = None
+        self._steps = StepClock(rate_hz)
+        return rate_hz
+
+    def flush(self) -> list[SampleBlock]:
+        """Turn what is collected into blocks now (registers change, the link goes, the end)."""
+        extractor = self._extractor
+        if extractor is None or not self._rows:
+            return []
+        if not extractor.has_time and self._steps is None:
+            self._rate(_ARRIVALS)
+        extracted = extractor.extract(self._rows)
+        arrivals = np.array(self._arrivals)
+        if extracted.time_s is not None:
+            time_s = extracted.time_s
+        else:
+            assert self._steps is not None
+            time_s = self._steps.times(np.array(self._lost))
+        self._rows.clear()
+        self._arrivals.clear()
+        self._lost.clear()
+        steps = self._timeline.extend(time_s, extracted.usable)
+        self._note(steps)
+        self.clock.update(float(time_s[-1]), float(arrivals[-1]))
+        host_s = np.maximum.accumulate(np.minimum(self.clock.to_host(time_s), arrivals))
+        return sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+
+    def _note(self, steps: Steps) -> None:
+        facts = self.facts
+        kept = int(np.count_nonzero(steps.keep))
+        facts.samples += kept
+        facts.unusable += len(steps.keep) - kept
+        facts.expected += kept
+        period = self._timeline.period_s
+        if np.isfinite(period) and period > 0:
+            facts.expected += sum(max(gap.length_s / period - 1.0, 0.0) for gap in steps.gaps)
+            if self._steps is None:
+                facts.rate_hz, facts.rate_source = 1.0 / period, "device time"
+        self.gaps.extend(steps.gaps)
+
+    def check(self) -> None:
+        """Raise NoSamplesError, naming what came, where messages came and none is of use."""
+        if self.facts.samples or not self.by_layout:
+            return
+        reasons = "; ".join(str(error) for error in self.refused.values())
+        if reasons:
+            raise NoSamplesError(reasons)
+
+
+def _better(new: Extractor, old: Extractor) -> bool:
+    """Uncompensated before compensated, with device time before without."""
+
+    def rank(e: Extractor) -> tuple[bool, bool]:
+        return (not e.mag_compensated, e.has_time)
+
+    return rank(new) > rank(old)
