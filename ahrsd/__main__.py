@@ -60,8 +60,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; always ends in SystemExit."""
     with _Bugs():
         try:
-            code = group.main(args=arguments, prog_name="ahrsd", standalone_mode=False)
+            # not `group.main`: a reader that went away would be exit 1, "the answer is no"
+            given = sys.argv[1:] if arguments is None else list(arguments)
+            with group.make_context("ahrsd", given) as context:
+                group.invoke(context)
             sys.stdout.flush()
+        except click.exceptions.Exit as end:
+            sys.exit(end.exit_code)
         except click.ClickException as error:
             error.show()
             sys.exit(error.exit_code)
@@ -75,7 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
         except BrokenPipeError:
             _detach_stdout()
             sys.exit(EXIT_DONE)
-        sys.exit(code if isinstance(code, int) else EXIT_DONE)
+        sys.exit(EXIT_DONE)
 
 
 if __name__ == "__main__":

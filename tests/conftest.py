@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -37,3 +38,32 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         yield mount
     finally:
         subprocess.run(["umount", str(mount)], check=True)
+
+
+@pytest.fixture
+def run() -> Callable[..., int]:
+    """`run(*arguments)`: the exit code of `ahrsd ARGUMENTS`, in this process."""
+    from ahrsd.__main__ import main
+
+    def call(*arguments: object) -> int:
+        with pytest.raises(SystemExit) as caught:
+            main([str(argument) for argument in arguments])
+        code = caught.value.code
+        return code if isinstance(code, int) else 0
+
+    return call
+
+
+@pytest.fixture
+def emulated() -> Callable[..., AbstractContextManager[tuple[object, str]]]:
+    """`with emulated(faults=...) as (emulator, path)`: an emulated VN-100 on a pty."""
+    from drivers.vn100.emulator_pty import PtyEmulator
+    from drivers.vn100.emulator_scenarios import Setup, build
+
+    @contextmanager
+    def serve(**setup: object) -> Iterator[tuple[object, str]]:
+        emulator = build(Setup(**setup))
+        with PtyEmulator(emulator) as server:
+            yield emulator, server.path
+
+    return serve

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import click
 
@@ -38,20 +39,16 @@ _YES = click.option("--yes", is_flag=True, help="Do it; without, only say what w
 _SAVE = click.option("--save", is_flag=True, help="Also save all of RAM to flash. Keep it still.")
 
 
+Ids = TypeVar("Ids", int, tuple[int, ...])
 _SHOWN = ("txn", "reason", "error", "restored")  # facts of a record besides its registers
 
 
-class _RegisterNumber(click.ParamType[int]):
-    """A number of the register map."""
-
-    name = "register"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> int:
-        if isinstance(value, str) and value.isdecimal() and int(value) in REGISTERS:
-            return int(value)
-        return self.fail(f"{value!r} is no register of the VN-100", param, ctx)
+def _known(_context: click.Context, _option: click.Parameter, numbers: Ids) -> Ids:
+    """Refuse numbers that are not in the register map before a port is opened."""
+    for number in numbers if isinstance(numbers, tuple) else (numbers,):
+        if number not in REGISTERS:
+            raise click.BadParameter(f"the VN-100 has no register {number}")
+    return numbers
 
 
 @click.group()
@@ -65,7 +62,7 @@ def command() -> None:
 
 @command.command()
 @click.argument("port", type=click.Path(path_type=Path))
-@click.argument("ids", nargs=-1, type=_RegisterNumber())
+@click.argument("ids", nargs=-1, type=int, callback=_known)
 @_BAUD
 @click.option("--json", "json_path", help="Values as JSON into this file, - for stdout.")
 def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | None) -> None:
@@ -125,7 +122,7 @@ def diff(
 
 @command.command(context_settings={"ignore_unknown_options": True})
 @click.argument("port", type=click.Path(path_type=Path))
-@click.argument("number", metavar="ID", type=_RegisterNumber())
+@click.argument("number", metavar="ID", type=int, callback=_known)
 @click.argument("values", nargs=-1, required=True)
 @_YES
 @_SAVE

@@ -1,0 +1,208 @@
+"""`ahrsd registers` against the emulated device: what it says, writes, journals and undoes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ahrsd.journal import Journal, journal_path
+
+SERIAL = 100130608
+BAUD = ("--baud", "115200")
+NEW = ["1.1", "0", "0", "0", "1", "0", "0", "0", "0.9", "0.125", "-0.0625", "0.03"]
+NEW_VALUES = (1.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.9, 0.125, -0.0625, 0.03)
+IDENTITY = ["1", "0", "0", "0", "1", "0", "0", "0", "1", "0", "0", "0"]
+BIAS = ["1", "0", "0", "0", "1", "0", "0", "0", "1", "0.01", "0", "0"]
+FACTORY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def kinds(tmp_path) -> list[str]:
+    return [record.kind for record in Journal.open(journal_path(tmp_path, SERIAL)).records()]
+
+
+def ram(emulator, number: int = 23) -> tuple[float, ...]:
+    return tuple(round(float(value), 6) for value in emulator.memory.get(number))
+
+
+def test_read_prints_a_table_or_json(run, emulated, capsys):
+    with emulated() as (_, path):
+        assert run("registers", "read", path, "23", "4", *BAUD) == 0
+        table = capsys.readouterr().out.splitlines()
+        assert run("registers", "read", path, "--json", "-", *BAUD) == 0
+    assert table[0].startswith("VN-100")
+    assert f"serial {SERIAL}, firmware 3.1.0.0" in table[0]
+    assert table[1].split() == ["23", "Magnetometer", "Calibration", "1,0,0,0,1,0,0,0,1,0,0,0"]
+    body = json.loads(capsys.readouterr().out)
+    assert body["schema"] == "ahrsd.registers/1"
+    assert body["device"]["serial"] == str(SERIAL)
+    assert tuple(body["registers"]["23"]) == FACTORY
+    assert len(body["registers"]) > 15
+
+
+def test_reading_sends_nothing_but_reads(run, emulated, capsys):
+    with emulated() as (emulator, path):
+        before = {n: emulator.memory.get(n) for n in (5, 6, 7, 23, 75, 84)}
+        assert run("registers", "read", path, *BAUD) == 0
+        assert {n: emulator.memory.get(n) for n in before} == before
+        assert emulator.counters["saves"] == 0
+
+
+def test_write_journals_verifies_and_tells_how_to_go_back(run, emulated, tmp_path, capsys):
+    with emulated() as (emulator, path):
+        code = run("registers", "write", path, 23, *NEW, "--yes",
+                   "--state-directory", tmp_path, *BAUD)  # fmt: skip
+        assert code == 0
+        assert ram(emulator) == NEW_VALUES
+        assert emulator.counters["saves"] == 0
+    assert kinds(tmp_path) == ["PREPARED", "RAM_VERIFIED"]
+    record = Journal.open(journal_path(tmp_path, SERIAL)).records()[0]
+    assert tuple(record.facts["old"]["23"]) == FACTORY
+    assert record.facts["device"]["serial"] == str(SERIAL)
+    shown = capsys.readouterr().out
+    assert f"ahrsd registers rollback {path} 1 --yes" in shown
+    assert "$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*5D" in shown
+
+
+def test_without_yes_nothing_is_written(run, emulated, tmp_path, capsys):
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, 23, ",".join(NEW),
+                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+        assert ram(emulator) == FACTORY
+    assert list(tmp_path.iterdir()) == []
+    output = capsys.readouterr()
+    assert "add --yes to do it" in output.err
+    assert "new  1.1,0,0,0,1,0,0,0,0.9,0.125,-0.0625,0.03" in output.out
+
+
+def test_what_is_there_already_is_not_written_again(run, emulated, tmp_path, capsys):
+    with emulated() as (_, path):
+        assert run("registers", "write", path, 23, *IDENTITY, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+    assert "holds the wanted values already" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rollback_finds_the_change_in_force(run, emulated, tmp_path, capsys):
+    options = ("--yes", "--state-directory", tmp_path, *BAUD)
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, 23, *NEW, *options) == 0
+        assert run("registers", "write", path, 84, *BIAS,
+                   *options) == 0  # fmt: skip
+        assert run("registers", "rollback", path, *options) == 0
+        assert ram(emulator, 84) == FACTORY
+        assert ram(emulator) == NEW_VALUES
+        assert run("registers", "rollback", path, *options) == 0
+        assert ram(emulator) == FACTORY
+        assert run("registers", "rollback", path, *options) == 1
+        assert "none of the journal's changes" in capsys.readouterr().err
+        assert run("registers", "rollback", path, "99", *options) == 1
+        assert "record 99 is no change; changes are: 1, 3, 5, 7" in capsys.readouterr().err
+    capsys.readouterr()
+    assert run("registers", "history", "--state-directory", tmp_path) == 0
+    shown = capsys.readouterr().out
+    assert "journal-100130608.jsonl: 8 records" in shown
+    assert "reason=rollback of 3" in shown
+    assert "to go back send  $VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*5D" in shown
+
+
+def test_save_writes_flash_once_and_journals_it(run, emulated, tmp_path):
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+        assert emulator.counters["saves"] == 1
+    assert kinds(tmp_path) == ["PREPARED", "RAM_VERIFIED", "FLASH_SENT", "FLASH_ACKED"]
+
+
+def test_a_refused_write_leaves_the_device_as_it_was(run, emulated, tmp_path, capsys):
+    with emulated(faults=("refused_write",)) as (emulator, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 1  # fmt: skip
+        assert ram(emulator) == FACTORY
+    assert kinds(tmp_path) == ["PREPARED", "RAM_FAILED"]
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "the old values are back" in error
+
+
+def test_without_a_journal_nothing_is_written(run, emulated, tmp_path, capsys):
+    (tmp_path / "state").write_text("a file where the folder should be")
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes",
+                   "--state-directory", tmp_path / "state", *BAUD) == 1  # fmt: skip
+        assert ram(emulator) == FACTORY
+    assert "nothing will be written to the device" in capsys.readouterr().err
+
+
+def test_unknown_firmware_is_never_written(run, emulated, tmp_path, capsys):
+    with emulated(scenario="unknown-firmware") as (emulator, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+        assert ram(emulator) == FACTORY
+    assert "firmware 7.0.0.0 is not known" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["23", "1", "2"], "register 23: 2 values, at least 12 needed"),
+        (["23", *["1", "0", "0", "0", "1", "0", "0", "0", "x", "0", "0", "0"]], "'x' is no f32"),
+        (["4", "3.1"], "register 4 is never written: it is read only"),
+        (["200", "1"], "the VN-100 has no register 200"),
+    ],
+)
+def test_wrong_values_never_reach_the_port(run, arguments, words, capsys):
+    assert run("registers", "write", "/dev/does-not-exist", *arguments, "--yes") == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_port_that_is_not_there_is_75(run, capsys):
+    assert run("registers", "read", "/dev/does-not-exist", *BAUD) == 75
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "/dev/does-not-exist does not exist" in error
+
+
+def test_diff_of_device_file_and_journal(run, emulated, tmp_path, capsys):
+    state = ("--state-directory", tmp_path)
+    (tmp_path / "calibration.json").write_text(json.dumps({"registers": {"23": NEW_VALUES}}))
+    with emulated() as (_, path):
+        assert run("registers", "read", path, "--json", tmp_path / "a.json", *BAUD) == 0
+        assert run("registers", "diff", tmp_path / "a.json", path, *BAUD, *state) == 0
+        capsys.readouterr()
+        assert run("registers", "diff", path, tmp_path / "calibration.json", *BAUD) == 1
+        shown = capsys.readouterr().out.splitlines()
+        assert shown[1:] == [
+            "  -  1,0,0,0,1,0,0,0,1,0,0,0",
+            "  +  1.1,0,0,0,1,0,0,0,0.9,0.125,-0.0625,0.03",
+            "1 registers compared, 1 differ",
+        ]
+        assert run("registers", "write", path, 23, *NEW, "--yes", *state, *BAUD) == 0
+        assert run("registers", "diff", "1:new", path, *state, *BAUD) == 0
+        assert run("registers", "diff", "1", path, *state, *BAUD) == 1
+    assert run("registers", "diff", "1", tmp_path / "calibration.json", *state) == 1
+    assert run("registers", "diff", "1:new", tmp_path / "calibration.json", *state) == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "code", "words"),
+    [
+        ("missing.json", 2, "cannot be read: No such file"),
+        ("other.json", 2, 'has no "registers"'),
+        ("unknown.json", 2, "register 200 is no register"),
+        ("1", 1, "there is no journal"),
+        ("empty.json", 2, "have no register in common"),
+    ],
+)
+def test_diff_of_what_is_no_set_of_registers(
+    run, tmp_path, monkeypatch, capsys, first, code, words
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "other.json").write_text('{"a": 1}')
+    (tmp_path / "unknown.json").write_text('{"registers": {"200": [1]}}')
+    (tmp_path / "empty.json").write_text('{"registers": {}}')
+    (tmp_path / "good.json").write_text('{"registers": {"23": [1]}}')
+    assert run("registers", "diff", first, "good.json", "--state-directory", tmp_path) == code
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
