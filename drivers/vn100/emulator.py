@@ -119,8 +119,7 @@ class Emulator:
     def advance(self, now_s: float) -> bytes:
         """Everything that reached the host since the last call, whole messages, in order."""
         self._run(now_s)
-        arrived = self._wire.collect(now_s)
-        return arrived if self.plugged else b""
+        return self._wire.collect(now_s)
 
     def receive(self, data: bytes, now_s: float) -> None:
         """The host's bytes, as they arrive at `now_s`."""
@@ -310,10 +309,18 @@ class Emulator:
         self.counters["restarts"] += 1
         self.log("restart")
 
-    def lose_power(self) -> None:
+    def plug(self, connected: bool, now_s: float) -> None:
+        """The host's port comes or goes."""
+        self.plugged = self._wire.connected = connected
+        if not connected:
+            self._wire.cut(now_s)
+            self._commands.clear()
+            self._deframer = Deframer(host_side=True)
+
+    def lose_power(self, now_s: float) -> None:
         """Silence until `restart`; what was under way is lost."""
         self._life += 1
-        self._wire.clear()
+        self._wire.cut(now_s)
         self._fall_silent()
 
     @property

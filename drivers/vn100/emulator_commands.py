@@ -11,7 +11,12 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from drivers.vn100.emulator_memory import PER_PORT, Memory
-from drivers.vn100.emulator_output import KNOWN_ACCELERATION, KNOWN_MAGNETIC, MEASURED
+from drivers.vn100.emulator_output import (
+    KNOWN_ACCELERATION,
+    KNOWN_MAGNETIC,
+    MEASURED,
+    quantities_of,
+)
 from drivers.vn100.emulator_physics import GRAVITY_M_S2, HISTORY_TICKS, World
 from drivers.vn100.emulator_sensor import Sensor
 from drivers.vn100.emulator_streams import BINARY_OUTPUTS, binary_packet, fits
@@ -107,7 +112,9 @@ class Interpreter:
             if register == 80:  # reading it begins a new integration
                 step = min(max(tick - self._integrated_tick, 1), HISTORY_TICKS)
                 self._integrated_tick = tick
-            return tuple(self.sensor.row(MEASURED[register], tick, step))
+            columns = MEASURED[register]
+            values = self.sensor.row(quantities_of(columns), tick, step)
+            return tuple(v * c.per_si for v, c in zip(values, columns, strict=True))
         if register == 33:
             counts = self.sensor.row(("sync_in_count", "time_sync_in_s", "sync_out_count"), tick, 1)
             return int(counts[0]), int(counts[1] * 1e6) & 0xFFFF_FFFF, int(counts[2])

@@ -23,7 +23,6 @@ class Device(Protocol):
 
     memory: Memory
     sensor: Sensor
-    plugged: bool
     serial: int
 
     def at(self, when_s: float, what: Callable[[float], None], *, any_life: bool = False) -> None:
@@ -32,8 +31,11 @@ class Device(Protocol):
     def restart(self, now_s: float) -> None:
         """Power comes back."""
 
-    def lose_power(self) -> None:
+    def lose_power(self, now_s: float) -> None:
         """Power goes."""
+
+    def plug(self, connected: bool, now_s: float) -> None:
+        """The host's port comes or goes."""
 
     @property
     def powered(self) -> bool:
@@ -108,21 +110,21 @@ class Events:
         self._power_cut(fault, now_s)
 
     def _reset(self, _: Fault, now_s: float) -> None:
-        self._device.lose_power()
+        self._device.lose_power(now_s)
         self._device.restart(now_s)
 
     def _power_cut(self, fault: Fault, now_s: float) -> None:
-        self._device.lose_power()
+        self._device.lose_power(now_s)
         self._device.at(now_s + fault.duration_s, self._device.restart)
 
     def _unplug(self, fault: Fault, now_s: float) -> None:
-        self._device.plugged = False
+        self._device.plug(False, now_s)
         if fault.parameter or fault.name == "replug_other_serial":
-            self._device.lose_power()
+            self._device.lose_power(now_s)
         self._device.at(now_s + fault.duration_s, partial(self._replug, fault), any_life=True)
 
     def _replug(self, fault: Fault, now_s: float) -> None:
-        self._device.plugged = True
+        self._device.plug(True, now_s)
         if fault.name == "replug_other_serial":
             self._device.replace_unit(self._device.serial + 1)
         if not self._device.powered:

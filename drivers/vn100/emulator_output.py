@@ -1,4 +1,4 @@
-"""What the emulated VN-100 can put into a message, quantity by quantity, and the ASCII messages.
+"""What the emulated VN-100 can put into a message, quantity by quantity.
 
 A quantity has a row per tick of the block. The gyro's value is the mean over the output's own step
 (`step_ticks`), as are the increments of angle and velocity. Sources: vn100-protocol 1.3, 2, 4.2, 6.
@@ -8,48 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from drivers.vn100.emulator_chain import Outputs
 from drivers.vn100.emulator_motion import Array
 from drivers.vn100.emulator_physics import BLOCK_TICKS, TICK_HZ
+from drivers.vn100.fields import Columns
+from drivers.vn100.sentences import MESSAGES
 
 KNOWN_MAGNETIC, KNOWN_ACCELERATION = 0x0800, 0x1000  # VpeStatus, after VNKMD and VNKAD
 GYRO_FULL, MAG_FULL = 0x0004, 0x0040
 
-# ADOR: message, the register with the same values, and the bytes of a line with a 2-digit checksum
-# (vn100-protocol 1.5; VNHVE by the format of register 115).
-ASCII_MESSAGES: dict[int, tuple[str, int, int]] = {
-    1: ("VNYPR", 8, 38),
-    2: ("VNQTN", 9, 51),
-    8: ("VNQMR", 15, 135),
-    10: ("VNMAG", 17, 38),
-    11: ("VNACC", 18, 35),
-    12: ("VNGYR", 19, 44),
-    13: ("VNMAR", 20, 95),
-    14: ("VNYMR", 27, 122),
-    16: ("VNYBA", 239, 95),
-    17: ("VNYIA", 240, 95),
-    19: ("VNIMU", 54, 110),
-    30: ("VNDTV", 80, 75),
-    34: ("VNHVE", 115, 17),
-}
-MEASURED: dict[int, tuple[str, ...]] = {
-    8: ("ypr_deg",),
-    9: ("quaternion",),
-    15: ("quaternion", "mag", "accel", "gyro"),
-    17: ("mag",),
-    18: ("accel",),
-    19: ("gyro",),
-    20: ("mag", "accel", "gyro"),
-    27: ("ypr_deg", "mag", "accel", "gyro"),
-    54: ("uncomp_mag", "uncomp_accel", "uncomp_gyro", "temperature", "pressure"),
-    80: ("delta_time", "delta_theta_deg", "delta_velocity"),
-    115: ("heave",),
-    239: ("ypr_deg", "linear_accel_body", "gyro"),
-    240: ("ypr_deg", "linear_accel_ned", "gyro"),
-}
+# Registers that hold what an asynchronous message carries.
+MEASURED: dict[int, Columns] = {row.register: row.columns for row in MESSAGES.values()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,38 +112,50 @@ def _plain(name: str) -> Callable[[Readings], Array]:
     return lambda of: of.outputs.quantity(name)
 
 
+def _raw(of: Readings) -> Array:
+    """What firmware 2 puts into Imu.Raw is not known; here the uncompensated values."""
+    names = ("uncomp_mag_x_gauss", "uncomp_accel_x_m_s2", "uncomp_gyro_x_rad_s", "temperature_c")
+    return np.hstack([of.column(name) for name in names])
+
+
 def _dcm(of: Readings) -> Array:
     return of.outputs.R_nu.transpose(0, 2, 1).reshape(BLOCK_TICKS, 9)
 
 
+# By the name of the quantity's first column (`fields`); SI, angles in rad.
 QUANTITIES: dict[str, Callable[[Readings], Array]] = {
     "time_startup_s": _time_startup,
     "time_sync_in_s": _time_startup,  # no SyncIn event ever came: since the start
     "sync_in_count": _zeros(1),
     "sync_out_count": _sync_out_count,
-    "ypr_deg": lambda of: np.degrees(of.outputs.quantity("ypr")),
-    "ypr_rad": _plain("ypr"),
-    "quaternion": lambda of: of.outputs.q_nu,
-    "dcm": _dcm,
-    "ypr_uncertainty": _zeros(3),  # zeros in recordings of the real device
-    "uncomp_mag": _plain("uncomp_mag"),
-    "uncomp_accel": _plain("uncomp_accel"),
-    "uncomp_gyro": lambda of: of.outputs.rates(of.step_ticks),
-    "mag": _plain("mag"),
-    "accel": _plain("accel"),
-    "gyro": lambda of: of.outputs.compensated_rates(of.step_ticks),
-    "mag_ned": _plain("mag_ned"),
-    "accel_ned": _plain("accel_ned"),
-    "linear_accel_body": _plain("linear_accel_body"),
-    "linear_accel_ned": _plain("linear_accel_ned"),
-    "temperature": lambda of: of.outputs.block.temperature_c,
-    "pressure": lambda of: of.outputs.block.pressure_kpa,
-    "delta_time": lambda of: np.full(BLOCK_TICKS, of.step_ticks / TICK_HZ),
-    "delta_theta_deg": lambda of: np.degrees(_delta_theta(of)),
-    "delta_theta_rad": _delta_theta,
-    "delta_velocity": _delta_velocity,
+    "yaw_rad": _plain("ypr"),
+    "quat_x": lambda of: of.outputs.q_nu,
+    "dcm_00": _dcm,
+    "yaw_sigma_rad": _zeros(3),  # zeros in recordings of the real device
+    "uncomp_mag_x_gauss": _plain("uncomp_mag"),
+    "uncomp_accel_x_m_s2": _plain("uncomp_accel"),
+    "uncomp_gyro_x_rad_s": lambda of: of.outputs.rates(of.step_ticks),
+    "mag_x_gauss": _plain("mag"),
+    "accel_x_m_s2": _plain("accel"),
+    "gyro_x_rad_s": lambda of: of.outputs.compensated_rates(of.step_ticks),
+    "mag_n_n_gauss": _plain("mag_ned"),
+    "accel_n_n_m_s2": _plain("accel_ned"),
+    "linear_accel_b_x_m_s2": _plain("linear_accel_body"),
+    "linear_accel_n_n_m_s2": _plain("linear_accel_ned"),
+    "temperature_c": lambda of: of.outputs.block.temperature_c,
+    "pressure_kpa": lambda of: of.outputs.block.pressure_kpa,
+    "delta_time_s": lambda of: np.full(BLOCK_TICKS, of.step_ticks / TICK_HZ),
+    "delta_theta_x_rad": _delta_theta,
+    "delta_velocity_x_m_s": _delta_velocity,
     "vpe_status": _vpe_status,
     "imu_status": _zeros(1),
     "sens_sat": lambda of: of.outputs.saturation(),
-    "heave": _zeros(3),  # the emulated vehicle does not heave
+    "heave_m": _zeros(3),  # the emulated vehicle does not heave
+    "imu_raw_0": _raw,
 }
+
+
+@cache
+def quantities_of(columns: Columns) -> tuple[str, ...]:
+    """The quantities that fill a message's columns, in their order."""
+    return tuple(column.name for column in columns if column.name in QUANTITIES)

@@ -13,6 +13,7 @@ import numpy as np
 from drivers.vn100.emulator import Emulator
 from drivers.vn100.emulator_motion import make_motion
 from drivers.vn100.emulator_physics import TICK_HZ, Truth, draw_truth
+from drivers.vn100.emulator_streams import fits
 
 Values = tuple[float | int | str, ...]
 
@@ -90,7 +91,7 @@ def build(setup: Setup) -> Emulator:
     if scenario.calibrated:
         presets.update(calibration_registers(truth))
     firmware = FIRMWARES.get(setup.firmware, setup.firmware) or scenario.firmware
-    return Emulator(
+    device = Emulator(
         truth,
         make_motion(scenario.motion, setup.seed),
         firmware,
@@ -99,6 +100,12 @@ def build(setup: Setup) -> Emulator:
         port=setup.port,
         presets=presets,
     )
+    if not fits(device.memory, 5, setup.port, (setup.baud,)):
+        raise ValueError(
+            f"{setup.output} output at {setup.rate_hz} Hz does not fit {setup.baud} Bd; "
+            "lower --rate or raise --baud"
+        )
+    return device
 
 
 def calibration_registers(truth: Truth) -> dict[int, Values]:

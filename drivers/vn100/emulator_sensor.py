@@ -18,7 +18,7 @@ from drivers.vn100.emulator_output import DeviceClock, Readings, Switches
 from drivers.vn100.emulator_physics import BLOCK_TICKS, HISTORY_TICKS, TICK_HZ, World
 
 Row = list[float]
-_TIMES = ("time_startup_s", "time_sync_in_s", "delta_time")
+_TIMES = ("time_startup_s", "time_sync_in_s", "delta_time_s")
 
 
 class Sensor:
@@ -77,7 +77,7 @@ class Sensor:
         """The attitude at `tick` counts as zero until the next start (VNTAR)."""
         self._tare = None
         self.changed()
-        self._tare = np.array(self.row(("quaternion",), tick, 1))
+        self._tare = np.array(self.row(("quat_x",), tick, 1))
         self.changed()
 
     def row(self, names: Sequence[str], tick: int, step_ticks: int) -> Row:

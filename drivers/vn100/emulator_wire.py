@@ -16,11 +16,15 @@ BITS_PER_BYTE = 10  # 8N1
 
 
 class Transmitter:
-    """Orders messages in time. Messages must be sent in order of time."""
+    """Orders messages in time. Messages must be sent in order of time.
+
+    connected: whether anybody hears them;  overflows: messages that found no room
+    """
 
     def __init__(self, plan: FaultPlan, baud: int, overflow: Callable[[], bytes]) -> None:
         self.baud = baud
         self.overflows = 0
+        self.connected = True
         self._plan = plan
         self._overflow = overflow
         self._overflowed = False
@@ -43,10 +47,12 @@ class Transmitter:
         """When everything that is in the queue will have left."""
         return max(self._free_s, now_s)
 
-    def clear(self) -> None:
-        """Power is gone: what has not left is lost."""
-        self._queue.clear()
+    def cut(self, now_s: float) -> None:
+        """Power or plug is gone: what has not arrived is lost."""
+        while self._queue and self._queue[-1][0] > now_s:
+            self._queue.pop()
         self._free_s = 0.0
+        self._released_s = 0.0
         self._overflowed = False
 
     def collect(self, now_s: float) -> bytes:
@@ -67,4 +73,5 @@ class Transmitter:
         start_s = self.empty_at_s(now_s)
         self._free_s = start_s + len(message) * BITS_PER_BYTE / self.baud
         self._released_s = max(self._released_s, self._plan.release_s(self._free_s))
-        self._queue.append((self._released_s, self._free_s, message))
+        if self.connected:
+            self._queue.append((self._released_s, self._free_s, message))
