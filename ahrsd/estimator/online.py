@@ -13,6 +13,7 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, noise, start, summary
+from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.steps import StepAverager, Steps, join, samples_per_step, split
@@ -30,11 +31,17 @@ class Estimator:
     """Streaming MAGYC.  Not thread-safe; deterministic: the same samples give the same numbers."""
 
     def __init__(
-        self, parameters: EstimatorParameters | None = None, present: Affine | None = None
+        self,
+        parameters: EstimatorParameters | None = None,
+        present: Affine | None = None,
+        present_gyro_bias_rad_s: Array | None = None,
     ) -> None:
-        """`present` is the device's calibration (register 23): the prior's centre."""
+        """`present` is the device's calibration (registers 23 and 84): the prior's centre."""
         self.parameters = parameters or EstimatorParameters()
         self._present = present or Affine.identity()
+        self._present_bias = (
+            np.zeros(3) if present_gyro_bias_rad_s is None else present_gyro_bias_rad_s.copy()
+        )
         self._averager: StepAverager | None = None
         self._pending: list[Steps] = []
         self._pending_count = 0
@@ -126,7 +133,8 @@ class Estimator:
         sigma_c = np.r_[np.full(6, p.prior_soft_iron * scale), np.full(3, p.prior_hard_iron_gauss)]
         self._prior_sigma = np.r_[sigma_c, np.full(3, p.prior_gyro_bias_rad_s)]
         direction = chain.start_directions(chain.symmetric(c[:6]), c[6:], data.field_b_gauss[:1])[0]
-        return Window(p, c, sigma_c, direction, noise.first_guess(data, p))
+        first = Node.at(self._present_bias, direction)
+        return Window(p, c, sigma_c, first, noise.first_guess(data, p))
 
     def _search(self, window: Window) -> None:
         """The present answer and fresh starts compete by cost, until they agree on good data."""

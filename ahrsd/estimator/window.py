@@ -75,7 +75,7 @@ class Window:
         parameters: EstimatorParameters,
         c: Array,
         sigma_c: Array,
-        first_direction: Array,
+        first: Node,
         usual: chain.Noise,
     ) -> None:
         self.parameters = parameters
@@ -84,9 +84,8 @@ class Window:
         self.misfit = Misfit()
         self.step_sigmas = np.inf
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
-        node = Node.at(np.zeros(3), first_direction)
-        prior = bias_prior(0, c, node, parameters.prior_gyro_bias_rad_s)
-        self.graph = Graph(c, sigma_c, node, prior)
+        prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
+        self.graph = Graph(c, sigma_c, first, prior)
 
     # -- growing and forgetting ------------------------------------------------------------------
 
