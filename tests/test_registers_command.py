@@ -42,7 +42,7 @@ def test_read_prints_a_table_or_json(run, emulated, capsys):
 
 def test_reading_sends_nothing_but_reads(run, emulated, capsys):
     with emulated() as (emulator, path):
-        before = {n: emulator.memory.get(n) for n in (5, 6, 7, 23, 75, 84)}
+        before = {n: emulator.memory.get(n) for n in (23, 26, 75, 84)}
         assert run("registers", "read", path, *BAUD) == 0
         assert {n: emulator.memory.get(n) for n in before} == before
         assert emulator.counters["saves"] == 0
@@ -61,7 +61,7 @@ def test_write_journals_verifies_and_tells_how_to_go_back(run, emulated, tmp_pat
     assert record.facts["device"]["serial"] == str(SERIAL)
     shown = capsys.readouterr().out
     assert f"ahrsd registers rollback {path} 1 --yes" in shown
-    assert "$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*5D" in shown
+    assert "$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*76" in shown
 
 
 def test_without_yes_nothing_is_written(run, emulated, tmp_path, capsys):
@@ -102,8 +102,8 @@ def test_rollback_finds_the_change_in_force(run, emulated, tmp_path, capsys):
     assert run("registers", "history", "--state-directory", tmp_path) == 0
     shown = capsys.readouterr().out
     assert "journal-100130608.jsonl: 8 records" in shown
-    assert "reason=rollback of 3" in shown
-    assert "to go back send  $VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*5D" in shown
+    assert "reason=rollback undoes=3" in shown
+    assert "to go back send  $VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*76" in shown
 
 
 def test_save_writes_flash_once_and_journals_it(run, emulated, tmp_path):

@@ -11,18 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.vn100.errors import DriverError
-
 from ahrsd.commands.device_access import describe
 from ahrsd.errors import DeviceError
 from ahrsd.journal import Journal, Record, register_values
 from drivers.serial_port import PortError
 from drivers.vn100.commands import Command, Procedure, Read, Word, Write
 from drivers.vn100.device import Device
+from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import (
     Identity,
     quiet,
     read_registers,
+    restore,
     save_settings,
     write_verified,
 )
@@ -57,15 +57,16 @@ def to_write(present: Changes, wanted: Changes) -> Changes:
 
 
 def apply(
-    device: Device, journal: Journal, identity: Identity, changes: Changes, reason: str
+    device: Device, journal: Journal, identity: Identity, changes: Changes, **why: object
 ) -> Record:
     """Write and verify `changes` in RAM; returns the record that `rollback` goes back to.
 
+    why: facts for the journal: `reason`, and for a rollback `undoes`, the number of the change.
     Raises JournalError before anything is sent, DeviceError with the outcome of putting back.
     """
     old = device.run(read_registers(changes))
     prepared = journal.append(
-        "PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), reason=reason
+        "PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), **why
     )
     try:
         device.run(quiet(_write_all(changes)))
@@ -95,9 +96,9 @@ def _write_all(changes: Changes) -> Procedure[None]:
 
 
 def _put_back(device: Device, old: Changes) -> str:
-    """Write the old values again; "" or why that failed."""
+    """Whatever differs from `old` gets it again; "" or why that failed."""
     try:
-        device.run(quiet(_write_all(old)))
+        device.run(quiet(restore(old, old)))
     except (DriverError, PortError) as error:
         return str(error)
     return ""

@@ -36,13 +36,16 @@ def find(journal: Journal, number: int) -> Record:
 
 
 def newest_in_force(journal: Journal, read: Callable[[Iterable[int]], Changes]) -> Record:
-    """The newest change whose values the device holds now and did not hold before.
+    """The newest change that is in the device and was not undone; undoing is no change itself.
 
     Raises JournalError where there is none: then a person must say which record is meant.
     """
-    for record in reversed(journal.records()):
+    records = journal.records()
+    done = {record.facts.get("txn") for record in records if record.kind == "RAM_VERIFIED"}
+    undone = {record.facts.get("undoes") for record in records if record.seq in done}
+    for record in reversed(records):
         new = register_values(record, "new")
-        if not new:
+        if not new or record.seq in undone or "undoes" in record.facts:
             continue
         present = read(new)
         if not to_write(present, new) and to_write(present, register_values(record)):

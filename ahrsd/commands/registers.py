@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,7 +40,7 @@ _SAVE = click.option("--save", is_flag=True, help="Also save all of RAM to flash
 
 
 Ids = TypeVar("Ids", int, tuple[int, ...])
-_SHOWN = ("txn", "reason", "error", "restored")  # facts of a record besides its registers
+_SHOWN = ("txn", "reason", "undoes", "error", "restored")  # facts of a record besides its registers
 
 
 def _known(_context: click.Context, _option: click.Parameter, numbers: Ids) -> Ids:
@@ -146,7 +146,7 @@ def write(
     except RegisterValueError as error:
         raise click.BadParameter(str(error), param_hint="VALUES") from error
     state = _state(state_directory)
-    _change(port, baud, lambda *_: (wanted, "registers write"), state, None, yes=yes, save=save)
+    _change(port, baud, lambda *_: (wanted, {"reason": "write"}), state, None, yes=yes, save=save)
 
 
 @command.command()
@@ -187,12 +187,12 @@ def rollback(
     Without ID: before the newest change whose values the device holds now.
     """
 
-    def wanted(device: Device, journal: Journal) -> tuple[Changes, str]:
+    def wanted(device: Device, journal: Journal) -> tuple[Changes, Mapping[str, object]]:
         if number is not None:
             record = find(journal, number)
         else:
             record = newest_in_force(journal, lambda ids: device.run(read_registers(ids)))
-        return register_values(record), f"rollback of {record.seq}"
+        return register_values(record), {"reason": "rollback", "undoes": record.seq}
 
     _change(port, baud, wanted, _state(state_directory), journal_file, yes=yes, save=save)
 
@@ -200,7 +200,7 @@ def rollback(
 def _change(
     port: Path,
     baud: int | None,
-    wanted: Callable[[Device, Journal], tuple[Changes, str]],
+    wanted: Callable[[Device, Journal], tuple[Changes, Mapping[str, object]]],
     state: Path,
     journal_file: Path | None,
     *,
@@ -212,7 +212,7 @@ def _change(
     with open_device(port, baud, gate(permitted, save=save and yes)) as device:
         identity = device.run(identify())
         journal = Journal.open(journal_file or journal_path(state, identity.serial))
-        changes, reason = wanted(device, journal)
+        changes, why = wanted(device, journal)
         present = device.run(read_registers(changes))
         changes = to_write(present, changes)
         _show(identity, present, changes)
@@ -223,7 +223,7 @@ def _change(
         if not identity.profile.writable:
             raise AhrsdError(f"firmware {identity.firmware} is not known; nothing is written to it")
         permitted.update(changes)
-        record = apply(device, journal, identity, changes, reason)
+        record = apply(device, journal, identity, changes, **why)
         click.echo(f"written and verified in RAM, journal {journal.path} record {record.seq}")
         click.echo(f"to go back: ahrsd registers rollback {port} {record.seq} --yes, or send")
         for line in wrg_lines(record):
@@ -245,10 +245,7 @@ def _show(identity: Identity, present: Changes, changes: Changes) -> None:
 
 
 def _print_record(record: Record) -> None:
-    facts = record.facts
-    words = [
-        f"{key}={facts[key]}" for key in ("txn", "reason", "error", "restored") if key in facts
-    ]
+    words = [f"{key}={record.facts[key]}" for key in _SHOWN if key in record.facts]
     click.echo(f"{record.seq:4}  {record.time}  {record.kind:12}  {' '.join(words)}".rstrip())
     for which in ("old", "new"):
         for number, values in register_values(record, which).items():
