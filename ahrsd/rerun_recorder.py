@@ -83,7 +83,7 @@ class Recorder:
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._last_point = -1  # number of the 1/POINTS_PER_S interval that already has a point
-        self._first_at_s = math.nan
+        self._first_s: tuple[float, float] | None = None  # device and host time of sample 0
         self._gates: dict[str, bool] = {}
         self._state_known = False
         self._table_at_s = self._shape_at_s = -math.inf
@@ -94,8 +94,8 @@ class Recorder:
         rows = _Rows.of(seen)
         if not len(rows.time_s):
             return
-        if math.isnan(self._first_at_s):
-            self._first_at_s = float(rows.time_s[0])
+        if self._first_s is None:
+            self._first_s = float(rows.time_s[0]), float(rows.host_s[0])
         every = np.arange(len(rows.time_s))
         norms = np.stack(
             [np.linalg.norm(rows.present, axis=1), np.linalg.norm(rows.corrected, axis=1)], axis=1
@@ -230,11 +230,10 @@ class Recorder:
             )
 
     def _state_changed(self, event: StateChanged, first_sample: int) -> None:
-        if not self._state_known:  # the lane begins where the recording begins
-            self._state_known = True
-            start = event.at_s if math.isnan(self._first_at_s) else self._first_at_s
-            self._at(start, math.nan, 0)
+        if not self._state_known and self._first_s is not None:
+            self._at(*self._first_s, 0)  # the lane begins where the samples do
             self._stream.log(names.STATE_LANE, rr.StateChange(state=event.old))
+        self._state_known = True
         self._at(event.at_s, event.host_s, first_sample)
         self._stream.log(names.STATE_LANE, rr.StateChange(state=event.new))
         self._text("states", f"{event.old} -> {event.new}: {event.reason}", "info")
