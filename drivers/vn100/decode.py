@@ -1,0 +1,181 @@
+"""Messages to values in SI. Total: every frame gives a result, and nothing raises.
+
+A right checksum does not make sane numbers: what cannot be read, has too few or too many values or
+is not finite becomes `Undecodable` (vn100-protocol 1.4).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from operator import truediv
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.vn100.binary import BinaryLayout
+from drivers.vn100.deframer import Packet, Sentence
+from drivers.vn100.fields import Layout
+from drivers.vn100.sentences import (
+    COMMAND_WORDS,
+    MESSAGES,
+    REGISTER_WORDS,
+    sentence_layout,
+)
+
+_ERROR_CODE = re.compile(r"[0-9A-Fa-f]{1,2}")
+_REGISTER = re.compile(r"[0-9]{1,3}")
+_COUNT = re.compile(r"T[0-9]{1,10}")
+_STATUS = re.compile(r"S[0-9A-Fa-f]{1,4}")
+_LAYOUTS = {name: sentence_layout(name) for name in MESSAGES}
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One measurement. `values` in SI, the field in gauss, in the order of `layout.columns`.
+
+    A time is exact to its float: 0.1 us after ten years. `BinaryLayout.unpack` has nanoseconds.
+    """
+
+    layout: Layout
+    values: tuple[float, ...]
+    offset: int
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The device's answer to a command: its word, the register if it has one, and the rest."""
+
+    word: str
+    register: int | None
+    tokens: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorReply:
+    """``$VNERR``; the codes are in `errors.ERRORS`."""
+
+    code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Undecodable:
+    """A message with a right checksum whose content makes no sense; `what` is for a person."""
+
+    what: str
+    offset: int
+
+
+Decoded = Measurement | Reply | ErrorReply | Undecodable
+
+
+def decode(frame: Sentence | Packet) -> Decoded:
+    """The content of a message."""
+    if isinstance(frame, Packet):
+        return _decode_packet(frame)
+    tokens = frame.body.split(",")
+    layout = _LAYOUTS.get(tokens[0])
+    if layout is not None:
+        return _decode_measurement(layout, tokens, frame)
+    return _decode_reply(tokens[0], tokens[1:], frame)
+
+
+def _decode_reply(
+    word: str, tokens: list[str], frame: Sentence
+) -> Reply | ErrorReply | Undecodable:
+    if word in REGISTER_WORDS:
+        if not tokens or not _REGISTER.fullmatch(tokens[0]):
+            return Undecodable(f"{word} without a register number", frame.offset)
+        return Reply(word, int(tokens[0]), tuple(tokens[1:]))
+    if word in COMMAND_WORDS:
+        return Reply(word, None, tuple(tokens))
+    if word == "VNERR":
+        if len(tokens) != 1 or not _ERROR_CODE.fullmatch(tokens[0]):
+            return Undecodable("VNERR without an error code", frame.offset)
+        return ErrorReply(int(tokens[0], 16))
+    return Undecodable(f"{word} is not a message of a VN-100", frame.offset)
+
+
+def decode_batch(packets: Sequence[Packet]) -> NDArray[np.float64]:
+    """Packets of one layout as rows of SI values, (N, columns); as `decode`, but quick.
+
+    A row of which `decode` says Undecodable is nan all over. ValueError where there is no packet or
+    more than one layout.
+    """
+    layouts = {packet.layout for packet in packets}
+    if len(layouts) != 1:
+        raise ValueError(f"a batch is packets of one layout, not of {len(layouts)}")
+    (layout,) = layouts
+    wire = np.frombuffer(b"".join([packet.data for packet in packets]), _wire_type(layout))
+    values = np.empty((len(packets), len(layout.columns)))
+    for place, per_si in enumerate(layout.per_si):
+        np.divide(wire[str(place)], per_si, out=values[:, place])
+    values[~np.isfinite(values).all(axis=1)] = np.nan
+    return values
+
+
+@cache
+def _wire_type(layout: BinaryLayout) -> np.dtype[np.void]:
+    """The packet as numpy reads it: columns "0", "1", ..."""
+    return np.dtype(
+        {
+            "names": [str(place) for place in range(len(layout.codes))],
+            "formats": ["<" + _NUMPY_CODES[code] for code in layout.codes],
+            "offsets": layout.offsets,
+            "itemsize": layout.size,
+        }
+    )
+
+
+_NUMPY_CODES = {"f": "f4", "Q": "u8", "I": "u4", "H": "u2"}
+
+
+def _decode_packet(packet: Packet) -> Measurement | Undecodable:
+    layout = packet.layout
+    values = tuple(map(truediv, layout.unpack(packet.data), layout.per_si))
+    if not values:
+        return Undecodable(f"{layout.name} has nothing that a VN-100 measures", packet.offset)
+    if not all(map(math.isfinite, values)):
+        bad = next(c.name for c, v in zip(layout.columns, values) if not math.isfinite(v))
+        return Undecodable(f"{layout.name}: {bad} is not finite", packet.offset)
+    return Measurement(layout, values, packet.offset)
+
+
+def _decode_measurement(
+    layout: Layout, tokens: list[str], sentence: Sentence
+) -> Measurement | Undecodable:
+    """The message of which `tokens` are name and values."""
+    numbers = tokens[1:]
+    if len(numbers) > len(layout.columns):
+        appended = _appended(numbers[len(layout.columns) :])
+        if appended is None:
+            return Undecodable(f"{layout.name}: too many values", sentence.offset)
+        del numbers[len(layout.columns) :]
+        layout = sentence_layout(layout.name, "count" in appended, "status" in appended)
+        numbers += appended.values()
+    if len(numbers) != len(layout.columns):
+        what = f"{layout.name}: {len(numbers)} values where {len(layout.columns)} belong"
+        return Undecodable(what, sentence.offset)
+    try:
+        wire = list(map(float, numbers))
+    except ValueError:
+        wire = [math.nan]
+    body = sentence.body  # float() also takes what no device prints: nan, inf, 1_0, blanks
+    if not math.isfinite(sum(wire)) or "_" in body or " " in body:
+        return Undecodable(f"{layout.name}: a value is no number: {body}", sentence.offset)
+    return Measurement(layout, tuple(map(truediv, wire, layout.per_si)), sentence.offset)
+
+
+def _appended(tokens: list[str]) -> dict[str, str] | None:
+    """Serial count and status as register 30 appends them, in either order, as decimal numbers.
+
+    In the dictionary count comes first; None where anything else is there.
+    """
+    count = [token[1:] for token in tokens if _COUNT.fullmatch(token)]
+    status = [str(int(token[1:], 16)) for token in tokens if _STATUS.fullmatch(token)]
+    if len(count) > 1 or len(status) > 1 or len(count) + len(status) < len(tokens):
+        return None
+    return dict(zip(["count"] * len(count) + ["status"] * len(status), count + status))

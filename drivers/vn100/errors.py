@@ -1,0 +1,79 @@
+"""What the device says when it refuses, as a table and as exceptions. Source: UM001 "Error Codes".
+
+    DriverError
+     ├── DeviceRefused(code)   the device answered VNERR
+     └── ...                   session and port errors, in their own modules
+
+Codes are hexadecimal on the wire (vn100-protocol 3.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Outcome(Enum):
+    """What a program can do about an error."""
+
+    RETRY = "retry"  # the command was damaged on the way and not carried out
+    STOP = "stop"  # the same command will be refused again
+    RESET = "reset"  # the device restarted: RAM settings are gone
+    BANDWIDTH = "bandwidth"  # more output than the baud rate carries
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceError:
+    """A row of the table of error codes. `advice` is for a person."""
+
+    code: int
+    name: str
+    outcome: Outcome
+    advice: str
+
+
+_ROWS = (
+    DeviceError(
+        0x01, "hard fault", Outcome.RESET, "its processor restarted; RAM settings are gone"
+    ),
+    DeviceError(0x02, "serial input buffer overflow", Outcome.RETRY, "a line was over 256 bytes"),
+    DeviceError(
+        0x03, "invalid checksum", Outcome.RETRY, "a byte was lost on the way to the device"
+    ),
+    DeviceError(0x04, "invalid command", Outcome.STOP, "this firmware does not know the command"),
+    DeviceError(0x05, "not enough parameters", Outcome.STOP, "this firmware expects more values"),
+    DeviceError(0x06, "too many parameters", Outcome.STOP, "this firmware expects fewer values"),
+    DeviceError(0x07, "invalid parameter", Outcome.STOP, "a value is out of the allowed range"),
+    DeviceError(
+        0x08, "invalid register", Outcome.STOP, "this model or firmware lacks the register"
+    ),
+    DeviceError(0x09, "unauthorized access", Outcome.STOP, "the register is read-only"),
+    DeviceError(
+        0x0A, "watchdog reset", Outcome.RESET, "the device restarted; RAM settings are gone"
+    ),
+    DeviceError(0x0B, "output buffer overflow", Outcome.BANDWIDTH, "lower rates or raise the baud"),
+    DeviceError(0x0C, "insufficient baud rate", Outcome.BANDWIDTH, "lower rates or raise the baud"),
+    DeviceError(0xFF, "error buffer overflow", Outcome.STOP, "errors came faster than it reports"),
+)
+ERRORS: dict[int, DeviceError] = {row.code: row for row in _ROWS}
+
+
+def device_error(code: int) -> DeviceError:
+    """The row of `code`; codes that no manual lists get one that says so."""
+    advice = "no manual lists this code; nothing was confirmed"
+    return ERRORS.get(code) or DeviceError(code, "unknown error", Outcome.STOP, advice)
+
+
+class DriverError(Exception):
+    """Root of everything that the VN-100 driver raises about the device and the link."""
+
+
+class DeviceRefused(DriverError):  # noqa: N818 - says what the device did
+    """The device answered ``$VNERR,code``; `error` is the table's row."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+        self.error = device_error(code)
+        super().__init__(
+            f"the device answered error {code:02X} ({self.error.name}): {self.error.advice}"
+        )
