@@ -1,0 +1,215 @@
+"""From an estimate of the raw sensor and the registers in force to the registers to write.
+
+The estimate is of the *raw* sensor: every sample was un-mapped through the registers in force when
+it was taken (`unmapping`). So nothing is left to compose but the scale::
+
+    register 23:  C' = s A^-1,  B' = b          whatever stood in 23 and 26 before
+    register 84:  C' = C84,     B' = w_b        the gyro's matrix is not estimated
+
+The scale s.  Without a known field det A = 1 is a convention, not a measurement: the fit cannot
+tell a strong field from a sensitive sensor. The device's present scale is kept, det C' = det C23:
+unlike a ratio of mean field strengths it does not depend on the hard iron or on the data, so a
+second run on the written device proposes the same. With a known field (world model), s = 1.
+
+Where the estimate is of a stream whose registers act on it, C' = C2 C23 and B' = B23 + C23^-1 B2
+(with register 26: C' = R^T C2 R C23, B' = B23 + C23^-1 R^T B2) is the same thing; `Affine.after`
+and tests/test_fixed_point.py show it.
+
+Numbers are rounded to the six digits that the device prints: what it stores then equals what it
+shows, and a restart reads back exactly what was written. Six digits are 3e-4 deg of heading.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.samples import Array
+from drivers.vn100.registers import Values, as_stored, format_command, same
+from drivers.vn100.sentences import encode
+
+MAG, GYRO = 23, 84
+MAX_CONDITION: Final = 8.0  # daemon.md 4.3 G9: hard limits, not a person's to loosen
+MAX_OFFSET_GAUSS: Final = 1.3
+MAX_GYRO_BIAS_RAD_S: Final = 0.175  # 10 deg/s, what the data sheet allows a cold sensor
+HELD_WITHIN_SIGMA: Final = 0.5  # an undetermined direction stays where the device has it
+HELD_WITHIN: Final = 1e-5  # and what rounding on the wire may move
+DIGITS: Final = 6
+
+_NAMES: Final = (
+    *(f"soft iron {pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")),
+    *(f"hard iron {axis}" for axis in "xyz"),
+    *(f"gyro bias {axis}" for axis in "xyz"),
+)
+
+
+class UnwritableError(ValueError):
+    """The estimate must not reach a device; the text says why, in one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """What would be written. `old` and `new` have the same registers, 23 and 84 or one of them.
+
+    id:                  eight hex digits of a hash of the lines: what a person types to approve
+    lines:               the very text that would be sent, checksum included
+    heading_change_deg:  largest change of heading, level, over all headings
+    gyro_change_rad_s:   length of the change of the gyro bias
+    """
+
+    id: str
+    old: dict[int, Values]
+    new: dict[int, Values]
+    lines: tuple[str, ...]
+    heading_change_deg: float
+    gyro_change_rad_s: float
+
+
+def compose(
+    estimate: Estimate, registers: Mapping[int, Values], *, gyro_is_raw: bool = True
+) -> Proposal:
+    """The registers that `estimate` asks for, given the ones in force.
+
+    gyro_is_raw: false where the stream was AngularRate, from which the device's filter has taken
+    its own, unknown bias: register 84 then stays. Raises UnwritableError.
+    """
+    present = _affine(registers, MAG)
+    present_gyro = _affine(registers, GYRO)
+    _refuse_unusable(estimate)
+    _refuse_moved(estimate, present, present_gyro)
+    proposed = _wire(MAG, Affine(_matrix(estimate, present), estimate.hard_iron_gauss))
+    gyro = _wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
+    new = {MAG: proposed}
+    if gyro_is_raw and not same(GYRO, gyro, registers[GYRO]):
+        new[GYRO] = gyro
+    written = Affine.from_register(_floats(proposed))
+    _refuse_out_of_bounds(written, estimate.gyro_bias_rad_s)
+    lines = register_lines(new)
+    return Proposal(
+        id=hashlib.sha256("\n".join(lines).encode()).hexdigest()[:8],
+        old={number: registers[number] for number in new},
+        new=new,
+        lines=lines,
+        heading_change_deg=heading_change_deg(present, written, estimate),
+        gyro_change_rad_s=_gyro_change(present_gyro, new),
+    )
+
+
+def register_lines(values: Mapping[int, Values]) -> tuple[str, ...]:
+    """`$VNWRG,23,...*XX`: what is sent, and what a person may type into a terminal."""
+    return tuple(
+        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]))}")
+        .decode()
+        .strip()
+        for number in sorted(values)
+    )
+
+
+def heading_change_deg(present: Affine, proposed: Affine, estimate: Estimate) -> float:
+    """Largest difference of heading between two corrections over all headings, level, in degrees.
+
+    The field is taken to dip by 60 deg, as in middle latitudes; `proposed` is taken as true.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+    dip = np.radians(60.0)
+    level = np.stack([np.cos(angle), -np.sin(angle), np.full_like(angle, np.tan(dip))], axis=1)
+    strength = estimate.field_gauss * _scale(proposed, estimate) * np.cos(dip)
+    seen = present.apply(proposed.undo(strength * level))
+    difference = np.angle(
+        np.exp(
+            1j * (np.arctan2(-seen[:, 1], seen[:, 0]) - np.arctan2(np.sin(angle), np.cos(angle)))
+        )
+    )
+    return float(np.degrees(np.max(np.abs(difference))))
+
+
+def _scale(written: Affine, estimate: Estimate) -> float:
+    """How much larger the written correction makes the field than A^-1 does."""
+    return float(np.cbrt(np.linalg.det(written.matrix) * np.linalg.det(estimate.soft_iron)))
+
+
+def _matrix(estimate: Estimate, present: Affine) -> Array:
+    inverse = np.linalg.inv(estimate.soft_iron)
+    inverse = 0.5 * (inverse + inverse.T)
+    if estimate.field_known:
+        return np.asarray(inverse)
+    return np.asarray(inverse * np.cbrt(np.linalg.det(present.matrix) / np.linalg.det(inverse)))
+
+
+def _wire(number: int, affine: Affine) -> Values:
+    """As the device will store and print it."""
+    rounded = tuple(float(f"{value:.{DIGITS}g}") for value in affine.to_register())
+    return as_stored(number, rounded)
+
+
+def _floats(values: Values) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _affine(registers: Mapping[int, Values], number: int) -> Affine:
+    if number not in registers:
+        raise UnwritableError(f"register {number} was not read: nothing can be written")
+    affine = Affine.from_register(_floats(registers[number]))
+    if not np.isfinite(affine.to_register()).all() or not np.linalg.det(affine.matrix) > 0.0:
+        raise UnwritableError(f"register {number} holds no usable calibration: {registers[number]}")
+    return affine
+
+
+def _gyro_change(present: Affine, new: Mapping[int, Values]) -> float:
+    if GYRO not in new:
+        return 0.0
+    return float(np.linalg.norm(np.array(_floats(new[GYRO])[9:]) - present.offset))
+
+
+def _refuse_unusable(estimate: Estimate) -> None:
+    numbers = [estimate.soft_iron, estimate.hard_iron_gauss, estimate.gyro_bias_rad_s]
+    if not all(np.isfinite(part).all() for part in numbers):
+        raise UnwritableError("the estimate is not finite")
+    if not np.isfinite(estimate.field_gauss) or estimate.field_gauss <= 0.0:
+        raise UnwritableError(f"the estimated field is {estimate.field_gauss} gauss")
+    A = estimate.soft_iron
+    if not np.allclose(A, A.T, rtol=0.0, atol=1e-9) or np.linalg.eigvalsh(A)[0] <= 0.0:
+        raise UnwritableError("the estimated soft iron is not symmetric and positive definite")
+
+
+def _refuse_moved(estimate: Estimate, present: Affine, present_gyro: Affine) -> None:
+    """Directions that the motion did not determine must be where the device has them."""
+    inverse = np.linalg.inv(present.matrix)
+    soft_iron = 0.5 * (inverse + inverse.T) / np.cbrt(np.linalg.det(inverse))
+    held = _named(soft_iron, present.offset, present_gyro.offset)
+    found = _named(estimate.soft_iron, estimate.hard_iron_gauss, estimate.gyro_bias_rad_s)
+    sigma = dict(zip(held, estimate.sigma.tolist(), strict=True))
+    blind = {name for text in estimate.observability.unobservable for name in text.split(" + ")}
+    for name in sorted(blind & held.keys()):
+        if abs(found[name] - held[name]) > HELD_WITHIN_SIGMA * sigma[name] + HELD_WITHIN:
+            raise UnwritableError(
+                f"{name} is not determined by the motion and yet moved from {held[name]:.4f} to "
+                f"{found[name]:.4f}"
+            )
+
+
+def _named(soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array) -> dict[str, float]:
+    """The twelve numbers of an estimate by name, in the order of its covariance."""
+    upper = soft_iron[np.triu_indices(3)]
+    numbers = np.concatenate([upper, hard_iron_gauss, gyro_bias_rad_s])
+    return dict(zip(_NAMES, numbers.tolist(), strict=True))
+
+
+def _refuse_out_of_bounds(written: Affine, gyro_bias_rad_s: Array) -> None:
+    eigenvalues = np.linalg.eigvalsh(0.5 * (written.matrix + written.matrix.T))
+    if eigenvalues[0] <= 0.0:
+        raise UnwritableError("the correction matrix is not positive definite")
+    condition = float(np.linalg.cond(written.matrix))
+    if condition > MAX_CONDITION:
+        raise UnwritableError(f"condition {condition:.1f} of the correction, limit {MAX_CONDITION}")
+    offset = float(np.linalg.norm(written.offset))
+    if offset > MAX_OFFSET_GAUSS:
+        raise UnwritableError(f"hard iron {offset:.2f} gauss, limit {MAX_OFFSET_GAUSS}")
+    bias = float(np.linalg.norm(gyro_bias_rad_s))
+    if bias > MAX_GYRO_BIAS_RAD_S:
+        raise UnwritableError(f"gyro bias {bias:.3f} rad/s, limit {MAX_GYRO_BIAS_RAD_S}")

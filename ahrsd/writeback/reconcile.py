@@ -1,0 +1,217 @@
+"""After an interruption: what the journal says last, what the device holds, what follows.
+
+A transaction can end at any point: the power, the link or this program goes. RAM that was written
+and not saved is lost with the device's power and keeps living with the program's, so "the device
+holds the old values" is always a safe end. The one dangerous stretch is VNWNV itself, between
+FLASH_SENT and the next reading after a reset.
+
+The table is total over (last record, what the device holds). Where they contradict each other it
+raises an alarm; it never writes flash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+from typing import Final
+
+from ahrsd.writeback.states import Signal
+from drivers.vn100.registers import Values, same
+
+
+class Kind(StrEnum):
+    """Records of the journal. The first group leaves a transaction open, the second ends it."""
+
+    PREPARED = "PREPARED"  # J1: what the device holds, what it shall hold; nothing sent yet
+    RAM_FAILED = "RAM_FAILED"  # J3: a write was refused or did not verify; old values follow
+    RAM_VERIFIED = "RAM_VERIFIED"  # J3: read back, equal
+    PROVEN = "PROVEN"  # J4: the trial passed
+    ROLLBACK = "ROLLBACK"  # J4: the old values are about to be written
+    FLASH_SENT = "FLASH_SENT"  # J5: VNWNV is about to be sent
+    FLASH_ACKED = "FLASH_ACKED"  # J6: the device said yes
+
+    ABORTED = "ABORTED"  # nothing was changed
+    ROLLED_BACK = "ROLLED_BACK"  # the old values were read back
+    LOST = "LOST"  # the device restarted with the old values
+    NOT_SAVED = "NOT_SAVED"  # VNWNV was sent, a restart brought the old values
+    CONFIRMED = "CONFIRMED"  # J7: a restart brought the new values
+    FOREIGN = "FOREIGN"  # the device holds what nobody here wrote
+    FLASH_TORN = "FLASH_TORN"  # VNWNV was interrupted, the flash holds neither
+
+    LOCKED = "LOCKED"  # not part of a transaction
+    UNLOCKED = "UNLOCKED"
+
+
+OPEN: Final = (
+    Kind.PREPARED,
+    Kind.RAM_FAILED,
+    Kind.RAM_VERIFIED,
+    Kind.PROVEN,
+    Kind.ROLLBACK,
+    Kind.FLASH_SENT,
+    Kind.FLASH_ACKED,
+)
+
+
+class Found(Enum):
+    """What the device holds in the registers of a transaction."""
+
+    OLD = "the old values"
+    NEW = "the new values"
+    NEW_AFTER_RESTART = "the new values after a restart"
+    MIXED = "some old and some new values"
+    NEITHER = "neither the old nor the new values"
+
+
+@dataclass(frozen=True, slots=True)
+class Resolution:
+    """What follows: the signal, the record that says so (if any), the level and text of a note."""
+
+    signal: Signal
+    record: Kind | None
+    level: str
+    text: str
+
+
+def found(
+    old: Mapping[int, Values],
+    new: Mapping[int, Values],
+    device: Mapping[int, Values],
+    restarted: bool,
+) -> Found:
+    """Compare register by register, as the device prints them. A register not read is neither."""
+    is_old = {n: n in device and same(n, old[n], device[n]) for n in new}
+    is_new = {n: n in device and same(n, new[n], device[n]) for n in new}
+    if all(is_old.values()):
+        return Found.OLD
+    if all(is_new.values()):
+        return Found.NEW_AFTER_RESTART if restarted else Found.NEW
+    if all(is_old[n] or is_new[n] for n in new):
+        return Found.MIXED
+    return Found.NEITHER
+
+
+def _foreign(what: str) -> Resolution:
+    return Resolution(
+        Signal.FOREIGN,
+        Kind.FOREIGN,
+        "error",
+        f"{what}, and the device holds values that nobody here wrote; compare it with the journal, "
+        "then unlock",
+    )
+
+
+def _undo(level: str, text: str) -> Resolution:
+    return Resolution(Signal.UNDO, Kind.ROLLBACK, level, text)
+
+
+_TORN: Final = Resolution(
+    Signal.TORN,
+    Kind.FLASH_TORN,
+    "error",
+    "FLASH TORN: saving was interrupted and the device holds neither the old nor the new values; "
+    "write the journal's old values by hand, check the heading, then unlock",
+)
+_SAVED_BY_OTHERS: Final = "somebody else saved the device's registers: they survived a restart"
+
+TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
+    Kind.PREPARED: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN, Kind.ABORTED, "info", "a write was prepared and never made"
+        ),
+        Found.NEW: Resolution(
+            Signal.RESUME_TRIAL,
+            Kind.RAM_VERIFIED,
+            "warning",
+            "the device holds the new values of an interrupted write; the trial begins",
+        ),
+        Found.NEW_AFTER_RESTART: _undo("error", f"{_SAVED_BY_OTHERS}, and were never tried"),
+        Found.MIXED: _undo("warning", "a write was interrupted between its registers"),
+        Found.NEITHER: _foreign("a write was prepared"),
+    },
+    Kind.RAM_FAILED: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN, Kind.ROLLED_BACK, "info", "a failed write is undone"
+        ),
+        Found.NEW: _undo("warning", "a failed write was not undone"),
+        Found.NEW_AFTER_RESTART: _undo("error", _SAVED_BY_OTHERS),
+        Found.MIXED: _undo("warning", "a failed write was not undone"),
+        Found.NEITHER: _undo("warning", "a failed write left values that were never meant"),
+    },
+    Kind.RAM_VERIFIED: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN,
+            Kind.LOST,
+            "warning",
+            "the device restarted during the trial and has its old values: safe",
+        ),
+        Found.NEW: Resolution(
+            Signal.RESUME_TRIAL, None, "info", "the device kept the new values; the trial restarts"
+        ),
+        Found.NEW_AFTER_RESTART: _undo("error", f"{_SAVED_BY_OTHERS}, and were not proven yet"),
+        Found.MIXED: _undo("warning", "one of two registers went back by itself"),
+        Found.NEITHER: _foreign("a trial was under way"),
+    },
+    Kind.PROVEN: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN,
+            Kind.LOST,
+            "warning",
+            "the device restarted before the proven values were saved and has its old ones: safe",
+        ),
+        Found.NEW: Resolution(
+            Signal.RESUME_PROVEN, None, "info", "the device kept the proven values"
+        ),
+        Found.NEW_AFTER_RESTART: Resolution(
+            Signal.READ_CONFIRMED, Kind.CONFIRMED, "warning", _SAVED_BY_OTHERS
+        ),
+        Found.MIXED: _undo("warning", "one of two registers went back by itself"),
+        Found.NEITHER: _foreign("proven values waited to be saved"),
+    },
+    Kind.ROLLBACK: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN, Kind.ROLLED_BACK, "info", "a rollback is complete"
+        ),
+        Found.NEW: _undo("warning", "a rollback was interrupted"),
+        Found.NEW_AFTER_RESTART: _undo("error", f"a rollback was interrupted; {_SAVED_BY_OTHERS}"),
+        Found.MIXED: _undo("warning", "a rollback was interrupted"),
+        Found.NEITHER: _foreign("a rollback was interrupted"),
+    },
+    Kind.FLASH_SENT: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN,
+            Kind.NOT_SAVED,
+            "warning",
+            "saving was interrupted and the device has its old values: not saved, safe",
+        ),
+        Found.NEW: Resolution(
+            Signal.UNRESOLVED,
+            None,
+            "error",
+            "nobody knows whether the registers were saved: switch the device off and on, then "
+            "they are read again",
+        ),
+        Found.NEW_AFTER_RESTART: Resolution(
+            Signal.READ_CONFIRMED, Kind.CONFIRMED, "info", "the new values survived a restart"
+        ),
+        Found.MIXED: _TORN,
+        Found.NEITHER: _TORN,
+    },
+    Kind.FLASH_ACKED: {
+        Found.OLD: Resolution(
+            Signal.NOTHING_OPEN,
+            Kind.NOT_SAVED,
+            "error",
+            "the device acknowledged the save and still has its old values",
+        ),
+        Found.NEW: Resolution(
+            Signal.RESUME_COMMITTED, None, "info", "saved; the next restart confirms it"
+        ),
+        Found.NEW_AFTER_RESTART: Resolution(
+            Signal.READ_CONFIRMED, Kind.CONFIRMED, "info", "the new values survived a restart"
+        ),
+        Found.MIXED: _TORN,
+        Found.NEITHER: _TORN,
+    },
+}

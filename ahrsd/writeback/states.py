@@ -1,0 +1,242 @@
+"""The states of the write-back and every way from one to another, as a table.
+
+Theory of operation
+===================
+
+A proposal for registers 23 and 84 is watched until it is worth a write (CANDIDATE) and every gate
+is green (QUALIFIED). Approval opens a *transaction*. From PREPARING on the journal knows about it
+before the device does: nothing is sent until the record of what the device held is on the disk.
+
+    CHECKING      async off, all registers read again, equal to the record? no byte was changed yet
+    STAGING       23 and 84 written and read back; from here on only ROLLING_BACK leads out
+    STAGED        the device holds the new values in RAM; waits for the journal to say so too
+    TRIAL         lives with them, is judged against the old ones on the same samples
+    PROVEN        was better, or not worse, for long enough; in mode `stage` it rests here
+    SAVE_PREPARING waits for the journal to say that the flash is about to be written
+    SAVING        session settings put back, every register compared, then VNWNV: one conversation
+    COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
+
+"verified", "proven", "committed" and "confirmed" are different words on purpose.
+
+RECONCILING is entered at the start and whenever the link or the device went away: the registers are
+read and compared with the journal (`reconcile`), which says where to go on. FAULT is a device in a
+state that this program cannot mend alone; FLASH_TORN one whose flash holds neither the old nor the
+new values. Neither ends by itself. LOCKED: no writes until a person unlocks. In FAULT "unlock"
+means: look again.
+
+A signal that a state does not name is ignored there (and noted), never an error.
+Power may go at any point; `reconcile` lists what is found then.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Final
+
+
+class State(StrEnum):
+    """Where the write-back stands; the value is what people and the journal see."""
+
+    RECONCILING = "RECONCILING"
+    OBSERVING = "OBSERVING"
+    CANDIDATE = "CANDIDATE"
+    QUALIFIED = "QUALIFIED"
+    PREPARING = "PREPARING"
+    CHECKING = "CHECKING"
+    STAGING = "STAGING"
+    STAGED = "STAGED"
+    TRIAL = "TRIAL"
+    PROVEN = "PROVEN"
+    SAVE_PREPARING = "SAVE_PREPARING"
+    SAVING = "SAVING"
+    COMMITTED = "COMMITTED"
+    CONFIRMED = "CONFIRMED"
+    ROLLING_BACK = "ROLLING_BACK"
+    ROLLED_BACK = "ROLLED_BACK"
+    FAULT = "FAULT"
+    FLASH_TORN = "FLASH_TORN"
+    LOCKED = "LOCKED"
+
+
+class Signal(StrEnum):
+    """What can happen to the write-back."""
+
+    WORTH_WRITING = "worth writing"
+    NOT_WORTH_WRITING = "not worth writing"
+    GATES_PASSED = "gates passed"
+    GATES_FAILED = "gates failed"
+    APPROVED = "approved"
+    JOURNALLED = "journalled"
+    JOURNAL_FAILED = "journal failed"
+    DONE = "done"
+    DIFFERS = "device differs"
+    FAILED = "failed"
+    NOT_SENT = "not sent"
+    TRIAL_PASSED = "trial passed"
+    TRIAL_FAILED = "trial failed"
+    SAVE_DUE = "save due"
+    ROLL_BACK = "roll back"
+    TIMEOUT = "timeout"
+    LINK_LOST = "link lost"
+    DEVICE_RESET = "device reset"
+    LOCK = "lock"
+    UNLOCK = "unlock"
+    NOTHING_OPEN = "nothing open"
+    RESUME_TRIAL = "resume trial"
+    RESUME_PROVEN = "resume proven"
+    RESUME_COMMITTED = "resume committed"
+    READ_CONFIRMED = "read confirmed"
+    UNDO = "undo"
+    UNRESOLVED = "unresolved"
+    FOREIGN = "foreign values"
+    TORN = "torn"
+
+
+S, E = State, Signal
+
+_AWAY: Final = {E.LINK_LOST: S.RECONCILING, E.DEVICE_RESET: S.RECONCILING}
+_WATCHING: Final = {**_AWAY, E.LOCK: S.LOCKED, E.WORTH_WRITING: S.CANDIDATE}
+
+TABLE: Final[dict[State, dict[Signal, State]]] = {
+    S.RECONCILING: {
+        E.NOTHING_OPEN: S.OBSERVING,
+        E.RESUME_TRIAL: S.TRIAL,
+        E.RESUME_PROVEN: S.PROVEN,
+        E.RESUME_COMMITTED: S.COMMITTED,
+        E.READ_CONFIRMED: S.CONFIRMED,
+        E.UNDO: S.ROLLING_BACK,
+        E.UNRESOLVED: S.FAULT,
+        E.TORN: S.FLASH_TORN,
+        E.FOREIGN: S.LOCKED,
+        E.TIMEOUT: S.RECONCILING,
+        **_AWAY,
+    },
+    S.OBSERVING: _WATCHING,
+    S.CANDIDATE: {
+        **_AWAY,
+        E.LOCK: S.LOCKED,
+        E.NOT_WORTH_WRITING: S.OBSERVING,
+        E.GATES_PASSED: S.QUALIFIED,
+    },
+    S.QUALIFIED: {
+        **_AWAY,
+        E.LOCK: S.LOCKED,
+        E.NOT_WORTH_WRITING: S.OBSERVING,
+        E.GATES_FAILED: S.CANDIDATE,
+        E.APPROVED: S.PREPARING,
+        E.TIMEOUT: S.CANDIDATE,
+    },
+    S.PREPARING: {
+        **_AWAY,
+        E.JOURNALLED: S.CHECKING,
+        E.JOURNAL_FAILED: S.OBSERVING,
+        E.ROLL_BACK: S.OBSERVING,
+        E.TIMEOUT: S.OBSERVING,
+    },
+    S.CHECKING: {
+        **_AWAY,
+        E.DONE: S.STAGING,
+        E.DIFFERS: S.OBSERVING,
+        E.FAILED: S.OBSERVING,
+        E.ROLL_BACK: S.OBSERVING,
+        E.TIMEOUT: S.OBSERVING,
+    },
+    S.STAGING: {
+        **_AWAY,
+        E.DONE: S.STAGED,
+        E.DIFFERS: S.FAULT,
+        E.FAILED: S.ROLLING_BACK,
+        E.ROLL_BACK: S.ROLLING_BACK,
+        E.TIMEOUT: S.ROLLING_BACK,
+    },
+    S.STAGED: {
+        **_AWAY,
+        E.JOURNALLED: S.TRIAL,
+        E.JOURNAL_FAILED: S.ROLLING_BACK,
+        E.ROLL_BACK: S.ROLLING_BACK,
+        E.TIMEOUT: S.ROLLING_BACK,
+    },
+    S.TRIAL: {
+        **_AWAY,
+        E.TRIAL_PASSED: S.PROVEN,
+        E.TRIAL_FAILED: S.ROLLING_BACK,
+        E.ROLL_BACK: S.ROLLING_BACK,
+        E.TIMEOUT: S.ROLLING_BACK,
+    },
+    S.PROVEN: {**_AWAY, E.SAVE_DUE: S.SAVE_PREPARING, E.ROLL_BACK: S.ROLLING_BACK},
+    S.SAVE_PREPARING: {
+        **_AWAY,
+        E.JOURNALLED: S.SAVING,
+        E.JOURNAL_FAILED: S.PROVEN,
+        E.ROLL_BACK: S.ROLLING_BACK,
+        E.TIMEOUT: S.PROVEN,
+    },
+    S.SAVING: {
+        **_AWAY,
+        E.DONE: S.COMMITTED,
+        E.NOT_SENT: S.PROVEN,
+        E.FAILED: S.FAULT,
+        E.TIMEOUT: S.FAULT,
+    },
+    S.COMMITTED: _WATCHING,
+    S.CONFIRMED: _WATCHING,
+    S.ROLLING_BACK: {
+        **_AWAY,
+        E.DONE: S.ROLLED_BACK,
+        E.FAILED: S.FAULT,
+        E.TIMEOUT: S.FAULT,
+    },
+    S.ROLLED_BACK: _WATCHING,
+    S.FAULT: {**_AWAY, E.ROLL_BACK: S.ROLLING_BACK, E.UNLOCK: S.RECONCILING},
+    S.FLASH_TORN: {**_AWAY, E.UNLOCK: S.OBSERVING},
+    S.LOCKED: {**_AWAY, E.UNLOCK: S.OBSERVING},
+}
+
+# States that wait for something which may never come, how long, and where silence leads: the
+# table's own TIMEOUT edge, repeated here so that a reader sees all of them at once.
+ON_TIMEOUT: Final[dict[State, tuple[float, State]]] = {
+    S.RECONCILING: (30.0, S.RECONCILING),  # keeps waiting for the device, says so once
+    S.QUALIFIED: (600.0, S.CANDIDATE),  # an approval must be of what is true now
+    S.PREPARING: (5.0, S.OBSERVING),  # nothing was sent
+    S.CHECKING: (30.0, S.OBSERVING),  # nothing was changed
+    S.STAGING: (30.0, S.ROLLING_BACK),  # it may have been changed
+    S.STAGED: (5.0, S.ROLLING_BACK),
+    S.TRIAL: (60.0, S.ROLLING_BACK),  # since the last finite metric: unjudged is not proven
+    S.SAVE_PREPARING: (5.0, S.PROVEN),  # VNWNV was not sent
+    S.SAVING: (30.0, S.FAULT),  # it may have been carried out: only a reset tells
+    S.ROLLING_BACK: (30.0, S.FAULT),
+}
+
+# The device's RAM may hold values of a transaction, not yet in flash: the vehicle runs on them.
+CHANGED_IN_RAM: Final = frozenset(
+    {
+        S.STAGING,
+        S.STAGED,
+        S.TRIAL,
+        S.PROVEN,
+        S.SAVE_PREPARING,
+        S.SAVING,
+        S.ROLLING_BACK,
+    }
+)
+WITHOUT_TRANSACTION: Final = frozenset(
+    {S.OBSERVING, S.CANDIDATE, S.QUALIFIED, S.COMMITTED, S.CONFIRMED, S.ROLLED_BACK}
+)
+
+
+def after(state: State, signal: Signal) -> State:
+    """The state that `signal` leads to; `state` itself where it is ignored."""
+    return TABLE[state].get(signal, state)
+
+
+def mermaid() -> str:
+    """The table as a Mermaid state diagram, signals of one pair of states on one edge."""
+    lines = ["stateDiagram-v2", "    [*] --> RECONCILING"]
+    for state, row in TABLE.items():
+        edges: dict[State, list[str]] = {}
+        for signal, target in row.items():
+            if signal not in _AWAY:
+                edges.setdefault(target, []).append(signal.value)
+        for target, signals in edges.items():
+            lines.append(f"    {state.value} --> {target.value}: {', '.join(signals)}")
+    return "\n".join(lines)

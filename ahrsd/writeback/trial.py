@@ -1,0 +1,101 @@
+"""The trial: new registers against the old ones, on the same live samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from ahrsd.writeback.policy import TrialPolicy
+
+JUMP_NOISE_DEG = 1.0  # of a heading read off single samples; below it no jump is unexpected
+
+
+@dataclass(frozen=True, slots=True)
+class TrialMetrics:
+    """Figures over the trial so far, both corrections applied to the same raw samples.
+
+    duration_s, turns: of use, on the device's clock
+    new_figure, old_figure: the same figure of quality (heading or field error, smaller is better)
+                       over the newest stretch with the new and with the old registers
+    field_spread:      std/mean of the corrected field
+    heading_jump_deg:  how far the heading moved when the registers changed; None: not seen yet
+    """
+
+    duration_s: float
+    turns: float
+    new_figure: float
+    old_figure: float
+    field_spread: float
+    heading_jump_deg: float | None = None
+
+    @property
+    def finite(self) -> bool:
+        """Whether anything can be said."""
+        return bool(
+            np.isfinite(
+                [self.duration_s, self.turns, self.new_figure, self.old_figure, self.field_spread]
+            ).all()
+        )
+
+
+class Finding(Enum):
+    """What the metrics say."""
+
+    GOES_ON = "goes on"
+    PASSED = "passed"
+    FAILED = "failed"
+
+
+class Trial:
+    """Judges a sequence of metrics; `predicted_jump_deg` comes from the proposal."""
+
+    def __init__(self, policy: TrialPolicy, predicted_jump_deg: float) -> None:
+        self._policy = policy
+        self._predicted_deg = predicted_jump_deg
+        self._worse_since_s: float | None = None
+
+    def judge(self, metrics: TrialMetrics) -> tuple[Finding, str]:
+        """The finding and its reason. Metrics that are not finite say nothing."""
+        if not metrics.finite:
+            return Finding.GOES_ON, "nothing to judge yet"
+        if reason := self._failure(metrics):
+            return Finding.FAILED, reason
+        policy = self._policy
+        if self._worse_since_s is not None:
+            return Finding.GOES_ON, "worse than the old registers for the moment"
+        if metrics.duration_s >= policy.duration_s or metrics.turns >= policy.turns:
+            return Finding.PASSED, (
+                f"{metrics.new_figure:.4g} against {metrics.old_figure:.4g} after "
+                f"{metrics.duration_s:.0f} s and {metrics.turns:.1f} turns"
+            )
+        return Finding.GOES_ON, ""
+
+    def _failure(self, metrics: TrialMetrics) -> str | None:
+        policy = self._policy
+        spread_percent = 100.0 * metrics.field_spread
+        if spread_percent > policy.max_spread_percent:
+            return (
+                f"the corrected field varies by {spread_percent:.1f} %, "
+                f"limit {policy.max_spread_percent} %"
+            )
+        if (jump := metrics.heading_jump_deg) is not None and self._unexpected(jump):
+            return f"the heading jumped by {jump:.1f} deg, predicted {self._predicted_deg:.1f} deg"
+        if metrics.new_figure <= metrics.old_figure * (1.0 + policy.worse_percent / 100.0):
+            self._worse_since_s = None
+            return None
+        if self._worse_since_s is None:
+            self._worse_since_s = metrics.duration_s
+        if metrics.duration_s - self._worse_since_s >= policy.worse_for_s:
+            return (
+                f"{metrics.new_figure:.4g} where the old registers give "
+                f"{metrics.old_figure:.4g}, for {policy.worse_for_s:.0f} s"
+            )
+        return None
+
+    def _unexpected(self, jump_deg: float) -> bool:
+        """More than twice the prediction, or over it by the limit; a nan is unexpected too."""
+        size = abs(jump_deg)
+        likely = size <= 2.0 * self._predicted_deg + JUMP_NOISE_DEG
+        return not (likely and size <= self._predicted_deg + self._policy.max_jump_deg)
