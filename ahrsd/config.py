@@ -26,9 +26,13 @@ from ahrsd.config_sections import (
     Location,
     Rerun,
     Section,
+    Still,
     Trial,
+    WriteBack,
 )
 from ahrsd.errors import ConfigError
+from ahrsd.writeback.permissions import Mode as Ceiling
+from ahrsd.writeback.policy import WriteBackPolicy
 
 Mode = Literal["passive", "observe", "stage", "commit"]
 
@@ -48,8 +52,6 @@ class Config(Section):
     mode: Mode = "observe"
     """passive sends no byte; observe only reads registers and says what it would write; stage may
     write RAM; commit may write flash."""
-    unattended: bool = False
-    """Write without a person's approval where the change is small (gates.max_step_auto_deg)."""
     state_directory: Path | None = None
     """Journals and captures; default: $STATE_DIRECTORY (systemd), else ~/.local/state/ahrsd."""
     device: Device = Device()
@@ -59,7 +61,9 @@ class Config(Section):
     gates: Gates = Gates()
     interlock: Interlock = Interlock()
     location: Location = Location()
+    write_back: WriteBack = WriteBack()
     trial: Trial = Trial()
+    still: Still = Still()
     budget: Budget = Budget()
 
     @property
@@ -71,6 +75,19 @@ class Config(Section):
     def captures(self) -> Path:
         """The folder of the captures in force."""
         return self.capture.directory or self.state / "captures"
+
+    def write_back_policy(self) -> WriteBackPolicy:
+        """What the write-back takes, collected from the tables that a person sees."""
+        return WriteBackPolicy(
+            mode=Ceiling[self.mode.upper()],
+            configure_stream=self.device.configure_stream,
+            serial=self.device.serial_number,
+            interlock_max_age_s=self.interlock.max_age_s,
+            trial=self.trial.policy(),
+            still=self.still.policy(),
+            **self.write_back.model_dump(),
+            **self.budget.model_dump(),
+        )
 
 
 def default_state_directory() -> Path:

@@ -13,6 +13,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 
 Baud = Literal["auto", 9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600]
 
@@ -187,12 +188,6 @@ class Gates(Section):
     """Drift of the temperature over the window. [degC]"""
     max_gyro_bias_deg_s: float = Field(default=3.0, gt=0.0, le=100.0)
     """Gyro bias. [deg/s]"""
-    still_s: float = Field(default=3.0, ge=0.0, le=3600.0)
-    """How long the sensor must rest before a write. [s]"""
-    still_rate_rad_s: float = Field(default=0.01, gt=0.0, le=1.0)
-    """Rate below which it rests. [rad/s]"""
-    still_accel_m_s2: float = Field(default=0.05, gt=0.0, le=10.0)
-    """Standard deviation of the specific force below which it rests. [m/s^2]"""
 
     @model_validator(mode="after")
     def _in_order(self) -> Gates:
@@ -208,7 +203,7 @@ class Interlock(Section):
     file: Path | None = None
     """File that the vehicle rewrites while it is safe, its content the word safe; without one, or
     with anything else in it, nothing is ever written."""
-    max_age_s: float = Field(default=1.0, gt=0.0, le=60.0)
+    max_age_s: float = Field(default=WriteBackPolicy().interlock_max_age_s, gt=0.0, le=60.0)
     """Older than this counts as no. [s]"""
 
 
@@ -231,35 +226,83 @@ class Location(Section):
         return self
 
 
+_POLICY = WriteBackPolicy()
+_TRIAL = _POLICY.trial
+_STILL = _POLICY.still
+
+
+class WriteBack(Section):
+    """Who says yes to a write, and what is worth one."""
+
+    approval: Literal["operator", "auto"] = _POLICY.approval
+    """operator: a person approves each candidate by its id; auto: small changes need nobody."""
+    commit_unattended: bool = _POLICY.commit_unattended
+    """Save to flash without an operator's yes (mode commit, approval auto)."""
+    keep_on_stop: bool = _POLICY.keep_on_stop
+    """Leave values that were not saved in RAM when the daemon stops; otherwise they are undone."""
+    min_change_deg: float = Field(default=_POLICY.min_change_deg, ge=0.0, le=180.0)
+    """A change of heading below this is not worth a write. [deg]"""
+    min_gyro_change_rad_s: float = Field(default=_POLICY.min_gyro_change_rad_s, ge=0.0, le=1.0)
+    """And a change of the gyro bias below this neither. [rad/s]"""
+    max_change_auto_deg: float = Field(default=_POLICY.max_change_auto_deg, gt=0.0, le=180.0)
+    """A larger change of heading needs an operator whatever `approval` says. [deg]"""
+    margin_after_rollback: float = Field(default=_POLICY.margin_after_rollback, ge=1.0, le=100.0)
+    """After a rollback only changes so many times as large are worth a write. [1]"""
+
+
 class Trial(Section):
     """The time in which written registers must prove themselves on live data."""
 
-    duration_s: float = Field(default=600.0, gt=0.0, le=86400.0)
-    """How long, unless the turns below come first. [s]"""
-    turns: float = Field(default=2.0, gt=0.0, le=100.0)
+    duration_s: float = Field(default=_TRIAL.duration_s, gt=0.0, le=86400.0)
+    """How long, unless the turns below come first; longer proves more. [s]"""
+    turns: float = Field(default=_TRIAL.turns, gt=0.0, le=100.0)
     """Full turns that end the trial. [turns]"""
-    worse_percent: float = Field(default=10.0, gt=0.0, le=100.0)
-    """Roll back where the live heading error is worse than before by this ... [%]"""
-    worse_for_s: float = Field(default=60.0, ge=0.0, le=86400.0)
+    worse_percent: float = Field(default=_TRIAL.worse_percent, gt=0.0, le=100.0)
+    """Roll back where the live figure is worse than with the old registers by this ... [%]"""
+    worse_for_s: float = Field(default=_TRIAL.worse_for_s, ge=0.0, le=86400.0)
     """... for this long. [s]"""
-    max_jump_deg: float = Field(default=5.0, gt=0.0, le=180.0)
-    """Roll back where the heading jumps by more than predicted and by this. [deg]"""
+    max_spread_percent: float = Field(default=_TRIAL.max_spread_percent, gt=0.0, le=100.0)
+    """Roll back where the corrected field scatters by more than this. [%]"""
+    max_jump_deg: float = Field(default=_TRIAL.max_jump_deg, gt=0.0, le=180.0)
+    """Roll back where the heading jumps by so much more than predicted. [deg]"""
+    interlock: bool = _TRIAL.interlock
+    """Roll back where the vehicle withdraws its word; false where the word is only about the moment
+    of writing."""
+
+    def policy(self) -> TrialPolicy:
+        """What the write-back takes."""
+        return TrialPolicy(**self.model_dump())
+
+
+class Still(Section):
+    """Our own proof that the vehicle rests before the flash is written."""
+
+    gyro_rad_s: float = Field(default=_STILL.gyro_rad_s, gt=0.0, le=1.0)
+    """Rate less bias below which it rests. [rad/s]"""
+    accel_m_s2: float = Field(default=_STILL.accel_m_s2, gt=0.0, le=10.0)
+    """Standard deviation of the specific force below which it rests. [m/s^2]"""
+    duration_s: float = Field(default=_STILL.duration_s, gt=0.0, le=3600.0)
+    """For how long. [s]"""
+    max_age_s: float = Field(default=_STILL.max_age_s, gt=0.0, le=60.0)
+    """How old the newest sample may be then. [s]"""
+
+    def policy(self) -> StillPolicy:
+        """What the write-back takes."""
+        return StillPolicy(**self.model_dump())
 
 
 class Budget(Section):
     """How often the device may be written."""
 
-    min_interval_s: float = Field(default=600.0, ge=0.0, le=10**6)
+    min_interval_s: float = Field(default=_POLICY.min_interval_s, ge=0.0, le=10**6)
     """Between two writes of RAM. [s]"""
-    ram_writes_per_day: int = Field(default=6, ge=0, le=1000)
+    ram_writes_per_day: int = Field(default=_POLICY.ram_writes_per_day, ge=0, le=1000)
     """Writes of RAM. [1/day]"""
-    flash_writes_per_day: int = Field(default=1, ge=0, le=100)
+    flash_writes_per_day: int = Field(default=_POLICY.flash_writes_per_day, ge=0, le=100)
     """Writes of flash. [1/day]"""
-    flash_writes_lifetime: int = Field(default=200, ge=0, le=10_000)
+    flash_writes_lifetime: int = Field(default=_POLICY.flash_writes_lifetime, ge=0, le=10_000)
     """Writes of flash over the device's life, counted in the journal."""
-    min_change_deg: float = Field(default=0.5, ge=0.0, le=180.0)
-    """A change of heading below this is not worth a write. [deg]"""
-    cooldown_s: float = Field(default=86400.0, ge=0.0, le=10**7)
+    cooldown_s: float = Field(default=_POLICY.cooldown_s, ge=0.0, le=10**7)
     """No write for this long after a rollback. [s]"""
-    rollbacks_to_lock: int = Field(default=2, ge=1, le=100)
-    """So many rollbacks lock the write-back until a person unlocks it."""
+    rollbacks_to_lock: int = Field(default=_POLICY.rollbacks_to_lock, ge=1, le=100)
+    """So many rollbacks in a row lock the write-back until a person unlocks it."""

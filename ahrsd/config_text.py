@@ -40,7 +40,8 @@ def print_config(config: Config) -> str:
             lines += [*_comment(type(section).__doc__ or ""), f"[{name}]"]
         for key, field in _keys(type(section)):
             value = getattr(section, key)
-            lines += _comment(f"{_text(field)} {_allowed(field)}")
+            allowed = _allowed(field)
+            lines += _comment(_text(field) + f" ({allowed})" * bool(allowed))
             lines.append(f"# {key} =" if value is None else f"{key} = {to_toml(value)}")
     return "\n".join(lines) + "\n"
 
@@ -105,7 +106,7 @@ def _allowed(field: FieldInfo) -> str:
 
 def _kind(annotation: object) -> str:
     kinds = get_args(annotation) or (annotation,)
-    names = {bool: "true false", Path: "path", date: "date"}
+    names = {bool: "true or false", Path: "path", date: "date"}
     return " ".join(names[kind] for kind in kinds if kind in names)
 
 

@@ -128,13 +128,13 @@ class TestRun:
     """Options of `run` that need no device."""
 
     def test_print_config_reloads_to_what_is_in_force(self, run, tmp_path, capsys):
-        (tmp_path / "a.toml").write_text("[gates]\nstill_s = 4.0\n")
+        (tmp_path / "a.toml").write_text("[gates]\nclosure_deg = 4.0\n")
         assert run("run", "--config", str(tmp_path / "a.toml"), "--port", "/dev/vn100",
                    "--mode", "stage", "--print-config") == 0  # fmt: skip
         (tmp_path / "b.toml").write_text(capsys.readouterr().out)
         config = load_config(tmp_path / "b.toml")
         assert (config.mode, str(config.device.port)) == ("stage", "/dev/vn100")
-        assert config.gates.still_s == 4.0
+        assert config.gates.closure_deg == 4.0
         assert config.budget == Config().budget
 
     def test_a_wrong_configuration_is_2_and_one_line(self, run, tmp_path, capsys):

@@ -17,6 +17,8 @@ from ahrsd.config_sections import Device, Gates, Section
 from ahrsd.config_text import print_config, reference, to_toml
 from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
 
 PROJECT = Path(__file__).parent.parent
 
@@ -30,7 +32,8 @@ def test_an_empty_file_is_the_harmless_default(tmp_path):
     config = load(tmp_path, "")
     assert config == Config()
     assert config.mode == "observe"
-    assert config.unattended is False
+    assert config.write_back.approval == "operator"
+    assert config.write_back.commit_unattended is False
     assert config.device.configure_stream is False
     assert config.interlock.file is None
 
@@ -64,7 +67,7 @@ def test_values_are_frozen():
     with pytest.raises(ValidationError, match="frozen"):
         Config().mode = "commit"
     with pytest.raises(ValidationError, match="frozen"):
-        Config().gates.still_s = 0.0
+        Config().gates.closure_deg = 0.0
 
 
 @pytest.mark.parametrize(
@@ -73,7 +76,10 @@ def test_values_are_frozen():
         ('mode = "obsrve"', "mode = 'obsrve': must be 'passive', 'observe', 'stage' or 'commit'"),
         ('modee = "stage"', "modee = 'stage': unknown key; did you mean mode?"),
         ("[gates]\nmax_heding_sigma_deg = 1.0", "did you mean max_heading_sigma_deg?"),
-        ("[gate]\nstill_s = 1.0", "gate = {'still_s': 1.0}: unknown key; did you mean gates?"),
+        (
+            "[gate]\nclosure_deg = 1.0",
+            "gate = {'closure_deg': 1.0}: unknown key; did you mean gates?",
+        ),
         ("[interlock]\nxyz = 1", "interlock.xyz = 1: unknown key; known are file, max_age_s"),
         ("[gates]\nxyz = 1", "known are those of `ahrsd run --print-config`"),
         ("[device]\nport = 5", "device.port = 5: must be text, a path"),
@@ -124,7 +130,7 @@ def test_the_printed_configuration_reloads_to_itself(tmp_path):
     changed = check_config(
         {
             "mode": "commit",
-            "unattended": True,
+            "write_back": {"approval": "auto"},
             "device": {"port": '/dev/a "b" \\ é \U0001f600\x7f', "baud": 115200, "rate_hz": 12.5},
             "location": {
                 "latitude_deg": -1e-7,
@@ -157,6 +163,28 @@ def test_the_estimators_defaults_have_one_source():
     assert Config().estimator.parameters() == EstimatorParameters()
     names = {field.name for field in dataclasses.fields(EstimatorParameters)}
     assert set(type(Config().estimator).model_fields) == names
+
+
+def test_the_write_backs_defaults_have_one_source():
+    assert Config().write_back_policy() == WriteBackPolicy()
+    config = check_config(
+        {
+            "mode": "commit",
+            "device": {"serial_number": 7, "configure_stream": True},
+            "interlock": {"max_age_s": 0.5},
+            "write_back": {"approval": "auto", "keep_on_stop": True, "min_change_deg": 0.25},
+            "budget": {"ram_writes_per_day": 2},
+            "trial": {"turns": 3.0, "interlock": False},
+            "still": {"duration_s": 4.0},
+        },
+        "test",
+    )
+    policy = config.write_back_policy()
+    assert (policy.mode, policy.serial, policy.configure_stream) == (Mode.COMMIT, 7, True)
+    assert (policy.approval, policy.keep_on_stop) == ("auto", True)
+    assert (policy.interlock_max_age_s, policy.min_change_deg) == (0.5, 0.25)
+    assert (policy.ram_writes_per_day, policy.still.duration_s) == (2, 4.0)
+    assert (policy.trial.turns, policy.trial.interlock) == (3.0, False)
 
 
 def test_the_state_directory(monkeypatch):

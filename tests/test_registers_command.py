@@ -55,7 +55,7 @@ def test_write_journals_verifies_and_tells_how_to_go_back(run, emulated, tmp_pat
         assert code == 0
         assert ram(emulator) == NEW_VALUES
         assert emulator.counters["saves"] == 0
-    assert kinds(tmp_path) == ["PREPARED", "RAM_VERIFIED"]
+    assert kinds(tmp_path) == ["HAND_PREPARED", "HAND_VERIFIED"]
     record = Journal.open(journal_path(tmp_path, SERIAL)).records()[0]
     assert tuple(record.facts["old"]["23"]) == FACTORY
     assert record.facts["device"]["serial"] == str(SERIAL)
@@ -111,7 +111,12 @@ def test_save_writes_flash_once_and_journals_it(run, emulated, tmp_path):
         assert run("registers", "write", path, 23, *NEW, "--yes", "--save",
                    "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
         assert emulator.counters["saves"] == 1
-    assert kinds(tmp_path) == ["PREPARED", "RAM_VERIFIED", "FLASH_SENT", "FLASH_ACKED"]
+    assert kinds(tmp_path) == [
+        "HAND_PREPARED",
+        "HAND_VERIFIED",
+        "HAND_FLASH_SENT",
+        "HAND_FLASH_ACKED",
+    ]
 
 
 def test_a_refused_write_leaves_the_device_as_it_was(run, emulated, tmp_path, capsys):
@@ -119,7 +124,7 @@ def test_a_refused_write_leaves_the_device_as_it_was(run, emulated, tmp_path, ca
         assert run("registers", "write", path, 23, *NEW, "--yes",
                    "--state-directory", tmp_path, *BAUD) == 1  # fmt: skip
         assert ram(emulator) == FACTORY
-    assert kinds(tmp_path) == ["PREPARED", "RAM_FAILED"]
+    assert kinds(tmp_path) == ["HAND_PREPARED", "HAND_FAILED"]
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "the old values are back" in error

@@ -1,10 +1,10 @@
 """Changing registers by hand with the same care as the daemon: journal first, verify, undo.
 
-PREPARED        device, old and new values, durable before a byte is sent
-RAM_VERIFIED    written and read back equal
-RAM_FAILED      refused or not equal; what was written is put back, `restored` says whether
-FLASH_SENT      VNWNV is about to be sent
-FLASH_ACKED     the device acknowledged it
+HAND_PREPARED        device, old and new values, durable before a byte is sent
+HAND_VERIFIED    written and read back equal
+HAND_FAILED      refused or not equal; what was written is put back, `restored` says whether
+HAND_FLASH_SENT      VNWNV is about to be sent
+HAND_FLASH_ACKED     the device acknowledged it
 """
 
 from __future__ import annotations
@@ -66,16 +66,16 @@ def apply(
     """
     old = device.run(read_registers(changes))
     prepared = journal.append(
-        "PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), **why
+        "HAND_PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), **why
     )
     try:
         device.run(quiet(_write_all(changes)))
     except (DriverError, PortError) as error:
         restored = _put_back(device, old)
-        journal.append("RAM_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
+        journal.append("HAND_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
         outcome = f"NOT put back: {restored}" if restored else "the old values are back"
         raise DeviceError(f"{error}; {outcome}") from error
-    journal.append("RAM_VERIFIED", txn=prepared.seq)
+    journal.append("HAND_VERIFIED", txn=prepared.seq)
     return prepared
 
 
@@ -85,9 +85,9 @@ def save_to_flash(device: Device, journal: Journal, prepared: Record) -> None:
     present = device.run(read_registers(expected))
     if changed := to_write(present, expected):
         raise DeviceError(f"register {min(changed)} no longer holds what was written; not saved")
-    journal.append("FLASH_SENT", txn=prepared.seq)
+    journal.append("HAND_FLASH_SENT", txn=prepared.seq)
     device.run(quiet(save_settings()))
-    journal.append("FLASH_ACKED", txn=prepared.seq)
+    journal.append("HAND_FLASH_ACKED", txn=prepared.seq)
 
 
 def _write_all(changes: Changes) -> Procedure[None]:

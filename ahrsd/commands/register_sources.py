@@ -41,7 +41,7 @@ def newest_in_force(journal: Journal, read: Callable[[Iterable[int]], Changes]) 
     Raises JournalError where there is none: then a person must say which record is meant.
     """
     records = journal.records()
-    done = {record.facts.get("txn") for record in records if record.kind == "RAM_VERIFIED"}
+    done = {record.facts.get("txn") for record in records if record.kind == "HAND_VERIFIED"}
     undone = {record.facts.get("undoes") for record in records if record.seq in done}
     for record in reversed(records):
         new = register_values(record, "new")
