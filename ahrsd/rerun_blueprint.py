@@ -33,7 +33,7 @@ FIELD_NORM = "field_norm_gauss"
 GYRO = "gyro_b_rad_s"
 HARD_IRON = "estimate/hard_iron_gauss"
 SOFT_IRON = "estimate/soft_iron_minus_identity"
-GYRO_BIAS = "estimate/gyro_bias_rad_s"
+GYRO_BIAS = "estimate/gyro_bias_mrad_s"
 HEADING_SIGMA = "estimate/heading_sigma_deg"
 GATE_TABLE = "gate_table"
 GATE_LANES = "gate"
@@ -157,7 +157,7 @@ def _series(path: str, title: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=path,
         name=title,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
         axis_x=_whole_recording(),
     )
 
@@ -172,7 +172,13 @@ def blueprint() -> rrb.Blueprint:
     )
     left = rrb.Vertical(
         field,
-        rrb.TextLogView(origin=LOG, name="Log: states, register writes, notes"),
+        rrb.TextLogView(
+            origin=LOG,
+            name="Log: states, register writes, notes",
+            columns=rrb.TextLogColumns(
+                timeline_columns=[DEVICE_TIME], text_log_columns=["LogLevel", "Body"]
+            ),
+        ),
         row_shares=[7, 4],
     )
     middle = rrb.Vertical(
@@ -187,12 +193,13 @@ def blueprint() -> rrb.Blueprint:
     right = rrb.Vertical(
         _series(HARD_IRON, "Hard iron [gauss] ± sigma"),
         _series(SOFT_IRON, "Soft iron minus identity ± sigma"),
-        _series(GYRO_BIAS, "Gyro bias [rad/s] ± sigma"),
+        _series(GYRO_BIAS, "Gyro bias [mrad/s] ± sigma"),
         _series(HEADING_SIGMA, "Heading error expected (1 sigma) [deg]"),
         rrb.Tabs(
             _series(FIELD_NORM, "Field strength [gauss]"),
             _series(GYRO, "Gyro [rad/s]"),
         ),
+        row_shares=[4, 5, 4, 3, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(left, middle, right, column_shares=[4, 4, 4]),

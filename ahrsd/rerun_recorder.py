@@ -175,7 +175,7 @@ class Recorder:
         soft = (estimate.soft_iron - np.eye(3))[upper]
         self._band(names.SOFT_IRON, soft, sigma[:6])
         self._band(names.HARD_IRON, estimate.hard_iron_gauss, sigma[6:9])
-        self._band(names.GYRO_BIAS, estimate.gyro_bias_rad_s, sigma[9:12])
+        self._band(names.GYRO_BIAS, estimate.gyro_bias_rad_s * 1e3, sigma[9:12] * 1e3)
         self._stream.log(names.HEADING_SIGMA, rr.Scalars(estimate.heading_sigma_deg))
         if not abs(at_s - self._shape_at_s) < SLOW_S:
             self._shape_at_s = at_s
