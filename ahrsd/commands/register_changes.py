@@ -1,10 +1,12 @@
 """Changing registers by hand with the same care as the daemon: journal first, verify, undo.
 
-HAND_PREPARED        device, old and new values, durable before a byte is sent
-HAND_VERIFIED    written and read back equal
-HAND_FAILED      refused or not equal; what was written is put back, `restored` says whether
-HAND_FLASH_SENT      VNWNV is about to be sent
-HAND_FLASH_ACKED     the device acknowledged it
+    HAND_PREPARED     device, old and new values, durable before a byte is sent
+    HAND_VERIFIED     written and read back equal
+    HAND_FAILED       refused or not equal; what was written is put back, `restored` says whether
+    HAND_FLASH_SENT   VNWNV is about to be sent
+    HAND_FLASH_ACKED  the device acknowledged it
+
+The daemon's own kinds (`writeback.reconcile`) promise more, gates and a trial, so these are others.
 """
 
 from __future__ import annotations
