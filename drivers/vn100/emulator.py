@@ -118,6 +118,10 @@ class Emulator:
 
     def advance(self, now_s: float) -> bytes:
         """Everything that reached the host since the last call, whole messages, in order."""
+        return b"".join(message for _, message in self.deliver(now_s))
+
+    def deliver(self, now_s: float) -> list[tuple[int, bytes]]:
+        """As `advance`, message by message, each with the baud rate at which it was sent."""
         self._run(now_s)
         return self._wire.collect(now_s)
 

@@ -14,6 +14,7 @@ bytes of both directions are garbled, as they would be on a wire (`check_baud`).
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import pty
@@ -37,12 +38,10 @@ TURN_S = 1e-3  # real time between two looks at the line
 CATCH_UP_S = 0.02  # lossless: a stall of the process is not made up for beyond this
 OVERRUN_BYTES = 65536
 UNREAD_BYTES = 512  # lossless: time stands still while the host has left more than this unread
-COOKED_S = 0.2  # a host that has not configured the port for so long is given a raw one
 DESERTED_S = 1.0  # lossless: nobody has read for so long; the port may be opened again
 
 _TCGETS2 = 0x802C542A  # asm-generic: struct termios2, whose speeds are plain numbers
 _TERMIOS2 = struct.Struct("4I20B2I")
-_COOKED = termios.ICANON | termios.ECHO
 
 
 class Line:
@@ -52,14 +51,14 @@ class Line:
     but not whether there is a host.
     """
 
-    def __init__(self, link: Path | None, hold: bool) -> None:
+    def __init__(self, link: Path | None, hold: bool, baud: int) -> None:
         if link is not None and link.exists() and not link.is_symlink():
             raise FileExistsError(f"{link} exists and is no symbolic link; choose another --link")
         self.link = link
         self._master, self._slave = pty.openpty()
         self.device = os.ttyname(self._slave)
         self._hold = hold
-        tty.setraw(self._slave)
+        _configure(self._slave, baud)
         os.set_blocking(self._master, False)
         if not hold:
             os.close(self._slave)
@@ -105,23 +104,21 @@ class Line:
         except BlockingIOError:
             return 0
 
-    def mode(self) -> tuple[bool, int]:
-        """Whether the host's end is still in line mode, and the bit rate that it has set."""
+    def host_baud(self) -> int:
+        """The bit rate that the host has set; 0 where the system does not tell."""
         try:
-            raw = fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2.size))
+            settings = fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2.size))
         except OSError:  # no termios2 on this system
-            return False, 0
-        numbers = _TERMIOS2.unpack(raw)
-        return bool(numbers[3] & _COOKED), numbers[-1]
+            return 0
+        return int(_TERMIOS2.unpack(settings)[-1])
 
-    def set_raw(self, baud: int) -> None:
-        """Make the host's end raw, at a rate, for hosts that do not (`cat`)."""
-        tty.setraw(self._master)
-        speed = getattr(termios, f"B{baud}", None)
-        if speed is not None:
-            settings = termios.tcgetattr(self._master)
-            settings[4] = settings[5] = speed
-            termios.tcsetattr(self._master, termios.TCSANOW, settings)
+    def free(self) -> bool:
+        """Whether a host could open the port; false where one was killed in exclusive use."""
+        try:
+            os.close(os.open(self.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK))
+        except OSError as error:
+            return error.errno != errno.EBUSY
+        return True
 
     def unread(self) -> int:
         """Bytes that the host could read now; only where `hold`."""
@@ -131,6 +128,16 @@ class Line:
     def release(self) -> None:
         """Undo the exclusive use that a host left behind; only where `hold`."""
         fcntl.ioctl(self._slave, termios.TIOCNXCL)
+
+
+def _configure(terminal: int, baud: int) -> None:
+    """Raw, at the device's rate: also hosts that set nothing (`cat`) see its bytes."""
+    tty.setraw(terminal)
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is not None:
+        settings = termios.tcgetattr(terminal)
+        settings[4] = settings[5] = speed
+        termios.tcsetattr(terminal, termios.TCSANOW, settings)
 
 
 class PtyEmulator:
@@ -169,7 +176,7 @@ class PtyEmulator:
         self._line: Line | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._cooked_since: float | None = None
+        self._present = False
         self._read_at = 0.0
         self._plug()
 
@@ -219,16 +226,14 @@ class PtyEmulator:
             last = now
             if heard:
                 self.emulator.receive(heard, self.device_s)
-            self._send(self.emulator.advance(self.device_s))
+            self._send(self.emulator.deliver(self.device_s))
             for line in self.emulator.take_log():
                 self._report(f"{self.device_s:9.3f} s  {line}")
             self._follow_plug()
 
     def _plug(self) -> None:
-        self._line = Line(self._link, self._lossless)
-        self._present = self._lossless
-        if self._lossless:
-            self._line.set_raw(self.emulator.baud)
+        self._line = Line(self._link, self._lossless, self.emulator.baud)
+        self._present = False
         self._read_at = time.monotonic()
 
     def _unplug(self) -> None:
@@ -240,29 +245,31 @@ class PtyEmulator:
     def _follow_plug(self) -> None:
         if self.emulator.plugged == (self._line is not None):
             return
+        self._unplug()
         if self.emulator.plugged:
             self._plug()
             self._report(f"{self.device_s:9.3f} s  port {self.path}")
-        else:
-            self._unplug()
 
     def _listen(self) -> bytes:
         """Wait a turn; the host's bytes as the device hears them."""
         if self._line is None:
             time.sleep(TURN_S)
             return b""
-        self._present = self._line.wait(TURN_S)
-        if not self._present:
-            self._backlog.clear()
-            self._cooked_since = None
-            return b""
-        return self._garbled(self._line.read())
+        was_present, self._present = self._present, self._line.wait(TURN_S)
+        if self._present:
+            heard = self._line.read()
+            return self._garbled(heard, self.emulator.baud, self._line.host_baud())
+        self._backlog.clear()
+        if was_present and not self._line.free() and not self._line.wait(0):
+            self._unplug()  # nobody but root could open this one again
+            self._plug()
+            self._report(f"{self.device_s:9.3f} s  port {self.path}")
+        return b""
 
-    def _garbled(self, data: bytes) -> bytes:
-        if not data or self._line is None or not self._check_baud:
+    def _garbled(self, data: bytes, device_baud: int, host_baud: int) -> bytes:
+        if not self._check_baud or host_baud in (0, device_baud):
             return data
-        _, host_baud = self._line.mode()
-        return data if host_baud in (0, self.emulator.baud) else garble(data, self._draw)
+        return garble(data, self._draw)
 
     def _pass_time(self, elapsed_s: float, now: float) -> None:
         if not self._lossless:
@@ -276,27 +283,17 @@ class PtyEmulator:
         self._read_at = now
         self.device_s += min(elapsed_s, CATCH_UP_S) * self._speed
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, messages: list[tuple[int, bytes]]) -> None:
         line = self._line
-        if line is None or not self._present or not self._ready(line):
+        if line is None or not self._present:
             return
-        self._backlog += self._garbled(data)
+        if messages:
+            host_baud = line.host_baud()
+            for baud, message in messages:
+                self._backlog += self._garbled(message, baud, host_baud)
         if self._backlog:
             del self._backlog[: line.write(bytes(self._backlog))]
         excess = len(self._backlog) - OVERRUN_BYTES
         if excess > 0 and not self._lossless:
             del self._backlog[OVERRUN_BYTES:]
             self.overrun_bytes += excess
-
-    def _ready(self, line: Line) -> bool:
-        """Whether the host has configured the port; before that the kernel would echo our bytes."""
-        cooked, _ = line.mode()
-        if not cooked:
-            self._cooked_since = None
-            return True
-        now = time.monotonic()
-        if self._cooked_since is None:
-            self._cooked_since = now
-        elif now - self._cooked_since > COOKED_S:
-            line.set_raw(self.emulator.baud)
-        return False

@@ -30,7 +30,7 @@ class Transmitter:
         self._overflowed = False
         self._free_s = 0.0  # when the last byte of the queue will have left
         self._released_s = 0.0
-        self._queue: deque[tuple[float, float, bytes]] = deque()
+        self._queue: deque[tuple[float, float, int, bytes]] = deque()
 
     def send(self, message: bytes, now_s: float) -> None:
         """Put a message into the queue at `now_s`."""
@@ -55,13 +55,16 @@ class Transmitter:
         self._released_s = 0.0
         self._overflowed = False
 
-    def collect(self, now_s: float) -> bytes:
-        """What has reached the host by `now_s`, as the faults left it."""
+    def collect(self, now_s: float) -> list[tuple[int, bytes]]:
+        """Messages that have reached the host by `now_s`, as the faults left them.
+
+        With each the baud rate at which it was sent.
+        """
         arrived = []
         while self._queue and self._queue[0][0] <= now_s:
-            _, sent_s, message = self._queue.popleft()
-            arrived.append(self._plan.distort(message, sent_s))
-        return b"".join(arrived)
+            _, sent_s, baud, message = self._queue.popleft()
+            arrived.append((baud, self._plan.distort(message, sent_s)))
+        return arrived
 
     def _room(self, now_s: float) -> float:
         waiting = max(0.0, self._free_s - now_s) * self.baud / BITS_PER_BYTE
@@ -74,4 +77,4 @@ class Transmitter:
         self._free_s = start_s + len(message) * BITS_PER_BYTE / self.baud
         self._released_s = max(self._released_s, self._plan.release_s(self._free_s))
         if self.connected:
-            self._queue.append((self._released_s, self._free_s, message))
+            self._queue.append((self._released_s, self._free_s, self.baud, message))

@@ -1,0 +1,96 @@
+"""The emulated VN-100 in a process of its own, beside the program that talks to it.
+
+    with EmulatorProcess(Setup("rov", seed=1), speed=30.0, lossless=True) as emulated:
+        port = serial.Serial(emulated.path, 115200)
+
+The process ends with `stop`, and by itself when the program that started it ends in whatever way.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from drivers.vn100.emulator_pty import PtyEmulator
+from drivers.vn100.emulator_scenarios import Setup, build
+
+START_S = 30.0
+
+
+class EmulatorProcess:
+    """Starts when it is made; the arguments are those of `Setup` and `PtyEmulator`.
+
+    path: what the host opens. Raises ValueError for a setup that cannot be, OSError where there is
+    no pty or the link cannot be made.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        link: Path | None = None,
+        speed: float = 1.0,
+        lossless: bool = False,
+        check_baud: bool = True,
+    ) -> None:
+        build(setup)  # refuse here what cannot be
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve,
+            args=(setup, link, speed, lossless, check_baud, theirs),
+            name="vn100-emulator",
+            daemon=True,
+        )
+        self._process.start()
+        theirs.close()
+        if not self._pipe.poll(START_S):
+            self.stop()
+            raise OSError(f"the emulator process did not start within {START_S:g} s")
+        answer = self._pipe.recv()
+        if isinstance(answer, Exception):
+            self.stop()
+            raise answer
+        self.path = str(answer)
+
+    def stop(self) -> None:
+        """Close the pty and end the process. May be called twice."""
+        self._pipe.close()
+        self._process.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+def _serve(
+    setup: Setup,
+    link: Path | None,
+    speed: float,
+    lossless: bool,
+    check_baud: bool,
+    pipe: Connection,
+) -> None:
+    """The other process: serve until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to both; the pipe decides
+    try:
+        served = PtyEmulator(
+            build(setup), link=link, speed=speed, lossless=lossless, check_baud=check_baud
+        )
+    except (ValueError, OSError) as error:
+        pipe.send(error)
+        return
+    with served:
+        pipe.send(served.path)
+        pipe.poll(None)
