@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Literal, Self, TypeVar
+from typing import Literal, Self, TypeVar, cast
 
 from drivers.serial_port import LinkLost, SerialPort
 from drivers.vn100.commands import (
@@ -73,12 +73,7 @@ class Device:
         finally:
             if self._session.busy:
                 self._tidy()
-        if isinstance(self._outcome, Finished):
-            result: T = self._outcome.result  # type: ignore[assignment]
-            return result
-        if self._outcome is None:
-            raise TookTooLong(f"{self._port.path}: no end after {timeout_s:g} s, given up")
-        raise self._outcome.error
+        return cast("T", self._result(timeout_s))
 
     def __enter__(self) -> Self:
         return self
@@ -96,6 +91,13 @@ class Device:
                 self.run(resume(), TIDY_S)
         finally:
             self._port.close()
+
+    def _result(self, timeout_s: float) -> object:
+        if self._outcome is None:
+            raise TookTooLong(f"{self._port.path}: no end after {timeout_s:g} s, given up")
+        if isinstance(self._outcome, Failed):
+            raise self._outcome.error
+        return self._outcome.result
 
     def _gate(self, command: Command) -> bool:
         permitted = self._allow(command)
