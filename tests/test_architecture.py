@@ -35,12 +35,14 @@ SHELL = (
     "ahrsd.replay",
     "ahrsd.report",
     "ahrsd.rerun_blueprint",
+    "ahrsd.rerun_process",
     "ahrsd.rerun_recorder",
     "ahrsd.rerun_sink",
     "drivers.port_holders",
     "drivers.serial_port",
     "drivers.usb",
     "drivers.vn100.device",
+    "drivers.vn100.emulator_process",
     "drivers.vn100.emulator_pty",
 )
 

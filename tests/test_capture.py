@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from errno import ENOSPC
 from io import FileIO
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import (
     Input,
     Interlock,
+    Journalled,
+    JournalOpened,
     LinkLost,
     LinkOpened,
     Operator,
@@ -31,6 +34,7 @@ from ahrsd.inputs import (
     Samples,
     Stop,
     Tick,
+    WallClock,
 )
 from ahrsd.recording import inputs_json
 from ahrsd.recording.capture import CaptureReader, CaptureWriter, Sent, part_path
@@ -42,10 +46,13 @@ EVERY_INPUT: list[Input] = [
     RegistersKnown(6, {23: (1.0, 0.0, 1e-7), 1: ("VN-100",), 5: (115200, 0)}, "capture"),
     Received(10, b"\xfa\x00\r\n$VN"),
     Tick(11),
+    WallClock(11, 1762171200.25),
     Received(12, b""),
     Interlock(13, True),
     Operator(14, "approve", "ab12"),
     LinkLost(15, "unplugged"),
+    JournalOpened(15, 100012345, [{"seq": 1, "old": {"23": [1.0, 1e-7]}}], "line 2 is damaged"),
+    Journalled(15, "PREPARED"),
     Stop(16, "SIGTERM"),
 ]
 
@@ -88,6 +95,10 @@ def test_side_channels(tmp_path):
     ]
     assert list(reader.facts("registers")) == [(2, {"23": [1.0, 2.0]})]
     assert list(reader.facts("covariate")) == [(3, {"motor_current_a": [1.5]})]
+
+
+def test_every_kind_of_input_can_be_recorded():
+    assert {type(item) for item in EVERY_INPUT} | {Samples} == set(get_args(Input))
 
 
 def test_samples_survive_json():
