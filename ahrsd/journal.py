@@ -24,10 +24,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from drivers.vn100.sentences import encode
-
 from ahrsd.errors import JournalError
 from drivers.vn100.registers import REGISTERS, as_stored, format_command
+from drivers.vn100.sentences import encode
 
 _OWN_KEYS = ("seq", "time", "kind", "crc")
 
