@@ -24,8 +24,9 @@ def test_identity_and_registers_come_first_then_the_stream(run, emulated, tmp_pa
     items = list(reader)
     assert reader.notes == []
     assert reader.header["serial"] == "100130608"
-    assert isinstance(items[0], LinkOpened)
-    assert (items[0].port, items[0].baud) == (path, 115200)
+    assert abs(items[0].wall_s - time.time()) < 60.0
+    assert isinstance(items[1], LinkOpened)
+    assert (items[1].port, items[1].baud) == (path, 115200)
     known = next(item for item in items if isinstance(item, RegistersKnown))
     assert known.values[23] == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     sent = b"".join(item.data for item in items if isinstance(item, Sent))
@@ -40,6 +41,12 @@ def test_identity_and_registers_come_first_then_the_stream(run, emulated, tmp_pa
     assert snapshot["23"][0] == 1.0
     assert host_ns == known.host_ns
     assert "ended by --seconds 1.5" in capsys.readouterr().out
+
+
+def test_a_device_with_unknown_firmware_can_be_recorded(run, emulated, tmp_path):
+    with emulated(scenario="unknown-firmware") as (_, path):
+        assert run("capture", path, "-o", tmp_path / "a.mcap", "--seconds", 0.5, *BAUD) == 0
+    assert CaptureReader(tmp_path / "a.mcap").header["firmware"] == "7.0.0.0"
 
 
 def test_passive_sends_not_one_byte(run, emulated, tmp_path, capsys):

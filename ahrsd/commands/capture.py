@@ -15,7 +15,7 @@ import click
 
 from ahrsd.commands.device_access import describe, driver_errors, open_port, read_all
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
-from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop
+from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
 from ahrsd.recording.capture import CaptureStatus, CaptureWriter, Sent
 from drivers import serial_port
 from drivers.serial_port import SerialPort
@@ -65,7 +65,7 @@ def command(
     if not path.parent.is_dir():
         raise click.BadParameter(f"{path.parent} is no folder", param_hint="-o")
     with driver_errors(), open_port(port, baud, may_query=not passive) as serial:
-        before = [_opened(port, serial)]
+        before = _opened(port, serial)
         header = {} if passive else _read_device(serial, before)
         with CaptureWriter(path, header) as writer:
             for item in before:
@@ -75,8 +75,12 @@ def command(
     _report(path, session, status, json_path)
 
 
-def _opened(port: Path, serial: SerialPort) -> Input | Sent:
-    return LinkOpened(time.monotonic_ns(), str(port), serial.baud, latency_timer_ms(port))
+def _opened(port: Path, serial: SerialPort) -> list[Input | Sent]:
+    host_ns = time.monotonic_ns()
+    return [
+        WallClock(host_ns, time.time()),
+        LinkOpened(host_ns, str(port), serial.baud, latency_timer_ms(port)),
+    ]
 
 
 def _read_device(serial: SerialPort, items: list[Input | Sent]) -> dict[str, str]:
