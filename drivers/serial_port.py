@@ -217,7 +217,10 @@ def detect_baud(
     with SerialPort(path, order[0]) as port:
         for attempt in (_listen, _query) if may_query else (_listen,):
             for baud in order:
-                heard = attempt(port, baud, listen_s)
+                try:
+                    heard = attempt(port, baud, listen_s)
+                except PortUnusable:  # not every adapter can do every rate
+                    continue
                 tried.append(heard)
                 if heard.messages:
                     how = "heard" if attempt is _listen else "an answer came"
@@ -275,14 +278,13 @@ def _collect(port: SerialPort, listen_s: float, enough: Callable[[bytes], bool])
 
 def _refuse_if_held(path: str) -> None:
     """PortAbsent or PortBusy before anything of the port is changed."""
-    if not Path(path).exists():
-        raise PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
-    others = holders(path)
-    if others:
-        raise PortBusy(path, others)
-    if is_pty(path):  # there the flag outlives its owner, as long as the other end is open
-        return
     try:
+        pty = is_pty(path)
+        others = holders(path)
+        if others:
+            raise PortBusy(path, others)
+        if pty:  # there the flag outlives its owner, as long as the other end is open
+            return
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         raise _why(path, error) from error

@@ -266,7 +266,7 @@ def test_the_last_good_rate_is_tried_first(pty):
 
 def test_a_wrong_configured_rate_is_found_by_listening_alone(pty):
     with device(pty, 921600) as talking:
-        found = detect_baud(pty.path, configured=57600, listen_s=0.15, may_query=True)
+        found = detect_baud(pty.path, configured=57600, may_query=True)
     assert found.baud == 921600
     assert [heard.baud for heard in found.tried] == [57600, 115200, 921600]
     assert all(heard.received > 100 for heard in found.tried)
@@ -281,7 +281,7 @@ def test_a_quiet_device_is_asked_only_where_that_is_allowed(pty):
         assert caught.value.silent
         assert "57600: silence" in str(caught.value)
         assert talking.heard == b""
-        found = detect_baud(pty.path, 115200, 57600, listen_s=0.1, may_query=True)
+        found = detect_baud(pty.path, 115200, 57600, may_query=True)
     assert found.baud == 57600
     assert found.why == "an answer came at 57600 baud, the configured rate"
 
@@ -293,6 +293,20 @@ def test_garbage_at_every_rate_is_told_from_silence(pty):
     assert len(caught.value.tried) == 9
     assert "bytes arrive but no message" in str(caught.value)
     assert talking.heard == b""
+
+
+def test_a_rate_that_the_adapter_cannot_do_is_passed_over(pty, monkeypatch):
+    real = SerialPort.set_baud
+
+    def cannot(port, baud):
+        if baud == 115200:
+            raise PortUnusable("no 115200")
+        real(port, baud)
+
+    monkeypatch.setattr(SerialPort, "set_baud", cannot)
+    with device(pty, 921600):
+        found = detect_baud(pty.path, listen_s=0.2)
+    assert [heard.baud for heard in found.tried] == [921600]
 
 
 def test_the_latency_timer_is_read_and_set_where_allowed(tmp_path):

@@ -65,10 +65,10 @@ class RestoreFailed(SessionError):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who the device is, from registers 1 to 4."""
+    """Who the device is, from registers 1 to 4; `hardware` is None where it cannot be read."""
 
     model: str
-    hardware: int
+    hardware: int | None
     serial: int
     firmware: str
     profile: Profile
@@ -80,10 +80,12 @@ def identify() -> Procedure[Identity]:
         first = yield from read(1)
     except DeviceRefused:
         first = yield from read(1)
-    hardware = yield from read(2)
+    hardware: int | None = None
+    with suppress(NoReply, DeviceRefused):  # newer firmware may print it in a way of its own
+        hardware = int((yield from read(2))[0])
     serial = yield from read(3)
     firmware = str((yield from read(4))[0])
-    return Identity(str(first[0]), int(hardware[0]), int(serial[0]), firmware, profile_of(firmware))
+    return Identity(str(first[0]), hardware, int(serial[0]), firmware, profile_of(firmware))
 
 
 def read(register: int, port: int | None = None) -> Procedure[Values]:

@@ -9,10 +9,10 @@ import time
 import tty
 
 import pytest
-from drivers.vn100.decode import Measurement
 
 from drivers.serial_port import LinkLost, SerialPort
 from drivers.vn100.commands import NoReply, NotPermitted, Pause, Word, Write
+from drivers.vn100.decode import Measurement
 from drivers.vn100.device import Device, TookTooLong
 from drivers.vn100.procedures import identify, quiet, read, write_verified
 from drivers.vn100.session import DeviceFault

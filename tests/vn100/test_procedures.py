@@ -4,7 +4,6 @@ them; the emulator, which shares the register map with the driver, is not asked 
 from __future__ import annotations
 
 import pytest
-from drivers.vn100.errors import DeviceRefused
 
 from drivers.vn100.calibration_stream import (
     CalibrationStream,
@@ -14,6 +13,7 @@ from drivers.vn100.calibration_stream import (
     rate_divisor,
 )
 from drivers.vn100.commands import NoReply, Read, Word, Write
+from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.firmware import profile_of
 from drivers.vn100.procedures import (
     CONFIGURATION,
@@ -136,6 +136,13 @@ def test_identify():
         "VN-100S-CR", 7, 100130608, "3.1.0.0", profile_of("3.1.0.0")
     )
     assert device.log == ["VNRRG,01", "VNRRG,02", "VNRRG,03", "VNRRG,04"]
+
+
+def test_an_unreadable_hardware_revision_does_not_matter():
+    device = Device()
+    device.ram[2] = "7B"
+    identity = run(device, identify())
+    assert (identity.hardware, identity.serial) == (None, 100130608)
 
 
 def test_identify_survives_what_an_earlier_program_left_half_sent():

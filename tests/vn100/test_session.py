@@ -6,8 +6,6 @@ Lines are the manual's or recorded ones, except in the property test, which comp
 from __future__ import annotations
 
 import pytest
-from drivers.vn100.decode import Measurement, Reply
-from drivers.vn100.errors import DeviceRefused
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -24,6 +22,8 @@ from drivers.vn100.commands import (
     Write,
     reply_time_s,
 )
+from drivers.vn100.decode import Measurement, Reply
+from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.procedures import VerifyFailed, quiet, read, save_settings, write_verified
 from drivers.vn100.session import DeviceFault, Failed, Finished, Session, Stray
 
