@@ -118,6 +118,16 @@ class Conversation:
         """Whether a procedure may be started now."""
         return self.phase is Phase.READY and not self.session.busy
 
+    @property
+    def may_close(self) -> bool:
+        """Nothing is under way that must end before the port may be given back."""
+        return self.phase is Phase.CLOSED or self.idle
+
+    @property
+    def session_keys(self) -> frozenset[int]:
+        """Registers that this session changes and puts back."""
+        return frozenset(SESSION_SETTINGS) if self.change_stream else frozenset()
+
     def take_said(self) -> list[Said]:
         """What happened since the last call."""
         said, self._said = self._said, []
@@ -139,11 +149,9 @@ class Conversation:
         self._stream_is_ours = False  # what we set up in RAM may be gone
         if self.mode is Mode.PASSIVE or self.phase is Phase.DONE:
             return []
-        events = self.session.cancel(now_s) if self.session.busy else []
-        while self.session.busy:  # what a cancelled procedure still has to say ends with the link
-            events += self.session.link_lost(now_s)
+        events = self._abandon(now_s)
         self.phase = Phase.IDENTIFYING
-        return self._digest(events + self._start(identify(), Purpose.READ, now_s), now_s)
+        return events + self._digest(self._start(identify(), Purpose.READ, now_s), now_s)
 
     def received(self, data: bytes, now_s: float) -> list[Event]:
         """Bytes came; returns measurements, faults and strays, in order."""
@@ -155,11 +163,17 @@ class Conversation:
 
     def lost(self, now_s: float) -> list[Event]:
         """The port went away."""
-        events = self._digest(self.session.link_lost(now_s), now_s)
+        events = self._abandon(now_s)
         if self.phase is not Phase.DONE:
             self.phase = Phase.CLOSED
         self.identity = None
         return events
+
+    def _abandon(self, now_s: float) -> list[Event]:
+        """End what runs without another byte; only the write-back is told how its own ended."""
+        if self.phase not in (Phase.RUNNING, Phase.RESTORING):
+            self.phase = Phase.CLOSED
+        return self._digest(self.session.link_lost(now_s), now_s)
 
     def run(
         self,
@@ -172,6 +186,20 @@ class Conversation:
         """Start a procedure of the write-back; only while `idle`. `gate` is asked per command."""
         self.phase, self._name, self._extra_gate = Phase.RUNNING, name, gate
         return self._digest(self._start(procedure, purpose, now_s), now_s)
+
+    def cancel(self, name: str, now_s: float) -> list[Event]:
+        """End the procedure of this name, if it runs; it may still send what puts things back."""
+        if self.phase is not Phase.RUNNING or self._name != name:
+            return []
+        return self._digest(self.session.cancel(now_s), now_s)
+
+    def set_up_again(self, now_s: float) -> list[Event]:
+        """The user's own outputs are back for a save: set the session's up again."""
+        if not (self.change_stream and self.idle):
+            return []
+        self.phase = Phase.SETTING_UP
+        procedure = configure_stream(self.rate_hz, self._baud)
+        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
 
     def restore_and_close(self, now_s: float) -> list[Event]:
         """Put back what was changed for the session, then say Closed."""
@@ -214,6 +242,8 @@ class Conversation:
             self._stream_is_ours = False
             self._said.append(StreamChanged("outputs put back as they were"))
             self._said.append(Closed(error))
+            return []
+        if phase is Phase.CLOSED:
             return []
         if error is not None:
             self.phase = Phase.READY

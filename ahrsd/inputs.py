@@ -28,6 +28,14 @@ class Tick:
 
 
 @dataclass(frozen=True, slots=True)
+class WallClock:
+    """What the wall clock says: for budgets per day and for labels, never for durations."""
+
+    host_ns: int
+    wall_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class LinkOpened:
     """A port was opened. `latency_ms` is the USB adapter's latency timer where it has one."""
 
@@ -109,6 +117,7 @@ class Stop:
 Input = (
     Received
     | Tick
+    | WallClock
     | LinkOpened
     | LinkLost
     | Interlock

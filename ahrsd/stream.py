@@ -15,11 +15,11 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from drivers.vn100.decode import Measurement
 
 from ahrsd.clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
-from ahrsd.samples import SampleBlock
+from ahrsd.samples import Array, SampleBlock
 from ahrsd.unmapping import Extractor, MissingQuantityError, RegisterEpochs, sample_blocks
+from drivers.vn100.decode import Measurement
 
 FACTORY_RATE_HZ = 40.0
 _BLOCK_S = 0.25
@@ -67,6 +67,16 @@ class Stream:
     def restarts(self) -> int:
         """How often the device's time fell."""
         return self._timeline.restarts
+
+    @property
+    def compensated_mag(self) -> bool:
+        """Whether only the compensated field is in the stream."""
+        return self._extractor is not None and self._extractor.mag_compensated
+
+    @property
+    def compensated_gyro(self) -> bool:
+        """Whether only the compensated rate is in the stream."""
+        return self._extractor is not None and self._extractor.gyro_compensated
 
     def lost(self, messages: int) -> None:
         """So many messages are missing before the next one."""
@@ -164,9 +174,16 @@ class Stream:
         self._lost.clear()
         steps = self._timeline.extend(time_s, extracted.usable)
         self._note(steps)
-        self.clock.update(float(time_s[-1]), float(arrivals[-1]))
-        host_s = np.maximum.accumulate(np.minimum(self.clock.to_host(time_s), arrivals))
+        host_s = self._host(time_s, arrivals)
         return sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+
+    def _host(self, time_s: Array, arrivals: Array) -> Array:
+        """Host times; a recording without host time (arrivals of 0) has only the device's."""
+        if arrivals[-1] == 0.0:
+            return time_s
+        self.clock.update(float(time_s[-1]), float(arrivals[-1]))
+        line = np.minimum(self.clock.to_host(time_s), arrivals)
+        return np.asarray(np.maximum.accumulate(np.where(np.isfinite(line), line, arrivals)))
 
     def _note(self, steps: Steps) -> None:
         facts = self.facts

@@ -24,6 +24,7 @@ from ahrsd.inputs import (
     Samples,
     Stop,
     Tick,
+    WallClock,
 )
 from ahrsd.samples import SampleBlock
 
@@ -31,6 +32,7 @@ _TYPES = {
     kind.__name__: kind
     for kind in (
         Tick,
+        WallClock,
         LinkOpened,
         LinkLost,
         Interlock,

@@ -1,0 +1,102 @@
+"""Samples to a judged estimate: what is held out, what the estimator sees, what the gates say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.estimator.online import Estimator
+from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.events import GateResult
+from ahrsd.evidence.collector import BasisFacts, EvidenceCollector, HealthFacts
+from ahrsd.gates import GateLimits, judge
+from ahrsd.samples import Array, SampleBlock
+from ahrsd.worldfield import WorldField
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratorSettings:
+    """What the calibration needs from the configuration."""
+
+    estimator: EstimatorParameters
+    limits: GateLimits
+    world_field: WorldField | None = None
+    held_out: bool = True
+
+
+class Calibrator:
+    """One device's calibration. `present` and `present_gyro` are its registers 23 and 84."""
+
+    def __init__(
+        self, settings: CalibratorSettings, present: Affine, present_gyro_bias_rad_s: Array
+    ) -> None:
+        self.settings = settings
+        self.present = present
+        self.present_gyro_bias_rad_s = present_gyro_bias_rad_s
+        self.estimator = Estimator(settings.estimator, present, present_gyro_bias_rad_s)
+        self.collector = EvidenceCollector()
+        self.estimate: Estimate | None = None
+        self.gates: tuple[GateResult, ...] = ()
+        self._gap = True
+        self.started = False
+
+    def take(self, block: SampleBlock) -> bool:
+        """Samples in order; true where there is a new estimate."""
+        new = False
+        self.started = True
+        for role, part in self.collector.parts(block):
+            self.collector.add(part)
+            if role == "heldout" and self.settings.held_out:
+                self._gap = True
+                continue
+            piece = replace(part, gap_before=True) if self._gap and not part.gap_before else part
+            self._gap = False
+            new |= self.estimator.add(_unknown_first_step(piece))
+        if new:
+            self.estimate = self._scaled(self.estimator.estimate())
+        return new and self.estimate is not None
+
+    def finish(self) -> Estimate | None:
+        """The end of the stream: iterate to the end."""
+        self.estimate = self._scaled(self.estimator.finish())
+        return self.estimate
+
+    def judged(self, at_s: float, health: HealthFacts, basis: BasisFacts) -> tuple[GateResult, ...]:
+        """Evaluate the evidence for the present estimate and pass it through the gates."""
+        if self.estimate is None:
+            return ()
+        evidence = self.collector.evaluate(
+            self.estimate,
+            self.present,
+            self.present_gyro_bias_rad_s,
+            self.settings.world_field,
+            health,
+            basis,
+        )
+        self.gates = judge(evidence, self.settings.limits, at_s, self.gates)
+        return self.gates
+
+    def _scaled(self, estimate: Estimate | None) -> Estimate | None:
+        """With a world field the scale is known: A grows so that the corrected field has it."""
+        field = self.settings.world_field
+        if estimate is None or field is None:
+            return estimate
+        factor = estimate.field_gauss / field.total_gauss
+        scale = np.r_[np.full(6, factor), np.ones(6)]
+        return replace(
+            estimate,
+            soft_iron=estimate.soft_iron * factor,
+            field_gauss=field.total_gauss,
+            field_known=True,
+            covariance=estimate.covariance * np.outer(scale, scale),
+        )
+
+
+def _unknown_first_step(block: SampleBlock) -> SampleBlock:
+    if not block.gap_before or np.isnan(block.dt_s[0]):
+        return block
+    dt_s = block.dt_s.copy()
+    dt_s[0] = np.nan
+    return replace(block, dt_s=dt_s)

@@ -1,0 +1,486 @@
+"""The pure core: inputs in, events out. `run` and `replay` feed it the same way.
+
+It joins the parts and decides nothing itself: `conversation` talks to the device, `stream` makes
+samples, `calibrator` estimates and judges, `writeback` says what may be written. Its time is that
+of the inputs. Whatever it answers depends on the list of inputs alone, which is why a replay takes
+the same decisions; `decisions` holds them and their hash.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ahrsd import events, inputs
+from ahrsd.calibration import Affine
+from ahrsd.calibrator import Calibrator, CalibratorSettings
+from ahrsd.conversation import (
+    Closed,
+    Completed,
+    ConfigurationRead,
+    Conversation,
+    Identified,
+    Said,
+    StreamChanged,
+    Unanswered,
+)
+from ahrsd.decisions import DecisionLog
+from ahrsd.evidence.collector import BasisFacts, HealthFacts
+from ahrsd.live_trial import LiveTrial
+from ahrsd.samples import SampleBlock
+from ahrsd.stream import Stream
+from ahrsd.unmapping import Compensation, RegisterEpochs
+from ahrsd.writeback.actions import (
+    Action,
+    CancelProcedure,
+    Emit,
+    IdentifyAgain,
+    InForce,
+    JournalAppend,
+    RunProcedure,
+    SetUpStream,
+)
+from ahrsd.writeback.machine import WriteBack
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.states import State
+from drivers.vn100.decode import Measurement, Undecodable
+from drivers.vn100.deframer import Cause
+from drivers.vn100.registers import Values
+from drivers.vn100.session import DeviceFault, Stray
+from drivers.vn100.session import Event as SessionEvent
+
+_WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01
+_MAG, _GYRO, _RATE = 23, 84, 7
+_IDENTITY = Affine.identity().to_register()
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """A journal record as the write-back reads it."""
+
+    kind: str
+    facts: dict[str, Any]
+
+    @staticmethod
+    def of(body: dict[str, Any]) -> _Record:
+        return _Record(str(body["kind"]), dict(body["facts"]))
+
+
+@dataclass(frozen=True, slots=True)
+class CoreSettings:
+    """What the core needs from the configuration; `stream_rate_hz` for streams without time."""
+
+    calibrator: CalibratorSettings
+    policy: WriteBackPolicy = field(default_factory=WriteBackPolicy)
+    output_rate_hz: float = 100.0
+    stream_rate_hz: float | None = None
+
+
+class Core:
+    """See the module. Not thread-safe."""
+
+    def __init__(self, settings: CoreSettings) -> None:
+        self.settings = settings
+        self.decisions = DecisionLog()
+        self.epochs = RegisterEpochs()
+        self.stream = Stream(self.epochs, settings.stream_rate_hz)
+        self.conversation = Conversation(
+            settings.policy.mode,
+            change_stream=settings.policy.configure_stream,
+            rate_hz=settings.output_rate_hz,
+        )
+        self.writeback = WriteBack(settings.policy)
+        self.registers: dict[int, Values] = {}
+        self.calibrator = Calibrator(settings.calibrator, Affine.identity(), np.zeros(3))
+        self.at_s = 0.0
+        self.faults = 0
+        self.strays = 0
+        self.undecodable = 0
+        self._host_s = self._wall_offset_s = 0.0
+        self._stopping = ""
+        self._closing = self._closed = False
+        self._restarts = 0
+        self._journal: list[_Record] | None = None
+        self._journal_known = self._awaiting_journal = False
+        self._read: dict[int, Values] | None = None
+        self._todo: deque[Action] = deque()
+        self._pending: RunProcedure | None = None
+        self._trial: LiveTrial | None = None
+        self._out: list[events.Event] = []
+        self._handlers: dict[type, Callable[..., None]] = {
+            inputs.Received: self._received,
+            inputs.Tick: self._tick,
+            inputs.WallClock: self._wall_clock,
+            inputs.LinkOpened: self._link_opened,
+            inputs.LinkLost: self._link_lost,
+            inputs.Interlock: self._interlock,
+            inputs.Operator: self._operator,
+            inputs.RegistersKnown: self._registers_known,
+            inputs.Samples: self._samples_given,
+            inputs.JournalOpened: self._journal_opened,
+            inputs.Journalled: self._journalled,
+            inputs.Stop: self._stop,
+        }
+
+    # -- the two calls of a shell ------------------------------------------------------------------
+
+    def handle(self, item: inputs.Input) -> list[events.Event]:
+        """Take one input; everything that follows from it, in order."""
+        self._host_s = max(self._host_s, item.host_ns * 1e-9)
+        self._handlers[type(item)](item)
+        self._drive()
+        out, self._out = self._out, []
+        return out
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When a `Tick` is wanted if nothing else arrives before, on the host's clock."""
+        due = [self.conversation.session.deadline_s, self.writeback.deadline_s]
+        known = [d for d in due if d is not None]
+        return int(min(known) * 1e9) + 1 if known else None
+
+    # -- inputs ------------------------------------------------------------------------------------
+
+    def _received(self, item: inputs.Received) -> None:
+        self._take(self.conversation.received(item.data, self._host_s))
+
+    def _tick(self, _: inputs.Tick) -> None:
+        self._take(self.conversation.tick(self._host_s))
+        self._todo.extend(self.writeback.tick(self._host_s))
+
+    def _wall_clock(self, item: inputs.WallClock) -> None:
+        self._wall_offset_s = item.wall_s - self._host_s
+
+    def _link_opened(self, item: inputs.LinkOpened) -> None:
+        latency = "" if item.latency_ms is None else f", USB latency {item.latency_ms} ms"
+        self._note("info", f"{item.port} open at {item.baud} baud{latency}")
+        self.stream.forget()
+        if self.conversation.mode is Mode.PASSIVE:
+            self._no_device()
+        else:
+            self.epochs.begin(self._host_s, None)  # nothing is un-mapped before it is known how
+        self._take(self.conversation.opened(item.baud, self._host_s))
+
+    def _link_lost(self, item: inputs.LinkLost) -> None:
+        self._flush()
+        self._note("warning", f"link lost: {item.reason}")
+        self._take(self.conversation.lost(self._host_s))
+        self.stream.forget()
+        self._pending = None
+        self._todo.extend(self.writeback.on_link_lost(self._host_s))
+
+    def _interlock(self, item: inputs.Interlock) -> None:
+        self._todo.extend(self.writeback.on_interlock(item.safe, self._host_s))
+
+    def _operator(self, item: inputs.Operator) -> None:
+        self._note("info", f"operator: {item.verb} {item.argument}".strip())
+        self._todo.extend(self.writeback.on_operator(item.verb, item.argument, self._host_s))
+
+    def _registers_known(self, item: inputs.RegistersKnown) -> None:
+        self._flush()
+        self._note("info", f"registers taken from {item.source}")
+        self._in_force(dict(item.values))
+        self._no_device()
+
+    def _samples_given(self, item: inputs.Samples) -> None:
+        facts = self.stream.facts
+        facts.layout = "table"
+        facts.samples += len(item.block)
+        facts.expected += len(item.block)
+        if np.isnan(facts.rate_hz):
+            facts.rate_hz = 1.0 / float(np.nanmedian(item.block.dt_s))
+        self._block(item.block)
+
+    def _journal_opened(self, item: inputs.JournalOpened) -> None:
+        self._journal = None if item.error else [_Record.of(r) for r in item.records]
+        if item.error:
+            self._note("error", f"journal: {item.error}; nothing can be written")
+        self._journal_known = True
+        self._device_known()
+
+    def _journalled(self, item: inputs.Journalled) -> None:
+        kind = Kind(item.kind)
+        self._awaiting_journal = False
+        if item.error:
+            first = self.writeback.on_journal_failed(kind, item.error, self._host_s)
+        else:
+            first = self.writeback.on_journal_ok(kind, self._host_s)
+        self._todo.extendleft(reversed(first))
+
+    def _stop(self, item: inputs.Stop) -> None:
+        self._flush()
+        self._stopping = item.reason
+        self._todo.extend(self.writeback.on_stop(self._host_s))
+
+    # -- the device --------------------------------------------------------------------------------
+
+    def _take(self, found: list[SessionEvent]) -> None:
+        """Measurements to the stream, with what was damaged between them; the rest is counted."""
+        skipped = [
+            s for s in self.conversation.session.deframer.take_skipped() if s.cause != Cause.NOISE
+        ]
+        for event in found:
+            if isinstance(event, Measurement):
+                while skipped and skipped[0].offset < event.offset:
+                    self.stream.lost(max(1, round(len(skipped.pop(0).data) / 120)))
+                for block in self.stream.take(event, self._host_s):
+                    self._block(block)
+            elif isinstance(event, Undecodable):
+                self.undecodable += 1
+                self.stream.lost(1)
+            elif isinstance(event, DeviceFault):
+                self._fault(event.code)
+            elif isinstance(event, Stray):
+                self.strays += 1
+        if skipped:
+            self.stream.lost(len(skipped))
+        if self.stream.restarts > self._restarts:
+            self._restarts = self.stream.restarts
+            self._device_reset("its time fell")
+
+    def _fault(self, code: int) -> None:
+        self.faults += 1
+        self._note("warning", f"the device reports VNERR {code:02X}")
+        if code in (_WATCHDOG_RESET, _HARD_FAULT):
+            self._device_reset(f"VNERR {code:02X}")
+
+    def _device_reset(self, why: str) -> None:
+        self._note("warning", f"the device restarted ({why})")
+        if self.conversation.identity is None:
+            return
+        self.epochs.begin(self._host_s, None)
+        self._todo.extend(self.writeback.on_reset(self._host_s))
+        self._pending = None
+        self._take(self.conversation.identify_again(self._host_s))
+
+    def _no_device(self) -> None:
+        """Passive, or a recording without a conversation: the stream is taken as it is."""
+        self._todo.extend(self.writeback.on_no_device(self.registers or None, self._host_s))
+
+    def _device_known(self) -> None:
+        """Identity, registers and journal are all there: the write-back may look at them."""
+        identity, values = self.conversation.identity, self._read
+        if identity is None or values is None or not self._journal_known:
+            return
+        keys = self.conversation.session_keys
+        saved = self.conversation.saved
+        as_users = {n: saved[n] if n in keys and n in saved else v for n, v in values.items()}
+        self._read = None
+        self._todo.extend(
+            self.writeback.on_device(
+                identity,
+                as_users,
+                self._journal,
+                self._host_s,
+                self._host_s + self._wall_offset_s,
+                uptime_s=self.at_s if self.stream.facts.rate_source == "device time" else None,
+                session_keys=keys,
+            )
+        )
+
+    def _in_force(self, values: dict[int, Values]) -> None:
+        """These registers act on what follows; the first ones are the estimator's prior."""
+        self.registers = values
+        compensation = Compensation.from_registers(values)
+        self.epochs.begin(self._host_s, compensation)
+        self.stream.warnings.update(dict.fromkeys(compensation.warnings))
+        rate = values.get(_RATE, ())
+        if rate and isinstance(rate[0], int | float) and rate[0] > 0:
+            self.stream.register_rate_hz = float(rate[0])
+        present, gyro = _affine(values.get(_MAG)), _affine(values.get(_GYRO))
+        if not self.calibrator.started:
+            self.calibrator = Calibrator(self.settings.calibrator, present, gyro.offset)
+        self.calibrator.present = present
+        self.calibrator.present_gyro_bias_rad_s = gyro.offset
+
+    def _digest(self, said: Said) -> None:
+        match said:
+            case Identified(identity):
+                text = f"{identity.model} serial {identity.serial} firmware {identity.firmware}"
+                self._note("info", text)
+                self._journal_known = False
+                self._out.append(events.OpenJournal(identity.serial))
+            case ConfigurationRead(values):
+                self._flush()
+                self._in_force(values)
+                self._read = values
+                self._out.append(events.RegistersRead(self._host_s, values))
+                self._device_known()
+            case StreamChanged(text):
+                self._flush()
+                self.stream.forget()
+                self._note("info", text)
+            case Unanswered(text):
+                self._note("warning", f"{text}; listening only, nothing can be written")
+                self.epochs.begin(self._host_s, Compensation.unknown())
+                self._no_device()
+            case Completed(name, result, error):
+                self._flush()
+                self.stream.forget()
+                if error is None:
+                    more = self.writeback.on_procedure_finished(name, result, self._host_s)
+                else:
+                    more = self.writeback.on_procedure_failed(name, error, self._host_s)
+                self._todo.extend(more)
+            case Closed(error):
+                if error is not None:
+                    self._note("error", f"not everything was put back: {error}")
+                self._closed = True
+                self._out.append(events.Finished(self._stopping))
+
+    # -- what the write-back wants -----------------------------------------------------------------
+
+    def _drive(self) -> None:
+        """Let conversation and write-back answer each other until neither has more to say."""
+        while True:
+            said = self.conversation.take_said()
+            for one in said:
+                self._digest(one)
+            acted = False
+            while self._todo and not self._awaiting_journal:
+                self._act(self._todo.popleft())
+                acted = True
+            if self._pending is not None and self.conversation.idle:
+                run, self._pending = self._pending, None
+                self._take(
+                    self.conversation.run(run.name, run.make(), run.purpose, self._host_s, run.gate)
+                )
+                acted = True
+            if self._may_close():
+                self._closing = True
+                self._take(self.conversation.restore_and_close(self._host_s))
+                acted = True
+            if not said and not acted:
+                break
+        if output := self.conversation.session.take_output():
+            self._out.append(events.Send(output))
+
+    def _may_close(self) -> bool:
+        return (
+            bool(self._stopping)
+            and not self._closing
+            and not self._todo
+            and self._pending is None
+            and not self._awaiting_journal
+            and self.writeback.idle
+            and self.conversation.may_close
+        )
+
+    def _act(self, action: Action) -> None:
+        match action:
+            case Emit(event):
+                self._out.append(event)
+                if isinstance(event, events.StateChanged):
+                    self._on_state(event)
+            case JournalAppend(kind, facts):
+                self._awaiting_journal = True
+                self._out.append(events.JournalAppend(kind.value, dict(facts)))
+            case RunProcedure():
+                self._pending = action
+            case CancelProcedure(name):
+                if self._pending is not None and self._pending.name == name:
+                    self._pending = None
+                self._take(self.conversation.cancel(name, self._host_s))
+            case InForce(registers):
+                self._flush()
+                if registers is None:
+                    self.epochs.begin(self._host_s, None)
+                else:
+                    self._in_force(dict(registers))
+            case SetUpStream():
+                self._take(self.conversation.set_up_again(self._host_s))
+            case IdentifyAgain():
+                self._take(self.conversation.identify_again(self._host_s))
+
+    def _on_state(self, change: events.StateChanged) -> None:
+        self.decisions.add(self.at_s, change.new, reason=change.reason)
+        if change.new == State.TRIAL:
+            new = _affine(self.registers.get(_MAG))
+            transaction = self.writeback.history.open
+            old = new if transaction is None else _affine(transaction.old.get(_MAG, _IDENTITY))
+            self._trial = LiveTrial(new, old, _affine(self.registers.get(_GYRO)).offset)
+        elif change.old == State.TRIAL:
+            self._trial = None
+
+    # -- samples -----------------------------------------------------------------------------------
+
+    def _flush(self) -> None:
+        for block in self.stream.flush():
+            self._block(block)
+
+    def _block(self, block: SampleBlock) -> None:
+        self.at_s = float(block.time_s[-1])
+        calibrator = self.calibrator
+        new = calibrator.take(block)
+        estimate = calibrator.estimate
+        proposed = estimate.correction if estimate is not None and estimate.converged else None
+        self._out.append(events.SamplesSeen(block, calibrator.present, proposed))
+        self._todo.extend(self.writeback.on_samples(block))
+        if self._trial is not None:
+            metrics = self._trial.take(block)
+            self._todo.extend(self.writeback.on_trial_metrics(metrics, self._host_s))
+        if new and estimate is not None:
+            self._judge()
+
+    def _judge(self) -> None:
+        estimate = self.calibrator.estimate
+        assert estimate is not None
+        host_s = self._host_s or self.at_s
+        self._out.append(events.Estimated(self.at_s, host_s, estimate))
+        gates = self.calibrator.judged(self.at_s, self.health(), self.basis())
+        self._out.append(events.Judged(self.at_s, host_s, gates))
+        self.decisions.add(
+            self.at_s,
+            self.writeback.state.value,
+            gates,
+            hard_iron_gauss=estimate.hard_iron_gauss.tolist(),
+            gyro_bias_rad_s=estimate.gyro_bias_rad_s.tolist(),
+            converged=estimate.converged,
+        )
+        self._todo.extend(
+            self.writeback.on_verdict(
+                estimate,
+                gates,
+                self.at_s,
+                self._host_s,
+                gyro_is_raw=not self.stream.compensated_gyro,
+            )
+        )
+
+    def health(self) -> HealthFacts:
+        """Figures of the stream so far."""
+        counters = self.conversation.session.deframer.counters
+        facts = self.stream.facts
+        total = max(counters.valid + counters.rejected, 1)
+        return HealthFacts(
+            crc_error_rate=counters.rejected / total,
+            drop_rate=max(1.0 - facts.samples / max(facts.expected, 1.0), 0.0),
+            saturated=facts.unusable,
+            negative_dt=self.stream.restarts,
+            rate_hz=facts.rate_hz,
+        )
+
+    def basis(self) -> BasisFacts:
+        """What is known of where the samples come from."""
+        identity = self.conversation.identity
+        return BasisFacts(
+            registers_read=bool(self.registers),
+            changed=False,
+            hsi_applied=self.epochs.now.compensation is not None
+            and self.epochs.now.compensation.hsi is not None,
+            compensated_only=self.stream.compensated_mag,
+            firmware_known=identity is not None and identity.profile.writable,
+        )
+
+    def _note(self, level: str, text: str) -> None:
+        self._out.append(events.Noted(self.at_s, self._host_s, level, text))
+
+
+def _affine(values: Values | None) -> Affine:
+    return Affine.identity() if values is None else Affine.from_register(tuple(map(float, values)))

@@ -1,0 +1,86 @@
+"""Live figures of a trial: the written registers against the old ones, on the same raw samples.
+
+The figure is the spread (std / mean) of the corrected field over the newest minute: both
+corrections see the same motion and the same disturbances, so only their quality differs. At rest
+both show the sensor's noise and neither is worse. The heading's jump is the difference of the two
+tilt-compensated headings of the same samples, averaged over the first seconds.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from ahrsd.calibration import Affine
+from ahrsd.samples import Array, SampleBlock
+from ahrsd.writeback.trial import TrialMetrics
+
+_WINDOW_S = 60.0
+_JUMP_S = 3.0
+_SPACING_S = 0.1  # samples closer than this add nothing to a spread
+
+
+class LiveTrial:
+    """Collects what `TrialMetrics` needs from the moment the new registers are in force."""
+
+    def __init__(self, new: Affine, old: Affine, gyro_bias_rad_s: Array) -> None:
+        self._new, self._old, self._bias = new, old, gyro_bias_rad_s.copy()
+        self._rows: deque[tuple[float, Array]] = deque()
+        self._jumps: list[float] = []
+        self._start_s: float | None = None
+        self._last_s = 0.0
+        self._turned_rad = 0.0
+
+    def take(self, block: SampleBlock) -> TrialMetrics:
+        """Further samples; the figures so far."""
+        if self._start_s is None:
+            self._start_s = self._last_s = float(block.time_s[0])
+        down = _down(block.accel_b_m_s2)
+        rate = (block.gyro_b_rad_s - self._bias) @ down if np.isfinite(down).all() else np.zeros(1)
+        self._turned_rad += float(np.nansum(rate * np.nan_to_num(block.dt_s)))
+        for t, m in zip(block.time_s.tolist(), block.raw_b_gauss, strict=True):
+            if not self._rows or t - self._rows[-1][0] >= _SPACING_S:
+                self._rows.append((t, m))
+        now_s = float(block.time_s[-1])
+        while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
+            self._rows.popleft()
+        self._last_s = now_s
+        if now_s - self._start_s <= _JUMP_S and np.isfinite(down).all():
+            mean = block.raw_b_gauss.mean(axis=0)
+            self._jumps.append(
+                _heading(self._new.apply(mean), down) - _heading(self._old.apply(mean), down)
+            )
+        return self._metrics()
+
+    def _metrics(self) -> TrialMetrics:
+        field = np.array([m for _, m in self._rows])
+        new = np.linalg.norm(self._new.apply(field), axis=1)
+        old = np.linalg.norm(self._old.apply(field), axis=1)
+        spread = float(new.std() / new.mean()) if len(field) > 1 else float("nan")
+        jump = None
+        if self._jumps:
+            angles = np.array(self._jumps)
+            jump = float(np.degrees(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())))
+        start = self._last_s if self._start_s is None else self._start_s
+        return TrialMetrics(
+            duration_s=self._last_s - start,
+            turns=abs(self._turned_rad) / (2 * np.pi),
+            new_figure=spread,
+            old_figure=float(old.std() / old.mean()) if len(field) > 1 else float("nan"),
+            field_spread=spread,
+            heading_jump_deg=jump,
+        )
+
+
+def _down(accel: Array) -> Array:
+    mean = accel.mean(axis=0)
+    return np.asarray(-mean / max(float(np.linalg.norm(mean)), 1e-9))
+
+
+def _heading(field: Array, down: Array) -> float:
+    """Heading of the sensor's x axis against the field's level part, rad."""
+    level = field - down * (field @ down)
+    forward = np.array([1.0, 0.0, 0.0])
+    forward = forward - down * (forward @ down)
+    return float(np.arctan2(down @ np.cross(level, forward), level @ forward))

@@ -1,0 +1,123 @@
+"""calibration.json and the summary of a run or replay (docs: README, "File formats")."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.writeback.composition import UnwritableError, compose
+from drivers.vn100.registers import Values
+
+MAG, GYRO = 23, 84
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingErrors:
+    """Heading errors in deg on data that the estimate has not seen; None where nobody can say."""
+
+    before_rms: float | None = None
+    after_rms: float | None = None
+
+
+def calibration_json(
+    recording: str,
+    estimate: Estimate | None,
+    registers: Mapping[int, Values],
+    *,
+    method: str = "magyc",
+    samples: int = 0,
+    gyro_is_raw: bool = True,
+    heading: HeadingErrors | None = None,
+    warnings: Sequence[str] = (),
+) -> dict[str, object]:
+    """The contract's `ahrsd.calibration/1`; `registers` are those in force, empty for unknown."""
+    base: dict[str, object] = {
+        "schema": "ahrsd.calibration/1",
+        "method": method,
+        "recording": recording,
+        "samples": samples,
+    }
+    if estimate is None:
+        return base | _nothing(warnings)
+    written, refusal = _registers(estimate, registers, gyro_is_raw)
+    said = [*warnings, *estimate.warnings, *refusal]
+    if estimate.observability.unobservable:
+        blind = "; ".join(estimate.observability.unobservable)
+        said.append(f"this motion does not determine: {blind}")
+    found = heading or HeadingErrors()
+    sigma = estimate.sigma
+    return base | {
+        "samples": estimate.samples,
+        "duration_s": _number(estimate.duration_s),
+        "converged": estimate.converged,
+        "correction_matrix": estimate.correction.matrix.tolist(),
+        "soft_iron": estimate.soft_iron.tolist(),
+        "hard_iron_gauss": estimate.hard_iron_gauss.tolist(),
+        "gyro_bias_rad_s": estimate.gyro_bias_rad_s.tolist(),
+        "field_gauss": _number(estimate.field_gauss),
+        "field_known": estimate.field_known,
+        "standard_deviation": {
+            "soft_iron": sigma[:6].tolist(),
+            "hard_iron_gauss": sigma[6:9].tolist(),
+            "gyro_bias_rad_s": sigma[9:].tolist(),
+        },
+        "noise": {
+            "mag_gauss": _number(estimate.noise_mag_gauss),
+            "gyro_rad_s": _number(estimate.noise_gyro_rad_s),
+            "misfit": _number(estimate.misfit),
+        },
+        "heading_error_deg": {
+            "expected_worst": _number(estimate.heading_sigma_deg),
+            "before_rms": found.before_rms,
+            "after_rms": found.after_rms,
+        },
+        "observability": {
+            "score": _number(estimate.observability.score),
+            "unobservable": list(estimate.observability.unobservable),
+            "prior_ratio": estimate.observability.prior_ratio.tolist(),
+        },
+        "registers": written,
+        "warnings": said,
+    }
+
+
+def _registers(
+    estimate: Estimate, registers: Mapping[int, Values], gyro_is_raw: bool
+) -> tuple[dict[str, list[object]], list[str]]:
+    """What would be written, by register number; nothing and the reason where nothing may be."""
+    if not estimate.converged:
+        return {}, []
+    identity = Affine.identity().to_register()
+    present = {MAG: identity, GYRO: identity, **registers}
+    try:
+        proposal = compose(estimate, present, gyro_is_raw=gyro_is_raw)
+    except UnwritableError as error:
+        return {}, [str(error)]
+    return {str(number): list(values) for number, values in proposal.new.items()}, []
+
+
+def _nothing(warnings: Sequence[str]) -> dict[str, object]:
+    keys = (
+        "duration_s",
+        "correction_matrix",
+        "soft_iron",
+        "hard_iron_gauss",
+        "gyro_bias_rad_s",
+        "field_gauss",
+    )
+    return {
+        **dict.fromkeys(keys),
+        "converged": False,
+        "field_known": False,
+        "standard_deviation": {},
+        "heading_error_deg": {"expected_worst": None, "before_rms": None, "after_rms": None},
+        "observability": {},
+        "registers": {},
+        "warnings": [*warnings, "too few samples for an estimate"],
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
