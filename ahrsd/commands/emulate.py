@@ -44,6 +44,7 @@ def _device(setup: Setup) -> Emulator:
 @click.command()
 @click.option("--link", type=click.Path(path_type=Path), help="Symbolic link to the pty.")
 @click.option("--scenario", default="rov", show_default=True, help="What it is and how it moves.")
+@click.option("--motion", default="", help="Another motion than the scenario's.")
 @click.option("--seed", default=0, show_default=True, help="Chooses truth, motion and noise.")
 @click.option("--fault", "faults", multiple=True, help="name[=parameter][@start[+duration]].")
 @click.option("--firmware", default="", help="2, 3 or a version such as 3.0.0.0.")
@@ -66,6 +67,7 @@ def _device(setup: Setup) -> Emulator:
 def emulate(  # noqa: PLR0917 - click passes them by name
     link: Path | None,
     scenario: str,
+    motion: str,
     seed: int,
     faults: tuple[str, ...],
     firmware: str,
@@ -84,7 +86,7 @@ def emulate(  # noqa: PLR0917 - click passes them by name
     from drivers.vn100.emulator_pty import PtyEmulator
     from drivers.vn100.emulator_scenarios import Setup
 
-    setup = Setup(scenario, seed, faults, firmware, output, rate_hz, baud, int(port))
+    setup = Setup(scenario, seed, faults, firmware, output, rate_hz, baud, int(port), motion)
     try:
         server = PtyEmulator(
             _device(setup),

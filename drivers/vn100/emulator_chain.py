@@ -38,6 +38,7 @@ from drivers.vn100.emulator_physics import (
     Block,
 )
 
+LARGEST = 1e9  # whatever a host writes into a matrix: every value still fits an f32
 BIAS_S = 30.0
 HEADING_S = 3.0
 BLOCK_S = BLOCK_TICKS / TICK_HZ
@@ -82,7 +83,8 @@ class FilterState:
 
 def _through(vectors: Array, stage: tuple[Array, Array], rotation: Array) -> Array:
     matrix, offset = stage
-    return np.asarray((vectors - offset) @ (rotation @ matrix).T)
+    passed = (vectors - offset) @ (rotation @ matrix).T
+    return np.asarray(np.clip(passed, -LARGEST, LARGEST))
 
 
 class Outputs:

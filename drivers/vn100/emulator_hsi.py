@@ -55,6 +55,8 @@ class OnBoardHsi:
 
     def _moved(self, sample: Array) -> bool:
         """Whether this is a new direction: at rest there is nothing to learn but noise."""
+        if not sample.any():  # a matrix of zeros in register 23
+            return False
         if self._newest is not None and np.linalg.norm(sample - self._newest) < _STEP_GAUSS:
             return False
         self._newest = sample

@@ -75,6 +75,12 @@ class Truth:
     clock_ppm: float = 15.0
     clock_jitter_s: float = 2e-6
 
+    def __post_init__(self) -> None:
+        for name in ("soft_iron", "hard_iron_gauss", "gyro_bias_rad_s", "field_n_gauss"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
     def heading_error_deg(self, matrix: Array, offset: Array, headings: int = 72) -> float:
         """Worst heading error over all headings, level, after the correction C (m - B).
 

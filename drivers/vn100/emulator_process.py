@@ -42,20 +42,29 @@ class EmulatorProcess:
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=_serve,
-            args=(setup, link, speed, lossless, check_baud, theirs),
+            args=(setup, theirs),
+            kwargs={"link": link, "speed": speed, "lossless": lossless, "check_baud": check_baud},
             name="vn100-emulator",
             daemon=True,
         )
         self._process.start()
         theirs.close()
-        if not self._pipe.poll(START_S):
-            self.stop()
-            raise OSError(f"the emulator process did not start within {START_S:g} s")
-        answer = self._pipe.recv()
+        self.path = self._first_word()
+
+    def _first_word(self) -> str:
+        """The path that the process reports; raises what it reports instead."""
+        try:
+            answer = (
+                self._pipe.recv()
+                if self._pipe.poll(START_S)
+                else OSError(f"the emulator process did not start within {START_S:g} s")
+            )
+        except EOFError:
+            answer = OSError("the emulator process ended before it had started")
         if isinstance(answer, Exception):
             self.stop()
             raise answer
-        self.path = str(answer)
+        return str(answer)
 
     def stop(self) -> None:
         """Close the pty and end the process. May be called twice."""
@@ -76,11 +85,12 @@ class EmulatorProcess:
 
 def _serve(
     setup: Setup,
+    pipe: Connection,
+    *,
     link: Path | None,
     speed: float,
     lossless: bool,
     check_baud: bool,
-    pipe: Connection,
 ) -> None:
     """The other process: serve until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to both; the pipe decides

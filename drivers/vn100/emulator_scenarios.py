@@ -65,6 +65,7 @@ class Setup:
 
     seed:     chooses truth, motion, noise and the dice of the faults
     faults:   schedules beyond the scenario's own
+    motion:   a name of `MOTIONS`, or names with seconds; "" for the scenario's
     firmware: "2", "3" or a version; "" for the scenario's
     output:   "ascii" (VNYMR), "imu" (VNIMU) or "binary" (calibration set of vn100-protocol 9)
     rate_hz:  of that output; for binary a divisor of 800
@@ -79,6 +80,7 @@ class Setup:
     rate_hz: int = 40
     baud: int = 115200
     port: int = 1
+    motion: str | tuple[tuple[str, float], ...] = ""
 
 
 def build(setup: Setup) -> Emulator:
@@ -93,7 +95,7 @@ def build(setup: Setup) -> Emulator:
     firmware = FIRMWARES.get(setup.firmware, setup.firmware) or scenario.firmware
     device = Emulator(
         truth,
-        make_motion(scenario.motion, setup.seed),
+        make_motion(setup.motion or scenario.motion, setup.seed),
         firmware,
         setup.seed,
         faults=(*scenario.faults, *setup.faults),

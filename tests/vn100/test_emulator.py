@@ -1,7 +1,7 @@
 """The emulated device against bytes of the manual and of recordings.
 
-Nothing of the project's codec is used here: sums, lines and packets are checked by the few
-functions below, so that a mistake which codec and emulator share does not pass.
+Sums, lines and packets are checked by the few functions below and not by the project's codec, so
+that a mistake which codec and emulator share does not pass; two tests compare the two.
 """
 
 import json
@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.vn100.decode import Measurement, decode
+from drivers.vn100.deframer import Deframer
 from drivers.vn100.emulator import BOOT_S, Emulator
 from drivers.vn100.emulator_motion import make_motion
 from drivers.vn100.emulator_physics import Truth, draw_truth
@@ -517,6 +519,44 @@ def test_output_routed_to_the_other_port_is_silence():
     assert len(packets(other.wait(1.0), b"\xfa\x01\x01\x00", 14)) == 10
 
 
+ALL_FIELDS = [  # group byte, word, and the bytes of its fields by the compact table of 1.3
+    (0x01, 0x3F3D, [8, 8, 12, 16, 12, 12, 24, 20, 28, 2, 4]),
+    (0x02, 0x0191, [8, 8, 4, 4]),
+    (0x04, 0x1FFF, [2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12, 2, 40]),
+    (0x10, 0x11FF, [2, 12, 16, 36, 12, 12, 12, 12, 12, 12]),
+]
+
+
+@pytest.mark.parametrize(("group", "word", "sizes"), ALL_FIELDS)
+def test_every_field_of_a_vn100_can_be_sent_and_is_finite(group, word, sizes):
+    length = 4 + sum(sizes) + 2
+    wire = binary_device((1, 8, group, word)).advance(1.0)
+    header = bytes([0xFA, group]) + struct.pack("<H", word)
+    found = packets(wire, header, length)
+    assert len(found) >= 99
+    decoded = decode(Deframer().feed(found[50])[0])
+    assert isinstance(decoded, Measurement)
+    assert np.isfinite(decoded.values).all()
+
+
+def test_compensated_set_agrees_with_the_codec_and_with_the_truth():
+    """syn_time_imu_comp_uncomp: FA 06 8100 0E07; HSI is not applied, so Mag = UncompMag."""
+    bias = np.array([0.01, -0.02, 0.03])
+    truth = Truth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)
+    wire = binary_device((1, 16, 6, 0x0081, 0x070E), "static", truth=truth).advance(200.0)
+    last = packets(wire, bytes.fromhex("FA0681000E07"), 92)[-1]
+    raw = struct.unpack("<QI18f", last[6:-2])
+    measured = decode(Deframer().feed(last)[0])
+    assert isinstance(measured, Measurement)
+    assert measured.values[0] == pytest.approx(raw[0] / 1e9)
+    assert measured.values[1:] == raw[1:]
+    named = dict(zip([c.name for c in measured.layout.columns], measured.values, strict=True))
+    for axis, index in zip("xyz", range(3), strict=True):
+        assert named[f"uncomp_mag_{axis}_gauss"] == named[f"mag_{axis}_gauss"]
+        assert named[f"uncomp_gyro_{axis}_rad_s"] == pytest.approx(bias[index], abs=1e-7)
+        assert named[f"gyro_{axis}_rad_s"] == pytest.approx(0, abs=1e-4)
+
+
 def test_vnbom_polls_one_packet(host):
     host.ask("VNWRG,75,0,0,01,0009")
     assert host.wait(1.0) == b""
@@ -524,6 +564,36 @@ def test_vnbom_polls_one_packet(host):
     nanoseconds, yaw, pitch, roll = struct.unpack("<Q3f", packet[4:-2])
     assert nanoseconds == pytest.approx((host.now_s - 0.1) * 1e9, abs=10e6)
     assert abs(pitch) < 4 and abs(roll) < 4 and abs(yaw) <= 180
+
+
+def test_no_bytes_and_no_values_upset_it():
+    """Noise, mutilated commands, and commands with any values: every answer is a valid line."""
+    draw = np.random.default_rng(1)
+    host = Host(quiet(presets={5: (921600,)}, motion="tumble"))
+    numbers = ["0", "1", "-1", "3", "255", "65535", "1000000", "3.4e38", "-0.5", "0.25", "", "nan"]
+    numbers += ["340000000000000000000000000000000000000", "FFFF", "08", "083F", "+", "1.5.2", " 1"]
+    words = ["VNRRG", "VNWRG", "VNWRG", "VNWRG", "VNASY", "VNKMD", "VNBOM", "VNSGB", "VNXYZ", "VN"]
+    registers = [*map(str, [*range(90), 115, 116, 206, 227, 239]), "x", "-1", "1000"]
+    for _ in range(1500):
+        count = int(draw.choice([0, 1, 3, 4, 5, 9, 12, 13]))
+        body = ",".join(
+            [str(draw.choice(words)), str(draw.choice(registers))]
+            + [str(draw.choice(numbers)) for _ in range(count)]
+        )
+        host.send(command(body) + draw.bytes(int(draw.integers(0, 20))), 0.01)
+    host.send(b"\n" + command("VNRFS"), 1.0)
+    assert host.device.counters["commands"] > 1000
+    assert b"$VNRRG,07,40*5C\r\n" in host.send(b"\n" + command("VNRRG,07"))
+
+
+def test_known_magnetic_disturbance_stops_the_on_board_compensation():
+    host = Host(quiet(firmware="2.1.0.0", truth=draw_truth(3), motion="tumble"))
+    host.ask("VNKMD,1")
+    host.wait(30.0)
+    assert host.ask("VNRRG,47") == "VNRRG,47,1,0,0,0,1,0,0,0,1,0,0,0"
+    host.ask("VNKMD,0")
+    host.wait(30.0)
+    assert host.ask("VNRRG,47") != "VNRRG,47,1,0,0,0,1,0,0,0,1,0,0,0"
 
 
 FIT = [  # vn100-protocol 1.5: six observations on firmware 3.1.0.0
