@@ -6,26 +6,21 @@ Lines are the manual's or recorded ones, except in the property test, which comp
 from __future__ import annotations
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from drivers.vn100.commands import (
     QUIET,
-    RESUME,
     Cancelled,
     LinkGone,
     NoReply,
     NotPermitted,
     Pause,
     Read,
-    Word,
     Write,
-    reply_time_s,
 )
 from drivers.vn100.decode import Measurement, Reply
 from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.procedures import VerifyFailed, quiet, read, save_settings, write_verified
-from drivers.vn100.session import DeviceFault, Failed, Finished, Session, Stray
+from drivers.vn100.procedures import quiet, read, save_settings, write_verified
+from drivers.vn100.session import DeviceFault, Finished, Session, Stray
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 OTHER = (1.02, 0.01, 0.0, 0.01, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 0.1)
@@ -302,27 +297,6 @@ def test_observing_never_writes_even_to_clean_up():
     assert s.take_output() == b""
 
 
-@pytest.mark.parametrize(
-    ("word", "arguments"),
-    [("VNFWU", ()), ("VNSBL", ()), ("VNBLD", ()), ("VNMCU", ()), ("VNDBS", ()), ("VNCMD", ()),
-     ("VNBOM", (1,)), ("VNASY", (2,)), ("VNASY", ()), ("VNWNV", (1,)), ("VNRRG", (23,))],
-)  # fmt: skip
-def test_dangerous_words_cannot_be_constructed(word, arguments):
-    with pytest.raises(ValueError, match="never sent"):
-        Word(word, arguments)
-
-
-def test_impossible_reads_and_writes_cannot_be_constructed():
-    with pytest.raises(ValueError, match="no register 99"):
-        Read(99)
-    with pytest.raises(ValueError, match="no port"):
-        Read(23, 1)
-    with pytest.raises(ValueError, match="read only"):
-        Write(47, IDENTITY)
-    with pytest.raises(ValueError, match="finite"):
-        Write(23, (float("nan"), *IDENTITY[1:]))
-
-
 def test_output_is_paused_and_resumed_around_a_sequence():
     s = session()
     s.start(quiet(read(23)), 0.0)
@@ -418,139 +392,3 @@ def test_half_a_message_is_given_up_after_a_silence():
     assert s.deadline_s is None
     (event,) = s.receive(YMR, 1.0)
     assert isinstance(event, Measurement)
-
-
-def test_a_word_is_answered_by_its_own_argument_only():
-    s = session()
-    s.start(one(RESUME), 0.0)
-    assert isinstance(s.receive(ASY_0, 0.1)[0], Stray)
-    assert isinstance(s.receive(ASY_1, 0.1)[0], Finished)
-
-
-def test_a_port_is_asked_for_and_must_be_in_the_reply():
-    s = session()
-    s.start(read(6, 1), 0.0)
-    assert s.take_output() == checksum("VNRRG,06,1")
-    assert isinstance(s.receive(checksum("VNRRG,06,14"), 0.1)[0], Stray)
-    assert isinstance(s.receive(checksum("VNRRG,06,14,2"), 0.1)[0], Stray)
-    assert s.receive(b"$VNRRG,06,1,1*0865\r\n", 0.2) == [Finished((1, 1))]
-
-
-def test_a_slow_line_gets_more_patience():
-    assert reply_time_s(921600) < 0.3 < reply_time_s(115200) < 0.5 < 2.0 < reply_time_s(9600)
-
-
-class Wire:
-    """A device on a line that keeps its order: it stores, loses, is late, and serves a second
-    program. What it holds in register 23 is the truth of the property."""
-
-    def __init__(self, faults):
-        self.register = dict.fromkeys((23, 25), ["9"] * 12)
-        self.faults = faults
-        self.queue = []  # (due_s, bytes), in order
-        self.last_due_s = 0.0
-
-    def command(self, line, now_s):
-        fault = next(self.faults, "none")
-        if fault == "lost on the way there":
-            return
-        if fault == "damaged on the way there":
-            self.say(checksum("VNERR,03"), now_s, "none")
-            return
-        word, number, *values = line[1 : line.index("*")].split(",")
-        reply = f"{word},{number}"
-        if word == "VNWRG" and fault != "not kept":
-            self.register[int(number)] = [f"{float(v):G}" for v in values]
-        if word in ("VNRRG", "VNWRG"):
-            stored = {1: ["VN-100"], 2: ["1"], 3: ["7"], 4: ["3.1.0.0"], **self.register}
-            values = values if fault == "not kept" and word == "VNWRG" else stored[int(number)]
-            reply += "," + ",".join(values)
-        self.say(checksum(reply), now_s, fault)
-
-    def say(self, data, now_s, fault):
-        if fault == "reply lost":
-            return
-        delay_s = {"late": 0.5, "very late": 1.1, "later than all tries": 1.7}.get(fault, 0.004)
-        self.last_due_s = max(self.last_due_s, now_s + delay_s)
-        self.queue.append((self.last_due_s, data))
-
-    def foreign(self, kind, now_s):
-        """Another program on the same line, or noise that happens to be a sentence."""
-        if kind == "read":
-            self.say(checksum("VNRRG,23," + ",".join(self.register[23])), now_s, "none")
-        elif kind == "write 25":
-            self.register[25] = ["1"] * 12
-            self.say(checksum("VNWRG,25," + ",".join(self.register[25])), now_s, "none")
-        elif kind == "error":
-            self.say(checksum("VNERR,07"), now_s, "none")
-        elif kind == "measurement":
-            self.say(YMR, now_s, "none")
-
-
-FAULTS = st.sampled_from(
-    ["none"] * 4
-    + ["lost on the way there", "damaged on the way there", "not kept", "reply lost"]
-    + ["late", "very late", "later than all tries"]
-)
-FOREIGN = st.sampled_from(["nothing"] * 3 + ["read", "write 25", "error", "measurement"])
-VALUES = st.sampled_from([IDENTITY, OTHER])
-
-
-def converse(s, wire, procedure, now_s, strangers, cut):
-    """Run `procedure` to its end on `wire`; its last event and the time then."""
-    events = s.start(procedure, now_s)
-    while s.busy:
-        for line in s.take_output().decode().splitlines():
-            wire.command(line, now_s)
-        wire.foreign(next(strangers, "nothing"), now_s)
-        now_s = max(now_s, min([due_s for due_s, _ in wire.queue[:1]] + [s.deadline_s]))
-        if wire.queue and wire.queue[0][0] <= now_s:
-            data = wire.queue.pop(0)[1]
-            events += s.receive(data[:cut], now_s)
-            events += s.receive(data[cut:], now_s)
-        else:
-            events += s.tick(now_s)
-        assert now_s < 500.0
-    return next(event for event in events if isinstance(event, Finished | Failed)), now_s
-
-
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    faults=st.lists(FAULTS, max_size=40),
-    foreign=st.lists(FOREIGN, max_size=40),
-    writes=st.lists(VALUES, min_size=1, max_size=4),
-    cut=st.integers(1, 60),
-)
-def test_verified_means_that_the_device_holds_the_values(faults, foreign, writes, cut):
-    wire, s, now_s = Wire(iter(faults)), session(), 0.0
-    strangers, verified = iter(foreign), 0
-    for values in writes:
-        procedure = quiet(write_verified(23, values))
-        end, now_s = converse(s, wire, procedure, now_s, strangers, cut)
-        if isinstance(end, Finished):
-            verified += 1
-            assert [float(v) for v in wire.register[23]] == list(values)
-        else:
-            assert isinstance(end.error, NoReply | DeviceRefused | VerifyFailed)
-    if not faults and not foreign:
-        assert verified == len(writes)
-
-
-@settings(max_examples=400, deadline=None)
-@given(
-    faults=st.lists(FAULTS, max_size=20),
-    foreign=st.lists(FOREIGN.filter(lambda kind: kind != "read"), max_size=20),
-)
-def test_a_read_never_returns_what_was_there_before_it_was_asked(faults, foreign):
-    wire, s, now_s = Wire(iter(faults)), session(), 0.0
-    strangers, answers = iter(foreign), 0
-    for number in range(8):
-        wire.register[23] = [str(number)] * 12  # another program's write, between our reads
-        end, now_s = converse(s, wire, read(23), now_s, strangers, 9)
-        if isinstance(end, Finished):
-            answers += 1
-            assert end.result == (float(number),) * 12
-        else:
-            assert isinstance(end.error, NoReply | DeviceRefused)
-    if not faults and not foreign:
-        assert answers == 8
