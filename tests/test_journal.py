@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import zlib
+from pathlib import Path
 
 import pytest
 
@@ -110,7 +111,7 @@ def test_both_file_and_folder_are_synced_before_append_returns(tmp_path, monkeyp
     real = os.fsync
 
     def fsync(descriptor: int) -> None:
-        synced.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+        synced.append(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
         real(descriptor)
 
     monkeypatch.setattr(module.os, "fsync", fsync)
