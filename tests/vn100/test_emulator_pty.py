@@ -56,7 +56,7 @@ def test_commands_are_answered_and_output_streams():
         assert host.read_until(b"\n").startswith(b"$VNWRG,75,1,8,01,0001*")
         began = time.monotonic()
         times = stamps(host.read(14 * 50))
-        assert 0.4 < time.monotonic() - began < 2.0
+        assert 0.4 < time.monotonic() - began < 5.0
         assert all(abs(b - a - 10e6) < 30e3 for a, b in pairwise(times))
 
 
