@@ -108,7 +108,7 @@ class Recorder:
         self._points(names.CORRECTED_POINTS, rows, first_sample, known, rows.corrected)
 
     def event(self, event: Event, first_sample: int) -> None:
-        """Write one event other than samples; `Send` carries nothing for a viewer."""
+        """Write one event other than samples; what is meant for the shell is not shown."""
         match event:
             case Estimated():
                 self._at(event.at_s, event.host_s, first_sample)

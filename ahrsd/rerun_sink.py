@@ -36,7 +36,15 @@ from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
-from ahrsd.events import Estimated, Event, Judged, SamplesSeen, Send, StateChanged
+from ahrsd.events import (
+    Estimated,
+    Event,
+    Judged,
+    Noted,
+    RegisterWritten,
+    SamplesSeen,
+    StateChanged,
+)
 
 Item = tuple[int, Event]  # number of samples seen before the event, and the event
 
@@ -49,6 +57,7 @@ BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 STEADY_S = 60.0  # a process that lived this long is forgiven its predecessors
 POLL_S = 0.2
 FINISH_S = 1.5  # of close()'s time, kept for the process to finish its file
+SHOWN = (SamplesSeen, Estimated, Judged, StateChanged, RegisterWritten, Noted)
 REMEMBERED = (StateChanged, Estimated, Judged)  # told again to a new process and a new file part
 
 
@@ -160,7 +169,7 @@ class RerunSink:
 
     def push(self, event: Event, host_s: float) -> None:
         """Hand one event over; `host_s` is now on the host's monotonic clock."""
-        if isinstance(event, Send) or self._deadline_s is not None:
+        if not isinstance(event, SHOWN) or self._deadline_s is not None:
             return
         with self._wake:
             item = (self._samples, event)
