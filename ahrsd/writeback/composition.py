@@ -128,6 +128,12 @@ def heading_change_deg(present: Affine, proposed: Affine, estimate: Estimate) ->
     return float(np.degrees(np.max(np.abs(difference))))
 
 
+def apart_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
+    """How far two proposals are apart, as a change of heading."""
+    first, second = (Affine.from_register(_floats(p.new[MAG])) for p in (one, other))
+    return heading_change_deg(first, second, estimate)
+
+
 def _scale(written: Affine, estimate: Estimate) -> float:
     """How much larger the written correction makes the field than A^-1 does."""
     return float(np.cbrt(np.linalg.det(written.matrix) * np.linalg.det(estimate.soft_iron)))

@@ -90,6 +90,9 @@ class History:
             changes["flashes"] = self.flashes + 1
         if kind is Kind.PROVEN:
             changes["rollbacks"] = 0
+        if kind is Kind.PROVEN and self.last is Kind.FLASH_SENT:  # it was not sent after all
+            changes["flashes_wall_s"] = self.flashes_wall_s[:-1]
+            changes["flashes"] = self.flashes - 1
         if kind is Kind.ROLLBACK and facts.get("counts"):
             changes["rollbacks"] = self.rollbacks + 1
             changes["last_rollback_wall_s"] = wall_s

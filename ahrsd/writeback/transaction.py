@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ahrsd.writeback.composition import register_lines
-from drivers.vn100.commands import DeviceRefused, NoReply, NotPermitted, Procedure
+from drivers.vn100.commands import NoReply, NotPermitted, Procedure
+from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.firmware import Profile, profile_of
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,

@@ -1,0 +1,395 @@
+"""What happens on each way of the table: the state, and what is done on entering one.
+
+`states.TABLE` says where a signal leads; this module says what is asked of the core on arrival.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from ahrsd.calibration import Estimate
+from ahrsd.writeback.actions import IdentifyAgain, SetUpStream
+from ahrsd.writeback.composition import (
+    Proposal,
+    UnwritableError,
+    apart_deg,
+    compose,
+    register_lines,
+)
+from ahrsd.writeback.desk import Desk
+from ahrsd.writeback.permissions import Mode, Purpose
+from ahrsd.writeback.policy import WriteBackPolicy, worth_writing
+from ahrsd.writeback.reconcile import TABLE as RECONCILE
+from ahrsd.writeback.reconcile import Kind, found
+from ahrsd.writeback.safeguards import Safeguards
+from ahrsd.writeback.states import ON_TIMEOUT, TABLE, Signal, State
+from ahrsd.writeback.transaction import Outcome, Transaction, check, roll_back, save, stage
+from ahrsd.writeback.trial import Trial
+from drivers.vn100.procedures import Identity
+from drivers.vn100.registers import Values, same
+
+RETRY_SAVE_S = 600.0  # after a save that was not sent
+COUNTED = frozenset({"trial", "interlock", "operator"})  # rollbacks that speak against the values
+
+
+class Flow:
+    """The state machine behind `machine.WriteBack`."""
+
+    def __init__(self, policy: WriteBackPolicy) -> None:
+        self.policy = policy
+        self.safe = Safeguards(policy)
+        self.desk = Desk(self.safe.allow)
+        self.state = State.RECONCILING
+        self.deadline_s: float | None = None
+        self.identity: Identity | None = None
+        self.registers: dict[int, Values] = {}
+        self.session_keys: frozenset[int] = frozenset()
+        self.proposal: Proposal | None = None
+        self.approver = ""
+        self.trial = Trial(policy.trial, 0.0)
+        self._cause = "device"
+        self._save_from_s = float("-inf")
+        self._on_entry: dict[State, Callable[[str], None]] = {
+            State.RECONCILING: self._enter_reconciling,
+            State.OBSERVING: self._enter_rest,
+            State.CANDIDATE: self._enter_candidate,
+            State.QUALIFIED: self._enter_qualified,
+            State.PREPARING: self._enter_preparing,
+            State.CHECKING: self._enter_checking,
+            State.STAGING: self._enter_staging,
+            State.STAGED: self._enter_staged,
+            State.TRIAL: self._enter_trial,
+            State.PROVEN: self._enter_proven,
+            State.SAVE_PREPARING: lambda _: self.desk.record(Kind.FLASH_SENT),
+            State.SAVING: self._enter_saving,
+            State.COMMITTED: self._enter_rest,
+            State.CONFIRMED: self._enter_rest,
+            State.ROLLING_BACK: self._enter_rolling_back,
+            State.ROLLED_BACK: self._enter_rest,
+            State.FAULT: self._enter_fault,
+        }
+
+    # -- moving ------------------------------------------------------------------------------------
+
+    def signal(self, signal: Signal, reason: str) -> None:
+        """Something happened: move where the table says; what it does not name is ignored."""
+        target = TABLE[self.state].get(signal)
+        if target is None:
+            self.desk.note("debug", f"{signal.value} is ignored in {self.state.value}: {reason}")
+        elif target is not self.state:
+            self.enter(target, reason)
+
+    def enter(self, state: State, reason: str) -> None:
+        """Arrive in a state. A conversation of the old one ends."""
+        self.desk.stop_running()
+        old, self.state = self.state, state
+        wait = ON_TIMEOUT.get(state)
+        self.deadline_s = None if wait is None else self.desk.host_s + wait[0]
+        self.desk.changed(old.value, state.value, reason)
+        if state in self._on_entry:
+            self._on_entry[state](reason)
+
+    def watch(self) -> None:
+        """Take the step that waits for nothing but a condition, if it holds now."""
+        now = (self.desk.history, self.desk.host_s, self.desk.wall_s)
+        if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
+            self.signal(Signal.APPROVED, f"approved: {self.approver}")
+        elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
+            if not self.safe.save_holds(*now):
+                self.signal(Signal.SAVE_DUE, "proven, safe and still")
+        elif self.watches_interlock and (word := self.safe.interlock_holds(self.desk.host_s)):
+            self.roll_back("interlock", word)
+
+    @property
+    def watches_interlock(self) -> bool:
+        """Whether the vehicle's word is needed all the time now."""
+        return self.policy.trial.interlock and self.state in (State.STAGED, State.TRIAL)
+
+    def on_timeout(self) -> None:
+        """What was waited for did not come."""
+        if self.state is State.RECONCILING:  # there is nothing to do but to wait on
+            self.deadline_s = None
+            if self.desk.history.open is not None:
+                self.desk.note("error", "a transaction is open and the device does not come back")
+            return
+        self._cause = "device"
+        if self.state is State.STAGING:
+            self.desk.record(Kind.RAM_FAILED, reason="no end")
+        self.signal(Signal.TIMEOUT, "nothing came in time")
+
+    def roll_back(self, cause: str, reason: str) -> None:
+        """Back to the old values, where the state allows it at all; out of FAULT only by hand."""
+        by_hand = cause == "operator"
+        if Signal.ROLL_BACK in TABLE[self.state] and (by_hand or self.state is not State.FAULT):
+            self._cause = cause
+            self.signal(Signal.TRIAL_FAILED if cause == "trial" else Signal.ROLL_BACK, reason)
+        elif by_hand:
+            self.desk.note(
+                "warning",
+                f"nothing to roll back in {self.state.value}; for values that are in flash use "
+                "the registers rollback command",
+            )
+
+    # -- the candidate -----------------------------------------------------------------------------
+
+    def consider(self, estimate: Estimate, gyro_is_raw: bool) -> None:
+        """A new estimate: is there something to write, and may it be written?
+
+        What qualified is kept as it was, so that a person approves what will be written, until the
+        estimate has moved away from it by the smallest change that is worth a write.
+        """
+        fresh = self._compose(estimate, gyro_is_raw)
+        if fresh is None or not worth_writing(self.policy, self.desk.history, fresh):
+            self.signal_if(Signal.NOT_WORTH_WRITING, "the registers are right as they are")
+            return
+        self.signal_if(
+            Signal.WORTH_WRITING, f"heading changes by {fresh.heading_change_deg:.1f} deg"
+        )
+        if red := [gate.gate for gate in self.safe.gates if not gate.ok]:
+            self.signal_if(Signal.GATES_FAILED, f"gates not met: {', '.join(red)}")
+        elif self.safe.gates:
+            kept = self.proposal
+            if kept is not None and apart_deg(kept, fresh, estimate) > self.policy.min_change_deg:
+                self.signal_if(Signal.GATES_FAILED, "the estimate moved on")
+            if self.state is State.CANDIDATE:
+                self.proposal = fresh
+            self.signal_if(Signal.GATES_PASSED, "all gates are met")
+
+    def signal_if(self, signal: Signal, reason: str) -> None:
+        """A signal that is nothing to speak of where the state has no use for it."""
+        if signal in TABLE[self.state]:
+            self.signal(signal, reason)
+
+    def approve(self, text: str) -> None:
+        """An operator's yes to the candidate with this id; holds as long as it stays qualified."""
+        if self.state is not State.QUALIFIED or self.proposal is None:
+            self.desk.note("warning", f"no candidate to approve in {self.state.value}")
+        elif text.strip().lower() != self.proposal.id:
+            self.desk.note("warning", f"{text!r} is not the candidate, it is {self.proposal.id}")
+        else:
+            self.approver = "operator"
+            self.desk.note("info", f"{self.proposal.id} approved")
+
+    def _compose(self, estimate: Estimate, gyro_is_raw: bool) -> Proposal | None:
+        if not estimate.converged:
+            return None
+        try:
+            return compose(estimate, self.registers, gyro_is_raw=gyro_is_raw)
+        except UnwritableError as error:
+            self.desk.note("warning", f"this estimate cannot be written: {error}")
+            return None
+
+    # -- locks -------------------------------------------------------------------------------------
+
+    def lock(self, reason: str) -> None:
+        """No writes from now on; what is only in RAM is undone first."""
+        self.desk.record(Kind.LOCKED, reason=reason)
+        if Signal.ROLL_BACK in TABLE[self.state] and self.state is not State.FAULT:
+            self.roll_back("operator", reason)
+        self.signal_if(Signal.LOCK, reason)
+
+    def unlock(self, reason: str) -> None:
+        """A person looked and found it right. In FAULT: look again."""
+        self.desk.record(Kind.UNLOCKED, reason=reason)
+        if self.state is State.FAULT:
+            self.desk.ask(IdentifyAgain())
+        self.signal_if(Signal.UNLOCK, reason)
+
+    # -- arriving ----------------------------------------------------------------------------------
+
+    def _enter_reconciling(self, reason: str) -> None:
+        self.proposal, self.approver = None, ""
+        self.safe.stillness.reset()
+
+    def _enter_rest(self, reason: str) -> None:
+        """Nothing under way. A transaction that never sent a write ends here."""
+        self.proposal, self.approver = None, ""
+        if self.desk.history.last is Kind.PREPARED:
+            self.desk.record(Kind.ABORTED, reason=reason)
+        if self.desk.history.locked is not None:
+            self.signal(Signal.LOCK, self.desk.history.locked)
+
+    def _enter_candidate(self, reason: str) -> None:
+        self.proposal, self.approver = None, ""
+
+    def _enter_qualified(self, reason: str) -> None:
+        proposal = self._the_proposal()
+        small = proposal.heading_change_deg <= self.policy.max_change_auto_deg
+        self.approver = "auto" if self.policy.approval == "auto" and small else ""
+        may = self.safe.mode >= Mode.STAGE
+        self.desk.note(
+            "info",
+            f"candidate {proposal.id}, heading changes by up to {proposal.heading_change_deg:.1f} "
+            f"deg; {'to write' if may else 'would write'}: {' '.join(proposal.lines)}",
+        )
+
+    def _enter_preparing(self, reason: str) -> None:
+        proposal, identity = self._the_proposal(), self._the_identity()
+        transaction = Transaction(
+            id=f"{proposal.id}-{self.desk.wall_s:.0f}",
+            serial=identity.serial,
+            firmware=identity.firmware,
+            old=proposal.old,
+            new=proposal.new,
+            snapshot=self.registers,
+            heading_change_deg=proposal.heading_change_deg,
+            approver=self.approver,
+        )
+        gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
+        self.desk.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
+
+    def _enter_checking(self, reason: str) -> None:
+        make = partial(check, self.transaction(), self.session_keys)
+        self.desk.run("check", Purpose.STAGE, make)
+
+    def _enter_staging(self, reason: str) -> None:
+        self._cause = "device"
+        self.desk.in_force(None)
+        self.desk.run("write", Purpose.STAGE, partial(stage, self.transaction()))
+
+    def _enter_staged(self, reason: str) -> None:
+        transaction = self.transaction()
+        self._now_in_force(transaction.new)
+        self.desk.written(transaction.old, transaction.new, "verified")
+        self.desk.record(Kind.RAM_VERIFIED)
+
+    def _enter_trial(self, reason: str) -> None:
+        self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
+
+    def _enter_proven(self, reason: str) -> None:
+        """Also the way back from a save that was not sent: it does not count and waits a while."""
+        if self.desk.history.last is Kind.FLASH_SENT:
+            self._save_from_s = self.desk.host_s + RETRY_SAVE_S
+            self.desk.record(Kind.PROVEN, reason=reason, unsent=True)
+
+    def _enter_saving(self, reason: str) -> None:
+        make = partial(save, self.transaction(), self.session_keys)
+        self.desk.run("save", Purpose.SAVE, make)
+
+    def _enter_rolling_back(self, reason: str) -> None:
+        if self.desk.history.last is not Kind.ROLLBACK:
+            self.desk.record(
+                Kind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
+            )
+        self.desk.in_force(None)
+        self.desk.run("roll back", Purpose.ROLL_BACK, partial(roll_back, self.transaction()))
+
+    def _enter_fault(self, reason: str) -> None:
+        transaction = self.desk.history.open
+        by_hand = "" if transaction is None else f": {' '.join(register_lines(transaction.old))}"
+        self.desk.note("error", f"{reason}; the old values, to type in by hand if need be{by_hand}")
+
+    # -- conversations end -------------------------------------------------------------------------
+
+    def on_outcome(self, outcome: Outcome) -> None:
+        """A conversation came to its end and says how it found the device."""
+        endings: dict[State, Callable[[Outcome], None]] = {
+            State.CHECKING: self._checked,
+            State.STAGING: self._written,
+            State.SAVING: self._saved,
+            State.ROLLING_BACK: self._rolled_back,
+        }
+        endings[self.state](outcome)
+
+    def _checked(self, outcome: Outcome) -> None:
+        if outcome.as_expected:
+            self.signal(Signal.DONE, "the device holds what the journal says")
+            return
+        self.desk.in_force(None)
+        self.desk.ask(IdentifyAgain())
+        self.signal(Signal.DIFFERS, f"somebody else changed the device: {outcome}")
+
+    def _written(self, outcome: Outcome) -> None:
+        signal = Signal.DONE if outcome.as_expected else Signal.DIFFERS
+        self.signal(signal, f"read back: {outcome}")
+
+    def _saved(self, outcome: Outcome) -> None:
+        if outcome.as_expected:
+            self.desk.record(Kind.FLASH_ACKED)
+            self.signal(Signal.DONE, "the device acknowledged the save")
+        else:
+            self.desk.note("warning", f"not saved: {outcome}")
+            self.signal(Signal.NOT_SENT, str(outcome))
+        self._set_up_stream()
+
+    def on_failure(self, reason: str) -> None:
+        """A conversation broke off: the device may be anywhere between old and new."""
+        saving = self.state is State.SAVING
+        if self.state is State.STAGING:
+            transaction = self.transaction()
+            self.desk.written(transaction.old, transaction.new, "failed")
+            self.desk.record(Kind.RAM_FAILED, reason=reason)
+        self.signal(Signal.FAILED, reason)
+        if saving:
+            self._set_up_stream()
+
+    def _set_up_stream(self) -> None:
+        """A save put the user's outputs back."""
+        if self.session_keys:
+            self.desk.ask(SetUpStream())
+
+    def _rolled_back(self, outcome: Outcome) -> None:
+        transaction = self.transaction()
+        self._now_in_force(transaction.old)
+        self.desk.written(transaction.new, transaction.old, "undone")
+        self.desk.record(Kind.ROLLED_BACK)
+        history = self.desk.history
+        if history.rollbacks >= self.policy.rollbacks_to_lock and history.locked is None:
+            self.desk.record(Kind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
+        self.signal(Signal.DONE, "the old values were read back")
+
+    # -- after an interruption ---------------------------------------------------------------------
+
+    def reconcile(self, restarted: bool) -> None:
+        """Compare journal and device, say what follows, and go there."""
+        history = self.desk.history
+        if history.torn:
+            self.signal(Signal.TORN, "the flash was torn and nobody unlocked it yet")
+        elif history.open is None or history.last is None:
+            self._compare_with_the_last()
+            self.signal(Signal.NOTHING_OPEN, "no transaction is open")
+        else:
+            holds = found(history.open.old, history.open.new, self.registers, restarted)
+            resolution = RECONCILE[history.last][holds]
+            self.desk.note(resolution.level, resolution.text)
+            undoable = self.safe.mode >= Mode.STAGE
+            if resolution.signal in (Signal.UNDO, Signal.RESUME_TRIAL) and not undoable:
+                self.signal(Signal.UNRESOLVED, f"{resolution.text}, and this mode may not write")
+                return
+            if resolution.record is Kind.FOREIGN:
+                self.desk.record(Kind.LOCKED, reason=resolution.text)
+            if resolution.record is not None:
+                self.desk.record(resolution.record, reason=resolution.text)
+            self.signal(resolution.signal, resolution.text)
+
+    def _compare_with_the_last(self) -> None:
+        """No transaction is open: does the device still hold what the last one left in it?"""
+        held = self.desk.history.holds or {}
+        changed = [n for n, v in held.items() if not same(n, v, self.registers.get(n, ()))]
+        if changed:
+            self.desk.note(
+                "error",
+                f"register {', '.join(map(str, changed))} changed since the journal's last record: "
+                "somebody else wrote or saved it",
+            )
+
+    def transaction(self) -> Transaction:
+        """The open transaction; the table has no way into the states that ask without one."""
+        if self.desk.history.open is None:
+            raise AssertionError(f"{self.state.value} without a transaction")
+        return self.desk.history.open
+
+    def _the_proposal(self) -> Proposal:
+        if self.proposal is None:
+            raise AssertionError(f"{self.state.value} without a proposal")
+        return self.proposal
+
+    def _the_identity(self) -> Identity:
+        if self.identity is None:
+            raise AssertionError(f"{self.state.value} without a device")
+        return self.identity
+
+    def _now_in_force(self, values: dict[int, Values]) -> None:
+        self.registers = {**self.registers, **values}
+        self.desk.in_force(self.registers)

@@ -1,0 +1,135 @@
+"""What must be true of the device, the vehicle and the journal for anything to be sent.
+
+Everything here fails closed: what is not known, not fresh or not readable counts as no.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ahrsd.events import GateResult
+from ahrsd.writeback.composition import GYRO, MAG
+from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.permissions import Mode, Purpose, permitted
+from ahrsd.writeback.policy import WriteBackPolicy, flash_budget, ram_budget
+from ahrsd.writeback.stillness import Stillness
+from drivers.vn100.commands import Command, Word, Write
+from drivers.vn100.procedures import Identity
+from drivers.vn100.registers import Values
+
+HSI_CONTROL, HSI_APPLIED = 44, 3
+
+
+class Safeguards:
+    """Device, vehicle and journal as they were last told; each question takes the present time."""
+
+    def __init__(self, policy: WriteBackPolicy) -> None:
+        self.policy = policy
+        self.stillness = Stillness(policy.still)
+        self.journal_ok = False
+        self.stopping = False
+        self.gates: tuple[GateResult, ...] = ()
+        self.flash_gates: tuple[GateResult, ...] = ()
+        self._serial = policy.serial
+        self._limits: list[str] = ["no device yet"]
+        self._is_ours = False
+        self._hsi_applied = True
+        self._interlock: tuple[bool, float] | None = None
+
+    @property
+    def mode(self) -> Mode:
+        """The policy's mode, observe at most while the device or its journal is in doubt."""
+        return min(self.policy.mode, Mode.OBSERVE) if self._limits else self.policy.mode
+
+    def no_device(self, why: str) -> None:
+        """Nothing can be asked, so nothing can be written."""
+        self._limits, self._is_ours = [why], False
+
+    def bind(
+        self, identity: Identity, registers: Mapping[int, Values], journal_readable: bool
+    ) -> None:
+        """Judge a device that was identified and read; the first one is the one to write to."""
+        self.journal_ok = journal_readable
+        hsi = registers.get(HSI_CONTROL)
+        self._hsi_applied = hsi is None or hsi[1] == HSI_APPLIED
+        self._serial = identity.serial if self._serial is None else self._serial
+        self._limits = []
+        self._is_ours = identity.serial == self._serial and identity.profile.writable
+        if identity.serial != self._serial:
+            self._limits.append(
+                f"this is the device {identity.serial}, writes are for {self._serial} only"
+            )
+        if not identity.profile.writable:
+            self._limits.append(f"firmware {identity.firmware!r} is unknown: observe only")
+        if missing := [n for n in (MAG, GYRO, HSI_CONTROL) if n not in registers]:
+            self._limits.append(f"registers {missing} could not be read")
+        if not journal_readable:
+            self._limits.append("the journal cannot be read; see its error")
+
+    def hear_interlock(self, safe: bool, host_s: float) -> None:
+        """The vehicle's word."""
+        self._interlock = (safe, host_s)
+
+    def interlock_holds(self, host_s: float) -> str:
+        """Why the vehicle does not allow a write now; empty where it does."""
+        if self._interlock is None:
+            return "the vehicle has not said that a write is safe"
+        safe, since_s = self._interlock
+        if not safe:
+            return "the vehicle says that a write is not safe now"
+        if not 0.0 <= host_s - since_s <= self.policy.interlock_max_age_s:
+            return f"the vehicle's word is {host_s - since_s:.1f} s old"
+        return ""
+
+    def write_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
+        """Why no write may begin now, but for the approval."""
+        reasons = list(self._limits)
+        if self.policy.mode < Mode.STAGE:
+            reasons.append(
+                f"the mode is {self.policy.mode.name.lower()}; stage or commit may write"
+            )
+        reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.gates if not gate.ok]
+        if not self.gates:
+            reasons.append("no gate has judged yet")
+        if self._hsi_applied:
+            reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
+        reasons += ram_budget(self.policy, history, wall_s)
+        return reasons + self._always(host_s)
+
+    def save_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
+        """Why the flash may not be written now."""
+        reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
+        unattended = history.open is not None and history.open.approver != "operator"
+        if unattended and not self.policy.commit_unattended:
+            reasons.append("no operator approved it and commit_unattended is off")
+        reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.flash_gates if not gate.ok]
+        reasons += flash_budget(self.policy, history, wall_s)
+        if still := self.stillness.why_not(host_s):
+            reasons.append(still)
+        return reasons + self._always(host_s)
+
+    def allow(self, command: Command, purpose: Purpose, host_s: float) -> bool:
+        """The gate in front of every command of the write-back.
+
+        A rollback asks neither the vehicle nor the journal: the old values are what it lived with.
+        """
+        mode = self.mode
+        if purpose is Purpose.ROLL_BACK and self._is_ours:
+            mode = self.policy.mode
+        if not permitted(command, mode, self.policy.configure_stream, purpose):
+            return False
+        if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
+            return not self.interlock_holds(host_s)
+        if isinstance(command, Word) and command.word == "VNWNV":
+            return self.journal_ok and not (
+                self.interlock_holds(host_s) or self.stillness.why_not(host_s)
+            )
+        return True
+
+    def _always(self, host_s: float) -> list[str]:
+        reasons = [word] if (word := self.interlock_holds(host_s)) else []
+        if not self.journal_ok:
+            reasons.append("the journal cannot be written; free the disk, then unlock")
+        if self.stopping:
+            reasons.append("the daemon is stopping")
+        return reasons
