@@ -1,0 +1,121 @@
+"""Samples in, evidence for or against an estimate out.
+
+The protocol with the core: cut a block with `parts`; `add` each part here, and give it to the
+estimator only where its role is "train". A block that lies within one slot may be passed whole,
+under `role(block)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.evidence import comparison
+from ahrsd.evidence.attitude import Nodes, Track, nodes_at, track
+from ahrsd.evidence.coverage import UNKNOWN_MOTION, coverage
+from ahrsd.evidence.field import UNKNOWN_FIELD, field_facts
+from ahrsd.evidence.heading import NO_PROOF, field_0, prove
+from ahrsd.evidence.history import History, HistoryParameters, Role
+from ahrsd.evidence.stillness import Seconds, rest, seconds
+from ahrsd.evidence.values import BasisFacts, EstimateFacts, Evidence, HealthFacts
+from ahrsd.samples import Array, SampleBlock
+from ahrsd.worldfield import WorldField
+
+_LEAST_TURN_DEG = 60.0  # a held-out segment that turned less cannot show a heading error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Derived:
+    """What is computed once per segment (the track again when the gyro bias moves far)."""
+
+    track: Track
+    seconds: Seconds
+
+
+class EvidenceCollector:
+    """Bounded memory of the stream, and the judgement of an estimate by it.  Deterministic."""
+
+    def __init__(self, parameters: HistoryParameters | None = None) -> None:
+        self._history = History(parameters)
+        self._derived: dict[int, _Derived] = {}
+
+    def role(self, block: SampleBlock) -> Role:
+        """Role of a block that is about to be added (that of its first sample)."""
+        return self._history.role(block)
+
+    def parts(self, block: SampleBlock) -> Iterator[tuple[Role, SampleBlock]]:
+        """The block in pieces that lie within one slot each, with their roles.
+
+        A piece has `gap_before` where the piece before it had the other role.
+        """
+        return self._history.parts(block)
+
+    def add(self, block: SampleBlock) -> None:
+        """Remember a block, held out or not."""
+        self._history.add(block)
+
+    def finish(self) -> None:
+        """End of the stream: count the segment that is still open."""
+        self._history.interrupt()
+
+    def evaluate(
+        self,
+        estimate: Estimate,
+        present: Affine,
+        present_gyro_bias_rad_s: Array,
+        world: WorldField | None,
+        *,
+        health: HealthFacts,
+        basis: BasisFacts,
+        proposed: Affine | None = None,
+        halves: tuple[Affine, Affine] | None = None,
+    ) -> Evidence:
+        """Judge `proposed` (default: the estimate's correction) by what is remembered.
+
+        `halves`: corrections from two disjoint halves of the data; without them they are fitted
+        here. `present_gyro_bias_rad_s` (3,) is what register 84 takes off now.
+        """
+        judged = estimate.correction if proposed is None else proposed
+        nodes = self._nodes(estimate.gyro_bias_rad_s)
+        motion, field, proof = UNKNOWN_MOTION, UNKNOWN_FIELD, NO_PROOF
+        if nodes is not None:
+            motion = coverage(nodes, field_0(nodes, judged))
+            field = field_facts(nodes, judged)
+            proof = prove(nodes, judged, present, _LEAST_TURN_DEG)
+        envelope = comparison.envelope(motion, field, world)
+        still = rest([d.seconds for d in self._derived.values()], estimate.gyro_bias_rad_s)
+        return Evidence(
+            health=health,
+            basis=basis,
+            estimate=EstimateFacts(
+                estimate.converged,
+                estimate.observability.unobservable,
+                float(estimate.observability.score),
+                float(estimate.heading_sigma_deg),
+            ),
+            motion=motion,
+            field=field,
+            world=comparison.against_world(field, world),
+            proof=proof,
+            refits=comparison.refits(
+                nodes, judged, present, estimate, where=envelope, halves=halves
+            ),
+            change=comparison.change(nodes, judged, present, motion, where=envelope, world=world),
+            gyro=comparison.gyro(estimate, present_gyro_bias_rad_s, still),
+        )
+
+    def _nodes(self, bias_b_rad_s: Array) -> Nodes | None:
+        """Bring every segment's attitude up to date with the bias, and join them."""
+        derived = {}
+        for segment in self._history.segments:
+            old = self._derived.get(segment.number)
+            if old is not None and old.track.usable_for(bias_b_rad_s):
+                derived[segment.number] = old
+            else:
+                bins = seconds(segment) if old is None else old.seconds
+                derived[segment.number] = _Derived(track(segment, bias_b_rad_s), bins)
+        self._derived = derived
+        return nodes_at([d.track for d in derived.values()], np.asarray(bias_b_rad_s))

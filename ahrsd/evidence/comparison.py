@@ -1,0 +1,134 @@
+"""The candidate against the calibration in force, the world, refits and rest, as facts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.evidence.attitude import Bools, Nodes
+from ahrsd.evidence.coverage import Coverage
+from ahrsd.evidence.field import FieldFacts
+from ahrsd.evidence.prediction import Envelope, worst_difference_deg
+from ahrsd.evidence.refits import gyro_fit, size_fit
+from ahrsd.evidence.stillness import Rest
+from ahrsd.evidence.values import ChangeFacts, GyroFacts, RefitFacts, WorldFacts
+from ahrsd.samples import Array
+from ahrsd.worldfield import WorldField
+
+_NAN = float("nan")
+_VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move
+_BIAS_FLOOR_RAD_S = 3e-4  # a smaller change of the bias needs no better rest than this one
+_LEAST_NOISE_GAUSS = 2e-4
+_FACTORY = 1e-6
+
+
+def envelope(motion: Coverage, field: FieldFacts, world: WorldField | None) -> Envelope:
+    """Where heading is predicted: the field measured (the dip from the model where there is one)
+    and the tilts driven."""
+    dip = np.radians(field.inclination_deg) if world is None else world.inclination_rad
+    return Envelope(field.mean_gauss, float(dip), motion.roll_deg, motion.pitch_deg)
+
+
+def against_world(field: FieldFacts, world: WorldField | None) -> WorldFacts | None:
+    """Magnitude and dip against the model; None without a position."""
+    if world is None:
+        return None
+    return WorldFacts(
+        magnitude_error=abs(field.mean_gauss / world.total_gauss - 1.0),
+        inclination_error_deg=abs(field.inclination_deg - float(np.degrees(world.inclination_rad))),
+    )
+
+
+def refits(
+    nodes: Nodes | None,
+    judged: Affine,
+    present: Affine,
+    estimate: Estimate,
+    *,
+    where: Envelope,
+    halves: tuple[Affine, Affine] | None,
+) -> RefitFacts:
+    """Two halves against each other, and the size fit against the candidate."""
+    if nodes is None:
+        return RefitFacts(_NAN, _NAN, _NAN)
+    averaged = nodes.tracks[0].segment.averaged
+    sigma_gauss = max(estimate.noise_mag_gauss / np.sqrt(averaged), _LEAST_NOISE_GAUSS)
+    opinion = size_fit(nodes, present, sigma_gauss)
+    a, b = halves or _half_fits(nodes, present, sigma_gauss)
+    second = _NAN if opinion is None else worst_difference_deg(opinion, judged, where)
+    if a is None or b is None:
+        return RefitFacts(_NAN, _NAN, second)
+    apart = a.offset - b.offset
+    down = _mean_down(nodes)
+    return RefitFacts(
+        hard_iron_gauss=float(np.linalg.norm(apart - (apart @ down) * down)),
+        halves_deg=worst_difference_deg(_in_units_of(judged, a), _in_units_of(judged, b), where),
+        second_opinion_deg=second,
+    )
+
+
+def change(
+    nodes: Nodes | None,
+    judged: Affine,
+    present: Affine,
+    motion: Coverage,
+    *,
+    where: Envelope,
+    world: WorldField | None,
+) -> ChangeFacts:
+    """The proposed numbers by themselves, and what they would change."""
+    C = judged.matrix
+    ratio = np.cbrt(np.linalg.det(C) / np.linalg.det(present.matrix))
+    moved = _NAN
+    if nodes is not None and np.isfinite(motion.roll_deg):
+        flat = max(motion.roll_deg, motion.pitch_deg) < _VERTICAL_SEEN_DEG
+        moved = abs(float((judged.offset - present.offset) @ _mean_down(nodes))) if flat else 0.0
+    factory = np.allclose(present.matrix, np.eye(3), atol=_FACTORY) and np.allclose(
+        present.offset, 0.0, atol=_FACTORY
+    )
+    return ChangeFacts(
+        first_calibration=bool(factory),
+        eigenvalue_min=float(np.linalg.eigvalsh((C + C.T) / 2)[0]),
+        condition=float(np.linalg.cond(C)),
+        diagonal_min=float(np.min(np.diag(C))),
+        diagonal_max=float(np.max(np.diag(C))),
+        offset_gauss=float(np.linalg.norm(judged.offset)),
+        scale_change=float(abs(ratio - 1.0)) if world is None else 0.0,
+        moved_unseen_gauss=moved,
+        step_deg=worst_difference_deg(present, judged, where),
+    )
+
+
+def gyro(estimate: Estimate, present_b_rad_s: Array, still: Rest) -> GyroFacts:
+    """The estimate's gyro bias against rest."""
+    bias = estimate.gyro_bias_rad_s
+    written = max(float(np.linalg.norm(bias - present_b_rad_s)), _BIAS_FLOOR_RAD_S)
+    sigma = np.hypot(estimate.sigma[9:12], still.sigma_rad_s)
+    return GyroFacts(
+        bias_rad_s=float(np.linalg.norm(bias)),
+        rest_s=still.duration_s,
+        sigma_share=still.sigma_rad_s / written,
+        disagreement=float(np.max(np.abs(bias - still.rate_b_rad_s) / sigma)),
+    )
+
+
+def _half_fits(
+    nodes: Nodes, present: Affine, sigma_gauss: float
+) -> tuple[Affine | None, Affine | None]:
+    """Earlier and later half, cut where half of all turning was done: what drifts, shows."""
+    turned = np.cumsum([t.segment.turned_rad for t in nodes.tracks])
+    early: Bools = turned <= turned[-1] / 2
+    if not early.any():
+        return None, None
+    fit = [gyro_fit(nodes, use, present, sigma_gauss) for use in (early, ~early)]
+    return fit[0], fit[1]
+
+
+def _in_units_of(judged: Affine, fitted: Affine) -> Affine:
+    scale = np.cbrt(np.linalg.det(judged.matrix) / np.linalg.det(fitted.matrix))
+    return Affine(scale * fitted.matrix, fitted.offset)
+
+
+def _mean_down(nodes: Nodes) -> Array:
+    mean = np.mean(nodes.down_b, axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))

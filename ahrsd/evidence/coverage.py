@@ -1,0 +1,85 @@
+"""Which attitudes the vehicle has shown, and what is missing in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ahrsd.evidence.attitude import Bools, Nodes
+from ahrsd.evidence.heading import SECTOR_DEG, SECTORS, gyro_heading_rad, sectors
+from ahrsd.samples import Array
+
+Regime = Literal["3D", "partial", "2D", "none", "unknown"]
+PLANAR_DEG = 5.0
+FREE_DEG = 30.0
+_ANY_DEG = 45.0  # of heading, below which there was no motion to speak of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """Motion of the whole history.
+
+    heading_deg: ten-degree sectors visited, times ten; roll_deg, pitch_deg: half of the range
+    regime: 3D (tilts by 30 deg and more), 2D (within 5 deg of its mean tilt), partial (between),
+    none (turned less than 45 deg), unknown (no accelerometer)
+    turn: what is missing, e.g. "turn left about 120 deg more"; empty where nothing is
+    """
+
+    heading_deg: float
+    roll_deg: float
+    pitch_deg: float
+    regime: Regime
+    turn: str
+
+
+_NAN = float("nan")
+UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been recorded yet")
+
+
+def coverage(nodes: Nodes, field_0: Array) -> Coverage:
+    """Coverage of all segments; headings count from each segment's mean field (S, 3)."""
+    if not nodes.has_gravity:
+        return Coverage(_NAN, _NAN, _NAN, "unknown", "add acceleration to the stream")
+    heading_rad = gyro_heading_rad(nodes, field_0)
+    seen = sectors(heading_rad)
+    down_b = nodes.down_b
+    roll_deg = _half_range(np.degrees(np.unwrap(np.arctan2(down_b[:, 1], down_b[:, 2]))))
+    pitch_deg = _half_range(np.degrees(np.arcsin(np.clip(-down_b[:, 0], -1.0, 1.0))))
+    heading_deg = float(np.count_nonzero(seen) * SECTOR_DEG)
+    known = heading_rad[np.isfinite(heading_rad)]
+    return Coverage(
+        heading_deg=heading_deg,
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        regime=_regime(heading_deg, roll_deg, pitch_deg, down_b),
+        turn=turn_advice(seen, float(np.degrees(known[-1]))) if len(known) else "",
+    )
+
+
+def turn_advice(seen: Bools, heading_deg: float) -> str:
+    """The shorter way to sweep every sector that is missing, from the present heading."""
+    missing = np.flatnonzero(~seen)
+    if len(missing) == 0:
+        return ""
+    here = int(heading_deg // SECTOR_DEG)
+    right = int(np.max((missing - here) % SECTORS)) * SECTOR_DEG
+    left = int(np.max((here - missing) % SECTORS)) * SECTOR_DEG
+    way, far = ("left", left) if left < right else ("right", right)
+    return f"turn {way} about {far:.0f} deg more"
+
+
+def _regime(heading_deg: float, roll_deg: float, pitch_deg: float, down_b: Array) -> Regime:
+    if min(roll_deg, pitch_deg) >= FREE_DEG:
+        return "3D"
+    if heading_deg < _ANY_DEG:
+        return "none"
+    mean = np.mean(down_b, axis=0)
+    tilt = np.degrees(np.arccos(np.clip(down_b @ mean / np.linalg.norm(mean), -1.0, 1.0)))
+    return "2D" if np.quantile(tilt, 0.99) <= PLANAR_DEG else "partial"
+
+
+def _half_range(values: Array) -> float:
+    low, high = np.quantile(values, [0.01, 0.99])
+    return float(min(high - low, 360.0) / 2)

@@ -1,0 +1,187 @@
+"""Magnetic heading against gyro heading on data that the estimate has not seen.
+
+Within a segment (at most one slot long) the corrected field, turned into the segment's first frame
+by the gyro, must stand still. Its swing around down is tilt-compensated magnetic heading minus gyro
+heading, with the one unknown constant removed: the heading error. The candidate's gyro bias serves
+both calibrations that are compared, so that it is the magnetometer that is judged. Errors are
+averaged over one second: noise of single samples is no calibration error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.calibration import Affine
+from ahrsd.evidence.attitude import NODE_RATE_HZ, Bools, Nodes
+from ahrsd.samples import Array
+
+SECTOR_DEG = 10.0
+SECTORS = round(360.0 / SECTOR_DEG)
+_PER_MEAN = round(NODE_RATE_HZ)
+_BLOCK = 10  # one-second means in one block of the bootstrap
+_DRAWS = 500
+_SEED = 23
+_LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading
+_TYPICAL_DIP_RAD = np.radians(65.0)  # where gravity is not known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadingProof:
+    """Before and after on the same held-out segments, in degrees; nan where there are none.
+
+    windows: held-out segments that turned enough to say anything; sectors (36,): headings seen
+    closure_deg: change of the error over one full turn
+    gain_lower_deg: lower end of the 95 % interval of rms before minus rms after
+    """
+
+    windows: int
+    sectors: Bools
+    rms_before_deg: float
+    rms_after_deg: float
+    max_after_deg: float
+    closure_deg: float
+    gain_lower_deg: float
+
+
+NO_PROOF = HeadingProof(0, np.zeros(SECTORS, dtype=bool), *[float("nan")] * 5)
+
+
+def prove(nodes: Nodes, after: Affine, before: Affine, least_turn_deg: float) -> HeadingProof:
+    """Judge `after` against `before` on the held-out segments that turned by `least_turn_deg`."""
+    heading_rad = gyro_heading_rad(nodes, field_0(nodes, after))
+    turn_deg = turned_deg(nodes, heading_rad)
+    errors = np.column_stack([heading_errors_deg(nodes, c) for c in (after, before)])
+    ranges = _ranges(nodes)
+    chosen = [ranges[s] for s in np.flatnonzero(nodes.heldout & (turn_deg >= least_turn_deg))]
+    windows = [_one_second(errors[a:b]) for a, b in chosen]
+    turns = [_one_second(np.degrees(heading_rad[a:b, None]))[:, 0] for a, b in chosen]
+    if not windows:
+        return NO_PROOF
+    if nodes.has_gravity:
+        windows = [w - np.mean(w, axis=0) for w in windows]
+    pooled = np.concatenate(windows)
+    rms_deg = np.sqrt(np.mean(pooled**2, axis=0))
+    return HeadingProof(
+        windows=len(windows),
+        sectors=sectors(np.concatenate([heading_rad[a:b] for a, b in chosen])),
+        rms_before_deg=float(rms_deg[1]),
+        rms_after_deg=float(rms_deg[0]),
+        max_after_deg=float(np.max(np.abs(pooled[:, 0]))),
+        closure_deg=_closure_deg(turns, [w[:, 0] for w in windows]),
+        gain_lower_deg=_gain_lower_deg(windows),
+    )
+
+
+def field_0(nodes: Nodes, correction: Affine) -> Array:
+    """(S, 3) mean corrected field of each segment, in its first frame."""
+    return nodes.mean(_seen_from_0(nodes, correction))
+
+
+def gyro_heading_rad(nodes: Nodes, field_0: Array) -> Array:
+    """(N,) heading of the x axis from each segment's mean field direction (S, 3), unwrapped.
+
+    nan where x stands within 17 degrees of vertical, and where the stream has no gravity.
+    """
+    north, east = _level_axes(nodes.down_0, field_0)
+    x_0 = nodes.R_0b[:, :, 0]
+    n = np.sum(x_0 * north[nodes.segment], axis=1)
+    e = np.sum(x_0 * east[nodes.segment], axis=1)
+    heading = np.where(np.hypot(n, e) > _LEVEL_ENOUGH, np.arctan2(e, n), np.nan)
+    for a, b in _ranges(nodes):
+        known = a + np.flatnonzero(np.isfinite(heading[a:b]))
+        heading[known] = np.unwrap(heading[known])
+    return heading
+
+
+def turned_deg(nodes: Nodes, heading_rad: Array) -> Array:
+    """(S,) range of heading within each segment; without gravity, all that the gyro turned."""
+    if not nodes.has_gravity:
+        return np.degrees([t.segment.turned_rad for t in nodes.tracks])
+    high = np.fmax.reduceat(heading_rad, nodes.starts)
+    low = np.fmin.reduceat(heading_rad, nodes.starts)
+    return np.asarray(np.degrees(np.nan_to_num(high - low)))
+
+
+def heading_errors_deg(nodes: Nodes, correction: Affine) -> Array:
+    """(N,) heading error of a calibration; without gravity an upper estimate that has no sign."""
+    h_0 = _seen_from_0(nodes, correction)
+    mean_0 = nodes.mean(h_0)
+    if nodes.has_gravity:
+        north, east = _level_axes(nodes.down_0, mean_0)
+        n = np.sum(h_0 * north[nodes.segment], axis=1)
+        e = np.sum(h_0 * east[nodes.segment], axis=1)
+        return np.asarray(-np.degrees(np.arctan2(e, n)))  # north seen too far right: reads left
+    mean_0 = mean_0 / np.linalg.norm(mean_0, axis=1, keepdims=True)
+    off = np.cross(mean_0[nodes.segment], h_0 / np.linalg.norm(h_0, axis=1, keepdims=True))
+    return np.asarray(np.degrees(np.linalg.norm(off, axis=1) / np.cos(_TYPICAL_DIP_RAD)))
+
+
+def sectors(heading_rad: Array) -> Bools:
+    """(36,) which ten-degree sectors the headings visited; nan is nowhere."""
+    known = heading_rad[np.isfinite(heading_rad)]
+    seen = np.zeros(SECTORS, dtype=bool)
+    seen[(np.degrees(known) // SECTOR_DEG).astype(int) % SECTORS] = True
+    return seen
+
+
+def _seen_from_0(nodes: Nodes, correction: Affine) -> Array:
+    return np.asarray(np.einsum("nij,nj->ni", nodes.R_0b, correction.apply(nodes.raw_b_gauss)))
+
+
+def _level_axes(down_0: Array, along_0: Array) -> tuple[Array, Array]:
+    """Unit vectors normal to down: along the horizontal part of `along_0`, and to its right."""
+    forward = along_0 - np.sum(along_0 * down_0, axis=-1, keepdims=True) * down_0
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    return forward, np.cross(down_0, forward)
+
+
+def _ranges(nodes: Nodes) -> list[tuple[int, int]]:
+    return list(zip(nodes.starts, [*nodes.starts[1:], len(nodes.time_s)], strict=True))
+
+
+def _one_second(values: Array) -> Array:
+    """Means of (n, c) over one second of nodes; an incomplete last second is left out."""
+    whole = len(values) // _PER_MEAN * _PER_MEAN
+    return np.asarray(values[:whole].reshape(-1, _PER_MEAN, values.shape[1]).mean(axis=1))
+
+
+def _closure_deg(turns_deg: list[Array], errors_deg: list[Array]) -> float:
+    """How much the heading error changes over 360 degrees.
+
+    Where a window holds a full turn: mean change between its pairs one turn apart, worst window.
+    Else the slope of error against turn over all windows, times 360, if they turned 360 together.
+    """
+    changes = [
+        change
+        for turn, error in zip(turns_deg, errors_deg, strict=True)
+        if np.isfinite(change := _full_turn_change_deg(turn, error))
+    ]
+    if changes:
+        return float(np.max(np.abs(changes)))
+    known = [np.isfinite(t) for t in turns_deg]
+    parts = [(t[k], e[k]) for t, e, k in zip(turns_deg, errors_deg, known, strict=True) if k.any()]
+    if sum(float(np.ptp(t)) for t, _ in parts) < 360.0:
+        return float("nan")
+    turn = np.concatenate([t - np.mean(t) for t, _ in parts])
+    error = np.concatenate([e - np.mean(e) for _, e in parts])
+    return float(abs(turn @ error / (turn @ turn) * 360.0))
+
+
+def _full_turn_change_deg(turn_deg: Array, error_deg: Array) -> float:
+    apart = turn_deg[None, :] - turn_deg[:, None]
+    i, j = np.nonzero(np.abs(apart - 360.0) < SECTOR_DEG)
+    return float(np.mean(error_deg[j] - error_deg[i])) if len(i) else float("nan")
+
+
+def _gain_lower_deg(windows: list[Array]) -> float:
+    """Lower 95 % bound of rms before - rms after, by resampling ten-second blocks (seeded)."""
+    blocks = [w[k : k + _BLOCK] for w in windows for k in range(0, len(w), _BLOCK)]
+    if len(blocks) < 4:
+        return float("nan")
+    sums = np.array([np.sum(b**2, axis=0) for b in blocks])
+    counts = np.array([len(b) for b in blocks])
+    draws = np.random.default_rng(_SEED).integers(len(blocks), size=(_DRAWS, len(blocks)))
+    rms = np.sqrt(sums[draws].sum(axis=1) / counts[draws].sum(axis=1)[:, None])
+    return float(np.quantile(rms[:, 1] - rms[:, 0], 0.025))
