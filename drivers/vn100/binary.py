@@ -158,13 +158,10 @@ def read_header(buffer: bytes, start: int) -> bytes:
         return b""
     end = start + 2
     for _ in range(buffer[start + 1].bit_count()):
-        more = True
-        while more:
+        end += 2
+        if end <= len(buffer) and buffer[end - 1] & 0x80:
             end += 2
-            if end > len(buffer):
-                return b""
-            more = bool(buffer[end - 1] & 0x80)
-    return buffer[start:end]
+    return buffer[start:end] if end <= len(buffer) else b""
 
 
 @lru_cache(maxsize=1024)  # noise brings ever new headers
@@ -244,13 +241,10 @@ def _words(header: bytes) -> Iterator[tuple[int, int]]:
     """Group number and fields of each group; a second field word adds bits 16 and up."""
     words = (word for (word,) in struct.iter_unpack("<H", header[2:]))
     for number in _bits(header[1]):
-        shift, combined, more = 0, 0, True
-        while more:
-            word = next(words)
-            more = bool(word & _EXTENDED)
-            combined |= (word & ~_EXTENDED) << shift
-            shift += 16
-        yield number, combined
+        word = next(words)
+        if word & _EXTENDED:
+            word = word & ~_EXTENDED | next(words) << 16
+        yield number, word
 
 
 def _bits(word: int) -> list[int]:

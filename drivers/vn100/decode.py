@@ -112,7 +112,7 @@ def decode_batch(packets: Sequence[Packet]) -> NDArray[np.float64]:
     wire = np.frombuffer(b"".join([packet.data for packet in packets]), _wire_type(layout))
     values = np.empty((len(packets), len(layout.columns)))
     for place, per_si in enumerate(layout.per_si):
-        np.divide(wire[str(place)], per_si, out=values[:, place])
+        np.divide(wire[str(place)], per_si, out=values[:, place], dtype=np.float64)
     values[~np.isfinite(values).all(axis=1)] = np.nan
     return values
 

@@ -33,17 +33,16 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from drivers.vn100.binary import SYNC, BinaryLayout, layout_of, packet_size, read_header
-from drivers.vn100.checksum import crc16, packet_intact, xor8
+from drivers.vn100.checksum import packet_intact
+from drivers.vn100.sentences import COMMAND_LINE, LINE, line_intact
 
 LONGEST_LINE = 320
 LONGEST_COMMAND = 256  # receive buffer of the device
 KEPT_SKIPPED_BYTES = 65536  # of what nobody took; a feed's own skipped bytes are always all there
 _TRUSTED_LAYOUTS = 8
 
-_TEXT = rb"[ -#%-)+-~]"  # printable, neither $ nor *
-_LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})\r?\n" % _TEXT)
-_COMMAND = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2}|XX)\r?\n" % _TEXT)
 _LINE_END = re.compile(rb"[^ -#%-~]")  # not printable, or $
+_CR, _LF = 0x0D, 0x0A
 _LINE_START = rb"\$(?:\Z|V(?:\Z|N))"
 _COMMAND_STARTS = re.compile(_LINE_START)
 _STARTS = re.compile(_LINE_START + rb"|\xfa(?:\Z|[\x01-\x07\x10-\x17])")
@@ -153,7 +152,7 @@ class Deframer:
 
     def __init__(self, *, host_side: bool = False, generic: bool = False) -> None:
         self.counters = Counters()
-        self._line = _COMMAND if host_side else _LINE
+        self._line = COMMAND_LINE if host_side else LINE
         self._longest = LONGEST_COMMAND if host_side else LONGEST_LINE
         self._starts = _COMMAND_STARTS if host_side else _GENERIC_STARTS if generic else _STARTS
         self._generic = generic
@@ -167,7 +166,7 @@ class Deframer:
 
     @property
     def pending(self) -> int:
-        """Bytes that wait for more; never more than the longest message."""
+        """Bytes that wait for more; hardly more than the longest message has."""
         return len(self._buffer)
 
     def feed(self, chunk: bytes) -> list[Frame]:
@@ -193,16 +192,19 @@ class Deframer:
         Of what was not taken the newest 64 KiB stay, and all of the newest `feed`.
         """
         pieces: list[list[Skipped]] = []
+        end = 0
         for piece in self._skipped:
-            if pieces and piece.cause is Cause.NOISE is pieces[-1][-1].cause:
+            goes_on = piece.offset == end and piece.cause is Cause.NOISE
+            if pieces and goes_on and pieces[-1][0].cause is Cause.NOISE:
                 pieces[-1].append(piece)
             else:
                 pieces.append([piece])
+            end = piece.offset + len(piece.data)
         self._skipped.clear()
         self._kept = 0
         return [
-            Skipped(group[0].offset, b"".join(piece.data for piece in group), group[0].cause)
-            for group in pieces
+            Skipped(first.offset, b"".join(piece.data for piece in (first, *rest)), first.cause)
+            for first, *rest in pieces
         ]
 
     # ── in sync: message behind message ──────────────────────────────────────────────────────────
@@ -249,7 +251,7 @@ class Deframer:
                 frames.append(Packet(layout, data, base + position))
             else:
                 match = self._line.match(buffer, position, position + longest)
-                if match is None or not _line_intact(match):
+                if match is None or not line_intact(match):
                     break
                 stop = match.end()
                 frames.append(Sentence(match[1].decode(), base + position, stop - position))
@@ -287,8 +289,7 @@ class Deframer:
         if winner is not None:
             until, now, otherwise = winner.start, max(winner.stop, decided), Cause.OVERTAKEN
         else:
-            waiting = (c.start for c in candidates if c.waiting)
-            until = len(buffer) if final else next(waiting, len(buffer))
+            until = len(buffer) if final else _settled(candidates, len(buffer))
             now, otherwise = len(buffer), Cause.CUT
         before = [candidate for candidate in candidates if candidate.start < until]
         self._skip(buffer, position, until, _causes(before, now, otherwise))
@@ -310,16 +311,15 @@ class Deframer:
         data = buffer[start:stop]
         if not packet_intact(data):
             return _Candidate(start, stop, stop, Cause.CRC)
-        return _Candidate(
-            start, stop, stop, None, Packet(layout_of(header), data, self._base + start)
-        )
+        frame = Packet(layout_of(header), data, self._base + start)
+        return _Candidate(start, stop, stop, None, frame)
 
     def _examine_line(self, buffer: bytes, start: int) -> _Candidate:
         if len(buffer) < start + 3:
             return _Candidate(start, recognised=False)
         limit = start + self._longest
         match = self._line.match(buffer, start, limit)
-        if match is not None and _line_intact(match):
+        if match is not None and line_intact(match):
             stop = match.end()
             frame = Sentence(match[1].decode(), self._base + start, stop - start)
             return _Candidate(start, stop, stop, None, frame)
@@ -369,15 +369,17 @@ class Deframer:
             self.counters.skipped_bytes += stop - start
 
 
-_CR, _LF = 0x0D, 0x0A
+def _settled(candidates: list[_Candidate], available: int) -> int:
+    """Up to where nothing can change any more: where the first candidate that waits begins.
 
-
-def _line_intact(match: re.Match[bytes]) -> bool:
-    """Whether the check behind the ``*`` is right: two digits XOR, four CRC, XX whatever."""
-    body, check = match.groups()
-    if check == b"XX":
-        return True
-    return (xor8(body) if len(check) == 2 else crc16(body)) == int(check, 16)
+    While it is open whether a byte of a refused packet starts a message, the packet stays whole.
+    """
+    for place, candidate in enumerate(candidates):
+        if candidate.waiting:
+            before = candidates[place - 1] if place else candidate
+            inside = before.stop > candidate.start and not candidate.recognised
+            return before.start if inside else candidate.start
+    return available
 
 
 def _causes(

@@ -8,6 +8,7 @@ Reading is by commas and never by column, so the widths that older firmware prin
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -82,6 +83,22 @@ def sentence_layout(name: str, count: bool = False, status: bool = False) -> Lay
     Count comes before status in the columns, whichever the device prints first.
     """
     return _LAYOUTS[name, count, status]
+
+
+_TEXT = rb"[ -#%-)+-~]"  # printable, neither $ nor *
+LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})\r?\n" % _TEXT)
+COMMAND_LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2}|XX)\r?\n" % _TEXT)
+
+
+def line_intact(match: re.Match[bytes]) -> bool:
+    """Whether the check of a line, matched by one of the two, is right.
+
+    Two digits are the XOR, four the CRC; a host may write XX to have none.
+    """
+    body, check = match.groups()
+    if check == b"XX":
+        return True
+    return (xor8(body) if len(check) == 2 else crc16(body)) == int(check, 16)
 
 
 def encode(body: str, crc: bool = False) -> bytes:
