@@ -33,7 +33,6 @@ TICK_S = 1.0
 FLUSH_S = 3.0
 FINISH_FLUSH_S = 2.0
 RETRY_S = 30.0
-SERVER_MEMORY = "64MB"
 EXIT_FILE_LOST = 3
 
 
@@ -117,9 +116,8 @@ class Outputs:
         if self._path is not None and self._file.recorder is None and now_s >= self._file.retry_s:
             self._open_part(self._path, now_s)
         if self._settings.serve and self._server.recorder is None and now_s >= self._server.retry_s:
-            sink = rr.GrpcServerSink(
-                "127.0.0.1", self._settings.port, server_memory_limit=SERVER_MEMORY
-            )
+            memory = f"{self._settings.limits.server_bytes}B"
+            sink = rr.GrpcServerSink("127.0.0.1", self._settings.port, server_memory_limit=memory)
             self._tell(self._server, self._server.open(sink, now_s))
 
     def finish(self) -> None:

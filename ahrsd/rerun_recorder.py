@@ -7,6 +7,7 @@ only when it changes and to keep points, ellipsoids and the gate table at a read
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from ahrsd.events import (
     SamplesSeen,
     StateChanged,
 )
+from ahrsd.rerun_sink import BATCH_ROWS
 from ahrsd.samples import Array
 
 Indices = NDArray[np.signedinteger]
@@ -321,26 +323,27 @@ def write_batch(recorders: Sequence[Recorder], batch: Sequence[tuple[int, Event]
         start = max(end, start + 1)
 
 
-def record(events: Iterable[Event], path: Path, rows: int = 100) -> None:
-    """Write events to a .rrd file here and now, dropping nothing: for files made after the fact.
+def record(events: Iterable[Event], path: Path) -> None:
+    """Write events to a .rrd file in this process; raises OSError where that cannot be done.
 
-    Raises OSError where the file cannot be written.
+    For tests and tools. On a disk that fills up meanwhile, rerun may never let this process end:
+    programs use `RerunSink`.
     """
-    stream = new_stream(path.stem)
+    stream = new_stream(uuid.uuid4().hex)
     try:
         stream.set_sinks(rr.FileSink(path, write_footer=False), default_blueprint=names.blueprint())
     except RuntimeError as error:
         raise OSError(f"{path}: {error}") from error
     recorder = Recorder(stream)
     batch: list[tuple[int, Event]] = []
-    samples = pending = 0
+    samples = rows = 0
     for event in events:
         batch.append((samples, event))
         count = len(event.block) if isinstance(event, SamplesSeen) else 0
-        samples, pending = samples + count, pending + count
-        if pending >= rows:
+        samples, rows = samples + count, rows + count
+        if rows >= BATCH_ROWS:
             write_batch([recorder], batch)
-            batch, pending = [], 0
+            batch, rows = [], 0
     write_batch([recorder], batch)
     try:
         stream.flush(timeout_sec=FILE_FLUSH_S)

@@ -56,25 +56,28 @@ PIPE_BYTES = 1 << 20
 BACKOFF_S = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 STEADY_S = 60.0  # a process that lived this long is forgiven its predecessors
 POLL_S = 0.2
+WAIT_S = 5.0
 FINISH_S = 1.5  # of close()'s time, kept for the process to finish its file
 SHOWN = (SamplesSeen, Estimated, Judged, StateChanged, RegisterWritten, Noted)
 REMEMBERED = (StateChanged, Estimated, Judged)  # told again to a new process and a new file part
 
 
 @dataclass(frozen=True, slots=True)
-class FileLimits:
-    """How large files may become.
+class RerunLimits:
+    """How much the process may take of the disk and of the memory.
 
     part_s, part_bytes: a file part is closed at this age or size, and the next begins
     quota_bytes:        the oldest parts of this name are deleted above this sum
     reserve_bytes:      nothing is written while the disk has less than this free: captures and
                         the journal matter more
+    server_bytes:       what the live view keeps for viewers that connect late
     """
 
     part_s: float = 3600.0
     part_bytes: int = 256 << 20
     quota_bytes: int = 4 << 30
     reserve_bytes: int = 256 << 20
+    server_bytes: int = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +94,7 @@ class ProcessSettings:
     serve: bool
     port: int
     recording_id: str
-    limits: FileLimits
+    limits: RerunLimits
     fresh: bool = True
 
     def to_json(self) -> str:
@@ -102,7 +105,7 @@ class ProcessSettings:
     def from_json(text: str) -> ProcessSettings:
         """From `to_json`'s text."""
         values = json.loads(text)
-        return ProcessSettings(**{**values, "limits": FileLimits(**values["limits"])})
+        return ProcessSettings(**{**values, "limits": RerunLimits(**values["limits"])})
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,15 +118,17 @@ class SinkCounters:
     last_fault: str = ""
 
 
-_DEFAULT_LIMITS = FileLimits()
+_DEFAULT_LIMITS = RerunLimits()
 
 
 class RerunSink:
-    """Feeds rerun in another process; `push` never blocks and never raises.
+    """Feeds rerun in another process; `push` never blocks (see `wait`) and never raises.
 
     path: .rrd file to write (replaced if it exists), or None; serve: live viewer at
     127.0.0.1:port; queue_batches: how many batches may wait before the oldest is dropped;
-    stall_s: a process that reads nothing for this long is replaced.
+    stall_s: a process that reads nothing for this long is replaced; limits: of disk and memory;
+    wait: for replays, which are faster than rerun: `push` waits for room in the queue instead of
+    dropping, until it has once waited WAIT_S in vain.
     """
 
     def __init__(
@@ -134,13 +139,17 @@ class RerunSink:
         queue_batches: int = 256,
         *,
         stall_s: float = 30.0,
-        limits: FileLimits = _DEFAULT_LIMITS,
+        limits: RerunLimits = _DEFAULT_LIMITS,
+        wait: bool = False,
     ) -> None:
         file = None if path is None else str(path.absolute())
         self._settings = ProcessSettings(file, serve, port, uuid.uuid4().hex, limits)
         self._queue_batches = queue_batches
         self._stall_s = stall_s
-        self._wake = threading.Condition()  # guards everything down to `_deadline_s`
+        self._wait = wait
+        lock = threading.Lock()  # guards everything down to `_deadline_s`
+        self._wake = threading.Condition(lock)  # for the feeder: there is something to do
+        self._room = threading.Condition(lock)  # for `push`: a batch has left the queue
         self._pending: list[Item] = []
         self._pending_rows = 0
         self._pending_since_s = 0.0
@@ -172,6 +181,10 @@ class RerunSink:
         if not isinstance(event, SHOWN) or self._deadline_s is not None:
             return
         with self._wake:
+            if self._wait and len(self._queue) >= self._queue_batches:
+                self._wait = self._room.wait_for(
+                    lambda: len(self._queue) < self._queue_batches, WAIT_S
+                )
             item = (self._samples, event)
             if not self._pending:
                 self._pending_since_s = host_s
@@ -236,6 +249,7 @@ class RerunSink:
                 ):
                     break
                 batch = self._queue.popleft() if ready and self._queue else None
+                self._room.notify()
             if batch is None:
                 time.sleep(0.0 if ready else POLL_S / 4)
             elif not self._write(batch):

@@ -38,7 +38,7 @@ from ahrsd.events import (
 )
 from ahrsd.rerun_process import free_part, part_name
 from ahrsd.rerun_recorder import quaternion_xyzw, record
-from ahrsd.rerun_sink import FileLimits, ProcessSettings, RerunSink, SinkCounters
+from ahrsd.rerun_sink import ProcessSettings, RerunLimits, RerunSink, SinkCounters
 from ahrsd.samples import SampleBlock
 
 RATE_HZ = 100.0
@@ -336,7 +336,7 @@ def test_quaternion_of_any_rotation(seed):
 
 # What can go wrong with the process, its disk and its viewer.
 
-ALL_DISK = FileLimits(reserve_bytes=0)
+ALL_DISK = RerunLimits(reserve_bytes=0)
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
@@ -385,6 +385,27 @@ def test_a_closed_sink_leaves_a_complete_file(tmp_path):
     gyro = columns(path)["/gyro_b_rad_s"]
     assert gyro.column("sample").drop_null().to_pylist() == list(range(2000))
     sink.push(Noted(0.0, 0.0, "info", "too late"), 0.0)  # ignored, not an error
+
+
+def test_a_replay_that_is_faster_than_rerun_loses_nothing(tmp_path):
+    with opened(tmp_path / "run.rrd", queue_batches=4, wait=True) as sink:
+        push_all(sink, one_sample_events(20_000))
+        sink.close(30.0)
+        assert sink.counters == SinkCounters()
+    gyro = columns(tmp_path / "run.rrd")["/gyro_b_rad_s"]
+    assert gyro.column("sample").drop_null().to_pylist() == list(range(20_000))
+
+
+def test_a_replay_waits_for_a_stopped_process_only_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("ahrsd.rerun_sink.WAIT_S", 0.3)
+    with opened(tmp_path / "run.rrd", queue_batches=4, wait=True) as sink:
+        wait_for((tmp_path / "run.rrd").exists)
+        os.kill(sink.pid, signal.SIGSTOP)
+        begin_s = time.monotonic()
+        push_all(sink, one_sample_events(100_000))
+        assert 0.3 <= time.monotonic() - begin_s < 5.0
+        sink.close(0.5)
+    assert sink.counters.dropped > 50_000
 
 
 def test_the_daemon_never_loads_rerun(tmp_path):
@@ -479,7 +500,7 @@ def test_a_disk_that_fills_up_is_counted_and_tried_again(small_disk):
 
 
 def test_a_nearly_full_disk_is_left_to_those_who_need_it(small_disk):
-    limits = FileLimits(reserve_bytes=1 << 20)
+    limits = RerunLimits(reserve_bytes=1 << 20)
     with opened(small_disk / "run.rrd", limits=limits) as sink:
         push_all(sink, simulated_events(5.0))
         wait_for(lambda: sink.counters.faults >= 1)
@@ -488,7 +509,7 @@ def test_a_nearly_full_disk_is_left_to_those_who_need_it(small_disk):
 
 
 def test_parts_change_at_their_size_and_the_oldest_go(tmp_path):
-    limits = FileLimits(part_bytes=200_000, quota_bytes=600_000, reserve_bytes=0)
+    limits = RerunLimits(part_bytes=200_000, quota_bytes=600_000, reserve_bytes=0)
     path = tmp_path / "run.rrd"
     with opened(path, limits=limits) as sink:
         events = simulated_events(90.0)
@@ -541,5 +562,5 @@ def test_next_part_never_takes_a_name_in_use(tmp_path):
 
 
 def test_settings_survive_the_command_line():
-    settings = ProcessSettings("a b.rrd", True, 9876, "id", FileLimits(part_s=2.5), fresh=False)
+    settings = ProcessSettings("a b.rrd", True, 9876, "id", RerunLimits(part_s=2.5), fresh=False)
     assert ProcessSettings.from_json(settings.to_json()) == settings
