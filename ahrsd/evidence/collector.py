@@ -61,15 +61,15 @@ class EvidenceCollector:
         """End of the stream: count the segment that is still open."""
         self._history.interrupt()
 
-    def evaluate(
+    def evaluate(  # noqa: PLR0917  (everything that is known, once)
         self,
         estimate: Estimate,
         present: Affine,
         present_gyro_bias_rad_s: Array,
         world: WorldField | None,
-        *,
         health: HealthFacts,
         basis: BasisFacts,
+        *,
         proposed: Affine | None = None,
         halves: tuple[Affine, Affine] | None = None,
     ) -> Evidence:

@@ -149,18 +149,58 @@ class Evidence:
         return float(np.count_nonzero(self.proof.sectors) * SECTOR_DEG)
 
     @property
+    def heldout_rms_before_deg(self) -> float:
+        """Heading error on held-out data with the calibration in force."""
+        return self.proof.rms_before_deg
+
+    @property
+    def heldout_rms_deg(self) -> float:
+        """The same with the proposed one."""
+        return self.proof.rms_after_deg
+
+    @property
     def gain_deg(self) -> float:
         """Held-out rms before minus after."""
         return self.proof.rms_before_deg - self.proof.rms_after_deg
 
     @property
-    def gain_share(self) -> float:
-        """The same as a share of the rms before."""
-        return self.gain_deg / max(self.proof.rms_before_deg, 1e-6)
+    def gain_percent(self) -> float:
+        """The same over the rms before."""
+        return 100.0 * self.gain_deg / max(self.proof.rms_before_deg, 1e-6)
+
+    @property
+    def spread_percent(self) -> float:
+        """Standard deviation of the corrected field over its mean."""
+        return 100.0 * self.field.spread
+
+    @property
+    def model_error_percent(self) -> float:
+        """Corrected field against the world model; nan without a position."""
+        return float("nan") if self.world is None else 100.0 * self.world.magnitude_error
+
+    @property
+    def scale_change_percent(self) -> float:
+        """Change of scale against the calibration in force."""
+        return 100.0 * self.change.scale_change
+
+    @property
+    def gyro_bias_deg_s(self) -> float:
+        """Length of the proposed gyro bias."""
+        return float(np.degrees(self.gyro.bias_rad_s))
 
     def unmeasured(self) -> tuple[str, ...]:
         """Paths of the numbers that are not finite ("field.spread"); judged: none may be left."""
         return tuple(path for path, value in numbers(self) if not np.isfinite(value))
+
+    @property
+    def unmeasured_count(self) -> int:
+        """How many numbers are not finite."""
+        return len(self.unmeasured())
+
+    @property
+    def unmeasured_names(self) -> str:
+        """Their paths."""
+        return ", ".join(self.unmeasured())
 
 
 def numbers(value: object, path: str = "") -> Iterator[tuple[str, float]]:

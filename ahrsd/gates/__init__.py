@@ -1,0 +1,21 @@
+"""What must hold before a calibration is written: a table of gates and its judge.
+
+Guards (`Level`): CANDIDATE - it may be shown; RAM - an operator may approve it; FLASH - it may be
+saved; UNATTENDED - RAM without an operator. docs/gates.md explains every row to a field engineer.
+"""
+
+from ahrsd.gates.judging import for_level, holds, judge, limit_of
+from ahrsd.gates.limits import GateLimits
+from ahrsd.gates.row import Gate, Level
+from ahrsd.gates.table import GATES
+
+__all__ = [
+    "GATES",
+    "Gate",
+    "GateLimits",
+    "Level",
+    "for_level",
+    "holds",
+    "judge",
+    "limit_of",
+]
