@@ -4,7 +4,7 @@ Every output of a VN-100, the "uncompensated" ones too, has passed the user cali
 reference frame rotation (vn100-protocol.md 5.1, 5.3)::
 
     u = R C (m - B)       m: sensor frame; C, B: register 23, 84 or 25; R: register 26
-    m = C^-1 R^T u + B    which is what this module computes
+    m = C^-1 R^-1 u + B   which is what this module computes (R as printed has six digits: not R^T)
 
 A compensated field has also passed the on-board estimator where register 44 applies it (Output 3):
 u' = C47 (u - B47). A compensated rate has lost the filter's own bias estimate, which no register
@@ -84,15 +84,18 @@ class Compensation:
         """(N, 3) field as the sensor read it; `compensated` where the HSI acted on it."""
         if compensated and self.hsi is not None:
             output_gauss = self.hsi.undo(output_gauss)
-        return self.mag.undo(output_gauss @ self.rotation)
+        return self.mag.undo(self._unrotated(output_gauss))
 
     def raw_gyro(self, output_rad_s: Array) -> Array:
         """(N, 3) rate as the sensor read it (plus the filter's bias where compensated)."""
-        return self.gyro.undo(output_rad_s @ self.rotation)
+        return self.gyro.undo(self._unrotated(output_rad_s))
 
     def raw_accel(self, output_m_s2: Array) -> Array:
         """(N, 3) specific force as the sensor read it."""
-        return self.accel.undo(output_m_s2 @ self.rotation)
+        return self.accel.undo(self._unrotated(output_m_s2))
+
+    def _unrotated(self, vectors: Array) -> Array:
+        return np.asarray(vectors @ np.linalg.inv(self.rotation).T)
 
 
 def _affine(values: RegisterValues, number: int, warnings: list[str]) -> Affine:

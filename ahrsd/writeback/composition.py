@@ -30,7 +30,7 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.samples import Array
-from drivers.vn100.registers import Values, as_stored, format_command, same
+from drivers.vn100.registers import Values, as_stored, format_command
 from drivers.vn100.sentences import encode
 
 MAG, GYRO = 23, 84
@@ -54,7 +54,7 @@ class UnwritableError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What would be written. `old` and `new` have the same registers, 23 and 84 or one of them.
+    """What would be written. `old` and `new` have the same registers: 23, 84, both or none.
 
     id:                  eight hex digits of a hash of the lines: what a person types to approve
     lines:               the very text that would be sent, checksum included
@@ -82,20 +82,19 @@ def compose(
     present_gyro = _affine(registers, GYRO)
     _refuse_unusable(estimate)
     _refuse_moved(estimate, present, present_gyro)
-    proposed = _wire(MAG, Affine(_matrix(estimate, present), estimate.hard_iron_gauss))
-    gyro = _wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
-    new = {MAG: proposed}
-    if gyro_is_raw and not same(GYRO, gyro, registers[GYRO]):
-        new[GYRO] = gyro
-    written = Affine.from_register(_floats(proposed))
+    proposed = {MAG: _wire(MAG, Affine(_matrix(estimate, present), estimate.hard_iron_gauss))}
+    if gyro_is_raw:
+        proposed[GYRO] = _wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
+    written = Affine.from_register(_floats(proposed[MAG]))
     _refuse_out_of_bounds(written, estimate.gyro_bias_rad_s)
+    new = {n: v for n, v in proposed.items() if not _is_there(registers[n], v)}
     lines = register_lines(new)
     return Proposal(
         id=hashlib.sha256("\n".join(lines).encode()).hexdigest()[:8],
         old={number: registers[number] for number in new},
         new=new,
         lines=lines,
-        heading_change_deg=heading_change_deg(present, written, estimate),
+        heading_change_deg=heading_change_deg(present, written, estimate) if MAG in new else 0.0,
         gyro_change_rad_s=_gyro_change(present_gyro, new),
     )
 
@@ -130,6 +129,8 @@ def heading_change_deg(present: Affine, proposed: Affine, estimate: Estimate) ->
 
 def apart_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
     """How far two proposals are apart, as a change of heading."""
+    if MAG not in one.new or MAG not in other.new:
+        return 0.0 if MAG not in one.new and MAG not in other.new else 180.0
     first, second = (Affine.from_register(_floats(p.new[MAG])) for p in (one, other))
     return heading_change_deg(first, second, estimate)
 
@@ -151,6 +152,12 @@ def _wire(number: int, affine: Affine) -> Values:
     """As the device will store and print it."""
     rounded = tuple(float(f"{value:.{DIGITS}g}") for value in affine.to_register())
     return as_stored(number, rounded)
+
+
+def _is_there(present: Values, proposed: Values) -> bool:
+    """Whether they differ by no more than the rounding of one of them (of C: six digits near 1)."""
+    difference = np.abs(np.array(_floats(present)) - np.array(_floats(proposed)))
+    return bool(difference[:9].max() < 1.2e-5 and difference[9:].max() < 1e-6)
 
 
 def _floats(values: Values) -> tuple[float, ...]:

@@ -1,0 +1,105 @@
+"""The gate over every command there is: what a mode may send, and nothing else."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
+from drivers.vn100.commands import WORDS, Command, Pause, Read, Word, Write
+from drivers.vn100.procedures import SESSION_SETTINGS
+from drivers.vn100.registers import REGISTERS
+
+WRITES = [
+    Write(row.id, row.defaults[generation])
+    for row in REGISTERS.values()
+    for generation in (2, 3)
+    if row.writable and generation in row.defaults
+]
+SPOKEN = [Word(word, arguments) for word, takes in WORDS.items() for arguments in takes]
+READS = [Read(number) for number in REGISTERS]
+COMMANDS: list[Command] = [*WRITES, *SPOKEN, *READS]
+
+modes = st.sampled_from(Mode)
+purposes = st.sampled_from(Purpose)
+commands = st.sampled_from(COMMANDS)
+
+
+def allowed(mode: Mode, configure_stream: bool, purpose: Purpose) -> set[str]:
+    """Bodies' first words of what passes, reads left out."""
+    passed = [c for c in COMMANDS if permitted(c, mode, configure_stream, purpose)]
+    return {
+        f"{c.register}" if isinstance(c, Write) else c.word
+        for c in passed
+        if not isinstance(c, Read)
+    }
+
+
+def test_the_lists_of_this_test_are_complete() -> None:
+    assert {c.register for c in WRITES} >= {23, 84, 44, 26, 5, 6, 7, 75, 76, 77, 0, 21}
+    assert {c.word for c in SPOKEN} >= {"VNWNV", "VNRST", "VNRFS", "VNASY", "VNSGB", "VNTAR"}
+
+
+STREAM = {str(n) for n in SESSION_SETTINGS}
+TABLE = {
+    (Mode.STAGE, False, Purpose.STAGE): {"23", "84", "VNASY"},
+    (Mode.STAGE, False, Purpose.ROLL_BACK): {"23", "84", "VNASY"},
+    (Mode.COMMIT, False, Purpose.STAGE): {"23", "84", "VNASY"},
+    (Mode.COMMIT, False, Purpose.ROLL_BACK): {"23", "84", "VNASY"},
+    (Mode.COMMIT, False, Purpose.SAVE): {"VNASY", "VNWNV"},
+    (Mode.COMMIT, True, Purpose.SAVE): {"VNASY", "VNWNV", *STREAM},
+    (Mode.OBSERVE, True, Purpose.STREAM): {"VNASY", *STREAM},
+    (Mode.STAGE, True, Purpose.STREAM): {"VNASY", *STREAM},
+    (Mode.COMMIT, True, Purpose.STREAM): {"VNASY", *STREAM},
+}
+
+
+@pytest.mark.parametrize("mode", Mode)
+@pytest.mark.parametrize("configure_stream", [False, True])
+@pytest.mark.parametrize("purpose", Purpose)
+def test_every_mode_and_purpose(mode: Mode, configure_stream: bool, purpose: Purpose) -> None:
+    """Where the table above has no row for it, or its row without the stream, nothing passes."""
+    row = TABLE.get((mode, configure_stream, purpose), TABLE.get((mode, False, purpose), set()))
+    assert allowed(mode, configure_stream, purpose) == row
+    reads = [permitted(c, mode, configure_stream, purpose) for c in READS]
+    assert set(reads) == {mode is not Mode.PASSIVE}
+
+
+@given(commands, st.booleans(), purposes)
+def test_passive_sends_nothing(command: Command, stream: bool, purpose: Purpose) -> None:
+    assert not permitted(command, Mode.PASSIVE, stream, purpose)
+
+
+@given(st.sampled_from([*WRITES, *SPOKEN]), purposes)
+def test_observe_never_permits_a_write(command: Command, purpose: Purpose) -> None:
+    assert not permitted(command, Mode.OBSERVE, False, purpose)
+
+
+@given(st.sampled_from(WRITES), modes, st.booleans(), purposes)
+def test_no_mode_writes_any_other_register(
+    command: Write, mode: Mode, stream: bool, purpose: Purpose
+) -> None:
+    if permitted(command, mode, stream, purpose):
+        assert command.register in {*CALIBRATION, *SESSION_SETTINGS}
+        assert command.register in SESSION_SETTINGS or mode >= Mode.STAGE
+
+
+@given(commands, st.booleans(), purposes)
+def test_flash_only_in_commit_and_only_to_save(
+    command: Command, stream: bool, purpose: Purpose
+) -> None:
+    save = Word("VNWNV")
+    assert permitted(save, Mode.COMMIT, stream, purpose) == (purpose is Purpose.SAVE)
+    assert not permitted(save, Mode.STAGE, stream, purpose)
+
+
+@given(commands, modes, modes, st.booleans(), purposes)
+def test_a_higher_mode_never_permits_less(
+    command: Command, one: Mode, other: Mode, stream: bool, purpose: Purpose
+) -> None:
+    low, high = sorted((one, other))
+    assert permitted(command, low, stream, purpose) <= permitted(command, high, stream, purpose)
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_pause_is_no_command_to_the_device(mode: Mode) -> None:
+    assert permitted(Pause(1.0), mode, False, Purpose.READ)
