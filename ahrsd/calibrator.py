@@ -10,7 +10,8 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.events import GateResult
-from ahrsd.evidence.collector import BasisFacts, EvidenceCollector, HealthFacts
+from ahrsd.evidence.collector import EvidenceCollector
+from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.worldfield import WorldField
@@ -38,6 +39,7 @@ class Calibrator:
         self.estimator = Estimator(settings.estimator, present, present_gyro_bias_rad_s)
         self.collector = EvidenceCollector()
         self.estimate: Estimate | None = None
+        self.evidence: Evidence | None = None
         self.gates: tuple[GateResult, ...] = ()
         self._gap = True
         self.started = False
@@ -67,7 +69,7 @@ class Calibrator:
         """Evaluate the evidence for the present estimate and pass it through the gates."""
         if self.estimate is None:
             return ()
-        evidence = self.collector.evaluate(
+        self.evidence = self.collector.evaluate(
             self.estimate,
             self.present,
             self.present_gyro_bias_rad_s,
@@ -75,7 +77,7 @@ class Calibrator:
             health,
             basis,
         )
-        self.gates = judge(evidence, self.settings.limits, at_s, self.gates)
+        self.gates = judge(self.evidence, self.settings.limits, at_s, self.gates)
         return self.gates
 
     def _scaled(self, estimate: Estimate | None) -> Estimate | None:

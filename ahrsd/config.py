@@ -90,6 +90,18 @@ class Config(Section):
         )
 
 
+CONFIG_KEY = "config"  # where a capture's header keeps the configuration it was made with
+
+
+def recorded_config(text: str) -> Config:
+    """The configuration in a capture's header.  Raises ConfigError where it is not one."""
+    try:
+        return Config.model_validate_json(text)
+    except ValidationError as error:
+        lines = [f"the capture's configuration: {_explain(detail)}" for detail in error.errors()]
+        raise ConfigError(lines) from error
+
+
 def default_state_directory() -> Path:
     """$STATE_DIRECTORY as systemd sets it, else the user's own (XDG base directories)."""
     if given := os.environ.get("STATE_DIRECTORY"):

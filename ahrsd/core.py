@@ -29,7 +29,7 @@ from ahrsd.conversation import (
     Unanswered,
 )
 from ahrsd.decisions import DecisionLog
-from ahrsd.evidence.collector import BasisFacts, HealthFacts
+from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.live_trial import LiveTrial
 from ahrsd.samples import SampleBlock
 from ahrsd.stream import Stream
@@ -80,6 +80,7 @@ class CoreSettings:
     policy: WriteBackPolicy = field(default_factory=WriteBackPolicy)
     output_rate_hz: float = 100.0
     stream_rate_hz: float | None = None
+    stream_rate_source: str = "as given"
 
 
 class Core:
@@ -89,7 +90,7 @@ class Core:
         self.settings = settings
         self.decisions = DecisionLog()
         self.epochs = RegisterEpochs()
-        self.stream = Stream(self.epochs, settings.stream_rate_hz)
+        self.stream = Stream(self.epochs, settings.stream_rate_hz, settings.stream_rate_source)
         self.conversation = Conversation(
             settings.policy.mode,
             change_stream=settings.policy.configure_stream,
@@ -99,6 +100,7 @@ class Core:
         self.registers: dict[int, Values] = {}
         self.calibrator = Calibrator(settings.calibrator, Affine.identity(), np.zeros(3))
         self.at_s = 0.0
+        self.first_s = float("nan")
         self.faults = 0
         self.strays = 0
         self.undecodable = 0
@@ -112,6 +114,8 @@ class Core:
         self._todo: deque[Action] = deque()
         self._pending: RunProcedure | None = None
         self._trial: LiveTrial | None = None
+        if settings.policy.mode is Mode.PASSIVE:
+            self._no_device()
         self._out: list[events.Event] = []
         self._handlers: dict[type, Callable[..., None]] = {
             inputs.Received: self._received,
@@ -416,6 +420,8 @@ class Core:
 
     def _block(self, block: SampleBlock) -> None:
         self.at_s = float(block.time_s[-1])
+        if np.isnan(self.first_s):
+            self.first_s = float(block.time_s[0])
         calibrator = self.calibrator
         new = calibrator.take(block)
         estimate = calibrator.estimate

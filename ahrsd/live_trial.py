@@ -13,6 +13,7 @@ from collections import deque
 import numpy as np
 
 from ahrsd.calibration import Affine
+from ahrsd.headings import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.trial import TrialMetrics
 
@@ -47,10 +48,10 @@ class LiveTrial:
             self._rows.popleft()
         self._last_s = now_s
         if now_s - self._start_s <= _JUMP_S and np.isfinite(down).all():
-            mean = block.raw_b_gauss.mean(axis=0)
-            self._jumps.append(
-                _heading(self._new.apply(mean), down) - _heading(self._old.apply(mean), down)
-            )
+            mean, force = block.raw_b_gauss.mean(axis=0)[None], -down[None]
+            new = tilt_compensated_heading(self._new.apply(mean), force)
+            old = tilt_compensated_heading(self._old.apply(mean), force)
+            self._jumps.append(float((new - old)[0]))
         return self._metrics()
 
     def _metrics(self) -> TrialMetrics:
@@ -76,11 +77,3 @@ class LiveTrial:
 def _down(accel: Array) -> Array:
     mean = accel.mean(axis=0)
     return np.asarray(-mean / max(float(np.linalg.norm(mean)), 1e-9))
-
-
-def _heading(field: Array, down: Array) -> float:
-    """Heading of the sensor's x axis against the field's level part, rad."""
-    level = field - down * (field @ down)
-    forward = np.array([1.0, 0.0, 0.0])
-    forward = forward - down * (forward @ down)
-    return float(np.arctan2(down @ np.cross(level, forward), level @ forward))

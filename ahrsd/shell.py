@@ -54,7 +54,9 @@ class JournalKeeper:
         except JournalError as error:
             self.journal = None
             return JournalOpened(self.now_ns(), serial, [], str(error))
-        records = [{"kind": r.kind, "facts": dict(r.facts)} for r in self.journal.records()]
+        records: list[dict[str, object]] = [
+            {"kind": r.kind, "facts": dict(r.facts)} for r in self.journal.records()
+        ]
         return JournalOpened(self.now_ns(), serial, records)
 
     def append(self, item: events.JournalAppend) -> Journalled:

@@ -45,7 +45,9 @@ class NoSamplesError(ValueError):
 class Stream:
     """Measurements in, `SampleBlock`s out; time is an argument, nothing is read or written."""
 
-    def __init__(self, epochs: RegisterEpochs, rate_hz: float | None = None) -> None:
+    def __init__(
+        self, epochs: RegisterEpochs, rate_hz: float | None = None, rate_source: str = "as given"
+    ) -> None:
         self.epochs = epochs
         self.clock = DeviceClock()
         self.facts = StreamFacts()
@@ -54,7 +56,7 @@ class Stream:
         self.warnings: dict[str, None] = {}
         self.refused: dict[str, MissingQuantityError] = {}
         self.register_rate_hz: float | None = None
-        self._said_rate_hz = rate_hz
+        self._said_rate_hz, self._said_source = rate_hz, rate_source
         self._extractor: Extractor | None = None
         self._timeline = StreamTimeline()
         self._steps: StepClock | None = None
@@ -136,7 +138,7 @@ class Stream:
         """Rate of a stream without device time, None while it must still be watched."""
         said = self._said_rate_hz
         if said is not None:
-            return self._decide(said, "as given")
+            return self._decide(said, self._said_source)
         if self.register_rate_hz is not None:
             return self._decide(self.register_rate_hz, "register 7")
         if self._arrivals and self._arrivals[-1] > self._arrivals[0]:

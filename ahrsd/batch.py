@@ -1,0 +1,80 @@
+"""Batch calibration: every sample of a recording in one estimate, iterated to the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ahrsd.calibration import Estimate
+from ahrsd.config import Config
+from ahrsd.core import Core
+from ahrsd.events import Event, SamplesSeen
+from ahrsd.replay import replay
+from ahrsd.result import calibration_json
+from ahrsd.samples import SampleBlock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchResult:
+    """What `ahrsd calibrate` says."""
+
+    name: str
+    core: Core
+    estimate: Estimate | None
+    blocks: tuple[SampleBlock, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def samples(self) -> int:
+        """Samples used."""
+        return self.core.stream.facts.samples
+
+    @property
+    def converged(self) -> bool:
+        """Whether the recording determines the calibration."""
+        return self.estimate is not None and self.estimate.converged
+
+    def said(self) -> list[str]:
+        """Warnings of recording and stream."""
+        return [*self.warnings, *self.core.stream.warnings]
+
+    def json(self, method: str) -> dict[str, object]:
+        """The contract's calibration.json."""
+        return calibration_json(
+            self.name,
+            self.estimate,
+            self.core.registers,
+            method=method,
+            samples=self.samples,
+            gyro_is_raw=not self.core.stream.compensated_gyro,
+            warnings=self.said(),
+        )
+
+    def write_report(self, path: Path) -> None:
+        """A page with pictures."""
+        from ahrsd.report import write_report
+        from ahrsd.report_data import batch_report
+
+        write_report(path, batch_report(self))
+
+
+def calibrate(
+    path: Path,
+    config: Config,
+    *,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> BatchResult:
+    """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`."""
+    blocks: list[SampleBlock] = []
+
+    def keep(event: Event) -> None:
+        if isinstance(event, SamplesSeen):
+            blocks.append(event.block)
+
+    done = replay(
+        path, config, rate_hz=rate_hz, listeners=[keep], progress=progress, held_out=False
+    )
+    estimate = done.core.calibrator.finish()
+    return BatchResult(path.name, done.core, estimate, tuple(blocks), tuple(done.warnings))

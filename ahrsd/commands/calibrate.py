@@ -1,0 +1,53 @@
+"""`ahrsd calibrate RECORDING`: the best estimate that the whole recording allows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ahrsd.commands.json_output import write_json
+from ahrsd.commands.progress import byte_progress
+from ahrsd.config import Config, load_config
+from ahrsd.errors import EXIT_DONE, EXIT_NO
+
+_METHODS = ("magyc",)
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--method", type=click.Choice(_METHODS), default=_METHODS[0], show_default=True)
+@click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
+@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option("--json", "json_path", help="calibration.json into this file, - for stdout.")
+@click.option("--report", "report_path", type=click.Path(path_type=Path), help="Write a page.")
+def command(
+    recording: Path,
+    method: str,
+    path: Path | None,
+    rate_hz: float | None,
+    json_path: str | None,
+    report_path: Path | None,
+) -> None:
+    """Calibrate from all of RECORDING at once: a capture, a byte stream or a table.
+
+    Exit 1 where the motion does not determine the answer; the output then says what is missing.
+    """
+    from ahrsd.batch import calibrate
+    from ahrsd.summary import estimate_lines
+
+    config = load_config(path) if path else Config()
+    size = recording.stat().st_size if recording.is_file() else 0
+    with byte_progress(recording.name, size) as progress:
+        result = calibrate(recording, config, rate_hz=rate_hz, progress=progress)
+    if report_path is not None:
+        result.write_report(report_path)
+    if json_path is not None:
+        write_json(json_path, result.json(method))
+    if json_path != "-":
+        click.echo(f"{recording.name}: {result.samples} samples, method {method}")
+        for line in estimate_lines(result.estimate):
+            click.echo(line)
+        for text in result.said():
+            click.echo(f"  warning: {text}")
+    raise SystemExit(EXIT_DONE if result.converged else EXIT_NO)

@@ -1,0 +1,54 @@
+"""`ahrsd replay RECORDING`: the pipeline of `run` over a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ahrsd.commands.json_output import write_json
+from ahrsd.commands.progress import byte_progress
+from ahrsd.config import Config, load_config
+
+
+@click.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
+@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option("--speed", type=click.FloatRange(0.0), default=0.0,
+              help="0: as fast as it goes (default); 1: real time.")  # fmt: skip
+@click.option("--json", "json_path", help="Summary as JSON into this file, - for stdout.")
+@click.option("--rerun", "rerun_path", type=click.Path(path_type=Path), help="Write an .rrd file.")
+def command(
+    recording: Path,
+    path: Path | None,
+    rate_hz: float | None,
+    speed: float,
+    json_path: str | None,
+    rerun_path: Path | None,
+) -> None:
+    """Run the daemon's pipeline over RECORDING: a capture, a byte stream or a table.
+
+    A capture of `ahrsd run` is replayed with its own configuration and takes the same decisions,
+    which `decision_sha256` shows.
+    """
+    from ahrsd.replay import replay
+    from ahrsd.rerun_sink import RerunSink
+    from ahrsd.summary import summary_json, summary_lines
+
+    config = load_config(path) if path else Config()
+    viewer = None if rerun_path is None else RerunSink(rerun_path, serve=False, port=0)
+    size = recording.stat().st_size if recording.is_file() else 0
+    try:
+        with byte_progress(recording.name, size) as progress:
+            done = replay(
+                recording, config, rate_hz=rate_hz, speed=speed, viewer=viewer, progress=progress
+            )
+    finally:
+        if viewer is not None:
+            viewer.close()
+    if json_path is not None:
+        write_json(json_path, summary_json(done.core, recording.name, done.warnings))
+    if json_path != "-":
+        for line in summary_lines(done.core, recording.name, done.warnings):
+            click.echo(line)

@@ -1,0 +1,54 @@
+"""From the configuration to what the pure core takes."""
+
+from __future__ import annotations
+
+import datetime
+
+from ahrsd.calibrator import CalibratorSettings
+from ahrsd.config import Config
+from ahrsd.core import CoreSettings
+from ahrsd.worldfield import WorldField, world_field
+from ahrsd.writeback.policy import WriteBackPolicy
+
+
+def with_date(config: Config) -> Config:
+    """The configuration with the date of the world model filled in, so that a replay has it too."""
+    place = config.location
+    if place.latitude_deg is None or place.date is not None:
+        return config
+    today = datetime.datetime.now(datetime.UTC).date()
+    return config.model_copy(update={"location": place.model_copy(update={"date": today})})
+
+
+def expected_field(config: Config) -> WorldField | None:
+    """The world model's field where the configuration says a location, else None.
+
+    Raises WorldFieldError where the model does not hold for the date.
+    """
+    place = with_date(config).location
+    if place.latitude_deg is None or place.longitude_deg is None or place.date is None:
+        return None
+    day = place.date.timetuple().tm_yday - 1
+    year = place.date.year + day / 365.25
+    return world_field(place.latitude_deg, place.longitude_deg, place.height_m, year)
+
+
+def core_settings(
+    config: Config,
+    *,
+    stream_rate_hz: float | None = None,
+    policy: WriteBackPolicy | None = None,
+    held_out: bool = True,
+) -> CoreSettings:
+    """Settings of the core. `stream_rate_hz` is for recordings without time."""
+    return CoreSettings(
+        calibrator=CalibratorSettings(
+            estimator=config.estimator.parameters(),
+            limits=config.gates.limits(),
+            world_field=expected_field(config),
+            held_out=held_out,
+        ),
+        policy=policy or config.write_back_policy(),
+        output_rate_hz=config.device.rate_hz,
+        stream_rate_hz=stream_rate_hz,
+    )
