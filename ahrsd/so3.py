@@ -85,9 +85,15 @@ def _log_near_pi(R: Array, v: Array, t: Array) -> Array:
 
 
 def tangent_basis(u: Array) -> Array:
-    """(N, 3, 2) orthonormal bases of the planes normal to the unit vectors u (N, 3)."""
-    k = np.argmin(np.abs(u), axis=-1)
-    helper = np.eye(3)[k]
-    first = np.cross(helper, u)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(u, first)], axis=-1)
+    """(N, 3, 2) orthonormal bases of the planes normal to the unit vectors u (N, 3).
+
+    Without branches (Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017).
+    """
+    x, y, z = u.T
+    s = np.copysign(1.0, z)
+    a = -1.0 / (s + z)
+    ab = x * y * a
+    out = np.empty((len(u), 3, 2))
+    out[:, 0, 0], out[:, 1, 0], out[:, 2, 0] = 1.0 + s * x * x * a, s * ab, -s * x
+    out[:, 0, 1], out[:, 1, 1], out[:, 2, 1] = ab, s + y * y * a, -y
+    return out

@@ -123,43 +123,20 @@ def robust_weights(residual: Array, limit_gauss: float) -> Array:
 
 
 def linearise(
-    data: Data, u: Array, x: Array, bias: Array, noise: Noise, weights: Array | None = None
+    data: Data, u: Array, x: Array, bias: Array, noise: Noise, *, weights: Array | None = None
 ) -> Quadratic:
     """Quadratic of one epoch at directions u (n, 3), x = [M6, b], bias (3,) in rad/s."""
-    n = len(u)
-    M, b = symmetric(x[:6]), x[6:9]
     T = so3.tangent_basis(u)
-    w = np.ones(n) if weights is None else weights.copy()
+    w = np.ones(len(u)) if weights is None else weights.copy()
     if not data.measures_first:
         w[0] = 0.0
-    root = np.sqrt(w) / noise.mag_gauss
-    r = (data.field_b_gauss - u @ M - b) * root[:, None]
-    J_own = -(M @ T) * root[:, None, None]
-    J_x = np.concatenate([-symmetric_columns(u), np.tile(-np.eye(3), (n, 1, 1))], axis=2)
-    J_x *= root[:, None, None]
-
-    q, J_prev, J_bias, scale = _motion(data, u, T, bias, noise)
-
-    diag = np.einsum("nij,nik->njk", J_own, J_own)
-    diag[1:] += np.eye(2) * (scale**2)[:, None, None]
-    diag[:-1] += np.einsum("nij,nik->njk", J_prev, J_prev)
-    upper = -scale[:, None, None] * np.swapaxes(J_prev, 1, 2)  # rows d_(k-1), columns d_k
-
-    # border columns of every d_k: x (9), bias (3), and the gradient
-    border = np.zeros((n, 2, 13))
-    border[:, :, :9] = np.einsum("nij,nik->njk", J_own, J_x)
-    border[1:, :, 9:12] -= scale[:, None, None] * J_bias
-    border[:-1, :, 9:12] += np.einsum("nij,nik->njk", J_prev, J_bias)
-    border[:, :, 12] = np.einsum("nij,ni->nj", J_own, r)
-    border[1:, :, 12] -= scale[:, None] * q
-    border[:-1, :, 12] += np.einsum("nij,ni->nj", J_prev, q)
-
-    H_full, g_full = _shared_part(J_x, r, J_bias, q)
-    H, g, response = _eliminate(diag, upper, border, H_full, g_full)
-    d = np.zeros((n, 2))
+    field = _field(data, u, T, x, np.sqrt(w) / noise.mag_gauss)
+    motion = _motion(data, u, T, bias, noise)
+    H, g, response = _eliminate(*_interior(field, motion), *_shared_part(field, motion))
+    d = np.zeros((len(u), 2))
     d[1:-1] = response[:, :, WIDTH]
-    r_best = r + np.einsum("nij,nj->ni", J_own, d)
-    q_best = q + np.einsum("nij,nj->ni", J_prev, d[:-1]) - scale[:, None] * d[1:]
+    r_best = field.r + _times(field.J_own, d)
+    q_best = motion.q + _times(motion.J_prev, d[:-1]) - motion.scale[:, None] * d[1:]
     sum_mag, sum_gyro = float(np.sum(r_best**2)), float(np.sum(q_best**2))
     return Quadratic(
         H=H,
@@ -170,32 +147,79 @@ def linearise(
         sum_mag=sum_mag,
         sum_gyro=sum_gyro,
         count_mag=3.0 * float(np.count_nonzero(w)),
-        count_gyro=2.0 * (n - 1),
+        count_gyro=2.0 * (len(u) - 1),
     )
 
 
-def _motion(
-    data: Data, u: Array, T: Array, bias: Array, noise: Noise
-) -> tuple[Array, Array, Array, Array]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Field:
+    """Whitened field residuals r (n, 3), d r/d d_k (n, 3, 2) and d r/d x (n, 3, 9)."""
+
+    r: Array
+    J_own: Array
+    J_x: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """Whitened motion residuals q (n-1, 2), d q/d d_(k-1), d q/d w_b, and -d q/d d_k = scale I."""
+
+    q: Array
+    J_prev: Array
+    J_bias: Array
+    scale: Array
+
+
+def _field(data: Data, u: Array, T: Array, x: Array, root: Array) -> _Field:
+    M, b = symmetric(x[:6]), x[6:9]
+    J_x = np.zeros((len(u), 3, SHARED))
+    J_x[:, :, :6] = symmetric_columns(u)
+    J_x[:, [0, 1, 2], [6, 7, 8]] = 1.0
+    J_x *= -root[:, None, None]
+    r = (data.field_b_gauss - u @ M - b) * root[:, None]
+    return _Field(r, -(M @ T) * root[:, None, None], J_x)
+
+
+def _motion(data: Data, u: Array, T: Array, bias: Array, noise: Noise) -> _Motion:
     dt = data.dt_s[1:]
     R, Jl = so3.exp_and_left_jacobian(-(data.angle_b_rad[1:] - bias * dt[:, None]))
-    turned = np.einsum("nij,nj->ni", R, u[:-1])
+    turned = _times(R, u[:-1])
     scale = 1.0 / (noise.gyro_rad_s * dt)
     Tt = np.swapaxes(T[1:], 1, 2) * scale[:, None, None]
-    q = np.einsum("nij,nj->ni", Tt, turned)
-    J_prev = Tt @ R @ T[:-1]
     J_bias = -Tt @ so3.skew(turned) @ Jl * dt[:, None, None]
-    return q, J_prev, J_bias, scale
+    return _Motion(_times(Tt, turned), Tt @ R @ T[:-1], J_bias, scale)
 
 
-def _shared_part(J_x: Array, r: Array, J_bias: Array, q: Array) -> tuple[Array, Array]:
+def _interior(field: _Field, motion: _Motion) -> tuple[Array, Array, Array]:
+    """Diagonal blocks, blocks above them, and the border columns x (9), bias (3), gradient."""
+    n, scale = len(field.r), motion.scale[:, None]
+    own, prev = np.swapaxes(field.J_own, 1, 2), np.swapaxes(motion.J_prev, 1, 2)
+    diag = own @ field.J_own
+    diag[1:] += np.eye(2) * (scale**2)[:, :, None]
+    diag[:-1] += prev @ motion.J_prev
+    border = np.zeros((n, 2, 13))
+    border[:, :, :9] = own @ field.J_x
+    border[1:, :, 9:12] -= scale[:, :, None] * motion.J_bias
+    border[:-1, :, 9:12] += prev @ motion.J_bias
+    border[:, :, 12] = _times(own, field.r)
+    border[1:, :, 12] -= scale * motion.q
+    border[:-1, :, 12] += _times(prev, motion.q)
+    return diag, -scale[:, :, None] * prev, border
+
+
+def _times(J: Array, v: Array) -> Array:
+    """J_k v_k for stacks of matrices (n, i, j) and vectors (n, j)."""
+    return np.asarray((J @ v[:, :, None])[:, :, 0])
+
+
+def _shared_part(field: _Field, motion: _Motion) -> tuple[Array, Array]:
     H, g = np.zeros((WIDTH, WIDTH)), np.zeros(WIDTH)
-    Jx = J_x.reshape(-1, 9)
-    Jb = J_bias.reshape(-1, 3)
+    Jx = field.J_x.reshape(-1, SHARED)
+    Jb = motion.J_bias.reshape(-1, 3)
     H[:9, :9] = Jx.T @ Jx
     H[BIAS, BIAS] = Jb.T @ Jb
-    g[:9] = Jx.T @ r.ravel()
-    g[BIAS] = Jb.T @ q.ravel()
+    g[:9] = Jx.T @ field.r.ravel()
+    g[BIAS] = Jb.T @ motion.q.ravel()
     return H, g
 
 
@@ -242,5 +266,5 @@ def move(u: Array, quadratic: Quadratic, z: Array) -> Array:
     step = np.empty((len(u), 2))
     step[0], step[-1] = z[FIRST], z[LAST]
     step[1:-1] = quadratic.response[:, :, :WIDTH] @ z + quadratic.response[:, :, WIDTH]
-    moved = u + np.einsum("nij,nj->ni", quadratic.tangents, step)
+    moved = u + _times(quadratic.tangents, step)
     return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))

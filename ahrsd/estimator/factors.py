@@ -83,6 +83,12 @@ class Factor:
             J[where + 3 : where + 5, where + 3 : where + 5] = old.tangent.T @ node.tangent
         return z, J
 
+    def rise(self, c: Array, a: Node, b: Node) -> float:
+        """Cost at the present values above that at `point`, the walk of the bias included."""
+        z, _ = self.offset(c, a, b)
+        d = b.bias - a.bias
+        return float(self.g @ z + 0.5 * z @ self.H @ z + 0.5 * self.walk * d @ d)
+
     def at(self, c: Array, a: Node, b: Node) -> tuple[Array, Array]:
         """H (19, 19) and gradient (19,) around the present values."""
         z, J = self.offset(c, a, b)

@@ -25,6 +25,7 @@ class SingularError(ValueError):
 
 
 _C = gtsam.symbol("c", 0)
+_HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
 def _y(j: int) -> int:
@@ -55,6 +56,10 @@ def _hessian(factor: Factor, H: Array, g: Array) -> gtsam.HessianFactor:
     )
 
 
+def _singular(error: RuntimeError) -> SingularError:
+    return SingularError(str(error).strip().split("\n", maxsplit=1)[0])
+
+
 def _unary(mean: Array, sigma: Array) -> gtsam.PriorFactorVector:
     return gtsam.PriorFactorVector(_C, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
 
@@ -63,13 +68,15 @@ class Graph:
     """Calibration c (9,), nodes and factors; all values are the present linearisation point.
 
     `anchor` is what is believed of c without data, (mean, sigma); it is never folded, because its
-    weight against the data changes: `temper` multiplies its information (see `misfit`).
+    weight against the data changes: `temper` multiplies its information (see `misfit`), and `hold`
+    (9, 9) is added to it, which keeps the directions of c that nothing determines at the mean.
     """
 
     def __init__(self, c: Array, sigma_c: Array, first: Node, prior: Factor) -> None:
         self.c = c.copy()
         self.anchor = (c.copy(), sigma_c.copy())
         self.temper = 1.0
+        self.hold: Array = np.zeros((9, 9))
         self.nodes: dict[int, Node] = {prior.a: first}
         self.prior = prior
         self.factors: list[Factor] = []
@@ -92,18 +99,36 @@ class Graph:
             graph.add(gtsam.LinearContainerFactor(_hessian(factor, H, g), values))
         return graph
 
-    def _anchored(self, factors: list[Factor], damping: float = 0.0) -> gtsam.NonlinearFactorGraph:
+    def _anchored(self, factors: list[Factor], extra: Array) -> gtsam.NonlinearFactorGraph:
+        """All factors and the anchor; `extra` (9, 9) is information that pulls to the anchor."""
         graph = self._linear(factors)
-        mean, sigma = self.anchor
-        graph.add(_unary(mean - self.c, sigma / np.sqrt(self.temper)))
-        if damping > 0:
-            graph.add(_unary(np.zeros(9), sigma / np.sqrt(damping)))
+        information = self._belief() + extra
+        linear = information @ (self.anchor[0] - self.c)
+        if not np.isfinite(linear).all():
+            raise SingularError("the calibration is not finite")
+        hessian = gtsam.HessianFactor(_C, information, linear, 0.0)
+        graph.add(gtsam.LinearContainerFactor(hessian, self._values(factors)))
         return graph
+
+    def _belief(self) -> Array:
+        return np.asarray(np.diag(self.temper / self.anchor[1] ** 2))
 
     def anchor_cost(self) -> float:
         """What departing from the anchor costs, as a negative log likelihood."""
-        mean, sigma = self.anchor
-        return float(0.5 * self.temper * np.sum(((self.c - mean) / sigma) ** 2))
+        d = self.c - self.anchor[0]
+        return float(0.5 * d @ (self._belief() + self.hold) @ d)
+
+    def hold_blind(self, limit: float, covariance: Array) -> None:
+        """Hold the directions whose sigma stays above `limit` of the prior's at the prior's mean.
+
+        covariance (9+, 9+) of c first, tempered. In the eigenbasis of the posterior, whitened by
+        the prior, both are diagonal: holding one direction moves no other.
+        """
+        sigma = self.anchor[1]
+        scaled = covariance[:9, :9] / np.outer(sigma, sigma)
+        values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+        blind = vectors[:, values > limit**2] / sigma[:, None]
+        self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
 
     @staticmethod
     def _values(factors: list[Factor]) -> gtsam.Values:
@@ -124,11 +149,14 @@ class Graph:
         Raises SingularError where the graph does not determine all of it.
         """
         factors = self._all()
-        graph = self._anchored(factors, damping)
+        damped = damping / self.anchor[1] ** 2
+        graph = self._anchored(factors, self.hold)
+        if damping > 0:
+            graph.add(_unary(np.zeros(9), 1.0 / np.sqrt(damped)))
         try:
             delta = graph.linearize(self._values(factors)).optimize()
         except RuntimeError as error:
-            raise SingularError(str(error).split("\n", maxsplit=1)[0]) from error
+            raise _singular(error) from error
         dy = {j: np.array(delta.at(_y(j))) for j in self.nodes}
         return np.array(delta.at(_C)), dy
 
@@ -138,16 +166,19 @@ class Graph:
         self.nodes = {j: node.moved(dy[j]) for j, node in self.nodes.items()}
 
     def covariance(self) -> Array:
-        """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed."""
+        """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed.
+
+        As if nothing were held: what is not determined has the sigma of the prior.
+        """
         factors = self._all()
         values = self._values(factors)
-        graph = self._anchored(factors)
+        graph = self._anchored(factors, np.zeros((9, 9)))
         try:
             joint = gtsam.Marginals(graph, values).jointMarginalCovariance(
                 gtsam.KeyVector([_C, _y(self.last)])
             )
         except RuntimeError as error:
-            raise SingularError(str(error).split("\n", maxsplit=1)[0]) from error
+            raise _singular(error) from error
         return np.array(joint.fullMatrix())[:12, :12]
 
     def fold_oldest(self) -> None:
@@ -162,7 +193,7 @@ class Graph:
         try:
             _, rest = linear.eliminatePartialSequential(ordering)
         except RuntimeError as error:
-            raise SingularError(str(error).split("\n", maxsplit=1)[0]) from error
+            raise _singular(error) from error
         hessian = gtsam.HessianFactor(rest)
         augmented = np.array(hessian.augmentedInformation())
         H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)

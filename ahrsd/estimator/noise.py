@@ -23,7 +23,9 @@ from ahrsd.samples import Array
 
 _MAD = 1.4826
 _GYRO_LIMIT = 1.5
-_STRENGTH = 100.0  # degrees of freedom by which an epoch's noise is drawn to the usual one
+# Degrees of freedom by which an epoch's noise is drawn to the usual one. The gyro has so few per
+# epoch that its noise per epoch would be mostly chance, and weighting by chance is biased.
+_STRENGTH_MAG, _STRENGTH_GYRO = 100.0, 3000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +89,13 @@ def median(guesses: Sequence[chain.Noise]) -> chain.Noise:
 
 def shrunk(found: Residuals, usual: chain.Noise, parameters: EstimatorParameters) -> chain.Noise:
     """An epoch's own noise, drawn to the usual one: a disturbed epoch loses weight by itself."""
-    mag = found.mag_gauss2 + _STRENGTH * usual.mag_gauss**2
-    gyro = found.gyro_rad2_s2 + _STRENGTH * usual.gyro_rad_s**2
+    mag = found.mag_gauss2 + _STRENGTH_MAG * usual.mag_gauss**2
+    gyro = found.gyro_rad2_s2 + _STRENGTH_GYRO * usual.gyro_rad_s**2
     return _floored(
-        float(np.sqrt(mag / (found.mag_freedom + _STRENGTH))),
+        float(np.sqrt(mag / (found.mag_freedom + _STRENGTH_MAG))),
         min(
-            float(np.sqrt(gyro / (found.gyro_freedom + _STRENGTH))), _GYRO_LIMIT * usual.gyro_rad_s
+            float(np.sqrt(gyro / (found.gyro_freedom + _STRENGTH_GYRO))),
+            _GYRO_LIMIT * usual.gyro_rad_s,
         ),
         parameters,
     )

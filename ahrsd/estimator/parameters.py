@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,3 +38,16 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Raises ValueError naming the setting that is out of range."""
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}: it must be a positive number")
+        if self.epoch_steps < MIN_EPOCH_STEPS:
+            raise ValueError(f"epoch_steps is {self.epoch_steps}: at least {MIN_EPOCH_STEPS}")
+        if self.window_steps < self.epoch_steps:
+            raise ValueError(
+                f"window_steps is {self.window_steps}: at least epoch_steps, {self.epoch_steps}"
+            )

@@ -55,7 +55,7 @@ def sphere_start(field: Array) -> Array | None:
     r2 = solution[3] + solution[:3] @ solution[:3]
     if rank < 4 or r2 <= 0:
         return None
-    return np.r_[chain.upper_triangle(np.eye(3) * np.sqrt(r2)), solution[:3] + centre]
+    return np.concatenate([chain.upper_triangle(np.eye(3) * np.sqrt(r2)), solution[:3] + centre])
 
 
 def _orientation(data: chain.Data) -> Array:
@@ -87,4 +87,5 @@ def _solve(gram: Array, rows: int, field: Array) -> Array | None:
     scale = float(np.median(np.linalg.norm((field - b) @ C, axis=1)))
     if not np.isfinite(scale) or scale <= 0:
         return None
-    return np.r_[chain.upper_triangle(np.linalg.inv(C / scale)), b]
+    M = np.asarray(np.linalg.inv(C / scale), dtype=np.float64)
+    return np.concatenate([chain.upper_triangle(M), b])

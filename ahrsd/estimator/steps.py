@@ -52,14 +52,11 @@ class StepAverager:
         self._rows: list[Array] = []
         self._linked = False
 
-    def restart(self) -> None:
-        """A gap: what is pending is dropped and the next step is not linked to the last one."""
-        self._rows.clear()
-        self._linked = False
+    def add(self, rows: Array) -> Steps:
+        """Take samples (N, 11) without a gap, return completed steps.
 
-    def add(self, time_s: Array, dt_s: Array, field: Array, gyro: Array, accel: Array) -> Steps:
-        """Take (N,) times and steps and (N, 3) samples without a gap; return completed steps."""
-        rows = np.column_stack([time_s, dt_s, field, gyro, accel])
+        Columns: time_s, dt_s, field (3), gyro (3), accel (3).
+        """
         if self._rows:
             rows = np.vstack([*self._rows, rows])
         n, half = self.averaged, self.averaged // 2
@@ -88,7 +85,7 @@ def _average(rows: Array, lead: int, n: int, count: int, linked: bool) -> Steps:
     first = 0 if linked else 1
     if count > first:
         index = middles[first:, None] - np.arange(n - 1, -1, -1)[None, :]
-        angle[first:] = _compose(phi[index])
+        angle[first:] = compose(phi[index])
         length[first:] = dt[index].sum(axis=1)
     return Steps(
         time_s=body[:, half, 0],
@@ -101,7 +98,7 @@ def _average(rows: Array, lead: int, n: int, count: int, linked: bool) -> Steps:
     )
 
 
-def _compose(phi: Array) -> Array:
+def compose(phi: Array) -> Array:
     """Rotation vector of Exp(phi_1) Exp(phi_2) ... (body increments), for (N, n, 3)."""
     if phi.shape[1] == 1:
         return np.asarray(phi[:, 0])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from ahrsd.calibration import Observability
 from ahrsd.estimator import chain
+from ahrsd.estimator.window import BLIND
 from ahrsd.samples import Array
 
 _NAMES = (
@@ -13,7 +16,8 @@ _NAMES = (
     *(f"hard iron {i}" for i in "xyz"),
     *(f"gyro bias {i}" for i in "xyz"),
 )
-_SEEN = 0.5  # a direction whose sigma shrank by less than this from the prior is not observed
+_TYPICAL_DIP_RAD = float(np.radians(65.0))  # pessimistic for most of the inhabited earth
+_STEEPEST_RAD = float(np.radians(80.0))
 _FLOOR = 0.1  # ratio at which the observability score is 1
 
 
@@ -58,13 +62,33 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     return float(np.degrees(np.sqrt(worst)))
 
 
+def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:
+    """Tilts driven (K, 3) and the field's dip in rad, from gravity; level and steep without it.
+
+    tilts: unit vectors towards the earth, some nan; epochs: directions (n, 3) of the field and of
+    down.
+    """
+    down = np.array([d for d in tilts if np.isfinite(d).all()])
+    if len(down) == 0:
+        return np.array([[0.0, 0.0, 1.0]]), _TYPICAL_DIP_RAD
+    along = [
+        float(u[len(u) // 2] @ d[len(u) // 2])
+        for u, d in epochs
+        if np.isfinite(d[len(u) // 2]).all()
+    ]
+    if not along:
+        return down, _TYPICAL_DIP_RAD
+    dip = float(np.median(np.arcsin(np.clip(along, -1.0, 1.0))))
+    return down, float(np.clip(dip, -_STEEPEST_RAD, _STEEPEST_RAD))
+
+
 def observability(covariance: Array, prior_sigma: Array) -> Observability:
     """Compare the posterior of [M (6), b (3), w_b (3)] with the prior, direction by direction."""
     scaled = covariance / np.outer(prior_sigma, prior_sigma)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     ratio = np.sqrt(np.clip(values, 0.0, None))
     blind = []
-    for k in np.flatnonzero(ratio > _SEEN):
+    for k in np.flatnonzero(ratio > BLIND):
         v = np.abs(vectors[:, k])
         blind.append(" + ".join(_NAMES[i] for i in np.argsort(v)[::-1][:3] if v[i] > 0.4))
     return Observability(

@@ -3,7 +3,11 @@
 Two ways to move the estimate. `track` is a plain Gauss-Newton step in which only what has moved by
 more than a third of a sigma is linearised again: the steady state, whose cost does not depend on
 how long the run has been. `optimise` linearises everything and takes a step only if the true cost
-falls (Levenberg-Marquardt): for the start, and whenever a tracking step would be large.
+falls (Levenberg-Marquardt): for searching, and whenever a tracking step would be large. `track`
+spends at most _WORK linearisations; what is left over waits for the next epoch.
+
+Directions of the calibration that the data do not determine are held at the prior's mean, so that
+noise and model errors cannot make them wander (`Graph.hold_blind`).
 """
 
 from __future__ import annotations
@@ -32,8 +36,11 @@ _STALE = 0.3  # sigmas of movement after which an epoch is linearised again
 _SETTLED = 0.05  # sigmas of movement at which iterating stops
 _LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
 _MAX_STEPS = 12
-_CAREFUL_STEPS = 4
 _MAX_TRACKS = 6
+_WORK = 40  # linearisations of an epoch per tracking step
+BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
+_DAMPING = 1e-3
+_DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
 _SHORTEST_GAP_S = 0.1
@@ -82,7 +89,9 @@ class Window:
         self.usual = usual
         self.epochs: list[Epoch] = []
         self.misfit = Misfit()
-        self.step_sigmas = np.inf
+        self.step_sigmas = float(np.inf)
+        self.folded = False
+        self._damping = _DAMPING
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, sigma_c, first, prior)
@@ -114,8 +123,12 @@ class Window:
 
     def fold(self) -> None:
         """Fold the oldest epochs until the window has its size."""
-        while sum(len(e.data) for e in self.epochs) > self.parameters.window_steps:
+        while (
+            len(self.epochs) > 1
+            and sum(len(e.data) for e in self.epochs) > self.parameters.window_steps
+        ):
             old = self.epochs.pop(0)
+            self.folded = True
             self.misfit.remember(old.factor, self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
@@ -134,7 +147,7 @@ class Window:
         graph = self.graph
         first, last = graph.nodes[a], graph.nodes[a + 1]
         u[0], u[-1] = first.direction, last.direction
-        q = chain.linearise(data, u, graph.c, first.bias, used, weights)
+        q = chain.linearise(data, u, graph.c, first.bias, used, weights=weights)
         point = Point(graph.c.copy(), first.copy(), last.copy())
         factor = epoch_factor(q, a, point, walk)
         found = noise.residuals(q, data, used, chain.symmetric(graph.c[:6]))
@@ -167,7 +180,7 @@ class Window:
 
     # -- moving ----------------------------------------------------------------------------------
 
-    def restart_at(self, c: Array) -> None:
+    def restart_at(self, c: Array, bias: Array) -> None:
         """Put the calibration at c, directions from the field alone, noise as first guessed.
 
         The guess does not depend on c, so costs reached from different starts compare.
@@ -175,7 +188,6 @@ class Window:
         graph = self.graph
         guess = noise.median(self._guesses)
         graph.c = c.copy()
-        bias = graph.nodes[graph.last].bias
         for k, epoch in enumerate(self.epochs):
             u = chain.start_directions(chain.symmetric(c[:6]), c[6:], epoch.data.field_b_gauss)
             if epoch.data.measures_first or k == 0:
@@ -195,15 +207,12 @@ class Window:
 
     def cost(self) -> float:
         """Negative log likelihood of the window plus the prior, up to a constant."""
-        prior, graph = self.graph.prior, self.graph
-        node = graph.nodes[prior.a]
-        z, _ = prior.offset(graph.c, node, node)
-        walks = 0.0
-        for factor in graph.factors:
-            d = graph.nodes[factor.b].bias - graph.nodes[factor.a].bias
-            walks += 0.5 * factor.walk * float(d @ d)
-        prior_cost = float(prior.g[:14] @ z[:14] + 0.5 * z[:14] @ prior.H[:14, :14] @ z[:14])
-        return sum(e.cost for e in self.epochs) + prior_cost + walks + graph.anchor_cost()
+        graph = self.graph
+        rises = sum(
+            f.rise(graph.c, graph.nodes[f.a], graph.nodes[f.b])
+            for f in (graph.prior, *graph.factors)
+        )
+        return sum(e.cost for e in self.epochs) + rises + graph.anchor_cost()
 
     def optimise(self, steps: int = _MAX_STEPS) -> float:
         """Levenberg-Marquardt over the whole window at fixed noise and weights; returns the cost.
@@ -211,71 +220,86 @@ class Window:
         Stops at the iteration limit or where damping alone no longer finds a lower cost; the
         window is then at the best point found. Never raises on hopeless data: `step_sigmas` says.
         """
-        damping, cost = 1e-3, self.cost()
+        cost = self.cost()
         for _ in range(steps):
             kept = self.snapshot()
             try:
-                dc, dy = self.graph.step(damping)
+                dc, dy = self.graph.step(self._damping)
                 self.graph.move(dc, dy)
                 new = self._cost_here()
             except SingularError:
                 new = np.inf
             if new < cost:
                 gain, cost = cost - new, new
-                damping = max(damping / 10, 1e-9)
+                self._damping = max(self._damping / 10, _DAMPING_LIMITS[0])
                 if gain < _GAIN * self.graph.temper:
                     break
             else:
                 self.restore(kept)
-                damping *= 100
-                if damping > 1e6:
+                self._damping *= 100
+                if self._damping > _DAMPING_LIMITS[1]:
+                    self._damping = _DAMPING
                     break
         return cost
 
     def _cost_here(self) -> float:
         """Cost after a step, everything linearised there; infinite where M is not positive."""
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
-            return np.inf
+            return float(np.inf)
         directions = [self._moved_directions(e) for e in self.epochs]
         for k, u in enumerate(directions):
             self._replace(k, u, self.epochs[k].used, self.epochs[k].weights)
         return self.cost()
 
     def track(self, *, everything: bool = False) -> None:
-        """Follow the newest epoch; see the module's docstring."""
+        """Follow the newest epoch, or iterate to the end over `everything`."""
         everyone = list(range(len(self.epochs)))
         stale = everyone if everything else everyone[-1:]
+        work = _WORK
         for _ in range(_MAX_TRACKS):
             self.refresh(stale)
-            self._temper()
+            work -= len(stale)
             try:
-                information = np.linalg.inv(self.graph.covariance()[:9, :9]) / self.graph.temper
+                information = self._weigh()
                 dc, dy = self.graph.step()
             except (SingularError, np.linalg.LinAlgError):
-                self.step_sigmas = np.inf
+                self.step_sigmas = float(np.inf)
                 return
-            self.step_sigmas = _sigmas(dc, information)
+            self.step_sigmas = sigmas(dc, information)
             if self.step_sigmas > _LARGE:
-                self.optimise(_CAREFUL_STEPS)
+                self.optimise(max(1, work // len(everyone)))
                 if not everything:
-                    return  # the next epoch goes on from here: the cost per epoch stays bounded
+                    return  # the next epoch goes on from here: the work per epoch stays bounded
                 stale = everyone
                 continue
             self.graph.move(dc, dy)
-            if self.step_sigmas < _SETTLED:
+            stale = everyone if everything else self._stale(information)
+            if self.step_sigmas < _SETTLED or (len(stale) > work and not everything):
                 return
-            moved = [
-                k
-                for k, e in enumerate(self.epochs)
-                if _sigmas(self.graph.c - e.factor.point.c, information) > _STALE
-            ]
-            stale = everyone if everything else (moved or everyone[-1:])
 
-    def _temper(self) -> None:
-        """Let what is believed without data weigh against data that disagree among themselves."""
-        found = self.misfit.value([e.factor for e in self.epochs], self.graph)
-        self.graph.temper = max(1.0, found)
+    def _stale(self, information: Array) -> list[int]:
+        """Epochs far from where they were linearised, or else the newest one."""
+        c = self.graph.c
+        moved = [
+            k
+            for k, e in enumerate(self.epochs)
+            if sigmas(c - e.factor.point.c, information) > _STALE
+        ]
+        return moved or [len(self.epochs) - 1]
+
+    def _weigh(self) -> Array:
+        """Prior against data, and what is held; returns the tempered information of c (9, 9).
+
+        What is believed without data keeps its weight against data that disagree among themselves.
+        """
+        graph = self.graph
+        graph.temper = max(1.0, self.misfit.value([e.factor for e in self.epochs], graph))
+        covariance = graph.covariance()[:9, :9] * graph.temper
+        graph.hold_blind(BLIND, covariance)
+        return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
 
-def _sigmas(step: Array, information: Array) -> float:
-    return float(np.sqrt(max(step @ information @ step, 0.0) / len(step)))
+def sigmas(step: Array, information: Array) -> float:
+    """Length of a step in standard deviations, per square root of its dimension."""
+    squared = float(step @ information @ step)
+    return float(np.sqrt(max(squared, 0.0) / len(step)))

@@ -1,0 +1,144 @@
+"""From blocks of samples to the data of epochs; any split into blocks gives the same epochs.
+
+The rate is measured on the first _RATE_ROWS samples after a start or a gap, whatever blocks they
+came in; from it follows how many samples make a step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.estimator import chain
+from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
+from ahrsd.estimator.steps import StepAverager, Steps, join, samples_per_step, split
+from ahrsd.samples import Array, SampleBlock
+
+_RATE_ROWS = 33
+_SMOOTHED = 33  # steps over which the specific force is averaged to tell where down is
+
+
+def check(block: SampleBlock) -> None:
+    """Raises ValueError naming the first row that is not a finite sample with a positive step.
+
+    Only the first row of a block after a gap may lack its step.
+    """
+    table = (
+        ("time_s", block.time_s),
+        ("raw_b_gauss", block.raw_b_gauss),
+        ("gyro_b_rad_s", block.gyro_b_rad_s),
+    )
+    for name, values in table:
+        good = np.isfinite(values).reshape(len(block), -1).all(axis=1)
+        if not good.all():
+            k = int(np.argmin(good))
+            raise ValueError(f"{name} of row {k} is not finite: {values[k]}")
+    start = int(block.gap_before)
+    good = block.dt_s[start:] > 0.0
+    good &= block.dt_s[start:] < np.inf
+    if not good.all():
+        k = start + int(np.argmin(good))
+        raise ValueError(f"dt_s of row {k} is not a positive step: {block.dt_s[k]}")
+
+
+class Intake:
+    """Blocks in, epochs out; also counts what went in."""
+
+    def __init__(self, parameters: EstimatorParameters) -> None:
+        self._parameters = parameters
+        self.averaged = 1
+        self.samples = 0
+        self._averager: StepAverager | None = None
+        self._rows: list[Array] = []  # samples of a piece whose rate is not known yet
+        self._pending: list[Steps] = []
+        self._pending_count = 0
+        self._fresh = True
+        self._earlier_s = 0.0
+        self._from_s: float | None = None
+        self._to_s = 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Time covered, gaps left out."""
+        return self._earlier_s + (0.0 if self._from_s is None else self._to_s - self._from_s)
+
+    def add(self, block: SampleBlock) -> list[chain.Data]:
+        """Take samples that follow the last ones without a gap; return completed epochs."""
+        if len(block) == 0:
+            return []
+        self.samples += len(block)
+        if self._from_s is None:
+            self._from_s = float(block.time_s[0])
+        self._to_s = float(block.time_s[-1])
+        rows = np.column_stack(
+            [block.time_s, block.dt_s, block.raw_b_gauss, block.gyro_b_rad_s, block.accel_b_m_s2]
+        )
+        if self._averager is None:
+            self._rows.append(rows)
+            rows = np.vstack(self._rows)
+            if len(rows) < _RATE_ROWS:
+                return []
+            self._rows.clear()
+            self._averager = self._measured(rows[1:_RATE_ROWS, 1])
+        steps = self._averager.add(rows)
+        if len(steps):
+            self._pending.append(steps)
+            self._pending_count += len(steps)
+        return self._complete()
+
+    def _measured(self, dt_s: Array) -> StepAverager:
+        rate_hz = 1.0 / float(np.median(dt_s))
+        self.averaged = samples_per_step(rate_hz, self._parameters.step_rate_hz)
+        return StepAverager(self.averaged)
+
+    def _complete(self) -> list[chain.Data]:
+        closed = []
+        while self._pending_count >= self._parameters.epoch_steps + int(self._fresh):
+            closed.append(self._close(self._parameters.epoch_steps + int(self._fresh)))
+        return closed
+
+    def interrupt(self) -> chain.Data | None:
+        """A gap: what is pending as a short epoch, if it is worth one; the next one starts anew."""
+        enough = self._pending_count >= MIN_EPOCH_STEPS
+        data = self._close(self._pending_count) if enough else None
+        self._pending.clear()
+        self._pending_count = 0
+        self._rows.clear()
+        self._averager = None
+        self._fresh = True
+        self._earlier_s, self._from_s = self.duration_s, None
+        return data
+
+    def _close(self, count: int) -> chain.Data:
+        steps, rest = split(join(self._pending), count)
+        self._pending = [rest] if len(rest) else []
+        self._pending_count = len(rest)
+        fresh, self._fresh = self._fresh, False
+        return chain.Data(
+            steps.field_b_gauss,
+            steps.angle_b_rad,
+            steps.dt_s,
+            _down(steps.accel_b_m_s2),
+            steps.time_s,
+            measures_first=fresh,
+        )
+
+
+def _down(accel: Array) -> Array:
+    """Unit vectors towards the earth from specific force (it points up at rest), smoothed."""
+    if not np.isfinite(accel).all():
+        return np.full_like(accel, np.nan)
+    kernel = np.ones(min(len(accel), _SMOOTHED))
+    smooth = np.column_stack([np.convolve(accel[:, i], kernel, "same") for i in range(3)])
+    return np.asarray(-smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-9))
+
+
+def with_border(data: chain.Data, before: chain.Data) -> chain.Data:
+    """Put the previous epoch's last step in front, as the shared border."""
+    return chain.Data(
+        np.vstack([before.field_b_gauss[-1:], data.field_b_gauss]),
+        np.vstack([np.zeros((1, 3)), data.angle_b_rad]),
+        np.r_[data.dt_s[0], data.dt_s],
+        np.vstack([before.down_b[-1:], data.down_b]),
+        np.r_[before.time_s[-1], data.time_s],
+        measures_first=False,
+    )
