@@ -64,6 +64,10 @@ def _unary(mean: Array, sigma: Array) -> gtsam.PriorFactorVector:
     return gtsam.PriorFactorVector(_C, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
 
 
+Step = tuple[Array, dict[int, Array]]
+"""Moves dc (9,) of the calibration and dy (5,) per node."""
+
+
 class Graph:
     """Calibration c (9,), nodes and factors; all values are the present linearisation point.
 
@@ -141,7 +145,7 @@ class Graph:
     def _all(self) -> list[Factor]:
         return [self.prior, *self.factors]
 
-    def step(self, damping: float = 0.0) -> tuple[Array, dict[int, Array]]:
+    def step(self, damping: float = 0.0) -> Step:
         """One Gauss-Newton step: dc (9,) and dy (5,) per node.
 
         `damping` holds c back by that multiple of the anchor's information (Levenberg-Marquardt).

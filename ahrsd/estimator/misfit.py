@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.estimator.factors import Factor
-from ahrsd.estimator.graph import Graph
+from ahrsd.estimator.graph import Graph, Step
+from ahrsd.samples import Array
 
 _KEEP, _BORDERS = np.r_[0:12], np.r_[12:14, 17:19]
 _USED = 12.0  # parameters that the fit took from the scores
@@ -29,20 +30,30 @@ class Misfit:
 
     def remember(self, factor: Factor, graph: Graph) -> None:
         """An epoch leaves the window: keep its score."""
-        s, n = _score(factor, graph)
+        s, n = _score(*_alone(factor, graph))
         self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
 
-    def value(self, factors: Sequence[Factor], graph: Graph) -> float:
-        """Mean square of the scores per degree of freedom."""
+    def value(self, factors: Sequence[Factor], graph: Graph, step: Step) -> float:
+        """Mean square of the scores per degree of freedom, where `step` leads.
+
+        At the joint optimum, not at the present values: what all epochs ask for together is not
+        disagreement.
+        """
         total, count = self._sum, self._count
+        dc, dy = step
         for factor in factors:
-            s, n = _score(factor, graph)
+            H, g = _alone(factor, graph)
+            s, n = _score(H, g + H @ np.concatenate([dc, dy[factor.a], dy[factor.b]]))
             total, count = total + s, count + n
         return total / max(count - _USED, 0.2 * count, 1.0)
 
 
-def _score(factor: Factor, graph: Graph) -> tuple[float, float]:
-    H, g = replace(factor, walk=0.0).at(graph.c, graph.nodes[factor.a], graph.nodes[factor.b])
+def _alone(factor: Factor, graph: Graph) -> tuple[Array, Array]:
+    """An epoch's quadratic at the present values, without the walk of the bias."""
+    return replace(factor, walk=0.0).at(graph.c, graph.nodes[factor.a], graph.nodes[factor.b])
+
+
+def _score(H: Array, g: Array) -> tuple[float, float]:
     cross = H[np.ix_(_KEEP, _BORDERS)]
     inverse = np.linalg.pinv(H[np.ix_(_BORDERS, _BORDERS)], rcond=1e-12)
     S = H[np.ix_(_KEEP, _KEEP)] - cross @ inverse @ cross.T

@@ -21,7 +21,7 @@ from ahrsd.estimator.search import search, worthwhile
 from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
 
-_FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every doubling
+_FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
 _GAIN = 1.0  # of log likelihood, tempered, that another start must bring
 _GAIN_FOLDED = 20.0  # once older data are folded at the present answer, which a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
@@ -92,7 +92,7 @@ class Estimator:
         if self._searching and worthwhile([e.data for e in window.epochs]):
             self._moving_epochs += 1
             if self._moving_epochs >= self._next_search:
-                self._next_search = 2 * self._moving_epochs
+                self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
                 self._search(window)
         window.fold()
 
@@ -115,14 +115,14 @@ class Estimator:
         needed = _GAIN_FOLDED if window.folded else _GAIN
         if found.gain > needed * window.graph.temper:
             window.restart_at(found.c, found.bias)
-            window.track(everything=True)
+            window.track()
         self._agreed = found.agreed
         self._searching = not (found.agreed and self._sure(window))
 
     @staticmethod
     def _sure(window: Window) -> bool:
         try:
-            sigma = np.sqrt(np.diag(window.graph.covariance())[6:9])
+            sigma = np.sqrt(window.graph.temper * np.diag(window.graph.covariance())[6:9])
         except SingularError:
             return False
         size = np.cbrt(np.linalg.det(chain.symmetric(window.graph.c[:6])))
@@ -138,7 +138,6 @@ class Estimator:
             covariance = graph.covariance()
         except SingularError:
             return None
-        misfit = window.misfit.value([e.factor for e in window.epochs], graph)
         covariance = covariance * graph.temper
         observed = summary.observability(covariance, self._prior_sigma)
         A, b, size, J = summary.unit_volume(graph.c)
@@ -156,7 +155,7 @@ class Estimator:
             covariance=K @ covariance @ K.T,
             noise_mag_gauss=window.usual.mag_gauss * float(np.sqrt(averaged)),
             noise_gyro_rad_s=window.usual.gyro_rad_s * float(np.sqrt(averaged)),
-            misfit=misfit,
+            misfit=window.found_misfit,
             heading_sigma_deg=heading,
             observability=observed,
             samples=self._intake.samples,

@@ -4,7 +4,7 @@ Two ways to move the estimate. `track` is a plain Gauss-Newton step in which onl
 more than a third of a sigma is linearised again: the steady state, whose cost does not depend on
 how long the run has been. `optimise` linearises everything and takes a step only if the true cost
 falls (Levenberg-Marquardt): for searching, and whenever a tracking step would be large. `track`
-spends at most _WORK linearisations; what is left over waits for the next epoch.
+spends at most _WORK linearisations per epoch on average; what is left over waits.
 
 Directions of the calibration that the data do not determine are held at the prior's mean, so that
 noise and model errors cannot make them wander (`Graph.hold_blind`).
@@ -37,7 +37,7 @@ _SETTLED = 0.05  # sigmas of movement at which iterating stops
 _LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
-_WORK = 40  # linearisations of an epoch per tracking step
+_WORK, _MOST_WORK = 24, 160  # linearisations that each new epoch allows, and that may be saved up
 BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
 _DAMPING = 1e-3
 _DAMPING_LIMITS = (1e-9, 1e6)
@@ -89,9 +89,11 @@ class Window:
         self.usual = usual
         self.epochs: list[Epoch] = []
         self.misfit = Misfit()
+        self.found_misfit = 1.0
         self.step_sigmas = float(np.inf)
         self.folded = False
         self._damping = _DAMPING
+        self._work = 0
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, sigma_c, first, prior)
@@ -100,6 +102,7 @@ class Window:
 
     def append(self, data: chain.Data) -> None:
         """A new epoch at the end, linked to the last one unless `data.measures_first`."""
+        self._work = min(self._work + _WORK, _MOST_WORK)
         self._guesses.append(noise.first_guess(data, self.parameters))
         graph = self.graph
         a = graph.last
@@ -144,6 +147,7 @@ class Window:
         a: int,
         walk: float,
     ) -> Epoch:
+        self._work -= 1
         graph = self.graph
         first, last = graph.nodes[a], graph.nodes[a + 1]
         u[0], u[-1] = first.direction, last.direction
@@ -220,7 +224,8 @@ class Window:
         Stops at the iteration limit or where damping alone no longer finds a lower cost; the
         window is then at the best point found. Never raises on hopeless data: `step_sigmas` says.
         """
-        cost = self.cost()
+        present = all(np.array_equal(e.factor.point.c, self.graph.c) for e in self.epochs)
+        cost = self.cost() if present else self._cost_here()
         for _ in range(steps):
             kept = self.snapshot()
             try:
@@ -255,10 +260,8 @@ class Window:
         """Follow the newest epoch, or iterate to the end over `everything`."""
         everyone = list(range(len(self.epochs)))
         stale = everyone if everything else everyone[-1:]
-        work = _WORK
         for _ in range(_MAX_TRACKS):
             self.refresh(stale)
-            work -= len(stale)
             try:
                 information = self._weigh()
                 dc, dy = self.graph.step()
@@ -267,15 +270,26 @@ class Window:
                 return
             self.step_sigmas = sigmas(dc, information)
             if self.step_sigmas > _LARGE:
-                self.optimise(max(1, work // len(everyone)))
-                if not everything:
-                    return  # the next epoch goes on from here: the work per epoch stays bounded
+                if not self._careful(everything=everything):
+                    return
                 stale = everyone
                 continue
             self.graph.move(dc, dy)
             stale = everyone if everything else self._stale(information)
-            if self.step_sigmas < _SETTLED or (len(stale) > work and not everything):
+            if self.step_sigmas < _SETTLED or (len(stale) > self._work and not everything):
                 return
+
+    def _careful(self, *, everything: bool) -> bool:
+        """A large step with care, as far as the work allowed goes; whether iterating may go on.
+
+        The next epoch goes on from wherever this ends.
+        """
+        n = len(self.epochs)
+        steps = _MAX_STEPS if everything else min(_MAX_STEPS, self._work // n - 1)
+        if steps < 1:
+            return False
+        self.optimise(steps)
+        return everything or self._work >= 2 * n
 
     def _stale(self, information: Array) -> list[int]:
         """Epochs far from where they were linearised, or else the newest one."""
@@ -293,7 +307,10 @@ class Window:
         What is believed without data keeps its weight against data that disagree among themselves.
         """
         graph = self.graph
-        graph.temper = max(1.0, self.misfit.value([e.factor for e in self.epochs], graph))
+        graph.temper, graph.hold = 1.0, np.zeros((9, 9))
+        factors = [e.factor for e in self.epochs]
+        self.found_misfit = self.misfit.value(factors, graph, graph.step())
+        graph.temper = max(1.0, self.found_misfit)
         covariance = graph.covariance()[:9, :9] * graph.temper
         graph.hold_blind(BLIND, covariance)
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
