@@ -13,6 +13,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.gates.limits import GateLimits
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 
 Baud = Literal["auto", 9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600]
@@ -111,10 +112,11 @@ class Estimator(Section):
         return EstimatorParameters(**self.model_dump())
 
 
+_LIMITS = GateLimits()
 _ORDERED = (
-    ("tilt_2d_deg", "tilt_3d_deg"),
     ("field_min_gauss", "field_max_gauss"),
     ("field_spread_flash_percent", "field_spread_ram_percent"),
+    ("min_diagonal", "max_diagonal"),
     ("max_condition_auto", "max_condition_operator"),
     ("max_offset_auto_gauss", "max_offset_operator_gauss"),
     ("max_step_auto_deg", "max_step_operator_deg"),
@@ -122,72 +124,114 @@ _ORDERED = (
 
 
 class Gates(Section):
-    """What must hold before anything is written; every limit may be made stricter or looser."""
+    """What must hold before anything is written, one limit per gate (docs/gates.md)."""
 
-    max_error_rate: float = Field(default=1e-3, ge=0.0, le=1.0)
-    """Messages whose checksum or CRC was wrong, over all. [1]"""
-    max_drop_rate: float = Field(default=5e-3, ge=0.0, le=1.0)
-    """Samples that are missing, over all. [1]"""
-    min_rate_hz: float = Field(default=10.0, ge=1.0, le=800.0)
+    max_error_rate: float = Field(default=_LIMITS.max_error_rate, ge=0.0, le=1.0)
+    """Messages with a wrong checksum, over all. [1]"""
+    max_drop_rate: float = Field(default=_LIMITS.max_drop_rate, ge=0.0, le=1.0)
+    """Samples missing, over all. [1]"""
+    min_rate_hz: float = Field(default=_LIMITS.min_rate_hz, ge=1.0, le=800.0)
     """Sample rate. [Hz]"""
-    min_heading_excursion_deg: float = Field(default=280.0, ge=0.0, le=360.0)
-    """Headings that were driven. [deg]"""
-    tilt_3d_deg: float = Field(default=30.0, ge=0.0, le=90.0)
-    """Roll and pitch both beyond this make the motion three-dimensional. [deg]"""
-    tilt_2d_deg: float = Field(default=5.0, ge=0.0, le=90.0)
-    """Tilt that a planar motion may have at most. [deg]"""
-    max_heading_sigma_deg: float = Field(default=1.0, gt=0.0, le=20.0)
-    """1 sigma of the heading at the worst attitude that was driven. [deg]"""
-    field_min_gauss: float = Field(default=0.22, ge=0.0, le=2.5)
-    """Weakest field on Earth. [gauss]"""
-    field_max_gauss: float = Field(default=0.67, ge=0.0, le=2.5)
-    """Strongest field on Earth. [gauss]"""
-    field_model_percent: float = Field(default=10.0, gt=0.0, le=100.0)
-    """Mean field against the world magnetic model, where a location is given. [%]"""
-    field_spread_ram_percent: float = Field(default=2.0, gt=0.0, le=100.0)
-    """Standard deviation of the corrected field over its mean, to write RAM. [%]"""
-    field_spread_flash_percent: float = Field(default=1.0, gt=0.0, le=100.0)
-    """The same to write flash. [%]"""
-    max_inclination_error_deg: float = Field(default=3.0, gt=0.0, le=90.0)
-    """Inclination against the world magnetic model. [deg]"""
-    holdout_segments: int = Field(default=2, ge=0, le=100)
-    """Full turns that the estimate has not seen and on which it is judged. [turns]"""
-    holdout_separation_s: float = Field(default=600.0, ge=0.0, le=86400.0)
-    """Time between the data of the estimate and the data that judge it. [s]"""
-    holdout_rms_deg: float = Field(default=1.5, gt=0.0, le=180.0)
-    """Heading by the field against heading by the gyro there, RMS. [deg]"""
-    holdout_max_deg: float = Field(default=3.0, gt=0.0, le=180.0)
-    """The same, largest. [deg]"""
-    closure_deg: float = Field(default=2.0, gt=0.0, le=180.0)
-    """Heading error that is left after a full turn. [deg]"""
-    min_improvement_percent: float = Field(default=20.0, ge=0.0, le=100.0)
-    """RMS on the held-out data must be lower than with the present registers by this. [%]"""
-    min_improvement_deg: float = Field(default=0.3, ge=0.0, le=180.0)
-    """And by this. [deg]"""
-    repeat_hard_iron_gauss: float = Field(default=0.01, gt=0.0, le=2.5)
-    """Hard iron of two disjoint windows. [gauss]"""
-    repeat_heading_deg: float = Field(default=1.0, gt=0.0, le=180.0)
-    """Heading that two disjoint windows predict, over all headings. [deg]"""
-    second_opinion_deg: float = Field(default=2.0, gt=0.0, le=180.0)
-    """Heading against that of an independent ellipsoid fit. [deg]"""
-    max_condition_auto: float = Field(default=2.0, ge=1.0, le=100.0)
-    """Condition number of the correction matrix without a person. [1]"""
-    max_condition_operator: float = Field(default=8.0, ge=1.0, le=100.0)
-    """The same with a person's approval. [1]"""
-    max_offset_auto_gauss: float = Field(default=0.6, gt=0.0, le=2.5)
+    min_heading_excursion_deg: float = Field(
+        default=_LIMITS.min_heading_excursion_deg, ge=0.0, le=360.0
+    )
+    """Headings shown, in sectors of 10 deg. [deg]"""
+    min_planar_circle_deg: float = Field(default=_LIMITS.min_planar_circle_deg, ge=0.0, le=360.0)
+    """The same where the motion is planar: a whole circle is needed. [deg]"""
+    min_observability: float = Field(default=_LIMITS.min_observability, ge=0.0, le=100.0)
+    """Weakest direction of the information, 1 = just enough. [1]"""
+    max_heading_sigma_deg: float = Field(default=_LIMITS.max_heading_sigma_deg, ge=0.0, le=180.0)
+    """Expected heading error (1 sigma) at the worst attitude driven. [deg]"""
+    max_moved_unseen_gauss: float = Field(default=_LIMITS.max_moved_unseen_gauss, ge=0.0, le=2.5)
+    """Move of the vertical hard iron although the motion was too flat to see it. [gauss]"""
+    field_min_gauss: float = Field(default=_LIMITS.field_min_gauss, ge=0.0, le=2.5)
+    """Smallest corrected field; nowhere on Earth is it weaker than the limit. [gauss]"""
+    field_max_gauss: float = Field(default=_LIMITS.field_max_gauss, ge=0.0, le=2.5)
+    """Largest corrected field; nowhere on Earth is it stronger than the limit. [gauss]"""
+    field_model_percent: float = Field(default=_LIMITS.field_model_percent, ge=0.0, le=100.0)
+    """Mean corrected field against the world model. [%]"""
+    field_spread_ram_percent: float = Field(
+        default=_LIMITS.field_spread_ram_percent, ge=0.0, le=100.0
+    )
+    """Standard deviation of the corrected field over its mean. [%]"""
+    field_spread_flash_percent: float = Field(
+        default=_LIMITS.field_spread_flash_percent, ge=0.0, le=100.0
+    )
+    """The same, to save for good. [%]"""
+    max_inclination_error_deg: float = Field(
+        default=_LIMITS.max_inclination_error_deg, ge=0.0, le=180.0
+    )
+    """Dip of the corrected field against the world model. [deg]"""
+    holdout_segments: float = Field(default=_LIMITS.holdout_segments, ge=0.0, le=100.0)
+    """Held-out segments that turned by 60 deg and more. [segments]"""
+    min_holdout_excursion_deg: float = Field(
+        default=_LIMITS.min_holdout_excursion_deg, ge=0.0, le=360.0
+    )
+    """Headings shown in the held-out segments. [deg]"""
+    holdout_rms_deg: float = Field(default=_LIMITS.holdout_rms_deg, ge=0.0, le=180.0)
+    """Magnetic against gyro heading on held-out data, rms. [deg]"""
+    holdout_max_deg: float = Field(default=_LIMITS.holdout_max_deg, ge=0.0, le=180.0)
+    """The same, largest second. [deg]"""
+    closure_deg: float = Field(default=_LIMITS.closure_deg, ge=0.0, le=180.0)
+    """Change of the heading error over a full turn. [deg]"""
+    min_improvement_percent: float = Field(
+        default=_LIMITS.min_improvement_percent, ge=0.0, le=100.0
+    )
+    """Held-out rms below that of the calibration in force. [%]"""
+    min_improvement_deg: float = Field(default=_LIMITS.min_improvement_deg, ge=0.0, le=180.0)
+    """The same in degrees. [deg]"""
+    min_improvement_lower_deg: float = Field(
+        default=_LIMITS.min_improvement_lower_deg, ge=0.0, le=180.0
+    )
+    """Lower end of the 95 % interval of that improvement. [deg]"""
+    repeat_hard_iron_gauss: float = Field(default=_LIMITS.repeat_hard_iron_gauss, ge=0.0, le=2.5)
+    """Level hard iron of the earlier against the later half. [gauss]"""
+    repeat_heading_deg: float = Field(default=_LIMITS.repeat_heading_deg, ge=0.0, le=180.0)
+    """Heading by the earlier against the later half, worst heading and tilt. [deg]"""
+    second_opinion_deg: float = Field(default=_LIMITS.second_opinion_deg, ge=0.0, le=180.0)
+    """Heading by an independent fit without gyro, worst heading and tilt. [deg]"""
+    min_eigenvalue: float = Field(default=_LIMITS.min_eigenvalue, ge=0.0, le=100.0)
+    """Smallest eigenvalue of the symmetric part of C. [1]"""
+    min_diagonal: float = Field(default=_LIMITS.min_diagonal, ge=0.0, le=100.0)
+    """Smallest diagonal element of C. [1]"""
+    max_diagonal: float = Field(default=_LIMITS.max_diagonal, ge=0.0, le=100.0)
+    """Largest diagonal element of C. [1]"""
+    max_condition_auto: float = Field(default=_LIMITS.max_condition_auto, ge=1.0, le=100.0)
+    """Condition number of C without a person. [1]"""
+    max_condition_operator: float = Field(default=_LIMITS.max_condition_operator, ge=1.0, le=100.0)
+    """Condition number of C with a person's approval. [1]"""
+    max_offset_auto_gauss: float = Field(default=_LIMITS.max_offset_auto_gauss, ge=0.0, le=2.5)
     """Hard iron without a person. [gauss]"""
-    max_offset_operator_gauss: float = Field(default=1.3, gt=0.0, le=2.5)
-    """The same with a person's approval. [gauss]"""
-    max_step_auto_deg: float = Field(default=5.0, gt=0.0, le=180.0)
-    """Change of heading that a write may cause without a person. [deg]"""
-    max_step_operator_deg: float = Field(default=20.0, gt=0.0, le=180.0)
-    """The same with a person's approval; beyond it nothing is written. [deg]"""
-    max_field_change_gauss: float = Field(default=0.05, gt=0.0, le=2.5)
-    """Drift of the corrected field over the window. [gauss]"""
-    max_temperature_drift_c: float = Field(default=5.0, gt=0.0, le=100.0)
-    """Drift of the temperature over the window. [degC]"""
-    max_gyro_bias_deg_s: float = Field(default=3.0, gt=0.0, le=100.0)
+    max_offset_operator_gauss: float = Field(
+        default=_LIMITS.max_offset_operator_gauss, ge=0.0, le=2.5
+    )
+    """Hard iron with a person's approval. [gauss]"""
+    max_scale_change_percent: float = Field(
+        default=_LIMITS.max_scale_change_percent, ge=0.0, le=100.0
+    )
+    """Change of scale where no position is known: the motion does not determine it. [%]"""
+    max_step_auto_deg: float = Field(default=_LIMITS.max_step_auto_deg, ge=0.0, le=180.0)
+    """Worst heading change without a person, and of a first calibration. [deg]"""
+    max_step_operator_deg: float = Field(default=_LIMITS.max_step_operator_deg, ge=0.0, le=180.0)
+    """Worst heading change against an earlier calibration, with a person's approval. [deg]"""
+    max_field_change_gauss: float = Field(default=_LIMITS.max_field_change_gauss, ge=0.0, le=2.5)
+    """Corrected field of a segment against the median segment. [gauss]"""
+    max_inclination_change_deg: float = Field(
+        default=_LIMITS.max_inclination_change_deg, ge=0.0, le=180.0
+    )
+    """Dip of a calm segment against the median segment. [deg]"""
+    max_temperature_drift_c: float = Field(
+        default=_LIMITS.max_temperature_drift_c, ge=0.0, le=100.0
+    )
+    """Range of the sensor's temperature. [degC]"""
+    max_gyro_bias_deg_s: float = Field(default=_LIMITS.max_gyro_bias_deg_s, ge=0.0, le=100.0)
     """Gyro bias. [deg/s]"""
+    min_rest_s: float = Field(default=_LIMITS.min_rest_s, ge=0.0, le=3600.0)
+    """Rest within the last quarter of an hour. [s]"""
+    max_gyro_sigma_share: float = Field(default=_LIMITS.max_gyro_sigma_share, ge=0.0, le=1.0)
+    """Sigma of the mean rate at rest over the change that is written. [1]"""
+    max_gyro_disagreement: float = Field(default=_LIMITS.max_gyro_disagreement, ge=0.0, le=100.0)
+    """Gyro bias of the estimate against the mean rate at rest. [sigma]"""
 
     @model_validator(mode="after")
     def _in_order(self) -> Gates:
@@ -195,6 +239,10 @@ class Gates(Section):
             if getattr(self, low) > getattr(self, high):
                 raise ValueError(f"{low} must not be larger than {high}")
         return self
+
+    def limits(self) -> GateLimits:
+        """What the gates take."""
+        return GateLimits(**self.model_dump())
 
 
 class Interlock(Section):

@@ -17,6 +17,7 @@ from ahrsd.config_sections import Device, Gates, Section
 from ahrsd.config_text import print_config, reference, to_toml
 from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.gates import GATES, GateLimits
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -163,6 +164,12 @@ def test_the_estimators_defaults_have_one_source():
     assert Config().estimator.parameters() == EstimatorParameters()
     names = {field.name for field in dataclasses.fields(EstimatorParameters)}
     assert set(type(Config().estimator).model_fields) == names
+
+
+def test_the_gates_defaults_have_one_source():
+    assert Config().gates.limits() == GateLimits()
+    assert set(Gates.model_fields) == {field.name for field in dataclasses.fields(GateLimits)}
+    assert {str(gate.limit) for gate in GATES} >= set(Gates.model_fields)
 
 
 def test_the_write_backs_defaults_have_one_source():

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import click
-from drivers.vn100.errors import DriverError
 
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, DeviceError
 from drivers.serial_port import (
@@ -21,6 +20,7 @@ from drivers.serial_port import (
 )
 from drivers.vn100.commands import Command
 from drivers.vn100.device import Device, Tap, reads_only
+from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import Identity, identify, read_configuration
 from drivers.vn100.registers import Values
 

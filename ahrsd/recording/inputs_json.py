@@ -15,8 +15,8 @@ import numpy as np
 from ahrsd.inputs import (
     Input,
     Interlock,
-    JournalOpened,
     Journalled,
+    JournalOpened,
     LinkLost,
     LinkOpened,
     Operator,
