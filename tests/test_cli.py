@@ -148,6 +148,14 @@ class TestRun:
         assert run("run") == 2
         assert "no port: give --port" in capsys.readouterr().err
 
+    def test_a_port_that_is_not_there_is_75_and_one_line(self, run, tmp_path, capsys):
+        (tmp_path / "a.toml").write_text(f'state_directory = "{tmp_path}"')
+        port = "/dev/does-not-exist"
+        assert run("run", "--config", tmp_path / "a.toml", "--port", port) == 75
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert "/dev/does-not-exist does not exist" in error
+
     def test_an_unknown_mode(self, run, capsys):
         assert run("run", "--mode", "write") == 2
         assert "'passive', 'observe', 'stage', 'commit'" in capsys.readouterr().err

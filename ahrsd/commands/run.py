@@ -37,6 +37,8 @@ def command(path: Path | None, port: Path | None, mode: Mode | None, print_only:
         return
     if config.device.port is None:
         raise click.UsageError("no port: give --port, or device.port in the configuration")
+    from ahrsd.commands.device_access import driver_errors
     from ahrsd.daemon import run_daemon
 
-    raise SystemExit(run_daemon(config))
+    with driver_errors():
+        raise SystemExit(run_daemon(config))
