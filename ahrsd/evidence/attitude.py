@@ -124,6 +124,24 @@ class Nodes:
         """(N, 3) down in the sensor frame at each node."""
         return np.asarray(np.einsum("nji,nj->ni", self.R_0b, self.down_0[self.segment]))
 
+    def only(self, chosen: Bools) -> Nodes | None:
+        """The segments marked in `chosen` (S,); None where there are none."""
+        if not chosen.any():
+            return None
+        rows = chosen[self.segment]
+        counts = np.diff(np.append(self.starts, len(rows)))[chosen]
+        return Nodes(
+            time_s=self.time_s[rows],
+            raw_b_gauss=self.raw_b_gauss[rows],
+            R_0b=self.R_0b[rows],
+            segment=np.repeat(np.arange(len(counts)), counts),
+            starts=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp),
+            heldout=self.heldout[chosen],
+            down_0=self.down_0[chosen],
+            rough_m_s2=self.rough_m_s2[chosen],
+            tracks=tuple(t for t, c in zip(self.tracks, chosen, strict=True) if c),
+        )
+
     def mean(self, values: Array) -> Array:
         """Mean over each segment's nodes: (N, ...) to (S, ...)."""
         counts = np.diff(np.append(self.starts, len(values)))
@@ -140,8 +158,8 @@ def nodes_at(tracks: Sequence[Track], bias_b_rad_s: Array) -> Nodes | None:
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.intp)
     offset = np.array([bias_b_rad_s - t.bias_b_rad_s for t in tracks])[segment]
     drift_s = np.concatenate([t.drift_s for t in tracks])
-    turn = so3.exp(-np.einsum("nij,nj->ni", drift_s, offset))
-    force_0 = np.einsum("nij,nj->ni", turn, np.concatenate([t.force_0_m_s2 for t in tracks]))
+    turn = so3.exp(-(drift_s @ offset[..., None])[..., 0])
+    force_0 = (turn @ np.concatenate([t.force_0_m_s2 for t in tracks])[..., None])[..., 0]
     excess = np.linalg.norm(force_0, axis=1) - _GRAVITY_M_S2
     weight = 1.0 / (1.0 + (excess / _CALM_M_S2) ** 2)
     down_0 = -np.add.reduceat(weight[:, None] * force_0, starts)

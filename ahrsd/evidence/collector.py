@@ -7,7 +7,6 @@ under `role(block)`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ from ahrsd.evidence import comparison
 from ahrsd.evidence.attitude import Nodes, Track, nodes_at, track
 from ahrsd.evidence.coverage import UNKNOWN_MOTION, coverage
 from ahrsd.evidence.field import UNKNOWN_FIELD, field_facts
-from ahrsd.evidence.heading import NO_PROOF, field_0, prove
+from ahrsd.evidence.heading import NO_PROOF, field_0, gyro_heading_rad, prove
 from ahrsd.evidence.history import History, HistoryParameters, Role
 from ahrsd.evidence.stillness import Seconds, rest, seconds
 from ahrsd.evidence.values import BasisFacts, EstimateFacts, Evidence, HealthFacts
@@ -46,7 +45,7 @@ class EvidenceCollector:
         """Role of a block that is about to be added (that of its first sample)."""
         return self._history.role(block)
 
-    def parts(self, block: SampleBlock) -> Iterator[tuple[Role, SampleBlock]]:
+    def parts(self, block: SampleBlock) -> list[tuple[Role, SampleBlock]]:
         """The block in pieces that lie within one slot each, with their roles.
 
         A piece has `gap_before` where the piece before it had the other role.
@@ -61,7 +60,7 @@ class EvidenceCollector:
         """End of the stream: count the segment that is still open."""
         self._history.interrupt()
 
-    def evaluate(  # noqa: PLR0917  (everything that is known, once)
+    def evaluate(
         self,
         estimate: Estimate,
         present: Affine,
@@ -82,9 +81,10 @@ class EvidenceCollector:
         nodes = self._nodes(estimate.gyro_bias_rad_s)
         motion, field, proof = UNKNOWN_MOTION, UNKNOWN_FIELD, NO_PROOF
         if nodes is not None:
-            motion = coverage(nodes, field_0(nodes, judged))
+            heading_rad = gyro_heading_rad(nodes, field_0(nodes, judged))
+            motion = coverage(nodes, heading_rad)
             field = field_facts(nodes, judged)
-            proof = prove(nodes, judged, present, _LEAST_TURN_DEG)
+            proof = prove(nodes, heading_rad, judged, present, _LEAST_TURN_DEG)
         envelope = comparison.envelope(motion, field, world)
         still = rest([d.seconds for d in self._derived.values()], estimate.gyro_bias_rad_s)
         return Evidence(

@@ -118,10 +118,10 @@ def _half_fits(
     """Earlier and later half, cut where half of all turning was done: what drifts, shows."""
     turned = np.cumsum([t.segment.turned_rad for t in nodes.tracks])
     early: Bools = turned <= turned[-1] / 2
-    if not early.any():
+    first, second = nodes.only(early), nodes.only(~early)
+    if first is None or second is None:
         return None, None
-    fit = [gyro_fit(nodes, use, present, sigma_gauss) for use in (early, ~early)]
-    return fit[0], fit[1]
+    return gyro_fit(first, present, sigma_gauss), gyro_fit(second, present, sigma_gauss)
 
 
 def _in_units_of(judged: Affine, fitted: Affine) -> Affine:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ahrsd.evidence.attitude import Bools, Nodes
-from ahrsd.evidence.heading import SECTOR_DEG, SECTORS, gyro_heading_rad, sectors
+from ahrsd.evidence.heading import SECTOR_DEG, SECTORS, sectors
 from ahrsd.samples import Array
 
 Regime = Literal["3D", "partial", "2D", "none", "unknown"]
@@ -38,11 +38,10 @@ _NAN = float("nan")
 UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been recorded yet")
 
 
-def coverage(nodes: Nodes, field_0: Array) -> Coverage:
-    """Coverage of all segments; headings count from each segment's mean field (S, 3)."""
+def coverage(nodes: Nodes, heading_rad: Array) -> Coverage:
+    """Coverage of all segments; `heading_rad` (N,) is their `gyro_heading_rad`."""
     if not nodes.has_gravity:
         return Coverage(_NAN, _NAN, _NAN, "unknown", "add acceleration to the stream")
-    heading_rad = gyro_heading_rad(nodes, field_0)
     seen = sectors(heading_rad)
     down_b = nodes.down_b
     roll_deg = _half_range(np.degrees(np.unwrap(np.arctan2(down_b[:, 1], down_b[:, 2]))))

@@ -48,24 +48,28 @@ class HeadingProof:
 NO_PROOF = HeadingProof(0, np.zeros(SECTORS, dtype=bool), *[float("nan")] * 5)
 
 
-def prove(nodes: Nodes, after: Affine, before: Affine, least_turn_deg: float) -> HeadingProof:
-    """Judge `after` against `before` on the held-out segments that turned by `least_turn_deg`."""
-    heading_rad = gyro_heading_rad(nodes, field_0(nodes, after))
-    turn_deg = turned_deg(nodes, heading_rad)
-    errors = np.column_stack([heading_errors_deg(nodes, c) for c in (after, before)])
-    ranges = _ranges(nodes)
-    chosen = [ranges[s] for s in np.flatnonzero(nodes.heldout & (turn_deg >= least_turn_deg))]
-    windows = [_one_second(errors[a:b]) for a, b in chosen]
-    turns = [_one_second(np.degrees(heading_rad[a:b, None]))[:, 0] for a, b in chosen]
-    if not windows:
+def prove(
+    everything: Nodes, heading_rad: Array, after: Affine, before: Affine, least_turn_deg: float
+) -> HeadingProof:
+    """Judge `after` against `before` on the held-out segments that turned by `least_turn_deg`.
+
+    `heading_rad` (N,) is `gyro_heading_rad` of all nodes.
+    """
+    chosen = everything.heldout & (turned_deg(everything, heading_rad) >= least_turn_deg)
+    nodes = everything.only(chosen)
+    if nodes is None:
         return NO_PROOF
+    heading_rad = heading_rad[chosen[everything.segment]]
+    errors = np.column_stack([heading_errors_deg(nodes, c) for c in (after, before)])
+    windows = [_one_second(errors[a:b]) for a, b in _ranges(nodes)]
+    turns = [_one_second(np.degrees(heading_rad[a:b, None]))[:, 0] for a, b in _ranges(nodes)]
     if nodes.has_gravity:
         windows = [w - np.mean(w, axis=0) for w in windows]
     pooled = np.concatenate(windows)
     rms_deg = np.sqrt(np.mean(pooled**2, axis=0))
     return HeadingProof(
         windows=len(windows),
-        sectors=sectors(np.concatenate([heading_rad[a:b] for a, b in chosen])),
+        sectors=sectors(heading_rad),
         rms_before_deg=float(rms_deg[1]),
         rms_after_deg=float(rms_deg[0]),
         max_after_deg=float(np.max(np.abs(pooled[:, 0]))),
@@ -80,8 +84,9 @@ def field_0(nodes: Nodes, correction: Affine) -> Array:
 
 
 def gyro_heading_rad(nodes: Nodes, field_0: Array) -> Array:
-    """(N,) heading of the x axis from each segment's mean field direction (S, 3), unwrapped.
+    """(N,) heading of the x axis from each segment's mean field direction (S, 3).
 
+    Unwrapped within each segment; whole turns between segments mean nothing.
     nan where x stands within 17 degrees of vertical, and where the stream has no gravity.
     """
     north, east = _level_axes(nodes.down_0, field_0)
@@ -89,9 +94,8 @@ def gyro_heading_rad(nodes: Nodes, field_0: Array) -> Array:
     n = np.sum(x_0 * north[nodes.segment], axis=1)
     e = np.sum(x_0 * east[nodes.segment], axis=1)
     heading = np.where(np.hypot(n, e) > _LEVEL_ENOUGH, np.arctan2(e, n), np.nan)
-    for a, b in _ranges(nodes):
-        known = a + np.flatnonzero(np.isfinite(heading[a:b]))
-        heading[known] = np.unwrap(heading[known])
+    known = np.isfinite(heading)
+    heading[known] = np.unwrap(heading[known])
     return heading
 
 
@@ -127,7 +131,7 @@ def sectors(heading_rad: Array) -> Bools:
 
 
 def _seen_from_0(nodes: Nodes, correction: Affine) -> Array:
-    return np.asarray(np.einsum("nij,nj->ni", nodes.R_0b, correction.apply(nodes.raw_b_gauss)))
+    return np.asarray((nodes.R_0b @ correction.apply(nodes.raw_b_gauss)[..., None])[..., 0])
 
 
 def _level_axes(down_0: Array, along_0: Array) -> tuple[Array, Array]:

@@ -11,7 +11,6 @@ epoch ends it. Memory is bounded by the number of segments; rest is forgotten be
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -20,6 +19,7 @@ import numpy as np
 
 from ahrsd.samples import Array, SampleBlock
 
+_CLOCK_S = 1e-6  # a sample this close before a boundary is on it
 Role = Literal["train", "heldout"]
 
 
@@ -74,33 +74,37 @@ class History:
 
     def role(self, block: SampleBlock) -> Role:
         """Role of a block that is about to be added: that of its first sample's slot."""
-        return self._role_of(self._slot_of(float(block.time_s[0]))) if len(block) else self._role
+        if len(block) == 0:
+            return self._role
+        first_s = float(block.time_s[0])
+        return self._role_of(self._slot_of(first_s, self._anchor(first_s)))
 
-    def parts(self, block: SampleBlock) -> Iterator[tuple[Role, SampleBlock]]:
+    def parts(self, block: SampleBlock) -> list[tuple[Role, SampleBlock]]:
         """The block cut at slot boundaries; a part that follows another role has `gap_before`."""
         if len(block) == 0:
-            return
-        role = self._role
-        slots = np.array([self._slot_of(float(t)) for t in block.time_s[[0, -1]]])
-        edges = np.array([])
-        if self._start_s is not None or slots[1] > slots[0]:
-            start = self._anchor(float(block.time_s[0]))
-            edges = start + np.arange(slots[0] + 1, slots[1] + 1) * self.parameters.segment_s
-        cuts = [0, *np.searchsorted(block.time_s, edges).tolist(), len(block)]
-        for a, b in pairwise(cuts):
+            return []
+        start_s = self._anchor(float(block.time_s[0]))
+        first, last = (self._slot_of(float(t), start_s) for t in block.time_s[[0, -1]])
+        edges_s = start_s + np.arange(first + 1, last + 1) * self.parameters.segment_s
+        cuts = [0, *np.searchsorted(block.time_s, edges_s - _CLOCK_S).tolist(), len(block)]
+        parts: list[tuple[Role, SampleBlock]] = []
+        before = self._role
+        for slot, (a, b) in enumerate(pairwise(cuts), start=first):
+            role = self._role_of(slot)
             if b > a:
                 part = _rows(block, a, b)
-                now = self.role(part)
-                yield now, replace(part, gap_before=part.gap_before or now != role)
-                role = now
+                gap = part.gap_before or role != before
+                parts.append((role, replace(part, gap_before=gap)))
+                before = role
+        return parts
 
     def add(self, block: SampleBlock) -> None:
         """Take a block under its `role`; a row that is not finite ends the segment."""
         if len(block) == 0:
             return
         first_s = float(block.time_s[0])
-        slot = self._slot_of(first_s)
         self._start_s = self._anchor(first_s)
+        slot = self._slot_of(first_s, self._start_s)
         restarted = first_s <= self._newest_s
         fresh = block.gap_before or slot != self._slot or block.epoch != self._epoch
         if restarted or fresh:
@@ -140,8 +144,8 @@ class History:
             return time_s
         return self._start_s
 
-    def _slot_of(self, time_s: float) -> int:
-        return int((time_s - self._anchor(time_s)) // self.parameters.segment_s)
+    def _slot_of(self, time_s: float, start_s: float) -> int:
+        return int((time_s - start_s + _CLOCK_S) // self.parameters.segment_s)
 
     def _role_of(self, slot: int) -> Role:
         every = self.parameters.heldout_every

@@ -5,9 +5,9 @@ not move: R_0k (C m_k - c) = f_s, c = C b. Linear in (C, c); f_s is removed by c
 do, so the trace of C is held: C = C0 + sum x_i E_i over the five traceless symmetric E_i. Noise in
 the regressor m adds sigma^2 tr(E_i E_j) to the normal matrix on average; it is taken off again.
 
-Size fit (second opinion): |C (m - b)| = F by Gauss-Newton over symmetric C and b: an ellipsoid, in
-the units of the field, without gyro, gravity or the quadric's sign and shape troubles (Fang et al.
-2011 fit the quadric; its answer need not be an ellipsoid).
+Size fit (second opinion): |C m - c| = F over symmetric C and c by Levenberg and Marquardt, in
+distances from the ellipsoid: no gyro, no gravity, and none of the quadric's troubles with signs and
+shapes (Fang et al. 2011 fit the quadric; its answer need not be an ellipsoid).
 
 Both hold what the motion does not determine at the calibration in force, by a prior as wide as
 anything physical: in the plane the vertical stays, and a circle becomes the 2-D fit by itself.
@@ -18,17 +18,19 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.attitude import Bools, Nodes
+from ahrsd.evidence.attitude import Nodes
 from ahrsd.samples import Array
 
 _PRIOR_MATRIX = 0.3
 _PRIOR_GAUSS = 0.5
-_NODES = 2000
-_ROUNDS = 30
+_NODES = 1000
+_ROUNDS = 60
+_SETTLED = 1e-3  # of the cost, in units of one sigma squared
+_PRIOR_SIGMA = np.r_[np.full(6, _PRIOR_MATRIX), np.full(3, _PRIOR_GAUSS)]
 _ELEMENTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def symmetric_basis() -> Array:
+def _symmetric_basis() -> Array:
     """(6, 3, 3) the elements xx, xy, xz, yy, yz, zz."""
     basis = np.zeros((6, 3, 3))
     for k, (i, j) in enumerate(_ELEMENTS):
@@ -36,30 +38,26 @@ def symmetric_basis() -> Array:
     return basis
 
 
-def _traceless_basis() -> Array:
-    full = symmetric_basis()
-    return np.array([full[0] - full[3], full[3] - full[5], full[1], full[2], full[4]])
+_BASIS = _symmetric_basis()
+_TRACELESS = np.array(
+    [_BASIS[0] - _BASIS[3], _BASIS[3] - _BASIS[5], _BASIS[1], _BASIS[2], _BASIS[4]]
+)
 
 
-def gyro_fit(nodes: Nodes, use: Bools, present: Affine, sigma_gauss: float) -> Affine | None:
-    """Calibration from the segments marked in `use` (S,); None where it is no calibration.
+def gyro_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None:
+    """Calibration from the segments of `nodes`; None where it is no calibration.
 
     `sigma_gauss` is the noise of one node's field per axis.
     """
     C0 = (present.matrix + present.matrix.T) / 2
-    E = _traceless_basis()
-    chosen = use[nodes.segment]
+    E = _TRACELESS
     m, R = nodes.raw_b_gauss, nodes.R_0b
-    columns = [np.einsum("nij,nj->ni", R, m @ e) for e in E]
-    design = np.concatenate([np.stack(columns, axis=2), -R], axis=2)
-    target = -np.einsum("nij,nj->ni", R, m @ C0)
-    design = (design - nodes.mean(design)[nodes.segment])[chosen].reshape(-1, 8)
-    target = (target - nodes.mean(target)[nodes.segment])[chosen].ravel()
-    count = np.count_nonzero(chosen)
-    if count == 0:
-        return None
+    rows = np.stack([*(m @ e for e in E), -m @ C0], axis=2)
+    rows = np.concatenate([R @ rows, -R], axis=2)
+    rows = (rows - nodes.mean(rows)[nodes.segment]).reshape(-1, 9)
+    design, target = rows[:, [0, 1, 2, 3, 4, 6, 7, 8]], rows[:, 5]
     N, y = design.T @ design, design.T @ target
-    noise = count * sigma_gauss**2
+    noise = len(m) * sigma_gauss**2
     N[:5, :5] -= noise * np.einsum("aij,bij->ab", E, E)
     y[:5] += noise * np.einsum("aij,ij->a", E, C0)
     prior = sigma_gauss**2 / np.r_[np.full(5, _PRIOR_MATRIX), np.full(3, _PRIOR_GAUSS)] ** 2
@@ -74,29 +72,56 @@ def gyro_fit(nodes: Nodes, use: Bools, present: Affine, sigma_gauss: float) -> A
 def size_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None:
     """Ellipsoid through all nodes; None where it does not converge to one."""
     m = nodes.raw_b_gauss[:: max(1, len(nodes.raw_b_gauss) // _NODES)]
+    middle = m.mean(axis=0)
     C0 = (present.matrix + present.matrix.T) / 2
-    prior_sigma = np.r_[np.full(6, _PRIOR_MATRIX), np.full(3, _PRIOR_GAUSS)]
     start = _sphere_centre(m, present, sigma_gauss)
     F = float(np.mean(np.linalg.norm((m - start) @ C0, axis=1)))
-    centre = np.r_[[C0[i, j] for i, j in _ELEMENTS], present.offset]
-    x = np.r_[centre[:6], start]
-    basis = symmetric_basis()
+    upper = [C0[i, j] for i, j in _ELEMENTS]
+    prior = np.r_[upper, C0 @ (present.offset - middle)]
+    x = np.r_[upper, C0 @ (start - middle)]
+    cost, N, y = _size_normal(m - middle, x, F, sigma_gauss, prior=prior)
+    damping = 1e-3
     for _ in range(_ROUNDS):
-        C = np.einsum("a,aij->ij", x[:6], basis)
-        d = m - x[6:]
-        h = d @ C
-        size = np.linalg.norm(h, axis=1)
-        u = h / size[:, None]
-        J = np.column_stack([np.einsum("ni,aij,nj->na", u, basis, d), -u @ C]) / sigma_gauss
-        N = J.T @ J + np.diag(prior_sigma**-2)
-        step = _solve(N, J.T @ ((F - size) / sigma_gauss) + (centre - x) / prior_sigma**2)
-        if step is None or not np.isfinite(step).all():
+        step = _solve(N + damping * np.diag(np.diag(N)), y)
+        if step is None:
             return None
-        x = x + step * min(1.0, 0.3 / float(np.max(np.abs(step))))
-        if np.max(np.abs(step)) < 1e-7:
-            C = np.einsum("a,aij->ij", x[:6], basis)
-            return _calibration(C, C @ x[6:], present)
+        trial = _size_normal(m - middle, x + step, F, sigma_gauss, prior=prior)
+        if not trial[0] <= cost:
+            damping *= 10.0
+            continue
+        settled = cost - trial[0] < _SETTLED
+        x, (cost, N, y), damping = x + step, trial, damping / 10.0
+        if settled:
+            C = np.einsum("a,aij->ij", x[:6], _BASIS)
+            return _calibration(C, x[6:] + C @ middle, present)
     return None
+
+
+def _size_normal(
+    m: Array, x: Array, F: float, sigma_gauss: float, *, prior: Array
+) -> tuple[float, Array, Array]:
+    """Cost, normal matrix and right-hand side at x = (C, c), with h = C m - c.
+
+    The residual is the distance of m from the ellipsoid to first order, g / |grad g| with
+    g = (F^2 - |h|^2) / 2 and grad g = -C h; in field units the fit would shrink C to shrink noise.
+    """
+    C = np.einsum("a,aij->ij", x[:6], _BASIS)
+    h = m @ C - x[6:]
+    e = h @ C
+    q = np.linalg.norm(e, axis=1)[:, None]
+    g = (F**2 - np.sum(h**2, axis=1)[:, None]) / 2
+    f = e @ C
+    by_C = -_bilinear(h, m) / q - g * (_bilinear(e, h) + _bilinear(f, m)) / q**3
+    J = np.concatenate([by_C, h / q + g * f / q**3], axis=1) / sigma_gauss
+    r, p = (g / q)[:, 0] / sigma_gauss, (x - prior) / _PRIOR_SIGMA
+    N = J.T @ J + np.diag(_PRIOR_SIGMA**-2)
+    return float(r @ r + p @ p), N, -(J.T @ r + p / _PRIOR_SIGMA)
+
+
+def _bilinear(a: Array, b: Array) -> Array:
+    """(N, 6) a^T E b for the six symmetric elements E."""
+    columns = [a[:, i] * b[:, j] + (a[:, j] * b[:, i] if i != j else 0.0) for i, j in _ELEMENTS]
+    return np.stack(columns, axis=1)
 
 
 def _sphere_centre(m: Array, present: Affine, sigma_gauss: float) -> Array:
