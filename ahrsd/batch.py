@@ -9,10 +9,9 @@ from pathlib import Path
 from ahrsd.calibration import Estimate
 from ahrsd.config import Config
 from ahrsd.core import Core
-from ahrsd.events import Event, SamplesSeen
+from ahrsd.events import Estimated, Event
 from ahrsd.replay import replay
 from ahrsd.result import calibration_json
-from ahrsd.samples import SampleBlock
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +21,7 @@ class BatchResult:
     name: str
     core: Core
     estimate: Estimate | None
-    blocks: tuple[SampleBlock, ...]
+    events: tuple[Event, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -67,14 +66,11 @@ def calibrate(
     progress: Callable[[int], None] | None = None,
 ) -> BatchResult:
     """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`."""
-    blocks: list[SampleBlock] = []
-
-    def keep(event: Event) -> None:
-        if isinstance(event, SamplesSeen):
-            blocks.append(event.block)
-
+    seen: list[Event] = []
     done = replay(
-        path, config, rate_hz=rate_hz, listeners=[keep], progress=progress, held_out=False
+        path, config, rate_hz=rate_hz, listeners=[seen.append], progress=progress, held_out=False
     )
     estimate = done.core.calibrator.finish()
-    return BatchResult(path.name, done.core, estimate, tuple(blocks), tuple(done.warnings))
+    if estimate is not None:
+        seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
+    return BatchResult(path.name, done.core, estimate, tuple(seen), tuple(done.warnings))

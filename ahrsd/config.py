@@ -94,12 +94,12 @@ CONFIG_KEY = "config"  # where a capture's header keeps the configuration it was
 
 
 def recorded_config(text: str) -> Config:
-    """The configuration in a capture's header.  Raises ConfigError where it is not one."""
+    """The configuration in a capture's header, TOML.  Raises ConfigError where it is not one."""
+    source = "the capture's configuration"
     try:
-        return Config.model_validate_json(text)
-    except ValidationError as error:
-        lines = [f"the capture's configuration: {_explain(detail)}" for detail in error.errors()]
-        raise ConfigError(lines) from error
+        return check_config(tomllib.loads(text), source)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError([f"{source}: is not TOML: {error}"]) from error
 
 
 def default_state_directory() -> Path:

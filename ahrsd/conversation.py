@@ -92,14 +92,21 @@ Said = Identified | ConfigurationRead | StreamChanged | Unanswered | Completed |
 class Conversation:
     """Owns the session. `said` collects what the core must know; measurements come back at once."""
 
-    def __init__(self, mode: Mode, *, change_stream: bool = False, rate_hz: float = 100.0) -> None:
+    def __init__(
+        self,
+        mode: Mode,
+        *,
+        change_stream: bool = False,
+        rate_hz: float = 100.0,
+        reply_timeout_s: float = 0.4,
+    ) -> None:
         self.mode = mode
         self.change_stream = change_stream and mode is not Mode.PASSIVE
         self.rate_hz = rate_hz
         self.phase = Phase.CLOSED
         self.identity: Identity | None = None
         self.saved: dict[int, Values] = {}
-        self.session = Session(self._allowed)
+        self.session = Session(self._allowed, reply_timeout_s=reply_timeout_s)
         self._purpose = Purpose.READ
         self._extra_gate: Callable[[Command], bool] | None = None
         self._serial: int | None = None

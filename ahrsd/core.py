@@ -30,6 +30,7 @@ from ahrsd.conversation import (
 )
 from ahrsd.decisions import DecisionLog
 from ahrsd.evidence.values import BasisFacts, HealthFacts
+from ahrsd.gates import Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.samples import SampleBlock
 from ahrsd.stream import Stream
@@ -74,11 +75,15 @@ class _Record:
 
 @dataclass(frozen=True, slots=True)
 class CoreSettings:
-    """What the core needs from the configuration; `stream_rate_hz` for streams without time."""
+    """What the core needs from the configuration.
+
+    stream_rate_hz: of streams without time; reply_timeout_s: how long a reply may take
+    """
 
     calibrator: CalibratorSettings
     policy: WriteBackPolicy = field(default_factory=WriteBackPolicy)
     output_rate_hz: float = 100.0
+    reply_timeout_s: float = 0.4
     stream_rate_hz: float | None = None
     stream_rate_source: str = "as given"
 
@@ -95,6 +100,7 @@ class Core:
             settings.policy.mode,
             change_stream=settings.policy.configure_stream,
             rate_hz=settings.output_rate_hz,
+            reply_timeout_s=settings.reply_timeout_s,
         )
         self.writeback = WriteBack(settings.policy)
         self.registers: dict[int, Values] = {}
@@ -352,6 +358,7 @@ class Core:
                 acted = True
             if self._pending is not None and self.conversation.idle:
                 run, self._pending = self._pending, None
+                self.stream.forgive()
                 self._take(
                     self.conversation.run(run.name, run.make(), run.purpose, self._host_s, run.gate)
                 )
@@ -452,12 +459,19 @@ class Core:
         self._todo.extend(
             self.writeback.on_verdict(
                 estimate,
-                gates,
+                for_level(gates, self._level),
                 self.at_s,
                 self._host_s,
                 gyro_is_raw=not self.stream.compensated_gyro,
             )
         )
+
+    @property
+    def _level(self) -> Level:
+        """Which gates must hold before anything is written, by what the writing may end in."""
+        if self.settings.policy.mode is Mode.COMMIT:
+            return Level.FLASH
+        return Level.UNATTENDED if self.settings.policy.approval == "auto" else Level.RAM
 
     def health(self) -> HealthFacts:
         """Figures of the stream so far."""

@@ -22,6 +22,7 @@ from typing import Protocol
 
 from ahrsd import inputs
 from ahrsd.config import CONFIG_KEY, Config
+from ahrsd.config_text import print_config
 from ahrsd.core import Core
 from ahrsd.errors import EXIT_DONE, ConfigError
 from ahrsd.interlock import InterlockFile
@@ -123,17 +124,19 @@ class Daemon:
             item = self._queue.get(timeout=self._wait_s(longest_s))
         except queue.Empty:
             item = None
+        self._around()
         if isinstance(item, Bytes):
             self._feed(inputs.Received(item.host_ns, item.data))
         elif isinstance(item, Lost):
             self._lost(item.host_ns, item.reason)
-        self._between()
+        if self._queue.empty():  # else what is waited for may lie in the queue already
+            now, deadline = self.clock.now_ns(), self.shell.core.deadline_ns
+            if deadline is not None and now >= deadline:
+                self._feed(inputs.Tick(now))
 
-    def _between(self) -> None:
+    def _around(self) -> None:
+        """The vehicle's word, operators and the wall clock: before bytes are judged by them."""
         now = self.clock.now_ns()
-        deadline = self.shell.core.deadline_ns
-        if deadline is not None and now >= deadline:
-            self._feed(inputs.Tick(now))
         if self._interlock is not None and now >= self._next_interlock_ns:
             self._next_interlock_ns = now + int(_INTERLOCK_S * 1e9)
             self._feed(inputs.Interlock(now, self._interlock.safe()))
@@ -207,7 +210,7 @@ class Daemon:
                 return
             with contextlib.suppress(queue.Empty):
                 self._queue.get(timeout=wait_s)
-            self._between()
+            self._around()
             wait_s = min(wait_s * 1.5, _REOPEN_S[1])
 
     def _close(self) -> None:
@@ -257,7 +260,7 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
         capture.parent.mkdir(parents=True, exist_ok=True)
         writer = CaptureWriter(
             capture,
-            {"program": "ahrsd run", CONFIG_KEY: config.model_dump_json()},
+            {"program": "ahrsd run", CONFIG_KEY: print_config(config)},
             part_bytes=config.capture.part_megabytes * 1_000_000,
             keep_bytes=config.capture.keep_megabytes * 1_000_000,
         )

@@ -11,13 +11,14 @@ import json
 import tempfile
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.config import CONFIG_KEY, Config, check_config
+from ahrsd.config_text import print_config
 from ahrsd.core import Core
 from ahrsd.daemon import Daemon, HostClock, close_shell
 from ahrsd.events import Estimated, Event, GateResult, Judged, SamplesSeen, StateChanged
@@ -41,13 +42,14 @@ from drivers.vn100.procedures import read_registers
 from drivers.vn100.registers import same
 
 SPEED = 40.0
-_BAUD = 230400
+_BAUD = 115200
 _RATE_HZ = 50
 _MAG, _GYRO = 23, 84
 _LIMIT_DEG = 0.5
 _LIMIT_BIAS_RAD_S = 3e-4
 # Where the emulator's field (0.49 G, 60 deg dip) is that of the world model: San Francisco.
 _PLACE = {"latitude_deg": 37.8, "longitude_deg": -122.4}
+_REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `speed` times faster
 _LIVE_S = 120.0  # of device time after the proof, for the picture
 
 
@@ -176,13 +178,18 @@ class DemoResult:
         )
 
 
-def demo_config(directory: Path) -> Config:
-    """The configuration of the demo: RAM may be written, a person approves."""
+def demo_config(directory: Path, speed: float = 1.0) -> Config:
+    """The configuration of the demo: RAM may be written, a person approves.
+
+    What is asked of the host in seconds (how old the vehicle's word may be) is asked of a clock that
+    runs `speed` times faster here.
+    """
     body = {
         "mode": "stage",
         "state_directory": str(directory),
         "device": {"baud": _BAUD},
         "location": _PLACE,
+        "interlock": {"max_age_s": float(min(max(speed / 2, 1.0), 60.0))},
         "write_back": {"keep_on_stop": True},
     }
     return with_date(check_config(body, "demo"))
@@ -202,14 +209,14 @@ def run_demo(
     journal = directory / "journal.jsonl"
     for old in (capture, journal, directory / "run.rrd"):
         old.unlink(missing_ok=True)
-    setup = Setup("rov", seed=seed, output="imu", rate_hz=_RATE_HZ, baud=_BAUD)
+    setup = Setup("rov", seed=seed, output="binary", rate_hz=_RATE_HZ, baud=_BAUD)
     truth = build(setup).truth
-    config = demo_config(directory)
+    config = demo_config(directory, speed)
     clock = HostClock(speed)
     scene = Scene(seconds=seconds, say=say)
     shell = Shell(
-        Core(core_settings(config)),
-        CaptureWriter(capture, {"program": "ahrsd demo", CONFIG_KEY: config.model_dump_json()}),
+        Core(replace(core_settings(config), reply_timeout_s=_REPLY_S * speed)),
+        CaptureWriter(capture, {"program": "ahrsd demo", CONFIG_KEY: print_config(config)}),
         JournalKeeper(lambda _: Journal.open(journal), clock.now_ns),
         RerunSink(directory / "run.rrd", serve=False, port=0),
         [scene],
@@ -255,7 +262,7 @@ def _conclude(
     if transaction is not None and _MAG in transaction.old:
         old = Affine.from_register(tuple(map(float, transaction.old[_MAG])))
     written = Affine.from_register(registers[_MAG])
-    true = Affine(np.linalg.inv(truth.soft_iron), truth.hard_iron_gauss)
+    true = Affine(np.asarray(np.linalg.inv(truth.soft_iron), float), truth.hard_iron_gauss)
     live = _live_headings(scene, true, old, written)
     return DemoResult(
         truth=truth,

@@ -39,7 +39,7 @@ class LiveTrial:
             self._start_s = self._last_s = float(block.time_s[0])
         down = _down(block.accel_b_m_s2)
         rate = (block.gyro_b_rad_s - self._bias) @ down if np.isfinite(down).all() else np.zeros(1)
-        self._turned_rad += float(np.nansum(rate * np.nan_to_num(block.dt_s)))
+        self._turned_rad += abs(float(np.nansum(rate * np.nan_to_num(block.dt_s))))
         for t, m in zip(block.time_s.tolist(), block.raw_b_gauss, strict=True):
             if not self._rows or t - self._rows[-1][0] >= _SPACING_S:
                 self._rows.append((t, m))
@@ -66,7 +66,7 @@ class LiveTrial:
         start = self._last_s if self._start_s is None else self._start_s
         return TrialMetrics(
             duration_s=self._last_s - start,
-            turns=abs(self._turned_rad) / (2 * np.pi),
+            turns=self._turned_rad / (2 * np.pi),
             new_figure=spread,
             old_figure=float(old.std() / old.mean()) if len(field) > 1 else float("nan"),
             field_spread=spread,

@@ -64,6 +64,7 @@ class Stream:
         self._arrivals: list[float] = []
         self._lost: list[int] = []
         self._lost_next = 0
+        self._forgiven = False
 
     @property
     def restarts(self) -> int:
@@ -88,6 +89,10 @@ class Stream:
         """The link was away, or the output was changed: what follows does not follow on."""
         self._timeline.forget()
         self._lost_next = max(self._lost_next, 1)
+
+    def forgive(self) -> None:
+        """The output is about to be paused by us: the next gap is no loss of the link's."""
+        self._forgiven = True
 
     def take(self, measurement: Measurement, host_s: float) -> list[SampleBlock]:
         """One message that arrived at host_s (0 for a recording without host time)."""
@@ -117,13 +122,16 @@ class Stream:
         if self._extractor is not None and not _better(new, self._extractor):
             return None
         self._extractor = new
-        self._rows.clear()
-        self._arrivals.clear()
-        self._lost.clear()
+        self._clear()
         self.facts.layout = layout.name
         self.warnings.update(dict.fromkeys(new.warnings))
         self.forget()
         return new
+
+    def _clear(self) -> None:
+        self._rows.clear()
+        self._arrivals.clear()
+        self._lost.clear()
 
     def _wanted(self, extractor: Extractor) -> int:
         if extractor.has_time:
@@ -141,12 +149,12 @@ class Stream:
             return self._decide(said, self._said_source)
         if self.register_rate_hz is not None:
             return self._decide(self.register_rate_hz, "register 7")
-        if self._arrivals and self._arrivals[-1] > self._arrivals[0]:
-            if count < _ARRIVALS:
-                return None
-            span = self._arrivals[-1] - self._arrivals[0]
-            return self._decide((count - 1) / span, "arrival times")
-        return self._decide(FACTORY_RATE_HZ, "assumed: the factory's rate")
+        if not self._arrivals or self._arrivals[-1] == 0.0:
+            return self._decide(FACTORY_RATE_HZ, "assumed: the factory's rate")
+        span = self._arrivals[-1] - self._arrivals[0]
+        if self.epochs.now.compensation is None or count < _ARRIVALS or span <= 0:
+            return None  # register 7 may yet be read, or the arrivals say too little
+        return self._decide((count - 1) / span, "arrival times")
 
     def _decide(self, rate_hz: float, source: str) -> float:
         self.facts.rate_hz, self.facts.rate_source = rate_hz, source
@@ -162,8 +170,9 @@ class Stream:
         extractor = self._extractor
         if extractor is None or not self._rows:
             return []
-        if not extractor.has_time and self._steps is None:
-            self._rate(_ARRIVALS)
+        if not extractor.has_time and self._steps is None and self._rate(len(self._rows)) is None:
+            self._clear()  # nobody can say yet when they were
+            return []
         extracted = extractor.extract(self._rows)
         arrivals = np.array(self._arrivals)
         if extracted.time_s is not None:
@@ -171,9 +180,7 @@ class Stream:
         else:
             assert self._steps is not None
             time_s = self._steps.times(np.array(self._lost))
-        self._rows.clear()
-        self._arrivals.clear()
-        self._lost.clear()
+        self._clear()
         steps = self._timeline.extend(time_s, extracted.usable)
         self._note(steps)
         host_s = self._host(time_s, arrivals)
@@ -195,7 +202,11 @@ class Stream:
         facts.expected += kept
         period = self._timeline.period_s
         if np.isfinite(period) and period > 0:
-            facts.expected += sum(max(gap.length_s / period - 1.0, 0.0) for gap in steps.gaps)
+            lost = [max(gap.length_s / period - 1.0, 0.0) for gap in steps.gaps]
+            if lost and self._forgiven:
+                lost.remove(max(lost))
+                self._forgiven = False
+            facts.expected += sum(lost)
             if self._steps is None:
                 facts.rate_hz, facts.rate_source = 1.0 / period, "device time"
         self.gaps.extend(steps.gaps)
