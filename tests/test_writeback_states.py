@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from ahrsd.writeback.reconcile import TABLE as RECONCILE
+from ahrsd.writeback.reconcile import Found, Kind
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     ON_TIMEOUT,
@@ -112,3 +114,24 @@ def test_states_with_changed_ram_can_all_be_undone_or_are_undoing() -> None:
 
 def test_the_document_shows_this_table() -> None:
     assert f"```mermaid\n{mermaid()}\n```" in DOCUMENT.read_text()
+
+
+@pytest.mark.parametrize("state", ON_TIMEOUT)
+def test_the_document_shows_every_timeout(state: State) -> None:
+    seconds, target = ON_TIMEOUT[state]
+    assert f"| {state.value} | {seconds:.0f} s | {target.value} |\n" in DOCUMENT.read_text()
+
+
+@pytest.mark.parametrize("last", RECONCILE)
+def test_the_document_shows_what_follows_an_interruption(last: Kind) -> None:
+    cells = [
+        f"`{row.record.value}`, {row.signal.value}" if row.record else row.signal.value
+        for row in (RECONCILE[last][held] for held in Found)
+    ]
+    assert f"| `{last.value}` | {' | '.join(cells)} |\n" in DOCUMENT.read_text()
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_the_document_says_what_each_record_means(kind: Kind) -> None:
+    rows = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("| `")]
+    assert any(f"`{kind.value}`" in row.split("|")[1] for row in rows)

@@ -49,6 +49,7 @@ class Flow:
         self.approver = ""
         self.trial = Trial(policy.trial, 0.0)
         self._cause = "device"
+        self._since_s = 0.0
         self._save_from_s = float("-inf")
         self._on_entry: dict[State, Callable[[str], None]] = {
             State.RECONCILING: self._enter_reconciling,
@@ -84,6 +85,7 @@ class Flow:
         """Arrive in a state. A conversation of the old one ends."""
         self.desk.stop_running()
         old, self.state = self.state, state
+        self._since_s = self.desk.host_s
         wait = ON_TIMEOUT.get(state)
         self.deadline_s = None if wait is None else self.desk.host_s + wait[0]
         self.desk.changed(old.value, state.value, reason)
@@ -98,7 +100,9 @@ class Flow:
         elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
             if not self.safe.save_holds(*now):
                 self.signal(Signal.SAVE_DUE, "proven, safe and still")
-        elif self.watches_interlock and (word := self.safe.interlock_holds(self.desk.host_s)):
+        elif self.watches_interlock and (
+            word := self.safe.interlock_broken(self.desk.host_s, self._since_s)
+        ):
             self.roll_back("interlock", word)
 
     @property

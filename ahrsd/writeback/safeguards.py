@@ -81,6 +81,16 @@ class Safeguards:
             return f"the vehicle's word is {host_s - since_s:.1f} s old"
         return ""
 
+    def interlock_broken(self, host_s: float, since_s: float) -> str:
+        """Why what began at `since_s` must end: the vehicle withdrew its word, or fell silent.
+
+        A daemon that has just started gives the vehicle as long to speak as a word lasts.
+        """
+        begun = self._interlock is None or self._interlock[0]
+        if begun and host_s - since_s <= self.policy.interlock_max_age_s:
+            return ""
+        return self.interlock_holds(host_s)
+
     def write_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
         """Why no write may begin now, but for the approval."""
         reasons = list(self._limits)

@@ -1,0 +1,316 @@
+"""Budgets, locks, stops, and what the journal's history makes of its records."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ahrsd.samples import SampleBlock
+from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy, flash_budget, ram_budget
+from ahrsd.writeback.states import State
+from ahrsd.writeback.stillness import Stillness
+from drivers.vn100.commands import Write
+
+DAY_S = 86400.0
+
+
+def another(rig, shift_gauss=0.0):
+    """One more transaction, as far as it goes, with another hard iron."""
+    rig.pass_time(0.1)
+    rig.verdict(hard_iron_gauss=np.array([0.03 + shift_gauss, 0.04, -0.02]))
+    if rig.wb.state is State.QUALIFIED:
+        rig.approve()
+
+
+def rolled_back(make_rig, **policy):
+    rig = make_rig(Mode.STAGE, **policy)
+    rig.connect()
+    another(rig)
+    rig.live(field_spread=0.5)
+    assert rig.wb.state is State.ROLLED_BACK
+    return rig
+
+
+def test_ram_writes_keep_their_distance_and_their_number():
+    policy = WriteBackPolicy()
+    history = History(ram_writes_wall_s=(1000.0,))
+    assert "599 s ago" in ram_budget(policy, history, 1599.0)[0]
+    assert ram_budget(policy, history, 1600.0) == []
+    many = History(ram_writes_wall_s=tuple(1000.0 + 700.0 * k for k in range(6)))
+    assert ram_budget(policy, many, 10_000.0) == ["6 RAM writes in a day, limit 6"]
+    assert ram_budget(policy, many, 1000.1 + DAY_S) == []
+
+
+def test_a_clock_set_back_gives_no_budget():
+    history = History(ram_writes_wall_s=(1e9,), flashes_wall_s=(1e9,), flashes=1)
+    assert ram_budget(WriteBackPolicy(), history, 1e6) != []
+    assert flash_budget(WriteBackPolicy(), history, 1e6) != []
+
+
+def test_flash_by_day_and_by_life():
+    policy = WriteBackPolicy()
+    assert flash_budget(policy, History(flashes=1, flashes_wall_s=(0.0,)), DAY_S) == []
+    today = flash_budget(policy, History(flashes=1, flashes_wall_s=(0.0,)), DAY_S - 1.0)
+    assert today == ["1 flash writes in a day, limit 1"]
+    worn = flash_budget(policy, History(flashes=200), DAY_S)
+    assert worn == ["200 flash writes of this device, limit 200"]
+
+
+def test_thirty_days_of_changing_iron_stay_within_the_budget(make_rig):
+    rig = make_rig()
+    rig.connect()
+    for hour in range(30 * 24):
+        rig.now_s += 3600.0
+        another(rig, 0.02 * (hour % 5))
+        if rig.wb.state is State.TRIAL:
+            rig.live()
+        if rig.wb.state is State.PROVEN:
+            rig.stand_still()
+    assert 25 <= rig.device.flash_writes <= 30
+    times = rig.wb.history.flashes_wall_s
+    assert rig.wb.history.flashes == rig.device.flash_writes
+    assert np.diff(times).min() >= DAY_S
+
+
+def test_after_a_rollback_a_day_of_rest_and_twice_the_margin(make_rig):
+    rig = rolled_back(make_rig)
+    assert rig.wb.margin == 2.0
+    another(rig, 0.02)
+    assert rig.wb.state is State.QUALIFIED
+    assert any("a rollback was" in text for text in rig.wb.holds())
+    sent = len(rig.sent)
+    rig.now_s += DAY_S
+    small = {"soft_iron": np.eye(3), "gyro_bias_rad_s": np.zeros(3)}
+    rig.verdict(**small, hard_iron_gauss=np.array([0.003, 0.0, 0.0]))  # 0.7 deg: no longer enough
+    assert rig.wb.state is State.OBSERVING
+    another(rig)
+    assert rig.wb.state is State.TRIAL
+    assert len(rig.sent) == sent + 2
+
+
+def test_two_rollbacks_lock_for_good(make_rig):
+    rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
+    another(rig)
+    rig.live(field_spread=0.5)
+    assert rig.wb.state is State.LOCKED
+    assert rig.kinds[-3:] == ["ROLLBACK", "ROLLED_BACK", "LOCKED"]
+    rig.back("all")
+    assert rig.wb.state is State.LOCKED
+    sent = len(rig.sent)
+    another(rig)
+    assert len(rig.sent) == sent
+    rig.do(rig.wb.on_operator("unlock", "magnet removed", rig.now_s))
+    another(rig)
+    assert rig.wb.state is State.TRIAL
+
+
+def test_a_proven_write_forgives_an_earlier_rollback(make_rig):
+    rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
+    another(rig)
+    rig.live()
+    assert rig.wb.state is State.PROVEN
+    assert rig.wb.history.rollbacks == 0
+
+
+@pytest.mark.parametrize("when", ["resting", "trial"])
+def test_a_lock_undoes_what_is_only_in_ram(make_rig, when):
+    rig = make_rig(Mode.STAGE)
+    rig.connect()
+    if when == "trial":
+        another(rig)
+        assert rig.wb.state is State.TRIAL
+    rig.do(rig.wb.on_operator("lock", "race day", rig.now_s))
+    assert rig.wb.state is State.LOCKED
+    assert rig.device.held() == rig.device.held("flash")
+    assert any("locked: race day" in text for text in rig.wb.holds())
+
+
+def test_a_lock_while_saving_does_not_interrupt_it(make_rig):
+    rig = make_rig()
+
+    def lock(command):
+        if rig.wb.state is State.SAVING and "LOCKED" not in rig.kinds:
+            rig.do(rig.wb.on_operator("lock", "enough", rig.now_s))
+
+    rig.device.refuse = lock
+    rig.whole_way()
+    assert rig.device.flash_writes == 1
+    assert rig.wb.state is State.LOCKED
+
+
+def test_an_unknown_command_is_answered(make_rig):
+    rig = make_rig()
+    rig.do(rig.wb.on_operator("explode", "", rig.now_s))
+    assert "possible: approve, lock, unlock, rollback" in rig.notes("warning")[-1]
+    rig.do(rig.wb.on_operator("rollback", "", rig.now_s))
+    assert "nothing to roll back" in rig.notes("warning")[-1]
+
+
+# -- stopping --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("keep", "prove", "kept"), [(False, True, False), (True, False, False), (True, True, True)]
+)
+def test_a_stop_undoes_ram_unless_it_is_proven_and_to_be_kept(make_rig, keep, prove, kept):
+    rig = make_rig(Mode.STAGE, keep_on_stop=keep)
+    rig.connect()
+    another(rig)
+    if prove:
+        rig.live()
+    rig.do(rig.wb.on_stop(rig.now_s))
+    assert rig.wb.idle
+    assert (rig.device.held() != rig.device.held("flash")) is kept
+    assert rig.wb.history.rollbacks == 0  # a stop says nothing about the values
+    if kept:
+        rig.back("program")
+        assert rig.wb.state is State.PROVEN
+
+
+def test_a_stop_before_the_write_sends_nothing_more(make_rig):
+    rig = make_rig(Mode.STAGE)
+    rig.connect()
+    rig.verdict()
+    rig.approve()
+    rig.do(rig.wb.on_stop(rig.now_s))
+    rig.pass_time(0.1)
+    assert rig.wb.idle
+    assert rig.sent == []
+
+
+# -- refusals of the device ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("code", [2, 3, 4, 5, 6, 7, 8, 9, 0x0C])
+@pytest.mark.parametrize("number", [23, 84])
+def test_a_refused_write_leaves_the_device_as_it_was(make_rig, code, number):
+    rig = make_rig(Mode.STAGE)
+    before = rig.device.held()
+    refusals = iter([code])
+
+    def refuse(command):
+        if isinstance(command, Write) and command.register == number:
+            return next(refusals, None)
+        return None
+
+    rig.device.refuse = refuse
+    rig.whole_way()
+    assert rig.device.held() == before
+    assert rig.wb.state is State.ROLLED_BACK
+    assert rig.wb.history.rollbacks == 0
+    assert rig.device.asynchronous
+
+
+def test_a_device_that_cannot_be_put_back_is_a_fault_with_the_lines_to_type(make_rig):
+    rig = make_rig(Mode.STAGE)
+    writes = []
+
+    def breaks(command):
+        if isinstance(command, Write):
+            writes.append(command)
+            return 9 if len(writes) > 1 else None
+        return None
+
+    rig.device.refuse = breaks
+    rig.whole_way()
+    assert rig.wb.state is State.FAULT
+    assert "$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*" in rig.notes("error")[-1]
+    rig.device.refuse = lambda _: None
+    rig.do(rig.wb.on_operator("rollback", "", rig.now_s))
+    assert rig.wb.state is State.ROLLED_BACK
+    assert rig.device.held() == rig.device.held("flash")
+
+
+def test_a_third_party_that_writes_before_us_wins(make_rig):
+    rig = make_rig(Mode.STAGE)
+    rig.connect()
+    rig.pass_time(0.1)
+    rig.verdict()
+    rig.device.ram[23] = (1.5,) * 9 + (0.0,) * 3
+    rig.approve()
+    assert rig.wb.state is State.OBSERVING
+    assert rig.sent == []
+    assert rig.kinds == ["PREPARED", "ABORTED"]
+    assert rig.in_force[-1] is None
+    assert rig.asked_again == 1
+
+
+def test_samples_are_marked_unusable_while_registers_are_in_doubt(make_rig):
+    rig = make_rig(Mode.STAGE)
+    rig.connect()
+    another(rig)
+    assert [r is None for r in rig.in_force] == [False, True, False]
+    assert rig.in_force[2][84][9:] == pytest.approx((0.01, -0.02, 0.005))
+
+
+# -- history ---------------------------------------------------------------------------------------
+
+
+def test_the_history_of_the_file_is_the_history_that_was_lived(make_rig):
+    rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
+    another(rig)
+    rig.live()
+    assert History.of(rig.journal) == rig.wb.history
+
+
+def test_a_record_that_cannot_be_understood_forbids_writing(make_rig):
+    record = SimpleNamespace(kind="PREPARED", facts={"txn": "x"})
+    history = History.of([record])
+    assert history.broken == "PREPARED"
+    assert "cannot be understood" in ram_budget(WriteBackPolicy(), history, 0.0)[0]
+
+
+# -- stillness -------------------------------------------------------------------------------------
+
+
+def block(time_s, rate=0.0, shake=0.0, accel=True, gap=False):
+    count = len(time_s)
+    gyro = np.full((count, 3), 0.01)
+    gyro[:, 0] += rate
+    force = np.tile([0.0, 0.0, -9.8], (count, 1)) if accel else np.full((count, 3), np.nan)
+    force[:, 0] += shake * (-1.0) ** np.arange(count)
+    return SampleBlock(
+        time_s, np.full(count, 0.01), time_s, np.zeros((count, 3)), gyro, force, gap_before=gap
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({}, None),
+        ({"rate": 0.011}, "still for 0.0 s"),
+        ({"shake": 0.06}, "specific force varies by 0.060"),
+        ({"shake": 0.04}, None),
+        ({"accel": False}, "still for 0.0 s"),
+    ],
+)
+def test_still(changes, reason):
+    still = Stillness(StillPolicy())
+    for k in range(10):
+        still.update(block(k * 0.4 + 0.01 * np.arange(40), **changes), np.full(3, 0.01))
+    why = still.why_not(4.0)
+    assert why is None if reason is None else reason in (why or "")
+
+
+def test_not_still_without_samples_after_a_gap_or_when_they_are_old():
+    still = Stillness(StillPolicy())
+    assert still.why_not(0.0) is not None
+    still.update(block(0.01 * np.arange(400)), np.full(3, 0.01))
+    assert still.why_not(4.0) is None
+    assert "old" in (still.why_not(6.1) or "")
+    still.update(block(10.0 + 0.01 * np.arange(100), gap=True), np.full(3, 0.01))
+    assert "still for 1.0 s" in (still.why_not(11.0) or "")
+
+
+def test_a_movement_ends_the_rest_and_old_shaking_is_forgotten():
+    still = Stillness(StillPolicy())
+    still.update(block(0.01 * np.arange(400), shake=0.5), np.full(3, 0.01))
+    assert "varies" in (still.why_not(4.0) or "")
+    still.update(block(4.0 + 0.01 * np.arange(400)), np.full(3, 0.01))
+    assert still.why_not(8.0) is None
+    still.update(block(8.0 + 0.01 * np.arange(10), rate=0.1), np.full(3, 0.01))
+    assert still.why_not(8.1) is not None
