@@ -47,16 +47,28 @@ SAMPLE = "sample"  # counts samples since the sink was made
 POINT_COLOURS = {RAW_POINTS: RAW, CORRECTED_POINTS: CORRECTED}
 SHOWN_POINTS_S = 60.0  # 3D shows the newest minute: at most 3000 points a cloud at 50 a second
 
+_WATCHING: Colour = (120, 120, 130)
+_WRITING: Colour = (220, 180, 60)
+_BAD: Colour = (205, 70, 60)
 STATE_COLOURS: dict[str, Colour] = {
-    "OBSERVING": (120, 120, 130),
+    "RECONCILING": _WATCHING,
+    "OBSERVING": _WATCHING,
     "CANDIDATE": (90, 140, 210),
     "QUALIFIED": (70, 180, 200),
-    "STAGED": (220, 180, 60),
+    "PREPARING": _WRITING,
+    "CHECKING": _WRITING,
+    "STAGING": _WRITING,
+    "STAGED": _WRITING,
     "TRIAL": (230, 150, 50),
     "PROVEN": (120, 190, 90),
+    "SAVE_PREPARING": _WRITING,
+    "SAVING": _WRITING,
     "COMMITTED": (60, 170, 90),
     "CONFIRMED": (40, 150, 80),
-    "ROLLED_BACK": (205, 70, 60),
+    "ROLLING_BACK": _BAD,
+    "ROLLED_BACK": _BAD,
+    "FAULT": _BAD,
+    "FLASH_TORN": _BAD,
     "LOCKED": (150, 40, 90),
 }
 
@@ -127,7 +139,7 @@ def states_style(colours: dict[str, Colour]) -> rr.StateConfiguration:
 
 
 def gate_path(gate: str) -> str:
-    """Entity of one gate's lane; what a path would have to escape becomes an underscore."""
+    """Entity of a gate's lane; what a path would have to escape becomes an underscore."""
     return f"{GATE_LANES}/{re.sub(r'[^0-9A-Za-z_.-]', '_', gate)}"
 
 
@@ -199,7 +211,7 @@ def blueprint() -> rrb.Blueprint:
             _series(FIELD_NORM, "Field strength [gauss]"),
             _series(GYRO, "Gyro [rad/s]"),
         ),
-        row_shares=[4, 5, 4, 3, 4],
+        row_shares=[4, 5, 4, 4, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(left, middle, right, column_shares=[4, 4, 4]),

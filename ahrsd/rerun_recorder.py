@@ -17,7 +17,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from ahrsd import rerun_blueprint as names
-from ahrsd.calibration import Estimate
+from ahrsd.calibration import Affine, Estimate
 from ahrsd.events import (
     Estimated,
     Event,
@@ -59,9 +59,9 @@ class _Rows:
     corrected: Array
 
     @staticmethod
-    def of(seen: Sequence[SamplesSeen]) -> _Rows:
+    def of(seen: Sequence[SamplesSeen], newest: Affine | None) -> _Rows:
         blocks = [event.block for event in seen]
-        unknown = np.full((1, 3), np.nan)
+        corrections = [event.proposed or newest for event in seen]
         return _Rows(
             np.concatenate([b.time_s for b in blocks]),
             np.concatenate([b.host_s for b in blocks]),
@@ -70,10 +70,10 @@ class _Rows:
             np.concatenate([e.present.apply(e.block.raw_b_gauss) for e in seen]),
             np.concatenate(
                 [
-                    e.proposed.apply(e.block.raw_b_gauss)
-                    if e.proposed
-                    else np.repeat(unknown, len(e.block), axis=0)
-                    for e in seen
+                    np.full((len(block), 3), np.nan)
+                    if correction is None
+                    else correction.apply(block.raw_b_gauss)
+                    for block, correction in zip(blocks, corrections, strict=True)
                 ]
             ),
         )
@@ -87,13 +87,14 @@ class Recorder:
         self._last_point = -1  # number of the 1/POINTS_PER_S interval that already has a point
         self._first_s: tuple[float, float] | None = None  # device and host time of sample 0
         self._gates: dict[str, bool] = {}
+        self._newest: Affine | None = None  # shown until there is a proposal
         self._state_known = False
         self._table_at_s = self._shape_at_s = -math.inf
         names.log_styles(stream)
 
     def samples(self, seen: Sequence[SamplesSeen], first_sample: int) -> None:
         """Write consecutive sample events as columns; `first_sample` numbers their first row."""
-        rows = _Rows.of(seen)
+        rows = _Rows.of(seen, self._newest)
         if not len(rows.time_s):
             return
         if self._first_s is None:
@@ -172,6 +173,7 @@ class Recorder:
         )
 
     def _estimate(self, estimate: Estimate, at_s: float) -> None:
+        self._newest = estimate.correction
         sigma = estimate.sigma
         upper = np.triu_indices(3)
         soft = (estimate.soft_iron - np.eye(3))[upper]
@@ -214,16 +216,17 @@ class Recorder:
 
     def _judged(self, judged: Judged) -> None:
         changed = False
-        for gate in judged.gates:
-            if self._gates.get(gate.gate) is gate.ok:
+        for gate, checks in by_gate(judged.gates).items():
+            ok = all(check.ok for check in checks)
+            if self._gates.get(gate) is ok:
                 continue
             changed = True
-            path = names.gate_path(gate.gate)
-            if gate.gate not in self._gates:
+            path = names.gate_path(gate)
+            if gate not in self._gates:
                 style = names.states_style({"ok": names.OK, "not met": names.NOT_OK})
                 self._stream.log(path, style, static=True)
-            self._gates[gate.gate] = gate.ok
-            self._stream.log(path, rr.StateChange(state="ok" if gate.ok else "not met"))
+            self._gates[gate] = ok
+            self._stream.log(path, rr.StateChange(state="ok" if ok else "not met"))
         if changed or not abs(judged.at_s - self._table_at_s) < SLOW_S:
             self._table_at_s = judged.at_s
             self._stream.log(
@@ -232,7 +235,7 @@ class Recorder:
             )
 
     def _state_changed(self, event: StateChanged, first_sample: int) -> None:
-        if not self._state_known and self._first_s is not None:
+        if not self._state_known and self._first_s is not None and self._first_s[0] < event.at_s:
             self._at(*self._first_s, 0)  # the lane begins where the samples do
             self._stream.log(names.STATE_LANE, rr.StateChange(state=event.old))
         self._state_known = True
@@ -245,19 +248,30 @@ class Recorder:
         self._stream.log(f"{names.LOG}/{kind}", rr.TextLog(text, level=shown))
 
 
-def gate_table(gates: Iterable[GateResult]) -> str:
-    """Markdown table of a verdict; the gates that hold the write back come first."""
-    rows = sorted(gates, key=lambda gate: gate.ok)
-    failing = [gate.gate for gate in rows if not gate.ok]
-    head = (
-        f"**Held back by {len(failing)} of {len(rows)} gates**" if failing else "**All gates ok**"
-    )
-    lines = [head, "", "| | gate | value | limit | what to do |", "|---|---|---|---|---|"]
-    for gate in rows:
-        mark, advice = ("ok", "") if gate.ok else ("**NO**", _cell(gate.advice))
+def by_gate(checks: Iterable[GateResult]) -> dict[str, list[GateResult]]:
+    """The checks of each gate: `field.spread` and `field.strongest` both belong to `field`."""
+    gates: dict[str, list[GateResult]] = {}
+    for check in checks:
+        gates.setdefault(check.gate.partition(".")[0], []).append(check)
+    return gates
+
+
+def gate_table(checks: Sequence[GateResult]) -> str:
+    """Markdown of a verdict: what to do first, then every check with its value and its limit."""
+    gates = by_gate(checks)
+    failing = {
+        name: bad for name, rows in gates.items() if (bad := [row for row in rows if not row.ok])
+    }
+    held = f"**Held back by {len(failing)} of {len(gates)} gates**"
+    lines = [held if failing else f"**All {len(gates)} gates ok**", ""]
+    for name, bad in failing.items():
+        more = f" *(and {len(bad) - 1} more)*" if len(bad) > 1 else ""
+        lines.append(f"- **{name}**: {bad[0].advice}{more}")
+    lines += ["", "| | check | value | limit |", "|---|---|---|---|"]
+    for check in sorted(checks, key=lambda check: check.ok):
         lines.append(
-            f"| {mark} | {_cell(gate.gate)} | {gate.value:.3g} {gate.unit} "
-            f"| {gate.limit:.3g} {gate.unit} | {advice} |"
+            f"| {'ok' if check.ok else '**NO**'} | {_cell(check.gate)} "
+            f"| {check.value:.3g} {check.unit} | {check.limit:.3g} {check.unit} |"
         )
     return "\n".join(lines)
 

@@ -123,22 +123,45 @@ def judged_after(seconds: float, at_s: float, host_s: float, heading: float) -> 
         at_s,
         host_s,
         (
-            gate("stream health", 2e-4, 1e-3, True, "", "check the cable and the baud rate"),
-            gate("input basis", 6, 6, True, "registers", "let the daemon read registers"),
-            gate("motion", turn, 280.0, turn >= 280.0, "deg", "drive a full turn"),
-            gate("observability", seconds / 40, 1.0, seconds >= 40, "", "roll and pitch by 30 deg"),
-            gate("heading sigma", heading, 1.0, heading <= 1.0, "deg", "keep turning"),
-            gate("field strength", 1.4, 2.0, True, "%", "move away from steel"),
+            gate("stream.errors", 2e-4, 1e-3, True, "", "check the cable and the baud rate"),
             gate(
-                "held-out heading",
+                "input_basis.registers_read",
+                6,
+                6,
+                True,
+                "registers",
+                "let the daemon read registers",
+            ),
+            gate("motion.turn", turn, 280.0, turn >= 280.0, "deg", "drive a full turn"),
+            gate(
+                "observability.score",
+                seconds / 40,
+                1.0,
+                seconds >= 40,
+                "",
+                "pitch by 30 deg",
+            ),
+            gate(
+                "observability.heading_sigma", heading, 1.0, heading <= 1.0, "deg", "keep turning"
+            ),
+            gate("field.spread", 1.4, 2.0, True, "%", "move away from steel"),
+            gate(
+                "heldout_heading.rms",
                 30 / (5 + seconds),
                 0.5,
                 seconds > 55,
                 "deg",
                 "one more turn, in the other direction",
             ),
-            gate("second opinion", 0.4, 2.0, seconds > 20, "deg", "wait for the ellipsoid fit"),
-            gate("bounds", 1.27, 2.0, True, "", "an operator must approve"),
+            gate(
+                "second_opinion.heading",
+                0.4,
+                2.0,
+                seconds > 20,
+                "deg",
+                "wait for the ellipsoid fit",
+            ),
+            gate("bounds.condition", 1.27, 2.0, True, "", "an operator must approve"),
         ),
     )
 
@@ -287,11 +310,22 @@ def test_estimates_carry_their_band(story):
 
 def test_gates_are_lanes_that_change_once_and_a_table_of_advice(story):
     assert values(story["/gate/motion"], "StateChange:state") == [["not met"], ["ok"]]
-    assert values(story["/gate/field_strength"], "StateChange:state") == [["ok"]]
+    assert values(story["/gate/field"], "StateChange:state") == [["ok"]]
     tables = [row[0] for row in values(story["/gate_table"], "text")]
-    assert "Held back by 5 of 9 gates" in tables[0]
-    assert "| **NO** | motion | 8.1 deg | 280 deg | drive a full turn |" in tables[0]
-    assert "All gates ok" in tables[-1]
+    assert "**Held back by 4 of 8 gates**" in tables[0]
+    assert "- **motion**: drive a full turn\n" in tables[0]
+    assert "- **observability**: pitch by 30 deg *(and 1 more)*\n" in tables[0]
+    assert "| **NO** | motion.turn | 8.1 deg | 280 deg |" in tables[0]
+    assert "**All 8 gates ok**" in tables[-1]
+
+
+def test_points_show_the_newest_estimate_before_there_is_a_proposal(tmp_path):
+    (seen,) = (SamplesSeen(simulated(1.0), Affine.identity(), None),)
+    estimated = Estimated(12.0, 5000.0, estimate_after(60.0, np.random.default_rng(1)))
+    record([seen, estimated, seen], tmp_path / "run.rrd")
+    norm = np.array(values(columns(tmp_path / "run.rrd")["/field_norm_gauss"], "scalars"))
+    assert np.isnan(norm[:100, 1]).all()
+    assert np.allclose(norm[100:, 1], FIELD_GAUSS, atol=0.03)
 
 
 def test_states_and_register_writes_are_told(story):
@@ -355,16 +389,22 @@ def opened(path: Path | None, **options: Any) -> Iterator[RerunSink]:
         sink.close(0.0)
 
 
-def push_all(sink: RerunSink, events: Iterable[Event], every_s: float = 0.0) -> float:
-    """Push events as fast as they come; the slowest push in seconds."""
-    slowest_s = 0.0
+def push_all(sink: RerunSink, events: Iterable[Event], every_s: float = 0.0) -> np.ndarray:
+    """Push events as fast as they come; how long each push took, in seconds."""
+    took_s = []
     for event in events:
         begin_s = time.perf_counter()
         sink.push(event, time.monotonic())
-        slowest_s = max(slowest_s, time.perf_counter() - begin_s)
+        took_s.append(time.perf_counter() - begin_s)
         if every_s:
             time.sleep(every_s)
-    return slowest_s
+    return np.array(took_s)
+
+
+def assert_never_blocked(took_s: np.ndarray) -> None:
+    """A blocked push would wait for seconds; a busy machine may take the processor away."""
+    assert np.quantile(took_s, 0.999) < 0.01
+    assert took_s.max() < 1.0
 
 
 def one_sample_events(count: int) -> Iterator[SamplesSeen]:
@@ -433,11 +473,11 @@ def test_a_stopped_process_costs_events_but_no_time(tmp_path):
         wait_for((tmp_path / "run.rrd").exists)
         os.kill(sink.pid, signal.SIGSTOP)
         events = list(one_sample_events(100_000))
-        slowest_s = push_all(sink, events)
+        took_s = push_all(sink, events)
         begin_s = time.monotonic()
         sink.close(1.0)
         assert time.monotonic() - begin_s < 2.0
-    assert slowest_s < 0.1
+    assert_never_blocked(took_s)
     assert sink.counters.dropped > 20_000
     assert "killed" in sink.counters.last_fault
 
@@ -480,22 +520,22 @@ def readable(path: Path) -> dict[str, pyarrow.Table]:
 
 def test_an_unwritable_path_is_counted_and_harms_nobody(tmp_path):
     with opened(tmp_path / "absent" / "run.rrd") as sink:
-        slowest_s = push_all(sink, simulated_events(20.0))
+        took_s = push_all(sink, simulated_events(20.0))
         wait_for(lambda: sink.counters.faults >= 1)
         assert "No such file or directory" in sink.counters.last_fault
         sink.close(10.0)
-    assert slowest_s < 0.1
+    assert_never_blocked(took_s)
     assert sink.counters.respawns == 0
 
 
 def test_a_disk_that_fills_up_is_counted_and_tried_again(small_disk):
     with opened(small_disk / "run.rrd") as sink:
         wait_for((small_disk / "run.rrd").exists)
-        slowest_s = push_all(sink, one_sample_events(20_000), every_s=1e-4)
+        took_s = push_all(sink, one_sample_events(20_000), every_s=1e-4)
         wait_for(lambda: sink.counters.faults >= 1, timeout_s=30.0)
         wait_for(lambda: sink.counters.respawns >= 1)
         sink.close(3.0)
-    assert slowest_s < 0.1
+    assert_never_blocked(took_s)
     assert sink.counters.faults >= 1
 
 

@@ -145,8 +145,11 @@ class EventCollector:
         raw = event.block.raw_b_gauss
         before = np.linalg.norm(event.present.apply(raw), axis=1)
         after = np.full(len(raw), np.nan)
-        if event.proposed is not None:
-            after = np.linalg.norm(event.proposed.apply(raw), axis=1)
+        correction = event.proposed
+        if correction is None and self._newest is not None:
+            correction = self._newest.estimate.correction
+        if correction is not None:
+            after = np.linalg.norm(correction.apply(raw), axis=1)
         for row in np.column_stack([event.block.time_s, raw, before, after]):
             self._samples.add(row)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ahrsd.events import GateResult
 from ahrsd.report.data import EstimateHistory, HeadingError, KeyFigure, RegisterChange, ReportData
 from ahrsd.writeback.composition import register_lines
 
@@ -234,18 +235,27 @@ def _one_history(item: EstimateHistory) -> str:
 def _gates(data: ReportData) -> str:
     if not data.gates:
         return ""
-    rows = [
-        [
-            '<span class="good">ok</span>' if gate.ok else '<span class="bad">no</span>',
-            escape(gate.gate),
-            escape(number(gate.value, gate.unit)),
-            escape(number(gate.limit, gate.unit)),
-            "" if gate.ok else escape(gate.advice),
-        ]
-        for gate in sorted(data.gates, key=lambda gate: gate.ok)
+    failing = [gate for gate in data.gates if not gate.ok]
+    passing = [gate for gate in data.gates if gate.ok]
+    parts = []
+    if failing:
+        rows = [[*_gate_cells(gate), escape(gate.advice)] for gate in failing]
+        parts.append(_table(["", "gate", "value", "limit", "what to do"], rows, numeric=(2, 3)))
+    if passing:
+        table = _table(["", "gate", "value", "limit"], map(_gate_cells, passing), numeric=(2, 3))
+        count = f"{len(passing)} of {len(data.gates)} checks are ok"
+        opened = "" if failing else " open"
+        parts.append(f"<details{opened}><summary>{count}</summary>{table}</details>")
+    return _section("Gates: may it be written?", *parts)
+
+
+def _gate_cells(gate: GateResult) -> list[str]:
+    return [
+        '<span class="good">ok</span>' if gate.ok else '<span class="bad">no</span>',
+        escape(gate.gate).replace(".", ".<wbr>").replace("_", "_<wbr>"),
+        escape(number(gate.value, gate.unit)),
+        escape(number(gate.limit, gate.unit)),
     ]
-    head = ["", "gate", "value", "limit", "what to do"]
-    return _section("Gates: may it be written?", _table(head, rows, numeric=(2, 3)))
 
 
 def _states(data: ReportData) -> str:
