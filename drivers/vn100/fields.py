@@ -89,8 +89,9 @@ SERIAL_STATUS = Column("serial_status")
 YPR = _angles("yaw_rad pitch_rad roll_rad", _ANGLE)
 YPR_SIGMA = _angles("yaw_sigma_rad pitch_sigma_rad roll_sigma_rad", "")
 QUATERNION = tuple(Column(f"quat_{axis}", printed="%+09.6f") for axis in "xyzw")
-# UM001 says column by column; not confirmed on a device, so prefer the quaternion.
-DCM = tuple(Column(f"dcm_{row}{column}") for column in range(3) for row in range(3))
+# R_nb row by row, v_n = R_nb v_b (the manual's matrix, NED to body, column by column). A recording
+# of a real device says so: there it agrees with the angles to f32 precision.
+DCM = tuple(Column(f"dcm_{row}{column}") for row in range(3) for column in range(3))
 
 MAG = _vector("mag", "gauss", "b", "compensated", _MAG)
 ACCEL = _vector("accel", "m/s^2", "b", "compensated", _ACCEL)

@@ -84,7 +84,9 @@ def test_all_that_a_vn100_can_send_fits() -> None:
         ("FA 08 00 40", True, 0),  # SatInfo: length depends on its content
         ("FA 01 08 80 01 00", False, 0),  # no extension words on a VN-100
         ("FA 81 08 00", True, 0),  # groups 8 to 14: unknown
-        ("FA 60 B9 00 61 79", True, 0),  # longer than any packet
+        ("FA 60 B9 00 61 79", True, 0),  # found in a payload
+        ("FA 49 FF 7F FF 3F FF 3F", True, 198 + 142 + 142 + 10),
+        ("FA 69 FF 7F FF 3F FF 1F FF 3F", True, 0),  # 756 bytes: longer than any packet
     ],
 )
 def test_headers(header: str, generic: bool, size: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -202,8 +203,6 @@ def test_parsing_is_near_its_bound() -> None:
     assert spec is not None
     assert spec.loader is not None
     bench = importlib.util.module_from_spec(spec)
-    import sys
-
     sys.modules["bench_parse"] = bench
     spec.loader.exec_module(bench)
     lines, packets = bench.measure(4000)

@@ -8,7 +8,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.binary import MAX_PACKET_BYTES, binary_layout, encode_packet
+from drivers.vn100.binary import (
+    MAX_PACKET_BYTES,
+    BinaryLayout,
+    binary_layout,
+    encode_packet,
+)
+from drivers.vn100.checksum import crc16
 from drivers.vn100.deframer import (
     KEPT_SKIPPED_BYTES,
     LONGEST_LINE,
@@ -73,17 +79,18 @@ def packets(draw: st.DrawFn) -> bytes:
     layout = draw(st.sampled_from(LAYOUTS))
     free = layout.size - len(layout.header) - 2
     content = draw(st.binary(min_size=free, max_size=free) | ugly.map(lambda b: (b * free)[:free]))
-    values = layout.payload.unpack(content)
-    wire = [number / per_si for number, per_si in zip(values, layout.per_si, strict=True)]
-    return encode_packet(layout, _in_range(wire, layout.codes))
+    return packet_of(layout, content)
 
 
-def _in_range(values: list[float], codes: str) -> list[float]:
-    """Rounding may lift the largest integers over the limit."""
-    return [
-        min(value, (2**64 - 4096) / 1e9) if code == "Q" else value
-        for value, code in zip(values, codes, strict=True)
-    ]
+def packet_of(layout: BinaryLayout, content: bytes) -> bytes:
+    """A packet with these very bytes behind its header."""
+    checked = layout.header[1:] + content.ljust(layout.size - len(layout.header) - 2, b"\0")
+    return b"\xfa" + checked + crc16(checked).to_bytes(2, "big")
+
+
+def nest(inner: bytes) -> bytes:
+    """A packet of 110 bytes with another message in the middle."""
+    return packet_of(LAYOUTS[1], bytes(20) + inner)
 
 
 angles = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
@@ -91,6 +98,7 @@ sentences = angles.map(lambda values: encode_sentence("VNYPR", values)) | st.sam
     [encode("VNRRG,08,1,2,3"), encode("VNERR,03", crc=True), encode("VNWNV")]
 )
 messages = packets() | sentences
+nested = (packets() | sentences).filter(lambda inner: len(inner) < 80).map(nest)
 streams = st.lists(st.tuples(noise, messages), max_size=6)
 
 
@@ -113,7 +121,10 @@ def test_noise_between_messages_loses_none(stream: list[tuple[bytes, bytes]], ta
     assert contains_in_order(bodies(frames), [body_of(message) for _, message in stream])
 
 
-@given(streams, noise, st.randoms(use_true_random=False))
+mixtures = st.lists(st.tuples(noise, messages | nested), max_size=6)
+
+
+@given(mixtures, noise, st.randoms(use_true_random=False))
 @settings(max_examples=300, deadline=None)
 def test_how_the_stream_is_cut_changes_nothing(
     stream: list[tuple[bytes, bytes]], tail: bytes, rng: random.Random
@@ -270,18 +281,48 @@ def test_a_false_long_header_does_not_hold_packets_up() -> None:
     assert deframer.take_skipped() == [Skipped(0, long_header, Cause.OVERTAKEN)]
 
 
+SHORT = encode_packet(LAYOUTS[2], (12.5,))
+FIRST = encode_packet(LAYOUTS[1], [1] * len(LAYOUTS[1].columns))
+
+
 def test_a_known_header_is_waited_for() -> None:
     """Behind a message, a whole packet that another one has as content is not taken for one."""
-    short = encode_packet(LAYOUTS[2], (12.5,))
-    layout = binary_layout(0x01, (0x0739,))
-    content = (b"\0" * 20 + short).ljust(layout.size - 6, b"\0")
-    outer = encode_packet(
-        layout,
-        [a / b for a, b in zip(layout.payload.unpack(content), layout.per_si, strict=True)],
-    )
-    assert short in outer
-    first = encode_packet(layout, [1] * len(layout.columns))
-    assert bodies(Deframer().feed(first + outer)) == [first, outer]
+    assert bodies(Deframer().feed(FIRST + nest(SHORT))) == [FIRST, nest(SHORT)]
+
+
+@pytest.mark.parametrize("size", [1, 500])
+def test_out_of_sync_the_message_that_ends_first_wins(size: int) -> None:
+    deframer = Deframer()
+    data = nest(SHORT) + FIRST
+    frames = [f for at in range(0, len(data), size) for f in deframer.feed(data[at : at + size])]
+    assert bodies(frames) == [SHORT, FIRST]
+    assert deframer.counters.damage == {Cause.OVERTAKEN: 1}
+
+
+@pytest.mark.parametrize("size", [1, 500])
+def test_a_failed_packet_is_searched_and_counted_once(size: int) -> None:
+    """Its CRC was awaited, so the CRC is the cause, although the message inside ended before."""
+    deframer = Deframer()
+    damaged = nest(SHORT)[:-1] + b"\0"
+    data = FIRST + damaged + FIRST
+    frames = [f for at in range(0, len(data), size) for f in deframer.feed(data[at : at + size])]
+    assert bodies(frames) == [FIRST, SHORT, FIRST]
+    assert deframer.counters.damage == {Cause.CRC: 1}
+    start = len(FIRST) + damaged.index(SHORT)
+    assert deframer.take_skipped() == [
+        Skipped(len(FIRST), data[len(FIRST) : start], Cause.CRC),
+        Skipped(start + len(SHORT), data[start + len(SHORT) : -len(FIRST)], Cause.NOISE),
+    ]
+
+
+@pytest.mark.parametrize("size", [1, 500])
+def test_a_refused_packet_that_ends_in_a_sync_byte_is_one_piece(size: int) -> None:
+    deframer = Deframer()
+    refused = SHORT[:-2] + b"\0\xfa"
+    data = PACKET + refused + LINE
+    frames = [f for at in range(0, len(data), size) for f in deframer.feed(data[at : at + size])]
+    assert bodies(frames) == [PACKET, body_of(LINE)]
+    assert deframer.take_skipped() == [Skipped(len(PACKET), refused, Cause.CRC)]
 
 
 def test_silence_voids_what_waits() -> None:

@@ -15,9 +15,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from drivers.vn100.decode import ErrorReply, Measurement, Reply, Undecodable, decode
+from drivers.vn100.decode import (
+    ErrorReply,
+    Measurement,
+    Reply,
+    Undecodable,
+    decode,
+    decode_batch,
+)
 from drivers.vn100.deframer import Cause, Deframer, Packet, Sentence
 
 PROJECT = Path(__file__).parent.parent.parent
@@ -290,3 +299,16 @@ def receive_quickly(deframer: Deframer, data: bytes, how: str) -> list[Sentence 
     counters = deframer.counters
     assert counters.fed_bytes == counters.valid_bytes + counters.skipped_bytes + deframer.pending
     return frames
+
+
+def test_the_rotation_matrix_is_body_to_ned_row_by_row(recordings: Path) -> None:
+    """What the manual leaves open, settled by a real device: R_nb = Rz(yaw) Ry(pitch) Rx(roll)."""
+    data = gzip.decompress((recordings / "vn100" / "F00379.vnbin.gz").read_bytes())
+    packets = [frame for frame in Deframer().feed(data) if isinstance(frame, Packet)]
+    values = decode_batch(packets[::100])
+    names = [column.name for column in packets[0].layout.columns]
+    ypr = values[:, names.index("yaw_rad") :][:, :3]
+    R_nb = values[:, names.index("dcm_00") :][:, :9].reshape(-1, 3, 3)
+    assert names[names.index("dcm_00") + 1] == "dcm_01"
+    expected_nb = Rotation.from_euler("ZYX", ypr).as_matrix()
+    assert np.abs(R_nb - expected_nb).max() < 1e-6
