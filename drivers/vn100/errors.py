@@ -68,7 +68,7 @@ class DriverError(Exception):
     """Root of everything that the VN-100 driver raises about the device and the link."""
 
 
-class DeviceRefused(DriverError):  # noqa: N818 - says what the device did
+class DeviceRefused(DriverError):
     """The device answered ``$VNERR,code``; `error` is the table's row."""
 
     def __init__(self, code: int) -> None:
