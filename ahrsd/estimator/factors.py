@@ -21,6 +21,7 @@ NODE = 5
 Y_A = slice(9, 14)
 Y_B = slice(14, 19)
 SIZE = 19
+_VAGUE = 1e-2  # information on c, 1/gauss^2: next to nothing, but invertible
 # where chain.Quadratic's 16 numbers go among the factor's 19
 _FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
 
@@ -107,11 +108,22 @@ class Factor:
         return H, g
 
 
-def epoch_factor(q: chain.Quadratic, a: int, point: Point, walk: float) -> Factor:
-    """The factor of one epoch, between nodes a and a + 1, from its eliminated chain."""
+def epoch_factor(
+    q: chain.Quadratic, a: int, point: Point, walk: float, *, calibrates: bool = True
+) -> Factor:
+    """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
+
+    One that does not calibrate speaks of the gyro's bias only, whatever c is: c is marginalised.
+    """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     H[np.ix_(_FROM_CHAIN, _FROM_CHAIN)] = q.H
     g[_FROM_CHAIN] = q.g
+    if not calibrates:
+        gain = np.linalg.solve(H[C, C] + _VAGUE * np.eye(9), np.column_stack([H[C], g[C]]))
+        cross = H[:, C].copy()
+        H -= cross @ gain[:, :SIZE]
+        g -= cross @ gain[:, SIZE]
+        H[C, :], H[:, C], g[C] = 0.0, 0.0, 0.0
     return Factor(a, a + 1, H, g, point, walk)
 
 

@@ -7,16 +7,17 @@ elimination, which leaves one factor on (c, y 1) that holds all that the past sa
 
 Traps of the wrapper that shaped this file: HessianFactor's linear term is minus the gradient; views
 that it returns die with their owner, so they are copied at once; a rank-deficient system raises
-RuntimeError.
+RuntimeError; and a block counts as rank-deficient where its last two pivots differ by more than
+2^12 (choleskyPartial), as they do where little is known. So nodes are eliminated before c, while c
+counts as known, and the block of c ends in two idle coordinates with pivots of 1.
 """
 
 from __future__ import annotations
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point
+from ahrsd.estimator.factors import NODE, SIZE, Factor, Node, Point
 from ahrsd.samples import Array
 
 
@@ -25,6 +26,9 @@ class SingularError(ValueError):
 
 
 _C = gtsam.symbol("c", 0)
+_IDLE = 2
+_WIDE = 9 + _IDLE
+_USED = np.r_[0:9, _WIDE : SIZE + _IDLE]  # where a factor's rows go, the idle ones left out
 _HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
@@ -35,33 +39,33 @@ def _y(j: int) -> int:
 def _hessian(factor: Factor, H: Array, g: Array) -> gtsam.HessianFactor:
     if not (np.isfinite(H).all() and np.isfinite(g).all()):
         raise SingularError("a factor is not finite")
+    G, linear = np.zeros((SIZE + _IDLE, SIZE + _IDLE)), np.zeros(SIZE + _IDLE)
+    G[np.ix_(_USED, _USED)] = H
+    linear[_USED] = -g
+    c, a, b = slice(0, _WIDE), slice(_WIDE, _WIDE + NODE), slice(_WIDE + NODE, _WIDE + 2 * NODE)
     if factor.a == factor.b:
         return gtsam.HessianFactor(
-            _C, _y(factor.a), H[C, C], H[C, Y_A], -g[C], H[Y_A, Y_A], -g[Y_A], 0.0
+            _C, _y(factor.a), G[c, c], G[c, a], linear[c], G[a, a], linear[a], 0.0
         )
     return gtsam.HessianFactor(
         _C,
         _y(factor.a),
         _y(factor.b),
-        H[C, C],
-        H[C, Y_A],
-        H[C, Y_B],
-        -g[C],
-        H[Y_A, Y_A],
-        H[Y_A, Y_B],
-        -g[Y_A],
-        H[Y_B, Y_B],
-        -g[Y_B],
+        G[c, c],
+        G[c, a],
+        G[c, b],
+        linear[c],
+        G[a, a],
+        G[a, b],
+        linear[a],
+        G[b, b],
+        linear[b],
         0.0,
     )
 
 
 def _singular(error: RuntimeError) -> SingularError:
     return SingularError(str(error).strip().split("\n", maxsplit=1)[0])
-
-
-def _unary(mean: Array, sigma: Array) -> gtsam.PriorFactorVector:
-    return gtsam.PriorFactorVector(_C, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
 
 
 Step = tuple[Array, dict[int, Array]]
@@ -103,14 +107,19 @@ class Graph:
             graph.add(gtsam.LinearContainerFactor(_hessian(factor, H, g), values))
         return graph
 
-    def _anchored(self, factors: list[Factor], extra: Array) -> gtsam.NonlinearFactorGraph:
+    def _anchored(
+        self, factors: list[Factor], extra: Array, damping: float = 0.0
+    ) -> gtsam.NonlinearFactorGraph:
         """All factors and the anchor; `extra` (9, 9) is information that pulls to the anchor."""
         graph = self._linear(factors)
         information = self._belief() + extra
         linear = information @ (self.anchor[0] - self.c)
         if not np.isfinite(linear).all():
             raise SingularError("the calibration is not finite")
-        hessian = gtsam.HessianFactor(_C, information, linear, 0.0)
+        block, vector = np.eye(_WIDE), np.zeros(_WIDE)
+        block[:9, :9] = information + np.diag(damping / self.anchor[1] ** 2)
+        vector[:9] = linear
+        hessian = gtsam.HessianFactor(_C, block, vector, 0.0)
         graph.add(gtsam.LinearContainerFactor(hessian, self._values(factors)))
         return graph
 
@@ -137,7 +146,7 @@ class Graph:
     @staticmethod
     def _values(factors: list[Factor]) -> gtsam.Values:
         values = gtsam.Values()
-        values.insert(_C, np.zeros(9))
+        values.insert(_C, np.zeros(_WIDE))
         for j in sorted({k for f in factors for k in (f.a, f.b)}):
             values.insert(_y(j), np.zeros(NODE))
         return values
@@ -153,16 +162,13 @@ class Graph:
         Raises SingularError where the graph does not determine all of it.
         """
         factors = self._all()
-        damped = damping / self.anchor[1] ** 2
-        graph = self._anchored(factors, self.hold)
-        if damping > 0:
-            graph.add(_unary(np.zeros(9), 1.0 / np.sqrt(damped)))
+        graph = self._anchored(factors, self.hold, damping)
         try:
-            delta = graph.linearize(self._values(factors)).optimize()
+            delta = graph.linearize(self._values(factors)).optimize(self._order(with_all=True))
         except RuntimeError as error:
             raise _singular(error) from error
         dy = {j: np.array(delta.at(_y(j))) for j in self.nodes}
-        return np.array(delta.at(_C)), dy
+        return np.array(delta.at(_C), dtype=np.float64)[:9], dy
 
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
         """Move all values by a step."""
@@ -175,15 +181,24 @@ class Graph:
         As if nothing were held: what is not determined has the sigma of the prior.
         """
         factors = self._all()
-        values = self._values(factors)
-        graph = self._anchored(factors, np.zeros((9, 9)))
+        linear = self._anchored(factors, np.zeros((9, 9))).linearize(self._values(factors))
+        rest = _eliminated(linear, self._order(with_all=False))
+        H, _ = _information(rest)
         try:
-            joint = gtsam.Marginals(graph, values).jointMarginalCovariance(
-                gtsam.KeyVector([_C, _y(self.last)])
-            )
-        except RuntimeError as error:
-            raise _singular(error) from error
-        return np.array(joint.fullMatrix())[:12, :12]
+            joint = np.linalg.inv(H[:14, :14])
+        except np.linalg.LinAlgError as error:
+            raise SingularError(str(error)) from error
+        return np.asarray(joint[:12, :12], dtype=np.float64)
+
+    def _order(self, *, with_all: bool) -> gtsam.Ordering:
+        """Nodes from old to new, then c; without the newest node and c unless `with_all`."""
+        ordering = gtsam.Ordering()
+        nodes = sorted(self.nodes)
+        for j in nodes if with_all else nodes[:-1]:
+            ordering.push_back(_y(j))
+        if with_all:
+            ordering.push_back(_C)
+        return ordering
 
     def fold_oldest(self) -> None:
         """Eliminate the oldest node: prior and the factors on it become the prior of the next."""
@@ -194,23 +209,36 @@ class Graph:
         linear = self._linear(factors).linearize(self._values(factors))
         ordering = gtsam.Ordering()
         ordering.push_back(_y(old))
-        try:
-            _, rest = linear.eliminatePartialSequential(ordering)
-        except RuntimeError as error:
-            raise _singular(error) from error
-        hessian = gtsam.HessianFactor(rest)
-        augmented = np.array(hessian.augmentedInformation())
-        H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-        rows = _rows(list(hessian.keys()))
-        H[np.ix_(rows, rows)] = augmented[:-1, :-1]
-        g[rows] = -augmented[:-1, -1]
+        H, g = _information(_eliminated(linear, ordering))
         node = self.nodes[new]
         self.prior = Factor(new, new, H, g, Point(self.c.copy(), node.copy(), node.copy()))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]
         del self.nodes[old]
 
 
-def _rows(keys: list[int]) -> NDArray[np.intp]:
-    """Rows of [c, y_a] for a factor's keys in GTSAM's order."""
-    parts = [np.arange(9) if key == _C else np.arange(9, 14) for key in keys]
-    return np.asarray(np.concatenate(parts))
+def _eliminated(
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> gtsam.GaussianFactorGraph:
+    """What is left of a graph without the variables of `ordering`."""
+    try:
+        return linear.eliminatePartialSequential(ordering)[1]
+    except RuntimeError as error:
+        raise _singular(error) from error
+
+
+def _information(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
+    """H and gradient (SIZE) on [c, one node] of what an elimination left."""
+    hessian = gtsam.HessianFactor(rest)
+    augmented = np.array(hessian.augmentedInformation())
+    rows, kept, at = [], [], 0
+    keys: list[int] = list(hessian.keys())
+    for key in keys:
+        first, size, idle = (0, 9, _IDLE) if key == _C else (9, NODE, 0)
+        rows.append(np.arange(first, first + size))
+        kept.append(np.arange(at, at + size))
+        at += size + idle
+    into, of = np.concatenate(rows), np.concatenate(kept)
+    H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+    H[np.ix_(into, into)] = augmented[np.ix_(of, of)]
+    g[into] = -augmented[of, -1]
+    return H, g

@@ -17,13 +17,14 @@ from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.estimator.search import search, worthwhile
+from ahrsd.estimator.search import search
 from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
-_GAIN = 1.0  # of log likelihood, tempered, that another start must bring
-_GAIN_FOLDED = 20.0  # once older data are folded at the present answer, which a search cannot see
+# Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
+_AWAY, _AWAY_UNSETTLED = 3.0, 0.5
+_GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
@@ -89,7 +90,7 @@ class Estimator:
         self._down.append(data.down_b[len(data) // 2])
         window.append(data)
         window.track()
-        if self._searching and worthwhile([e.data for e in window.epochs]):
+        if self._searching and window.epochs[-1].turned:
             self._moving_epochs += 1
             if self._moving_epochs >= self._next_search:
                 self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
@@ -112,8 +113,10 @@ class Estimator:
     def _search(self, window: Window) -> None:
         """Other starts compete with the present answer, until they agree on good data."""
         found = search(self.parameters, window, self._present_bias, [e.data for e in window.epochs])
-        needed = _GAIN_FOLDED if window.folded else _GAIN
-        if found.gain > needed * window.graph.temper:
+        unsettled = window.step_sigmas > _SETTLED
+        if found.gain > _GAIN_FOLDED * window.graph.temper or (
+            found.away > (_AWAY_UNSETTLED if unsettled else _AWAY) and not window.folded
+        ):
             window.restart_at(found.c, found.bias)
             window.track()
         self._agreed = found.agreed

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.estimator import chain, start
+from ahrsd.estimator.excitation import spread
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError
 from ahrsd.estimator.parameters import EstimatorParameters
@@ -25,17 +26,21 @@ from ahrsd.samples import Array
 _EPOCHS = 8
 _STEPS = 128  # per epoch
 _DESCENT = 12  # Levenberg-Marquardt steps per start
-_MOVED = 0.04  # of the field's size: a smaller spread is noise and drift, nothing to search in
 _SAME = 1.0  # sigmas within which two answers are one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Best calibration c (9,) and gyro bias (3,), what it gains in log likelihood over the present
-    answer, and whether two independent starts arrived at it."""
+    """Best calibration c (9,) and gyro bias (3,).
+
+    away:   sigmas between it and the answer as it stands
+    gain:   in log likelihood over where a descent from the answer as it stands leads
+    agreed: two starts that know nothing of each other arrived at it
+    """
 
     c: Array
     bias: Array
+    away: float
     gain: float
     agreed: bool
 
@@ -48,12 +53,6 @@ class _Reached:
     information: Array | None
 
 
-def worthwhile(data: Sequence[chain.Data]) -> bool:
-    """Whether the field varied enough, in the sensor's frame, for a search to mean anything."""
-    field = np.vstack([d.field_b_gauss[::8] for d in data])
-    return bool(_spread(field) > _MOVED * np.median(np.linalg.norm(field, axis=1)))
-
-
 def search(
     parameters: EstimatorParameters, window: Window, present_bias: Array, data: Sequence[chain.Data]
 ) -> Found:
@@ -61,7 +60,7 @@ def search(
     graph = window.graph
     present, sigma = graph.anchor
     chosen = sorted(
-        sorted(range(len(data)), key=lambda k: -_spread(data[k].field_b_gauss))[:_EPOCHS]
+        sorted(range(len(data)), key=lambda k: -spread(data[k].field_b_gauss))[:_EPOCHS]
     )
     first = Node.at(present_bias, np.array([1.0, 0.0, 0.0]))
     thin = Window(parameters, present, sigma, first, window.usual)
@@ -77,7 +76,8 @@ def search(
     ]
     best = min([own, *independent], key=lambda r: r.cost)
     same = [r for r in independent if _same(r, best, graph.temper)]
-    return Found(best.c, best.bias, own.cost - best.cost, len(same) > 1)
+    away = np.inf if best.information is None else sigmas(graph.c - best.c, best.information)
+    return Found(best.c, best.bias, float(away), own.cost - best.cost, len(same) > 1)
 
 
 def _descend(thin: Window, c: Array, bias: Array) -> _Reached:
@@ -95,11 +95,6 @@ def _same(r: _Reached, best: _Reached, temper: float) -> bool:
     if best.information is None:
         return False
     return sigmas(r.c - best.c, best.information / temper) < _SAME
-
-
-def _spread(field: Array) -> float:
-    """Standard deviation along the direction in which the field varied most."""
-    return float(np.sqrt(np.linalg.eigvalsh(np.cov(field.T))[-1]))
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.estimator import chain, noise
+from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
     Factor,
     Node,
@@ -39,6 +40,7 @@ _MAX_STEPS = 12
 _MAX_TRACKS = 6
 _WORK, _MOST_WORK = 24, 160  # linearisations that each new epoch allows, and that may be saved up
 BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
+_RESTART_WORK = 6  # linearisations per epoch that a restart is worth
 _DAMPING = 1e-3
 _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
@@ -59,6 +61,7 @@ class Epoch:
     quadratic: chain.Quadratic
     factor: Factor
     residuals: noise.Residuals
+    turned: bool
 
     @property
     def cost(self) -> float:
@@ -121,7 +124,9 @@ class Window:
         u[0] = graph.nodes[a].direction
         graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
         info = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-        self.epochs.append(self._linearised(data, u, self.usual, None, a, info))
+        self.epochs.append(
+            self._linearised(data, u, self.usual, None, a, info, turned=turned(data))
+        )
         graph.factors.append(self.epochs[-1].factor)
 
     def fold(self) -> None:
@@ -132,7 +137,8 @@ class Window:
         ):
             old = self.epochs.pop(0)
             self.folded = True
-            self.misfit.remember(old.factor, self.graph)
+            if old.turned:
+                self.misfit.remember(old.factor, self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
 
@@ -146,6 +152,8 @@ class Window:
         weights: Array | None,
         a: int,
         walk: float,
+        *,
+        turned: bool,
     ) -> Epoch:
         self._work -= 1
         graph = self.graph
@@ -153,13 +161,15 @@ class Window:
         u[0], u[-1] = first.direction, last.direction
         q = chain.linearise(data, u, graph.c, first.bias, used, weights=weights)
         point = Point(graph.c.copy(), first.copy(), last.copy())
-        factor = epoch_factor(q, a, point, walk)
+        factor = epoch_factor(q, a, point, walk, calibrates=turned)
         found = noise.residuals(q, data, used, chain.symmetric(graph.c[:6]))
-        return Epoch(data, u, used, weights, a, a + 1, q, factor, found)
+        return Epoch(data, u, used, weights, a, a + 1, q, factor, found, turned)
 
     def _replace(self, k: int, u: Array, used: chain.Noise, weights: Array | None) -> None:
         old = self.epochs[k]
-        new = self._linearised(old.data, u, used, weights, old.a, old.factor.walk)
+        new = self._linearised(
+            old.data, u, used, weights, old.a, old.factor.walk, turned=old.turned
+        )
         self.graph.factors[self.graph.factors.index(old.factor)] = new.factor
         self.epochs[k] = new
 
@@ -198,6 +208,7 @@ class Window:
                 graph.nodes[epoch.a] = Node.at(bias, u[0])
             graph.nodes[epoch.b] = Node.at(bias, u[-1])
             self._replace(k, u, guess, None)
+        self._work = max(self._work, _RESTART_WORK * len(self.epochs))
 
     def snapshot(self) -> _Snapshot:
         """The whole state; cheap, because epochs, nodes and factors are replaced, never changed."""
@@ -308,7 +319,7 @@ class Window:
         """
         graph = self.graph
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
-        factors = [e.factor for e in self.epochs]
+        factors = [e.factor for e in self.epochs if e.turned]
         self.found_misfit = self.misfit.value(factors, graph, graph.step())
         graph.temper = max(1.0, self.found_misfit)
         covariance = graph.covariance()[:9, :9] * graph.temper

@@ -1,0 +1,33 @@
+"""Whether an epoch turned the sensor: one that did not says nothing about the iron.
+
+A field that changes while the sensor rests (a lift, a passing car, drift) would be taken for a
+strange calibration. So both sensors must have seen a rotation, unless the field swept so far that
+nothing but a rotation explains it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.estimator import chain
+from ahrsd.samples import Array
+
+_SWEPT = 0.10  # spread of the field over its size: a turn, whatever the gyro says
+_STIRRED = 0.004  # the same, if the gyro saw the turn
+_TURNED_RAD = 0.002  # spread of the integrated rate less its mean
+_SMOOTHED = 16  # steps
+
+
+def spread(field: Array) -> float:
+    """Standard deviation of (N, 3) along the direction in which it varied most."""
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(field.T))[-1]))
+
+
+def turned(data: chain.Data) -> bool:
+    """True where the epoch is worth a factor on the calibration."""
+    count = len(data) // _SMOOTHED
+    field = data.field_b_gauss[: count * _SMOOTHED].reshape(count, _SMOOTHED, 3).mean(axis=1)
+    relative = spread(field) / float(np.median(np.linalg.norm(data.field_b_gauss, axis=1)))
+    angle = data.angle_b_rad[1:]
+    path = np.cumsum(angle - angle.mean(axis=0), axis=0)
+    return relative > _SWEPT or (relative > _STIRRED and spread(path) > _TURNED_RAD)
