@@ -142,7 +142,6 @@ def _scale(written: Affine, estimate: Estimate) -> float:
 
 def _matrix(estimate: Estimate, present: Affine) -> Array:
     inverse = np.linalg.inv(estimate.soft_iron)
-    inverse = 0.5 * (inverse + inverse.T)
     if estimate.field_known:
         return np.asarray(inverse)
     return np.asarray(inverse * np.cbrt(np.linalg.det(present.matrix) / np.linalg.det(inverse)))

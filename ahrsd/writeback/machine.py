@@ -21,7 +21,7 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.actions import Action
+from ahrsd.writeback.actions import Action, IdentifyAgain
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
 from ahrsd.writeback.flow import Flow
 from ahrsd.writeback.journal_history import History, JournalRecord
@@ -168,6 +168,21 @@ class WriteBack:
         """The device restarted: its RAM is what its flash holds. `on_device` must follow."""
         self._desk.host_s, self._saw_reset = host_s, True
         self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
+        return self._answer()
+
+    def on_uptime(self, uptime_s: float, host_s: float) -> list[Action]:
+        """The device's time since its start-up, once its stream tells: a restart nobody saw.
+
+        Only a restart shows what a save left in flash, so it is asked again then.
+        """
+        self._desk.host_s = host_s
+        age_s = self._desk.wall_s - self.history.last_wall_s
+        open_save = self.history.last in (Kind.FLASH_SENT, Kind.FLASH_ACKED)
+        resting = self.state in (State.FAULT, State.COMMITTED)
+        if open_save and resting and 0.0 <= uptime_s < age_s:
+            self._saw_reset = True
+            self._flow.signal(Signal.DEVICE_RESET, "the device restarted since the save")
+            self._desk.ask(IdentifyAgain())
         return self._answer()
 
     def on_samples(self, block: SampleBlock) -> list[Action]:

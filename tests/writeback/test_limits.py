@@ -9,11 +9,11 @@ import pytest
 
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.journal_history import History
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy, flash_budget, ram_budget
 from ahrsd.writeback.states import State
 from ahrsd.writeback.stillness import Stillness
-from drivers.vn100.commands import Write
+from drivers.vn100.commands import Word, Write
 
 DAY_S = 86400.0
 
@@ -237,6 +237,55 @@ def test_a_third_party_that_writes_before_us_wins(make_rig):
     assert rig.kinds == ["PREPARED", "ABORTED"]
     assert rig.in_force[-1] is None
     assert rig.asked_again == 1
+
+
+def test_a_third_party_that_writes_between_check_and_write_is_a_fault(make_rig):
+    rig = make_rig(Mode.STAGE)
+
+    def writes(command):
+        if rig.wb.state is State.STAGING:
+            rig.device.ram[84] = (1.5,) * 9 + (0.0,) * 3
+
+    rig.device.refuse = writes
+    rig.whole_way()
+    assert rig.sent == []
+    assert rig.wb.state is State.FAULT
+    rig.do(rig.wb.on_stop(rig.now_s))  # a stop does not overwrite what somebody else wrote
+    assert rig.sent == []
+    assert rig.wb.idle
+
+
+def test_a_journal_that_cannot_be_read_in_the_trial_is_an_alarm_not_forgetting(make_rig):
+    rig = make_rig(Mode.STAGE)
+    rig.connect()
+    another(rig)
+    assert rig.wb.state is State.TRIAL
+    rig.do(rig.wb.on_link_lost(rig.now_s))
+    rig.connect(journal=None)
+    assert rig.wb.state is State.FAULT
+    assert "$VNWRG,23,1,0,0" in rig.notes("error")[-1]
+    rig.do(rig.wb.on_operator("rollback", "", rig.now_s))
+    assert rig.device.held() == rig.device.held("flash")
+
+
+def test_the_gate_itself_asks_everything_again(make_rig):
+    rig = make_rig()
+    rig.connect()
+    rig.pass_time(0.1)
+    rig.verdict()  # says the gyro's bias, without which it would not be still
+    rig.stand_still()
+    safe, now_s = rig.wb._safe, rig.now_s
+    write, save = Write(23, rig.device.ram[23]), Word("VNWNV")
+    assert safe.allow(write, Purpose.STAGE, now_s)
+    assert safe.allow(save, Purpose.SAVE, now_s)
+    assert not safe.allow(write, Purpose.STAGE, now_s + 1.1)
+    assert not safe.allow(save, Purpose.SAVE, now_s + 1.1)
+    assert safe.allow(write, Purpose.ROLL_BACK, now_s + 1.1)
+    safe.journal_ok = False
+    assert not safe.allow(save, Purpose.SAVE, now_s)
+    assert safe.write_holds(History(), now_s, 0.0)[-1].startswith("the journal cannot be written")
+    safe.gates = rig.RED
+    assert "gate observability: turn more" in safe.write_holds(History(), now_s, 0.0)
 
 
 def test_samples_are_marked_unusable_while_registers_are_in_doubt(make_rig):

@@ -198,6 +198,28 @@ def test_in_observe_an_interrupted_write_is_an_alarm_and_nothing_is_sent(make_ri
     assert alarms > 5
 
 
+@pytest.mark.parametrize("acknowledged", [True, False])
+def test_a_restart_that_only_the_streams_time_tells_confirms_a_save(make_rig, acknowledged):
+    rig = make_rig()
+    if not acknowledged:
+        rig.device.mute = lambda command: command == Word("VNWNV")
+    rig.whole_way()
+    waiting = State.COMMITTED if acknowledged else State.FAULT
+    rig.now_s += 60.0
+    rig.device.restart()
+    rig.start()
+    rig.connect()  # the registers are read before the first sample
+    assert rig.wb.state is waiting
+    rig.do(rig.wb.on_uptime(3600.0, rig.now_s))
+    assert (rig.wb.state, rig.asked_again) == (waiting, 0)
+    rig.do(rig.wb.on_uptime(5.0, rig.now_s))
+    assert rig.asked_again == 1
+    rig.connect()
+    assert rig.wb.state is State.CONFIRMED
+    rig.do(rig.wb.on_uptime(5.0, rig.now_s))
+    assert rig.asked_again == 1
+
+
 # -- the table -------------------------------------------------------------------------------------
 
 
