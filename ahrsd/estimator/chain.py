@@ -78,6 +78,7 @@ class Data:
     then `measures_first`); angle and dt of row 0 are not used.
 
     field_b_gauss (n, 3), angle_b_rad (n, 3), dt_s (n,), down_b (n, 3) unit or nan, time_s (n,)
+    linked (n,) is 0 for rows that the gyro does not link to the row before, else 1; None: all are.
     """
 
     field_b_gauss: Array
@@ -86,6 +87,7 @@ class Data:
     down_b: Array
     time_s: Array
     measures_first: bool
+    linked: Array | None = None
 
     def __len__(self) -> int:
         return len(self.dt_s)
@@ -185,6 +187,8 @@ def _motion(data: Data, u: Array, T: Array, bias: Array, noise: Noise) -> _Motio
     R, Jl = so3.exp_and_left_jacobian(-(data.angle_b_rad[1:] - bias * dt[:, None]))
     turned = _times(R, u[:-1])
     scale = 1.0 / (noise.gyro_rad_s * dt)
+    if data.linked is not None:
+        scale *= data.linked[1:]
     Tt = np.swapaxes(T[1:], 1, 2) * scale[:, None, None]
     J_bias = -Tt @ so3.skew(turned) @ Jl * dt[:, None, None]
     return _Motion(_times(Tt, turned), Tt @ R @ T[:-1], J_bias, scale)

@@ -50,7 +50,8 @@ class Estimator:
         self._prior_sigma = np.ones(12)
         self._down: deque[Array] = deque(maxlen=64)
         self._searching, self._agreed = True, False
-        self._moving_epochs, self._next_search = 0, _FIRST_SEARCH
+        self._moving_epochs, self._last_search = 0, 0
+        self._next_search = _FIRST_SEARCH
 
     def add(self, block: SampleBlock) -> bool:
         """Take samples; true where they completed an epoch, so that `estimate` says something new.
@@ -76,7 +77,7 @@ class Estimator:
         """End of the recording: use what is pending and iterate to the end."""
         self.interrupt()
         if self._window is not None:
-            if self._searching and self._moving_epochs:
+            if self._searching and self._moving_epochs > self._last_search:
                 self._search(self._window)
             self._window.track(everything=True)
         return self.estimate()

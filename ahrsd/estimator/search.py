@@ -2,8 +2,8 @@
 
 The likelihood has more than one valley when motion is poor. So now and then several starts descend
 on a thinned copy of the window (every k-th field, rotations between them composed exactly; the
-epochs whose field varied most): the device's present calibration, a linear fit, a sphere, and the
-answer as it stands. The lowest wins; it may be called sure only if two starts that know nothing of
+epochs whose field varied most, all in one chain with cuts in it): the device's present calibration,
+a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be called sure only if two starts that know nothing of
 each other arrive there.
 """
 
@@ -23,9 +23,9 @@ from ahrsd.estimator.steps import compose
 from ahrsd.estimator.window import Window, sigmas
 from ahrsd.samples import Array
 
-_EPOCHS = 8
+_EPOCHS = 6
 _STEPS = 128  # per epoch
-_DESCENT = 12  # Levenberg-Marquardt steps per start
+_DESCENT = 10  # Levenberg-Marquardt steps per start
 _SAME = 1.0  # sigmas within which two answers are one
 
 
@@ -64,8 +64,7 @@ def search(
     )
     first = Node.at(present_bias, np.array([1.0, 0.0, 0.0]))
     thin = Window(parameters, present, sigma, first, window.usual)
-    for k in chosen:
-        thin.append(thinned(data[k], max(1, len(data[k]) // _STEPS)))
+    thin.append(joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen]))
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
     own = _descend(thin, graph.c, graph.nodes[graph.last].bias)
@@ -103,7 +102,21 @@ def thinned(data: chain.Data, k: int) -> chain.Data:
     rows = np.arange(count + 1) * k
     angle = np.zeros((count + 1, 3))
     angle[1:] = compose(data.angle_b_rad[1 : count * k + 1].reshape(count, k, 3))
-    dt = np.r_[data.dt_s[0], data.dt_s[1 : count * k + 1].reshape(count, k).sum(axis=1)]
+    dt = np.r_[data.dt_s[1], data.dt_s[1 : count * k + 1].reshape(count, k).sum(axis=1)]
     return chain.Data(
         data.field_b_gauss[rows], angle, dt, data.down_b[rows], data.time_s[rows], True
+    )
+
+
+def joined(parts: Sequence[chain.Data]) -> chain.Data:
+    """Epochs that measure their first field as one chain that is cut between them."""
+    linked = np.concatenate([np.r_[0.0, np.ones(len(p) - 1)] for p in parts])
+    return chain.Data(
+        np.vstack([p.field_b_gauss for p in parts]),
+        np.vstack([p.angle_b_rad for p in parts]),
+        np.concatenate([p.dt_s for p in parts]),
+        np.vstack([p.down_b for p in parts]),
+        np.concatenate([p.time_s for p in parts]),
+        measures_first=True,
+        linked=linked,
     )

@@ -38,9 +38,11 @@ _SETTLED = 0.05  # sigmas of movement at which iterating stops
 _LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
-_WORK, _MOST_WORK = 24, 160  # linearisations that each new epoch allows, and that may be saved up
+_WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
 BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
-_RESTART_WORK = 6  # linearisations per epoch that a restart is worth
+_FINISH_WORK = 10  # linearisations per epoch at the end of a recording
+_WIDER = 2.0
+_RESTART_WORK = 5  # linearisations per epoch that a restart is worth
 _DAMPING = 1e-3
 _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
@@ -200,15 +202,19 @@ class Window:
         The guess does not depend on c, so costs reached from different starts compare.
         """
         graph = self.graph
-        guess = noise.median(self._guesses)
+        self.usual = self._start_noise()
         graph.c = c.copy()
         for k, epoch in enumerate(self.epochs):
             u = chain.start_directions(chain.symmetric(c[:6]), c[6:], epoch.data.field_b_gauss)
             if epoch.data.measures_first or k == 0:
                 graph.nodes[epoch.a] = Node.at(bias, u[0])
             graph.nodes[epoch.b] = Node.at(bias, u[-1])
-            self._replace(k, u, guess, None)
+            self._replace(k, u, self.usual, None)
         self._work = max(self._work, _RESTART_WORK * len(self.epochs))
+
+    def _start_noise(self) -> chain.Noise:
+        guess = noise.median(self._guesses)
+        return chain.Noise(min(self.usual.mag_gauss, _WIDER * guess.mag_gauss), guess.gyro_rad_s)
 
     def snapshot(self) -> _Snapshot:
         """The whole state; cheap, because epochs, nodes and factors are replaced, never changed."""
@@ -271,6 +277,8 @@ class Window:
         """Follow the newest epoch, or iterate to the end over `everything`."""
         everyone = list(range(len(self.epochs)))
         stale = everyone if everything else everyone[-1:]
+        if everything:
+            self._work = max(self._work, _FINISH_WORK * len(everyone))
         for _ in range(_MAX_TRACKS):
             self.refresh(stale)
             try:
@@ -281,7 +289,7 @@ class Window:
                 return
             self.step_sigmas = sigmas(dc, information)
             if self.step_sigmas > _LARGE:
-                if not self._careful(everything=everything):
+                if not self._careful():
                     return
                 stale = everyone
                 continue
@@ -290,17 +298,17 @@ class Window:
             if self.step_sigmas < _SETTLED or (len(stale) > self._work and not everything):
                 return
 
-    def _careful(self, *, everything: bool) -> bool:
+    def _careful(self) -> bool:
         """A large step with care, as far as the work allowed goes; whether iterating may go on.
 
         The next epoch goes on from wherever this ends.
         """
         n = len(self.epochs)
-        steps = _MAX_STEPS if everything else min(_MAX_STEPS, self._work // n - 1)
+        steps = min(_MAX_STEPS, self._work // n - 1)
         if steps < 1:
             return False
         self.optimise(steps)
-        return everything or self._work >= 2 * n
+        return self._work >= 2 * n
 
     def _stale(self, information: Array) -> list[int]:
         """Epochs far from where they were linearised, or else the newest one."""
