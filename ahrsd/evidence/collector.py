@@ -72,12 +72,18 @@ class EvidenceCollector:
         proposed: Affine | None = None,
         halves: tuple[Affine, Affine] | None = None,
     ) -> Evidence:
-        """Judge `proposed` (default: the estimate's correction) by what is remembered.
+        """Judge `proposed` by what is remembered.
 
+        `proposed`: default is the estimate's correction, in the scale of `present` where the
+        field is not known (det A = 1 is a convention; what is written keeps the device's scale).
         `halves`: corrections from two disjoint halves of the data; without them they are fitted
         here. `present_gyro_bias_rad_s` (3,) is what register 84 takes off now.
         """
-        judged = estimate.correction if proposed is None else proposed
+        judged = proposed
+        if judged is None and estimate.field_known:
+            judged = estimate.correction
+        elif judged is None:
+            judged = comparison.in_scale_of(present, estimate.correction)
         nodes = self._nodes(estimate.gyro_bias_rad_s)
         motion, field, proof = UNKNOWN_MOTION, UNKNOWN_FIELD, NO_PROOF
         if nodes is not None:

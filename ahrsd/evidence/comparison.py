@@ -29,6 +29,12 @@ def envelope(motion: Coverage, field: FieldFacts, world: WorldField | None) -> E
     return Envelope(field.mean_gauss, float(dip), motion.roll_deg, motion.pitch_deg)
 
 
+def in_scale_of(model: Affine, correction: Affine) -> Affine:
+    """`correction` with the determinant of `model`: the same headings, the other's field units."""
+    scale = np.cbrt(np.linalg.det(model.matrix) / np.linalg.det(correction.matrix))
+    return Affine(scale * correction.matrix, correction.offset)
+
+
 def against_world(field: FieldFacts, world: WorldField | None) -> WorldFacts | None:
     """Magnitude and dip against the model; None without a position."""
     if world is None:
@@ -62,7 +68,7 @@ def refits(
     down = _mean_down(nodes)
     return RefitFacts(
         hard_iron_gauss=float(np.linalg.norm(apart - (apart @ down) * down)),
-        halves_deg=worst_difference_deg(_in_units_of(judged, a), _in_units_of(judged, b), where),
+        halves_deg=worst_difference_deg(in_scale_of(judged, a), in_scale_of(judged, b), where),
         second_opinion_deg=second,
     )
 
@@ -122,11 +128,6 @@ def _half_fits(
     if first is None or second is None:
         return None, None
     return gyro_fit(first, present, sigma_gauss), gyro_fit(second, present, sigma_gauss)
-
-
-def _in_units_of(judged: Affine, fitted: Affine) -> Affine:
-    scale = np.cbrt(np.linalg.det(judged.matrix) / np.linalg.det(fitted.matrix))
-    return Affine(scale * fitted.matrix, fitted.offset)
 
 
 def _mean_down(nodes: Nodes) -> Array:

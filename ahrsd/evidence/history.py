@@ -65,7 +65,7 @@ class History:
         self.parameters = parameters or HistoryParameters()
         self.segments: list[Segment] = []
         self._start_s: float | None = None
-        self._newest_s = -np.inf
+        self._newest_s = np.inf  # nothing yet: the first block begins a segment
         self._closed = 0
         self._open = _Averager(1)
         self._role: Role = "train"

@@ -3,7 +3,9 @@
 Gyro fit (for halves of the data). With R_0k from `attitude`, the corrected field of a segment must
 not move: R_0k (C m_k - c) = f_s, c = C b. Linear in (C, c); f_s is removed by centring. C = 0 would
 do, so the trace of C is held: C = C0 + sum x_i E_i over the five traceless symmetric E_i. Noise in
-the regressor m adds sigma^2 tr(E_i E_j) to the normal matrix on average; it is taken off again.
+the regressor m pulls C towards 0 with the weight n sigma^2; its pull on the right-hand side is taken
+off, which leaves a pull towards C0: harmless where motion is rich, wanted where it is not. Likewise
+the gyro's drift: R_0k wrong by a few milliradians at random looks like motion, and is weighed down.
 
 Size fit (second opinion): |C m - c| = F over symmetric C and c by Levenberg and Marquardt, in
 distances from the ellipsoid: no gyro, no gravity, and none of the quadric's troubles with signs and
@@ -23,6 +25,7 @@ from ahrsd.samples import Array
 
 _PRIOR_MATRIX = 0.3
 _PRIOR_GAUSS = 0.5
+_DRIFT_RAD = 2e-3  # error of the gyro's attitude within a segment: 0.1 mrad/s for half a minute
 _NODES = 1000
 _ROUNDS = 60
 _SETTLED = 1e-3  # of the cost, in units of one sigma squared
@@ -57,10 +60,10 @@ def gyro_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None
     rows = (rows - nodes.mean(rows)[nodes.segment]).reshape(-1, 9)
     design, target = rows[:, [0, 1, 2, 3, 4, 6, 7, 8]], rows[:, 5]
     N, y = design.T @ design, design.T @ target
-    noise = len(m) * sigma_gauss**2
-    N[:5, :5] -= noise * np.einsum("aij,bij->ab", E, E)
-    y[:5] += noise * np.einsum("aij,ij->a", E, C0)
+    y[:5] += len(m) * sigma_gauss**2 * np.einsum("aij,ij->a", E, C0)
     prior = sigma_gauss**2 / np.r_[np.full(5, _PRIOR_MATRIX), np.full(3, _PRIOR_GAUSS)] ** 2
+    false_motion = len(m) * _DRIFT_RAD**2
+    prior += false_motion * np.r_[np.full(5, np.mean(np.sum(m**2, axis=1))), np.ones(3)]
     c0 = C0 @ present.offset
     solution = _solve(N + np.diag(prior), y + prior * np.r_[np.zeros(5), c0])
     if solution is None:

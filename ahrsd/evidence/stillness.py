@@ -2,7 +2,7 @@
 
 A segment is cut in bins of one second. At rest the force is steady, the rate is close to the bias
 under test, and the field stays where it is (a slow steady turn has the first two). Runs of three
-such bins and more count. The scatter of the bins gives the sigma of the mean; the Earth's rotation
+such bins and more count, between two more. The scatter of the bins gives the sigma of the mean; the Earth's rotation
 (0.07 mrad/s) and the wandering of the bias between bins are a floor under it.
 """
 
@@ -80,6 +80,7 @@ def _still_runs(bins: Seconds, bias_b_rad_s: Array) -> list[tuple[int, int]]:
     rate = np.linalg.norm(bins.rate_b_rad_s - bias_b_rad_s, axis=1)
     still = (rate < STILL_GYRO_RAD_S) & (bins.force_std_m_s2 < STILL_ACCEL_M_S2)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    runs = [(int(i), int(j)) for i, j in edges.reshape(-1, 2) if j - i >= STILL_BINS]
+    inner = [(int(i) + 1, int(j) - 1) for i, j in edges.reshape(-1, 2)]  # the ends may have moved
+    runs = [(i, j) for i, j in inner if j - i >= STILL_BINS]
     field = bins.field_b_gauss
     return [(i, j) for i, j in runs if np.linalg.norm(np.ptp(field[i:j], axis=0)) < _TURN_GAUSS]

@@ -74,7 +74,7 @@ PROOF = (
         "min_improvement_percent",
         Level.RAM,
         meaning="held-out rms below that of the calibration in force",
-        advice="only {v:.0f} % better than what is in force (needed {l:.0f}): leave it as it is",
+        advice="held-out error falls by {v:.0f} % (needed {l:.0f}): leave what is in force",
         missing=_HELD,
     ),
     least(
@@ -85,7 +85,7 @@ PROOF = (
         "min_improvement_deg",
         Level.RAM,
         meaning="the same in degrees",
-        advice="only {v:.2f} deg better than what is in force (needed {l:.2f}): leave it",
+        advice="held-out error falls by {v:.2f} deg (needed {l:.2f}): leave what is in force",
         missing=_HELD,
     ),
     least(
@@ -96,7 +96,7 @@ PROOF = (
         "min_improvement_lower_deg",
         Level.RAM,
         meaning="lower end of the 95 % interval of that improvement",
-        advice="the improvement is not certain ({v:.2f} deg or more): keep turning",
+        advice="the improvement is not certain (lower bound {v:.2f} deg): keep turning",
         missing=_HELD,
     ),
     most(

@@ -129,14 +129,16 @@ def evidence(scene: Scene, correction: Affine | None = None, **given: Any) -> Ev
         "health": HEALTHY,
         "basis": SOUND,
     }
-    changes = {k: given.pop(k) for k in list(given) if k not in facts and k != "halves"}
+    changes = {
+        k: given.pop(k) for k in list(given) if k not in facts and k not in {"halves", "proposed"}
+    }
     return collect(scene).evaluate(estimate(correction, **changes), **(facts | given))
 
 
 class World:
     """What the tests get."""
 
-    Scene = Scene
+    Scene, EvidenceCollector = Scene, EvidenceCollector
     truth, old = staticmethod(truth), staticmethod(old)
     estimate = staticmethod(estimate)
     collect, evidence = staticmethod(collect), staticmethod(evidence)
