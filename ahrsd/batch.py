@@ -52,10 +52,18 @@ class BatchResult:
 
     def write_report(self, path: Path) -> None:
         """A page with pictures."""
-        from ahrsd.report import write_report
-        from ahrsd.report_data import batch_report
+        from ahrsd.report import EventCollector, write_report
 
-        write_report(path, batch_report(self))
+        collector = EventCollector()
+        for event in self.events:
+            collector.add(event)
+        report = collector.report(
+            f"Calibration of {self.name}",
+            verdict="" if self.converged else "The motion does not determine the calibration.",
+            good=self.converged,
+            command=f"ahrsd calibrate {self.name}",
+        )
+        write_report(path, report)
 
 
 def calibrate(

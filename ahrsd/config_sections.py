@@ -49,6 +49,8 @@ class Device(Section):
     they are put back at exit."""
     rate_hz: float = Field(default=100.0, ge=1.0, le=800.0)
     """Binary output to ask for with configure_stream. [Hz]"""
+    reply_timeout_s: float = Field(default=0.4, ge=0.05, le=60.0)
+    """How long a reply may take before the question is asked again. [s]"""
 
 
 class Capture(Section):

@@ -8,16 +8,13 @@ the same decisions; `decisions` holds them and their hash.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from ahrsd import events, inputs
 from ahrsd.calibration import Affine
-from ahrsd.calibrator import Calibrator, CalibratorSettings
+from ahrsd.calibrator import Calibrator
 from ahrsd.conversation import (
     Closed,
     Completed,
@@ -28,27 +25,18 @@ from ahrsd.conversation import (
     StreamChanged,
     Unanswered,
 )
+from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
-from ahrsd.evidence.values import BasisFacts, HealthFacts
-from ahrsd.gates import Level, for_level
+from ahrsd.errands import Errands
+from ahrsd.evidence.values import BasisFacts
+from ahrsd.gates import for_level
 from ahrsd.live_trial import LiveTrial
+from ahrsd.rollcall import Rollcall
 from ahrsd.samples import SampleBlock
 from ahrsd.stream import Stream
 from ahrsd.unmapping import Compensation, RegisterEpochs
-from ahrsd.writeback.actions import (
-    Action,
-    CancelProcedure,
-    Emit,
-    IdentifyAgain,
-    InForce,
-    JournalAppend,
-    RunProcedure,
-    SetUpStream,
-)
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import WriteBackPolicy
-from ahrsd.writeback.reconcile import Kind
 from ahrsd.writeback.states import State
 from drivers.vn100.decode import Measurement, Undecodable
 from drivers.vn100.deframer import Cause
@@ -59,33 +47,6 @@ from drivers.vn100.session import Event as SessionEvent
 _WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01
 _MAG, _GYRO, _RATE = 23, 84, 7
 _IDENTITY = Affine.identity().to_register()
-
-
-@dataclass(frozen=True, slots=True)
-class _Record:
-    """A journal record as the write-back reads it."""
-
-    kind: str
-    facts: dict[str, Any]
-
-    @staticmethod
-    def of(body: dict[str, Any]) -> _Record:
-        return _Record(str(body["kind"]), dict(body["facts"]))
-
-
-@dataclass(frozen=True, slots=True)
-class CoreSettings:
-    """What the core needs from the configuration.
-
-    stream_rate_hz: of streams without time; reply_timeout_s: how long a reply may take
-    """
-
-    calibrator: CalibratorSettings
-    policy: WriteBackPolicy = field(default_factory=WriteBackPolicy)
-    output_rate_hz: float = 100.0
-    reply_timeout_s: float = 0.4
-    stream_rate_hz: float | None = None
-    stream_rate_source: str = "as given"
 
 
 class Core:
@@ -104,21 +65,20 @@ class Core:
         )
         self.writeback = WriteBack(settings.policy)
         self.registers: dict[int, Values] = {}
-        self.calibrator = Calibrator(settings.calibrator, Affine.identity(), np.zeros(3))
+        self._from_scratch = (settings.calibrator, Affine.identity(), np.zeros(3))
+        self.calibrator = Calibrator(*self._from_scratch)
         self.at_s = 0.0
         self.first_s = float("nan")
         self.faults = 0
         self.strays = 0
         self.undecodable = 0
-        self._host_s = self._wall_offset_s = 0.0
+        self._host_s = 0.0
         self._stopping = ""
-        self._closing = self._closed = False
+        self._closing = False
         self._restarts = 0
-        self._journal: list[_Record] | None = None
-        self._journal_known = self._awaiting_journal = False
-        self._read: dict[int, Values] | None = None
-        self._todo: deque[Action] = deque()
-        self._pending: RunProcedure | None = None
+        self._serial: int | None = None
+        self._rollcall = Rollcall()
+        self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
         if settings.policy.mode is Mode.PASSIVE:
             self._no_device()
@@ -158,14 +118,14 @@ class Core:
     # -- inputs ------------------------------------------------------------------------------------
 
     def _received(self, item: inputs.Received) -> None:
-        self._take(self.conversation.received(item.data, self._host_s))
+        self.take(self.conversation.received(item.data, self._host_s))
 
     def _tick(self, _: inputs.Tick) -> None:
-        self._take(self.conversation.tick(self._host_s))
-        self._todo.extend(self.writeback.tick(self._host_s))
+        self.take(self.conversation.tick(self._host_s))
+        self._errands.add(self.writeback.tick(self._host_s))
 
     def _wall_clock(self, item: inputs.WallClock) -> None:
-        self._wall_offset_s = item.wall_s - self._host_s
+        self._rollcall.wall_offset_s = item.wall_s - self._host_s
 
     def _link_opened(self, item: inputs.LinkOpened) -> None:
         latency = "" if item.latency_ms is None else f", USB latency {item.latency_ms} ms"
@@ -175,22 +135,22 @@ class Core:
             self._no_device()
         else:
             self.epochs.begin(self._host_s, None)  # nothing is un-mapped before it is known how
-        self._take(self.conversation.opened(item.baud, self._host_s))
+        self.take(self.conversation.opened(item.baud, self._host_s))
 
     def _link_lost(self, item: inputs.LinkLost) -> None:
         self._flush()
         self._note("warning", f"link lost: {item.reason}")
-        self._take(self.conversation.lost(self._host_s))
+        self.take(self.conversation.lost(self._host_s))
         self.stream.forget()
-        self._pending = None
-        self._todo.extend(self.writeback.on_link_lost(self._host_s))
+        self._errands.forget_procedure()
+        self._errands.add(self.writeback.on_link_lost(self._host_s))
 
     def _interlock(self, item: inputs.Interlock) -> None:
-        self._todo.extend(self.writeback.on_interlock(item.safe, self._host_s))
+        self._errands.add(self.writeback.on_interlock(item.safe, self._host_s))
 
     def _operator(self, item: inputs.Operator) -> None:
         self._note("info", f"operator: {item.verb} {item.argument}".strip())
-        self._todo.extend(self.writeback.on_operator(item.verb, item.argument, self._host_s))
+        self._errands.add(self.writeback.on_operator(item.verb, item.argument, self._host_s))
 
     def _registers_known(self, item: inputs.RegistersKnown) -> None:
         self._flush()
@@ -199,38 +159,26 @@ class Core:
         self._no_device()
 
     def _samples_given(self, item: inputs.Samples) -> None:
-        facts = self.stream.facts
-        facts.layout = "table"
-        facts.samples += len(item.block)
-        facts.expected += len(item.block)
-        if np.isnan(facts.rate_hz):
-            facts.rate_hz = 1.0 / float(np.nanmedian(item.block.dt_s))
+        self.stream.given(item.block)
         self._block(item.block)
 
     def _journal_opened(self, item: inputs.JournalOpened) -> None:
-        self._journal = None if item.error else [_Record.of(r) for r in item.records]
         if item.error:
             self._note("error", f"journal: {item.error}; nothing can be written")
-        self._journal_known = True
+        self._rollcall.journal(item)
         self._device_known()
 
     def _journalled(self, item: inputs.Journalled) -> None:
-        kind = Kind(item.kind)
-        self._awaiting_journal = False
-        if item.error:
-            first = self.writeback.on_journal_failed(kind, item.error, self._host_s)
-        else:
-            first = self.writeback.on_journal_ok(kind, self._host_s)
-        self._todo.extendleft(reversed(first))
+        self._errands.journalled(item, self._host_s)
 
     def _stop(self, item: inputs.Stop) -> None:
         self._flush()
         self._stopping = item.reason
-        self._todo.extend(self.writeback.on_stop(self._host_s))
+        self._errands.add(self.writeback.on_stop(self._host_s))
 
     # -- the device --------------------------------------------------------------------------------
 
-    def _take(self, found: list[SessionEvent]) -> None:
+    def take(self, found: list[SessionEvent]) -> None:
         """Measurements to the stream, with what was damaged between them; the rest is counted."""
         skipped = [
             s for s in self.conversation.session.deframer.take_skipped() if s.cause != Cause.NOISE
@@ -265,33 +213,19 @@ class Core:
         if self.conversation.identity is None:
             return
         self.epochs.begin(self._host_s, None)
-        self._todo.extend(self.writeback.on_reset(self._host_s))
-        self._pending = None
-        self._take(self.conversation.identify_again(self._host_s))
+        self._errands.add(self.writeback.on_reset(self._host_s))
+        self._errands.forget_procedure()
+        self.take(self.conversation.identify_again(self._host_s))
 
     def _no_device(self) -> None:
         """Passive, or a recording without a conversation: the stream is taken as it is."""
-        self._todo.extend(self.writeback.on_no_device(self.registers or None, self._host_s))
+        self._errands.add(self.writeback.on_no_device(self.registers or None, self._host_s))
 
     def _device_known(self) -> None:
-        """Identity, registers and journal are all there: the write-back may look at them."""
-        identity, values = self.conversation.identity, self._read
-        if identity is None or values is None or not self._journal_known:
-            return
-        keys = self.conversation.session_keys
-        saved = self.conversation.saved
-        as_users = {n: saved[n] if n in keys and n in saved else v for n, v in values.items()}
-        self._read = None
-        self._todo.extend(
-            self.writeback.on_device(
-                identity,
-                as_users,
-                self._journal,
-                self._host_s,
-                self._host_s + self._wall_offset_s,
-                uptime_s=self.at_s if self.stream.facts.rate_source == "device time" else None,
-                session_keys=keys,
-            )
+        """Identity, registers and journal may all be there now."""
+        uptime_s = self.at_s if self.stream.facts.rate_source == "device time" else None
+        self._errands.add(
+            self._rollcall.told(self.conversation, self.writeback, self._host_s, uptime_s)
         )
 
     def _in_force(self, values: dict[int, Values]) -> None:
@@ -314,12 +248,16 @@ class Core:
             case Identified(identity):
                 text = f"{identity.model} serial {identity.serial} firmware {identity.firmware}"
                 self._note("info", text)
-                self._journal_known = False
+                self._rollcall.identified()
+                if self._serial not in (None, identity.serial):
+                    self._note("warning", "another device: its calibration begins anew")
+                    self.calibrator = Calibrator(*self._from_scratch)
+                self._serial = identity.serial
                 self._out.append(events.OpenJournal(identity.serial))
             case ConfigurationRead(values):
                 self._flush()
                 self._in_force(values)
-                self._read = values
+                self._rollcall.registers(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
             case StreamChanged(text):
@@ -337,11 +275,10 @@ class Core:
                     more = self.writeback.on_procedure_finished(name, result, self._host_s)
                 else:
                     more = self.writeback.on_procedure_failed(name, error, self._host_s)
-                self._todo.extend(more)
+                self._errands.add(more)
             case Closed(error):
                 if error is not None:
                     self._note("error", f"not everything was put back: {error}")
-                self._closed = True
                 self._out.append(events.Finished(self._stopping))
 
     # -- what the write-back wants -----------------------------------------------------------------
@@ -352,62 +289,28 @@ class Core:
             said = self.conversation.take_said()
             for one in said:
                 self._digest(one)
-            acted = False
-            while self._todo and not self._awaiting_journal:
-                self._act(self._todo.popleft())
-                acted = True
-            if self._pending is not None and self.conversation.idle:
-                run, self._pending = self._pending, None
-                self.stream.forgive()
-                self._take(
-                    self.conversation.run(run.name, run.make(), run.purpose, self._host_s, run.gate)
-                )
-                acted = True
-            if self._may_close():
-                self._closing = True
-                self._take(self.conversation.restore_and_close(self._host_s))
-                acted = True
+            acted = self._errands.work(self, self._host_s)
+            if self._stopping and not self._closing and self._errands.at_rest:
+                self._closing = acted = True
+                self.take(self.conversation.restore_and_close(self._host_s))
             if not said and not acted:
                 break
         if output := self.conversation.session.take_output():
             self._out.append(events.Send(output))
 
-    def _may_close(self) -> bool:
-        return (
-            bool(self._stopping)
-            and not self._closing
-            and not self._todo
-            and self._pending is None
-            and not self._awaiting_journal
-            and self.writeback.idle
-            and self.conversation.may_close
-        )
+    def emit(self, event: events.Event) -> None:
+        """A fact of the write-back."""
+        self._out.append(event)
+        if isinstance(event, events.StateChanged):
+            self._on_state(event)
 
-    def _act(self, action: Action) -> None:
-        match action:
-            case Emit(event):
-                self._out.append(event)
-                if isinstance(event, events.StateChanged):
-                    self._on_state(event)
-            case JournalAppend(kind, facts):
-                self._awaiting_journal = True
-                self._out.append(events.JournalAppend(kind.value, dict(facts)))
-            case RunProcedure():
-                self._pending = action
-            case CancelProcedure(name):
-                if self._pending is not None and self._pending.name == name:
-                    self._pending = None
-                self._take(self.conversation.cancel(name, self._host_s))
-            case InForce(registers):
-                self._flush()
-                if registers is None:
-                    self.epochs.begin(self._host_s, None)
-                else:
-                    self._in_force(dict(registers))
-            case SetUpStream():
-                self._take(self.conversation.set_up_again(self._host_s))
-            case IdentifyAgain():
-                self._take(self.conversation.identify_again(self._host_s))
+    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+        """The write-back says what the device applies from now on; None: nobody knows."""
+        self._flush()
+        if registers is None:
+            self.epochs.begin(self._host_s, None)
+        else:
+            self._in_force(dict(registers))
 
     def _on_state(self, change: events.StateChanged) -> None:
         self.decisions.add(self.at_s, change.new, reason=change.reason)
@@ -434,10 +337,10 @@ class Core:
         estimate = calibrator.estimate
         proposed = estimate.correction if estimate is not None and estimate.converged else None
         self._out.append(events.SamplesSeen(block, calibrator.present, proposed))
-        self._todo.extend(self.writeback.on_samples(block))
+        self._errands.add(self.writeback.on_samples(block))
         if self._trial is not None:
             metrics = self._trial.take(block)
-            self._todo.extend(self.writeback.on_trial_metrics(metrics, self._host_s))
+            self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
         if new and estimate is not None:
             self._judge()
 
@@ -446,7 +349,9 @@ class Core:
         assert estimate is not None
         host_s = self._host_s or self.at_s
         self._out.append(events.Estimated(self.at_s, host_s, estimate))
-        gates = self.calibrator.judged(self.at_s, self.health(), self.basis())
+        gates = self.calibrator.judged(
+            self.at_s, self.stream.health(self.conversation.session.deframer.counters), self.basis()
+        )
         self._out.append(events.Judged(self.at_s, host_s, gates))
         self.decisions.add(
             self.at_s,
@@ -456,34 +361,14 @@ class Core:
             gyro_bias_rad_s=estimate.gyro_bias_rad_s.tolist(),
             converged=estimate.converged,
         )
-        self._todo.extend(
+        self._errands.add(
             self.writeback.on_verdict(
                 estimate,
-                for_level(gates, self._level),
+                for_level(gates, self.settings.level),
                 self.at_s,
                 self._host_s,
                 gyro_is_raw=not self.stream.compensated_gyro,
             )
-        )
-
-    @property
-    def _level(self) -> Level:
-        """Which gates must hold before anything is written, by what the writing may end in."""
-        if self.settings.policy.mode is Mode.COMMIT:
-            return Level.FLASH
-        return Level.UNATTENDED if self.settings.policy.approval == "auto" else Level.RAM
-
-    def health(self) -> HealthFacts:
-        """Figures of the stream so far."""
-        counters = self.conversation.session.deframer.counters
-        facts = self.stream.facts
-        total = max(counters.valid + counters.rejected, 1)
-        return HealthFacts(
-            crc_error_rate=counters.rejected / total,
-            drop_rate=max(1.0 - facts.samples / max(facts.expected, 1.0), 0.0),
-            saturated=facts.unusable,
-            negative_dt=self.stream.restarts,
-            rate_hz=facts.rate_hz,
         )
 
     def basis(self) -> BasisFacts:

@@ -28,7 +28,7 @@ from ahrsd.errors import EXIT_DONE, ConfigError
 from ahrsd.interlock import InterlockFile
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import new_capture_path
-from ahrsd.rerun_sink import RerunSink
+from ahrsd.rerun_sink import RerunLimits, RerunSink
 from ahrsd.serial_reader import Bytes, Lost, SerialReader
 from ahrsd.settings import core_settings, with_date
 from ahrsd.shell import JournalKeeper, Shell, journal_in
@@ -43,6 +43,7 @@ _LONGEST_WAIT_S = 0.2
 _STOP_S = 2.5  # for putting things back; a service manager's patience is limited
 _INTERLOCK_S = 0.2
 _WALL_STEP_S = 1.0
+_VIEWER_S = 3.0
 
 
 class Vehicle(Protocol):
@@ -266,7 +267,8 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
         )
     viewer = None
     if config.rerun.file is not None or config.rerun.serve:
-        viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port)
+        limits = RerunLimits(server_bytes=config.rerun.memory_megabytes * 1_000_000)
+        viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port, limits=limits)
     keeper = JournalKeeper(journal_in(config.state), clock.now_ns)
     return Shell(Core(core_settings(config)), writer, keeper, viewer)
 
@@ -274,7 +276,9 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
 def close_shell(shell: Shell) -> None:
     """Close what `open_shell` opened, each bounded in time."""
     if isinstance(shell.viewer, RerunSink):
-        shell.viewer.close()
+        shell.viewer.close(_VIEWER_S)
+        if fault := shell.viewer.counters.last_fault:
+            log.warning("rerun: %s", fault)
     if shell.capture is not None:
         status = shell.capture.close()
         if not status.complete:

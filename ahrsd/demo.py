@@ -11,7 +11,7 @@ import json
 import tempfile
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +80,7 @@ class Scene:
     said_s: float = -1e9
 
     def __call__(self, event: Event) -> None:
+        """Watch one event."""
         self.collector.add(event)
         match event:
             case SamplesSeen(block):
@@ -181,13 +182,13 @@ class DemoResult:
 def demo_config(directory: Path, speed: float = 1.0) -> Config:
     """The configuration of the demo: RAM may be written, a person approves.
 
-    What is asked of the host in seconds (how old the vehicle's word may be) is asked of a clock that
-    runs `speed` times faster here.
+    What is asked of the host in seconds (how old the vehicle's word may be) is asked of a clock
+    that runs `speed` times faster here.
     """
     body = {
         "mode": "stage",
         "state_directory": str(directory),
-        "device": {"baud": _BAUD},
+        "device": {"baud": _BAUD, "reply_timeout_s": max(0.4, _REPLY_S * speed)},
         "location": _PLACE,
         "interlock": {"max_age_s": float(min(max(speed / 2, 1.0), 60.0))},
         "write_back": {"keep_on_stop": True},
@@ -215,10 +216,10 @@ def run_demo(
     clock = HostClock(speed)
     scene = Scene(seconds=seconds, say=say)
     shell = Shell(
-        Core(replace(core_settings(config), reply_timeout_s=_REPLY_S * speed)),
+        Core(core_settings(config)),
         CaptureWriter(capture, {"program": "ahrsd demo", CONFIG_KEY: print_config(config)}),
         JournalKeeper(lambda _: Journal.open(journal), clock.now_ns),
-        RerunSink(directory / "run.rrd", serve=False, port=0),
+        RerunSink(directory / "run.rrd", wait=True),
         [scene],
     )
     with tempfile.TemporaryDirectory() as folder:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ahrsd.config import CONFIG_KEY, Config, recorded_config
-from ahrsd.core import Core, CoreSettings
+from ahrsd.core import Core
+from ahrsd.core_settings import CoreSettings
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples
 from ahrsd.recording.bytestream import read_chunks

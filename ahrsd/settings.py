@@ -6,7 +6,7 @@ import datetime
 
 from ahrsd.calibrator import CalibratorSettings
 from ahrsd.config import Config
-from ahrsd.core import CoreSettings
+from ahrsd.core_settings import CoreSettings
 from ahrsd.worldfield import WorldField, world_field
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -50,5 +50,6 @@ def core_settings(
         ),
         policy=policy or config.write_back_policy(),
         output_rate_hz=config.device.rate_hz,
+        reply_timeout_s=config.device.reply_timeout_s,
         stream_rate_hz=stream_rate_hz,
     )

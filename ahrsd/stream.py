@@ -17,9 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
+from ahrsd.evidence.values import HealthFacts
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.unmapping import Extractor, MissingQuantityError, RegisterEpochs, sample_blocks
 from drivers.vn100.decode import Measurement
+from drivers.vn100.deframer import Counters
 
 FACTORY_RATE_HZ = 40.0
 _BLOCK_S = 0.25
@@ -210,6 +212,26 @@ class Stream:
             if self._steps is None:
                 facts.rate_hz, facts.rate_source = 1.0 / period, "device time"
         self.gaps.extend(steps.gaps)
+
+    def given(self, block: SampleBlock) -> None:
+        """Samples of a table: nothing to decode, only to count."""
+        facts = self.facts
+        facts.layout, facts.rate_source = "table", "table"
+        facts.samples += len(block)
+        facts.expected += len(block)
+        if np.isnan(facts.rate_hz):
+            facts.rate_hz = 1.0 / float(np.nanmedian(block.dt_s))
+
+    def health(self, counters: Counters) -> HealthFacts:
+        """Figures of the stream so far, for the gates."""
+        total = max(counters.valid + counters.rejected, 1)
+        return HealthFacts(
+            crc_error_rate=counters.rejected / total,
+            drop_rate=max(1.0 - self.facts.samples / max(self.facts.expected, 1.0), 0.0),
+            saturated=self.facts.unusable,
+            negative_dt=self.restarts,
+            rate_hz=self.facts.rate_hz,
+        )
 
     def check(self) -> None:
         """Raise NoSamplesError, naming what came, where messages came and none is of use."""

@@ -10,10 +10,21 @@ from ahrsd.errors import EXIT_DONE, EXIT_NO
 
 
 @click.command()
-@click.option("--output", "directory", type=click.Path(path_type=Path, file_okay=False),
-              default=Path("ahrsd-demo"), show_default=True, help="Folder for what it leaves.")  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(60.0), default=2400.0, show_default=True,
-              help="Device time at most.")  # fmt: skip
+@click.option(
+    "--output",
+    "directory",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("ahrsd-demo"),
+    show_default=True,
+    help="Folder for what it leaves.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(60.0),
+    default=2400.0,
+    show_default=True,
+    help="Device time at most.",
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Which hidden truth.")
 def command(directory: Path, seconds: float, seed: int) -> None:
     """Calibrate an emulated VN-100 with hidden iron and gyro bias, and write its registers.

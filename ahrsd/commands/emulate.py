@@ -64,7 +64,7 @@ def _device(setup: Setup) -> Emulator:
 @click.option(
     "--list", is_flag=True, is_eager=True, expose_value=False, callback=_list, help="What there is."
 )
-def emulate(  # noqa: PLR0917 - click passes them by name
+def emulate(
     link: Path | None,
     scenario: str,
     motion: str,

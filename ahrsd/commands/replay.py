@@ -37,7 +37,7 @@ def command(
     from ahrsd.summary import summary_json, summary_lines
 
     config = load_config(path) if path else Config()
-    viewer = None if rerun_path is None else RerunSink(rerun_path, serve=False, port=0)
+    viewer = None if rerun_path is None else RerunSink(rerun_path, wait=True)
     size = recording.stat().st_size if recording.is_file() else 0
     try:
         with byte_progress(recording.name, size) as progress:
@@ -46,7 +46,7 @@ def command(
             )
     finally:
         if viewer is not None:
-            viewer.close()
+            viewer.close(10.0)
     if json_path is not None:
         write_json(json_path, summary_json(done.core, recording.name, done.warnings))
     if json_path != "-":

@@ -72,7 +72,8 @@ class Readings:
 
 def _time_startup(of: Readings) -> Array:
     seconds = of.ticks / TICK_HZ * (1 + of.clock.ppm * 1e-6) + of.clock.step_s
-    return np.asarray(np.round(seconds + of.outputs.block.jitter_s, 6))
+    stamps = np.round(seconds + of.outputs.block.jitter_s, 6)
+    return np.asarray(np.maximum(stamps, 0.0))  # jitter must not put the first one before zero
 
 
 def _delta_theta(of: Readings) -> Array:
@@ -119,7 +120,7 @@ def _raw(of: Readings) -> Array:
 
 
 def _dcm(of: Readings) -> Array:
-    return of.outputs.R_nu.transpose(0, 2, 1).reshape(BLOCK_TICKS, 9)
+    return of.outputs.R_nu.reshape(BLOCK_TICKS, 9)  # row by row, as recordings show
 
 
 # By the name of the quantity's first column (`fields`); SI, angles in rad.

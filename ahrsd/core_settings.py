@@ -1,0 +1,34 @@
+"""What the core needs from the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ahrsd.calibrator import CalibratorSettings
+from ahrsd.gates import Level
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class CoreSettings:
+    """What the core needs from the configuration.
+
+    output_rate_hz:  of the stream that `configure_stream` sets up
+    reply_timeout_s: how long a reply may take
+    stream_rate_hz, stream_rate_source: of streams without time, and how it is known
+    """
+
+    calibrator: CalibratorSettings
+    policy: WriteBackPolicy = field(default_factory=WriteBackPolicy)
+    output_rate_hz: float = 100.0
+    reply_timeout_s: float = 0.4
+    stream_rate_hz: float | None = None
+    stream_rate_source: str = "as given"
+
+    @property
+    def level(self) -> Level:
+        """Which gates must hold before anything is written, by what the writing may end in."""
+        if self.policy.mode is Mode.COMMIT:
+            return Level.FLASH
+        return Level.UNATTENDED if self.policy.approval == "auto" else Level.RAM

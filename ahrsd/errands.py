@@ -1,0 +1,118 @@
+"""The write-back's actions, carried out one after the other.
+
+A journal record stops the line until it is on the disk: what waits behind it may be a byte to the
+device. A procedure waits until the session is idle.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol
+
+from ahrsd import events
+from ahrsd.conversation import Conversation
+from ahrsd.inputs import Journalled
+from ahrsd.writeback.actions import (
+    Action,
+    CancelProcedure,
+    Emit,
+    IdentifyAgain,
+    InForce,
+    JournalAppend,
+    RunProcedure,
+    SetUpStream,
+)
+from ahrsd.writeback.machine import WriteBack
+from ahrsd.writeback.reconcile import Kind
+from drivers.vn100.registers import Values
+from drivers.vn100.session import Event as SessionEvent
+
+
+class Office(Protocol):
+    """The core, as far as errands concern it."""
+
+    def emit(self, event: events.Event) -> None:
+        """Let the event out."""
+
+    def take(self, found: list[SessionEvent]) -> None:
+        """Take in what the session heard."""
+
+    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+        """These registers act from now on."""
+
+
+class Errands:
+    """A line of actions. `pausing` is called before a procedure that may pause the output."""
+
+    def __init__(
+        self, conversation: Conversation, writeback: WriteBack, pausing: Callable[[], None]
+    ) -> None:
+        self._conversation, self._writeback = conversation, writeback
+        self._pausing = pausing
+        self._todo: deque[Action] = deque()
+        self._procedure: RunProcedure | None = None
+        self._awaiting_journal = False
+
+    @property
+    def at_rest(self) -> bool:
+        """Nothing is under way, so the port may be given back."""
+        return (
+            not self._todo
+            and self._procedure is None
+            and not self._awaiting_journal
+            and self._writeback.idle
+            and self._conversation.may_close
+        )
+
+    def add(self, actions: Iterable[Action]) -> None:
+        """To the end of the line."""
+        self._todo.extend(actions)
+
+    def forget_procedure(self) -> None:
+        """The link or the device went away before it could start; the write-back knows."""
+        self._procedure = None
+
+    def journalled(self, item: Journalled, host_s: float) -> None:
+        """The record that the line waits for is on the disk, or is not."""
+        self._awaiting_journal = False
+        kind = Kind(item.kind)
+        if item.error:
+            first = self._writeback.on_journal_failed(kind, item.error, host_s)
+        else:
+            first = self._writeback.on_journal_ok(kind, host_s)
+        self._todo.extendleft(reversed(first))
+
+    def work(self, office: Office, host_s: float) -> bool:
+        """As far as it goes now; whether anything was done."""
+        done = False
+        while self._todo and not self._awaiting_journal:
+            self._act(self._todo.popleft(), office, host_s)
+            done = True
+        if self._procedure is not None and self._conversation.idle:
+            run, self._procedure = self._procedure, None
+            self._pausing()
+            office.take(self._conversation.run(run.name, run.make(), run.purpose, host_s, run.gate))
+            done = True
+        return done
+
+    def _act(self, action: Action, office: Office, host_s: float) -> None:
+        match action:
+            case Emit(event):
+                office.emit(event)
+            case JournalAppend(kind, facts):
+                self._awaiting_journal = True
+                office.emit(events.JournalAppend(kind.value, dict(facts)))
+            case RunProcedure():
+                self._procedure = action
+            case CancelProcedure(name):
+                if self._procedure is not None and self._procedure.name == name:
+                    self._procedure = None
+                office.take(self._conversation.cancel(name, host_s))
+            case InForce(registers):
+                office.in_force(registers)
+            case SetUpStream():
+                self._pausing()
+                office.take(self._conversation.set_up_again(host_s))
+            case IdentifyAgain():
+                office.take(self._conversation.identify_again(host_s))

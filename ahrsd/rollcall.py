@@ -1,0 +1,75 @@
+"""Who the device is, what it holds, what its journal says: told to the write-back when complete."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ahrsd.conversation import Conversation
+from ahrsd.inputs import JournalOpened
+from ahrsd.writeback.actions import Action
+from ahrsd.writeback.machine import WriteBack
+from drivers.vn100.registers import Values
+
+
+@dataclass(frozen=True, slots=True)
+class RecordRead:
+    """A journal record as the write-back reads it."""
+
+    kind: str
+    facts: dict[str, Any]
+
+    @staticmethod
+    def of(body: Mapping[str, Any]) -> RecordRead:
+        """From `JournalOpened.records`."""
+        return RecordRead(str(body["kind"]), dict(body["facts"]))
+
+
+@dataclass(slots=True)
+class Rollcall:
+    """Waits for registers and journal of the device that was identified last."""
+
+    wall_offset_s: float = 0.0
+    _values: dict[int, Values] | None = None
+    _journal: Sequence[RecordRead] | None = field(default=None)
+    _journal_known: bool = False
+
+    def identified(self) -> None:
+        """A device said who it is: its journal is not open yet."""
+        self._journal_known = False
+
+    def journal(self, item: JournalOpened) -> None:
+        """Its journal, or why there is none that can be trusted."""
+        self._journal = None if item.error else [RecordRead.of(r) for r in item.records]
+        self._journal_known = True
+
+    def registers(self, values: dict[int, Values]) -> None:
+        """Its registers."""
+        self._values = values
+
+    def told(
+        self,
+        conversation: Conversation,
+        writeback: WriteBack,
+        host_s: float,
+        uptime_s: float | None,
+    ) -> list[Action]:
+        """Tell the write-back, once, when everything is there.
+
+        Registers that this session changes are told with the values that the user had.
+        """
+        identity, values = conversation.identity, self._values
+        if identity is None or values is None or not self._journal_known:
+            return []
+        self._values = None
+        keys, saved = conversation.session_keys, conversation.saved
+        return writeback.on_device(
+            identity,
+            {n: saved[n] if n in keys and n in saved else v for n, v in values.items()},
+            self._journal,
+            host_s,
+            host_s + self.wall_offset_s,
+            uptime_s=uptime_s,
+            session_keys=keys,
+        )
