@@ -33,7 +33,7 @@ RESTING = {
 }
 
 
-def reachable(start: State, without: set[State] = frozenset()) -> set[State]:
+def reachable(start: State, without: frozenset[State] = frozenset()) -> set[State]:
     seen, queue = {start}, [start]
     while queue:
         for target in TABLE[queue.pop()].values():
@@ -74,7 +74,7 @@ def test_link_loss_and_reset_lead_to_reconciling_everywhere(state: State) -> Non
 @pytest.mark.parametrize("state", [State.STAGING, State.STAGED, State.TRIAL, State.PROVEN])
 def test_nothing_leads_from_changed_ram_to_rest_without_undoing_or_saving(state: State) -> None:
     """RECONCILING and FAULT end in a comparison with the device; ROLLING_BACK undoes."""
-    ways_out = {State.RECONCILING, State.FAULT, State.ROLLING_BACK, State.SAVING}
+    ways_out = frozenset({State.RECONCILING, State.FAULT, State.ROLLING_BACK, State.SAVING})
     assert not reachable(state, without=ways_out) & (WITHOUT_TRANSACTION | {State.LOCKED})
 
 
