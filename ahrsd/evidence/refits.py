@@ -3,9 +3,9 @@
 Gyro fit (for halves of the data). With R_0k from `attitude`, the corrected field of a segment must
 not move: R_0k (C m_k - c) = f_s, c = C b. Linear in (C, c); f_s is removed by centring. C = 0 would
 do, so the trace of C is held: C = C0 + sum x_i E_i over the five traceless symmetric E_i. Noise in
-the regressor m pulls C towards 0 with the weight n sigma^2; its pull on the right-hand side is taken
-off, which leaves a pull towards C0: harmless where motion is rich, wanted where it is not. Likewise
-the gyro's drift: R_0k wrong by a few milliradians at random looks like motion, and is weighed down.
+the regressor m pulls C towards 0 with the weight n sigma^2; its pull on the right-hand side is
+taken off, which leaves a pull towards C0: harmless where motion is rich, wanted where it is not.
+Likewise the gyro's drift: R_0k wrong by milliradians looks like motion, and is weighed down.
 
 Size fit (second opinion): |C m - c| = F over symmetric C and c by Levenberg and Marquardt, in
 distances from the ellipsoid: no gyro, no gravity, and none of the quadric's troubles with signs and

@@ -2,8 +2,8 @@
 
 A segment is cut in bins of one second. At rest the force is steady, the rate is close to the bias
 under test, and the field stays where it is (a slow steady turn has the first two). Runs of three
-such bins and more count, between two more. The scatter of the bins gives the sigma of the mean; the Earth's rotation
-(0.07 mrad/s) and the wandering of the bias between bins are a floor under it.
+such bins and more count, between two more. The scatter of the bins gives the sigma of the mean; the
+Earth's rotation (0.07 mrad/s) and the wandering of the bias between bins are a floor under it.
 """
 
 from __future__ import annotations

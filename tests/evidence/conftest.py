@@ -41,7 +41,7 @@ class Scene:
     accel: bool = True
     temperature_c: float | None = 25.0
     forward_m_s2: float = 0.0  # amplitude of the vehicle's own acceleration
-    hard: np.ndarray = field(default_factory=lambda: HARD.copy())
+    hard: np.ndarray = field(default_factory=HARD.copy)
     magnet: Callable[[np.ndarray], np.ndarray] | None = None  # (N,) times to (N, 3) extra gauss
     seed: int = 1
 
@@ -110,7 +110,9 @@ def estimate(correction: Affine | None = None, **changes: Any) -> Estimate:
 
 def old() -> Affine:
     """A calibration in force that is 2 to 5 degrees wrong."""
-    return Affine(np.linalg.inv(SOFT) + 0.01 * np.diag([1.0, -1.0, 0.0]), HARD + [0.006, 0.004, 0])
+    return Affine(
+        np.linalg.inv(SOFT) + 0.01 * np.diag([1.0, -1.0, 0.0]), HARD + np.array([0.006, 0.004, 0])
+    )
 
 
 def collect(scene: Scene) -> EvidenceCollector:
@@ -129,9 +131,8 @@ def evidence(scene: Scene, correction: Affine | None = None, **given: Any) -> Ev
         "health": HEALTHY,
         "basis": SOUND,
     }
-    changes = {
-        k: given.pop(k) for k in list(given) if k not in facts and k not in {"halves", "proposed"}
-    }
+    ours = {*facts, "halves", "proposed"}
+    changes = {k: given.pop(k) for k in list(given) if k not in ours}
     return collect(scene).evaluate(estimate(correction, **changes), **(facts | given))
 
 

@@ -24,7 +24,9 @@ def test_the_same_samples_give_the_same_numbers(world) -> None:
 def test_numbers_do_not_depend_on_when_it_was_asked_before(world) -> None:
     """Attitude is integrated once, at another bias; the first-order correction must not show."""
     asked, fresh = world.collect(world.Scene()), world.collect(world.Scene())
-    evaluate(world, asked, world.estimate(gyro_bias_rad_s=world.BIAS + [5e-4, -5e-4, 5e-4]))
+    evaluate(
+        world, asked, world.estimate(gyro_bias_rad_s=world.BIAS + np.array([5e-4, -5e-4, 5e-4]))
+    )
     seen, direct = evaluate(world, asked), evaluate(world, fresh)
     for (path, a), (_, b) in zip(numbers(seen), numbers(direct), strict=True):
         assert a == pytest.approx(b, abs=5e-3, rel=5e-2), path
@@ -46,7 +48,7 @@ def test_the_step_is_that_of_the_registers(world) -> None:
 
 
 def test_the_vertical_may_move_only_where_it_is_seen(world) -> None:
-    moved = Affine(world.truth().matrix, world.HARD + [0.0, 0.0, 0.05])
+    moved = Affine(world.truth().matrix, world.HARD + np.array([0.0, 0.0, 0.05]))
     flat = world.evidence(world.Scene(roll_deg=1, pitch_deg=1), moved)
     free = world.evidence(world.Scene(), moved)
     assert flat.change.moved_unseen_gauss == pytest.approx(0.05, abs=0.001)

@@ -77,7 +77,7 @@ def test_a_step_of_the_iron_between_the_halves_shows(world) -> None:
 
 def test_halves_of_the_estimator_may_be_given(world) -> None:
     a = world.truth()
-    b = Affine(a.matrix, a.offset + [0.01, 0.0, 0.0])
+    b = Affine(a.matrix, a.offset + np.array([0.01, 0.0, 0.0]))
     seen = world.evidence(world.Scene(roll_deg=1, pitch_deg=1), halves=(a, b)).refits
     assert seen.hard_iron_gauss == pytest.approx(0.01, abs=1e-5)
     assert seen.halves_deg == pytest.approx(np.degrees(0.01 / 0.25), rel=0.2)

@@ -86,7 +86,7 @@ def test_an_uneasy_vehicle_passes_too(world) -> None:
 
 
 def moved(world, x=0.0, y=0.0, z=0.0):
-    return Affine(world.truth().matrix, world.HARD + [x, y, z])
+    return Affine(world.truth().matrix, world.HARD + np.array([x, y, z]))
 
 
 def test_a_cap_of_the_sphere_never_passes(world) -> None:
