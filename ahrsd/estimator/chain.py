@@ -26,7 +26,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpbsv
 
 from ahrsd import so3
 from ahrsd.samples import Array
@@ -245,8 +245,9 @@ def _eliminate(
     right[-1, :, LAST] = upper[-1]
     right[:, :, WIDTH] = border[1:-1, :, 12]
     flat = right.reshape(-1, WIDTH + 1)
-    factor = cholesky_banded(band, lower=True, check_finite=False)
-    solved = cho_solve_banded((factor, True), flat, check_finite=False)
+    _, solved, info = dpbsv(band, np.asfortranarray(flat), lower=1, overwrite_b=1)
+    if info != 0:
+        raise np.linalg.LinAlgError(f"directions of an epoch are not determined (dpbsv {info})")
     S = flat.T @ solved
     H -= S[:WIDTH, :WIDTH]
     g -= S[:WIDTH, WIDTH]

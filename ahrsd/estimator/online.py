@@ -22,6 +22,7 @@ from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
+_FRESH = 1.25  # at the end, a search that saw all but a quarter need not be repeated
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
 _AWAY, _AWAY_UNSETTLED = 3.0, 0.5
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
@@ -77,7 +78,7 @@ class Estimator:
         """End of the recording: use what is pending and iterate to the end."""
         self.interrupt()
         if self._window is not None:
-            if self._searching and self._moving_epochs > self._last_search:
+            if self._searching and self._moving_epochs > _FRESH * self._last_search:
                 self._search(self._window)
             self._window.track(everything=True)
         return self.estimate()

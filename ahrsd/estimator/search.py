@@ -3,8 +3,8 @@
 The likelihood has more than one valley when motion is poor. So now and then several starts descend
 on a thinned copy of the window (every k-th field, rotations between them composed exactly; the
 epochs whose field varied most, all in one chain with cuts in it): the device's present calibration,
-a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be called sure only if two starts that know nothing of
-each other arrive there.
+a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be called sure only if
+two starts that know nothing of each other arrive there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ahrsd.samples import Array
 
 _EPOCHS = 6
 _STEPS = 128  # per epoch
-_DESCENT = 10  # Levenberg-Marquardt steps per start
+_DESCENT = 8  # Levenberg-Marquardt steps per start
 _SAME = 1.0  # sigmas within which two answers are one
 
 
