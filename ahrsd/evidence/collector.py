@@ -92,7 +92,7 @@ class EvidenceCollector:
             field = field_facts(nodes, judged)
             proof = prove(nodes, heading_rad, judged, present, _LEAST_TURN_DEG)
         envelope = comparison.envelope(motion, field, world)
-        still = rest([d.seconds for d in self._derived.values()], estimate.gyro_bias_rad_s)
+        still = rest([d.seconds for d in self._derived.values()])
         return Evidence(
             health=health,
             basis=basis,

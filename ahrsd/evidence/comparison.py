@@ -18,6 +18,7 @@ from ahrsd.worldfield import WorldField
 _NAN = float("nan")
 _VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move
 _BIAS_FLOOR_RAD_S = 3e-4  # a smaller change of the bias needs no better rest than this one
+_MOST_BIAS_SIGMA_RAD_S = 3e-4  # an estimate that knows less must not agree with everything
 _LEAST_NOISE_GAUSS = 2e-4
 _FACTORY = 1e-6
 
@@ -109,7 +110,8 @@ def gyro(estimate: Estimate, present_b_rad_s: Array, still: Rest) -> GyroFacts:
     """The estimate's gyro bias against rest."""
     bias = estimate.gyro_bias_rad_s
     written = max(float(np.linalg.norm(bias - present_b_rad_s)), _BIAS_FLOOR_RAD_S)
-    sigma = np.hypot(estimate.sigma[9:12], still.sigma_rad_s)
+    own = np.minimum(estimate.sigma[9:12], _MOST_BIAS_SIGMA_RAD_S)
+    sigma = np.hypot(own, still.sigma_rad_s)
     return GyroFacts(
         bias_rad_s=float(np.linalg.norm(bias)),
         rest_s=still.duration_s,

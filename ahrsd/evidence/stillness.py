@@ -1,9 +1,9 @@
 """Gyro bias as the mean at rest: the plainest second opinion there is.
 
-A segment is cut in bins of one second. At rest the force is steady, the rate is close to the bias
-under test, and the field stays where it is (a slow steady turn has the first two). Runs of three
-such bins and more count, between two more. The scatter of the bins gives the sigma of the mean; the
-Earth's rotation (0.07 mrad/s) and the wandering of the bias between bins are a floor under it.
+A segment is cut in bins of one second. At rest the force is steady, the rate is small and steady,
+and the field stays where it is (a slow steady turn has the first two). No bias is assumed. Runs
+of three such bins and more count, between two more. The scatter of the bins gives the sigma of the
+mean; the Earth's rotation (0.07 mrad/s) and a bias that wanders are a floor under it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from ahrsd.samples import Array
 STILL_GYRO_RAD_S = 0.01
 STILL_ACCEL_M_S2 = 0.05
 STILL_BINS = 3
-_TURN_GAUSS = 0.005  # of the field within a run: more is a slow turn
+MOST_BIAS_RAD_S = 0.0625  # 3 deg/s of bias and what counts as still
+_TURN_GAUSS = 0.003  # between the halves of a run: more is a slow turn
 _FLOOR_RAD_S = 1e-4
 _NEWEST_S = 900.0  # rest that is older says nothing about the bias of today
 
@@ -58,13 +59,13 @@ def seconds(segment: Segment) -> Seconds:
     )
 
 
-def rest(bins: Sequence[Seconds], bias_b_rad_s: Array) -> Rest:
-    """Mean rate over the newest quarter of an hour's rest, for a bias that is about right."""
+def rest(bins: Sequence[Seconds]) -> Rest:
+    """Mean rate over the rest within the newest quarter of an hour."""
     newest_s = max((float(b.time_s[-1]) for b in bins if len(b.time_s)), default=0.0)
     runs = [
         b.rate_b_rad_s[i:j]
         for b in bins
-        for i, j in _still_runs(b, bias_b_rad_s)
+        for i, j in _still_runs(b)
         if newest_s - _NEWEST_S <= b.time_s[i] <= newest_s
     ]
     if not runs:
@@ -76,11 +77,21 @@ def rest(bins: Sequence[Seconds], bias_b_rad_s: Array) -> Rest:
     return Rest(rates.mean(axis=0), float(np.hypot(sigma, _FLOOR_RAD_S)), float(len(rates)))
 
 
-def _still_runs(bins: Seconds, bias_b_rad_s: Array) -> list[tuple[int, int]]:
-    rate = np.linalg.norm(bins.rate_b_rad_s - bias_b_rad_s, axis=1)
-    still = (rate < STILL_GYRO_RAD_S) & (bins.force_std_m_s2 < STILL_ACCEL_M_S2)
+def _still_runs(bins: Seconds) -> list[tuple[int, int]]:
+    still = bins.force_std_m_s2 < STILL_ACCEL_M_S2
+    if not still.any():
+        return []
+    rate = bins.rate_b_rad_s
+    usual = np.median(rate[still], axis=0)
+    still &= np.linalg.norm(rate - usual, axis=1) < STILL_GYRO_RAD_S
+    still &= np.linalg.norm(rate, axis=1) < MOST_BIAS_RAD_S
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     inner = [(int(i) + 1, int(j) - 1) for i, j in edges.reshape(-1, 2)]  # the ends may have moved
     runs = [(i, j) for i, j in inner if j - i >= STILL_BINS]
-    field = bins.field_b_gauss
-    return [(i, j) for i, j in runs if np.linalg.norm(np.ptp(field[i:j], axis=0)) < _TURN_GAUSS]
+    return [(i, j) for i, j in runs if _drift_gauss(bins.field_b_gauss[i:j]) < _TURN_GAUSS]
+
+
+def _drift_gauss(field: Array) -> float:
+    """Second half against first: noise averages out, a steady turn does not."""
+    middle = len(field) // 2
+    return float(np.linalg.norm(field[middle:].mean(axis=0) - field[:middle].mean(axis=0)))

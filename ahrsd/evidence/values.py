@@ -94,7 +94,8 @@ class GyroFacts:
     """The proposed gyro bias against the mean rate at rest.
 
     sigma_share: sigma of that mean over the change that would be written
-    disagreement: distance between the two over their combined sigma
+    disagreement: distance between the two over their combined sigma (the estimate's: at most
+    0.3 mrad/s)
     """
 
     bias_rad_s: float

@@ -59,7 +59,7 @@ STREAM = (
         "min_rate_hz",
         Level.CANDIDATE,
         meaning="sample rate",
-        advice="{v:.1f} samples per second are too few (limit {l:.0f}): raise the output rate",
+        advice="{v:.1f} samples per second are too few (limit {l:.1f}): raise the output rate",
         missing="no samples have been counted yet",
     ),
     yes(

@@ -81,6 +81,13 @@ def test_rest_agrees_with_the_true_bias_and_not_with_another(world) -> None:
     assert bad.disagreement == pytest.approx(0.002 / np.hypot(1e-4, 1e-4), rel=0.1)
 
 
+def test_an_estimate_that_knows_nothing_does_not_agree(world) -> None:
+    covariance = np.diag(np.r_[np.full(9, 1e-4), np.full(3, 0.02)]) ** 2
+    off = world.BIAS + np.array([0.02, 0.0, 0.0])
+    seen = world.evidence(world.Scene(), gyro_bias_rad_s=off, covariance=covariance).gyro
+    assert seen.disagreement > 50.0
+
+
 def test_a_slow_steady_turn_is_no_rest(world) -> None:
     """0.4 deg/s looks still to gyro and accelerometer; the field tells."""
     scene = world.Scene(turn_s=900.0, roll_deg=0, pitch_deg=0, rest_s=0.0)
