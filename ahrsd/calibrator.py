@@ -65,8 +65,13 @@ class Calibrator:
         self.estimate = self._scaled(self.estimator.finish())
         return self.estimate
 
-    def judged(self, at_s: float, health: HealthFacts, basis: BasisFacts) -> tuple[GateResult, ...]:
-        """Evaluate the evidence for the present estimate and pass it through the gates."""
+    def judged(
+        self, at_s: float, health: HealthFacts, basis: BasisFacts, margin: float = 1.0
+    ) -> tuple[GateResult, ...]:
+        """Evaluate the evidence for the present estimate and pass it through the gates.
+
+        margin: how much clearer than usual an improvement must be (after a rollback).
+        """
         if self.estimate is None:
             return ()
         self.evidence = self.collector.evaluate(
@@ -77,7 +82,9 @@ class Calibrator:
             health,
             basis,
         )
-        self.gates = judge(self.evidence, self.settings.limits, at_s, self.gates)
+        self.gates = judge(
+            self.evidence, self.settings.limits.with_margin(margin), at_s, self.gates
+        )
         return self.gates
 
     def _scaled(self, estimate: Estimate | None) -> Estimate | None:

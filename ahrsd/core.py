@@ -29,7 +29,7 @@ from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
 from ahrsd.errands import Errands
 from ahrsd.evidence.values import BasisFacts
-from ahrsd.gates import for_level
+from ahrsd.gates import Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.rollcall import Rollcall
 from ahrsd.samples import SampleBlock
@@ -74,7 +74,7 @@ class Core:
         self.undecodable = 0
         self._host_s = 0.0
         self._stopping = ""
-        self._closing = False
+        self._closing = self._uptime_due = False
         self._restarts = 0
         self._serial: int | None = None
         self._rollcall = Rollcall()
@@ -103,6 +103,8 @@ class Core:
     def handle(self, item: inputs.Input) -> list[events.Event]:
         """Take one input; everything that follows from it, in order."""
         self._host_s = max(self._host_s, item.host_ns * 1e-9)
+        # first of all: what is sent next is judged by how old the vehicle's word is *now*
+        self._errands.add(self.writeback.tick(self._host_s))
         self._handlers[type(item)](item)
         self._drive()
         out, self._out = self._out, []
@@ -122,7 +124,6 @@ class Core:
 
     def _tick(self, _: inputs.Tick) -> None:
         self.take(self.conversation.tick(self._host_s))
-        self._errands.add(self.writeback.tick(self._host_s))
 
     def _wall_clock(self, item: inputs.WallClock) -> None:
         self._rollcall.wall_offset_s = item.wall_s - self._host_s
@@ -223,10 +224,9 @@ class Core:
 
     def _device_known(self) -> None:
         """Identity, registers and journal may all be there now."""
-        uptime_s = self.at_s if self.stream.facts.rate_source == "device time" else None
-        self._errands.add(
-            self._rollcall.told(self.conversation, self.writeback, self._host_s, uptime_s)
-        )
+        told = self._rollcall.told(self.conversation, self.writeback, self._host_s)
+        self._uptime_due = self._uptime_due or bool(told)
+        self._errands.add(told)
 
     def _in_force(self, values: dict[int, Values]) -> None:
         """These registers act on what follows; the first ones are the estimator's prior."""
@@ -332,6 +332,9 @@ class Core:
         self.at_s = float(block.time_s[-1])
         if np.isnan(self.first_s):
             self.first_s = float(block.time_s[0])
+        if self._uptime_due and self.stream.facts.rate_source == "device time":
+            self._uptime_due = False  # the first one since the device was read: did it restart?
+            self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
         calibrator = self.calibrator
         new = calibrator.take(block)
         estimate = calibrator.estimate
@@ -350,7 +353,10 @@ class Core:
         host_s = self._host_s or self.at_s
         self._out.append(events.Estimated(self.at_s, host_s, estimate))
         gates = self.calibrator.judged(
-            self.at_s, self.stream.health(self.conversation.session.deframer.counters), self.basis()
+            self.at_s,
+            self.stream.health(self.conversation.session.deframer.counters),
+            self.basis(),
+            self.writeback.margin,
         )
         self._out.append(events.Judged(self.at_s, host_s, gates))
         self.decisions.add(
@@ -368,6 +374,7 @@ class Core:
                 self.at_s,
                 self._host_s,
                 gyro_is_raw=not self.stream.compensated_gyro,
+                flash_gates=for_level(gates, Level.FLASH),
             )
         )
 

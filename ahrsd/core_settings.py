@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 from ahrsd.calibrator import CalibratorSettings
 from ahrsd.gates import Level
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 
 
@@ -28,7 +27,5 @@ class CoreSettings:
 
     @property
     def level(self) -> Level:
-        """Which gates must hold before anything is written, by what the writing may end in."""
-        if self.policy.mode is Mode.COMMIT:
-            return Level.FLASH
+        """Which gates must hold before RAM is written; those of the flash are asked at the save."""
         return Level.UNATTENDED if self.policy.approval == "auto" else Level.RAM

@@ -53,7 +53,6 @@ class Rollcall:
         conversation: Conversation,
         writeback: WriteBack,
         host_s: float,
-        uptime_s: float | None,
     ) -> list[Action]:
         """Tell the write-back, once, when everything is there.
 
@@ -70,6 +69,5 @@ class Rollcall:
             self._journal,
             host_s,
             host_s + self.wall_offset_s,
-            uptime_s=uptime_s,
             session_keys=keys,
         )
