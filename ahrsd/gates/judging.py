@@ -16,6 +16,8 @@ from ahrsd.gates.limits import GateLimits
 from ahrsd.gates.row import Gate, Level
 from ahrsd.gates.table import GATES
 
+_ROUNDING = 1e-6  # of the limit: 10 Hz that is summed up to 9.9999999 is 10 Hz
+
 
 def judge(
     evidence: Evidence,
@@ -69,7 +71,8 @@ def _result(
 ) -> GateResult:
     value, limit = float(attrgetter(gate.value)(evidence)), limit_of(gate, limits)
     measured = math.isfinite(value)
-    ok = measured and (value <= limit if gate.at_most else value >= limit)
+    slack = _ROUNDING * abs(limit)
+    ok = measured and (value <= limit + slack if gate.at_most else value >= limit - slack)
     words = gate.advice.format(v=value, l=limit, e=evidence) if measured else gate.missing
     return GateResult(
         gate=gate.gate,

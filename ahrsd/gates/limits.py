@@ -11,7 +11,7 @@ class GateLimits:
 
     max_error_rate: float = 1e-3  # of messages
     max_drop_rate: float = 5e-3  # of samples
-    min_rate_hz: float = 9.5  # a nominal 10 Hz, measured
+    min_rate_hz: float = 10.0
     min_heading_excursion_deg: float = 280.0
     min_planar_circle_deg: float = 340.0
     min_observability: float = 1.0

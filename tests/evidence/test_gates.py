@@ -306,6 +306,14 @@ def test_limits_come_from_one_place(good) -> None:
     assert len(ROWS) == len(GATES)
 
 
+def test_rounding_is_no_reason_and_no_excuse(good) -> None:
+    def ok(rate_hz: float) -> bool:
+        return "stream_health.rate" not in red(put(good, "health.rate_hz", rate_hz))
+
+    assert ok(9.99999999)
+    assert not ok(9.999)
+
+
 def test_margin_after_a_rollback_makes_improvement_harder() -> None:
     twice = LIMITS.with_margin(2.0)
     assert (twice.min_improvement_percent, twice.min_improvement_deg) == (40.0, 0.6)
