@@ -28,7 +28,9 @@ class CalibratorSettings:
 
 
 class Calibrator:
-    """One device's calibration. `present` and `present_gyro` are its registers 23 and 84."""
+    """One device's calibration. `present` and `present_gyro_bias_rad_s` are the user's registers 23
+    and 84: what a candidate must be better than, also while a candidate of ours is on trial.
+    """
 
     def __init__(
         self, settings: CalibratorSettings, present: Affine, present_gyro_bias_rad_s: Array
@@ -43,6 +45,12 @@ class Calibrator:
         self.gates: tuple[GateResult, ...] = ()
         self._gap = True
         self.started = False
+
+    def compare_with(self, present: Affine, present_gyro_bias_rad_s: Array) -> None:
+        """What a candidate must be better than; before the first sample also the prior's centre."""
+        if not self.started:
+            self.estimator = Estimator(self.settings.estimator, present, present_gyro_bias_rad_s)
+        self.present, self.present_gyro_bias_rad_s = present, present_gyro_bias_rad_s
 
     def take(self, block: SampleBlock) -> bool:
         """Samples in order; true where there is a new estimate."""

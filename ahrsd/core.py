@@ -237,11 +237,10 @@ class Core:
         rate = values.get(_RATE, ())
         if rate and isinstance(rate[0], int | float) and rate[0] > 0:
             self.stream.register_rate_hz = float(rate[0])
-        present, gyro = _affine(values.get(_MAG)), _affine(values.get(_GYRO))
-        if not self.calibrator.started:
-            self.calibrator = Calibrator(self.settings.calibrator, present, gyro.offset)
-        self.calibrator.present = present
-        self.calibrator.present_gyro_bias_rad_s = gyro.offset
+        # on trial, a candidate is still compared with what the user had before it
+        trial = self.writeback.history.open
+        users = values if trial is None else {**values, **trial.old}
+        self.calibrator.compare_with(_affine(users.get(_MAG)), _affine(users.get(_GYRO)).offset)
 
     def _digest(self, said: Said) -> None:
         match said:
@@ -339,7 +338,7 @@ class Core:
         new = calibrator.take(block)
         estimate = calibrator.estimate
         proposed = estimate.correction if estimate is not None and estimate.converged else None
-        self._out.append(events.SamplesSeen(block, calibrator.present, proposed))
+        self._out.append(events.SamplesSeen(block, _affine(self.registers.get(_MAG)), proposed))
         self._errands.add(self.writeback.on_samples(block))
         if self._trial is not None:
             metrics = self._trial.take(block)
