@@ -18,6 +18,8 @@ COMMANDS: dict[str, str] = {
     "capture": "Record what a device sends.",
     "replay": "The pipeline of `run` over a recording.",
     "calibrate": "Batch calibration of a recording.",
+    "simulate": "A recording of a scenario, with the truth beside it.",
+    "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
     "registers": "Read, compare, write and roll back the device's registers.",
 }
 

@@ -34,6 +34,11 @@ class Disturbances:
     gap_at_s: float | None = None
     gap_length_s: float = 2.0
 
+    def __post_init__(self) -> None:
+        """Raises ValueError where the fraction of outliers is no fraction."""
+        if not 0.0 <= self.outlier_fraction <= 1.0:
+            raise ValueError(f"outlier_fraction is {self.outlier_fraction}: it must be in 0..1")
+
 
 def disturbed(experiment: Experiment, wanted: Disturbances, rng: np.random.Generator) -> Experiment:
     """The experiment with what is wanted added; the very same object where nothing is."""
