@@ -70,7 +70,7 @@ def log(R: Array) -> Array:
     out = np.asarray(v * scale[..., None])
     near_pi = (np.pi - t) < 1e-4
     if np.any(near_pi):
-        out = np.where(near_pi[..., None], _log_near_pi(R, v, t), out)
+        out[near_pi] = _log_near_pi(R[near_pi], v[near_pi], t[near_pi])
     return out
 
 

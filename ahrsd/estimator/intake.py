@@ -28,7 +28,7 @@ def check(block: SampleBlock) -> None:
         ("gyro_b_rad_s", block.gyro_b_rad_s),
     )
     for name, values in table:
-        good = np.isfinite(values).reshape(len(block), -1).all(axis=1)
+        good = np.isfinite(values if values.ndim == 1 else values.sum(axis=1))
         if not good.all():
             k = int(np.argmin(good))
             raise ValueError(f"{name} of row {k} is not finite: {values[k]}")

@@ -6,7 +6,8 @@ steps; the median of their size is robust against the rest.
 In the steady chain a tangent direction with field information a and motion information b per step
 has the hat value h = 1 / sqrt(1 + 4 b / a) on its field residual and 1 - h on its motion residual
 (inverse of the tridiagonal matrix -b, a + 2 b, -b). So the field residuals of an epoch have
-3 n - sum h degrees of freedom, the motion residuals sum h: both noise levels follow from one pass
+3 n - sum h degrees of freedom, the motion residuals sum h (1 less in a chain that stands alone:
+half a mode per tangent direction is free at its ends): both noise levels follow from one pass
 (restricted maximum likelihood at fixed calibration; tests/test_estimator_noise.py).
 """
 
@@ -56,6 +57,7 @@ def residuals(q: chain.Quadratic, data: chain.Data, used: chain.Noise, M: Array)
     a = np.sum(np.square(np.einsum("ij,njk->nik", M, q.tangents)), axis=1) / used.mag_gauss**2
     b = 1.0 / (used.gyro_rad_s * dt) ** 2
     hat = float(np.sum(1.0 / np.sqrt(1.0 + 4.0 * b / np.maximum(a, 1e-12))))
+    hat -= float(data.measures_first)
     return Residuals(
         q.sum_mag * used.mag_gauss**2,
         max(q.count_mag - hat, 1.0),

@@ -1,0 +1,81 @@
+"""The linear starts: exact without noise, and no shrinking with noise in the regressors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.estimator import chain, start
+from ahrsd.estimator.excitation import turned
+
+M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
+B = np.array([0.1, -0.2, 0.05])
+DT = 0.03
+
+
+def epoch(amplitude, noise_gauss, seed=0, n=2000):
+    rng = np.random.default_rng(seed)
+    t = DT * np.arange(n)
+    rate = amplitude * np.column_stack(
+        [np.sin(0.5 * t), np.sin(0.33 * t + 1), np.sin(0.21 * t + 2)]
+    )
+    u = np.empty((n, 3))
+    u[0] = [0.36, -0.48, 0.8]
+    for k in range(1, n):
+        u[k] = so3.exp(-rate[k] * DT) @ u[k - 1]
+    field = u @ M + B + rng.normal(size=(n, 3)) * noise_gauss
+    return chain.Data(field, rate * DT, np.full(n, DT), np.full((n, 3), np.nan), t, True)
+
+
+def test_linear_start_is_exact_without_noise():
+    c = start.linear_start([epoch(0.5, 0.0)])
+    np.testing.assert_allclose(chain.symmetric(c[:6]), M, atol=1e-6)
+    np.testing.assert_allclose(c[6:], B, atol=1e-6)
+
+
+def test_linear_start_does_not_shrink_with_noise():
+    """Errors in variables: the mean over noise stays at the truth; least squares would not."""
+    found = np.array([start.linear_start([epoch(0.25, 5e-3, seed)]) for seed in range(12)])
+    truth = np.r_[chain.upper_triangle(M), B]
+    error, spread = found.mean(axis=0) - truth, found.std(axis=0) / np.sqrt(12)
+    assert np.all(np.abs(error) < 4 * spread + 1e-3)
+    assert np.all(spread < 0.03)
+
+
+def test_linear_start_needs_an_epoch_longer_than_its_lags():
+    assert start.linear_start([epoch(0.5, 0.0, n=15)]) is None
+
+
+def test_linear_start_refuses_what_is_not_positive_definite():
+    rng = np.random.default_rng(0)
+    field = rng.normal(size=(400, 3))
+    data = chain.Data(
+        field, rng.normal(size=(400, 3)), np.full(400, DT), field, DT * field[:, 0], True
+    )
+    c = start.linear_start([data])
+    assert c is None or np.linalg.eigvalsh(chain.symmetric(c[:6]))[0] > 0
+
+
+def test_sphere_start_is_exact_on_a_sphere():
+    u = np.random.default_rng(0).normal(size=(300, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    c = start.sphere_start(0.47 * u + B)
+    np.testing.assert_allclose(c, np.r_[0.47, 0, 0, 0.47, 0, 0.47, B], atol=1e-12)
+
+
+def test_sphere_start_refuses_a_plane():
+    angle = np.linspace(0, 6, 100)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(100)])
+    assert start.sphere_start(circle) is None
+
+
+@pytest.mark.parametrize(("amplitude", "expected"), [(0.0, False), (0.02, True), (0.5, True)])
+def test_turned_wants_a_rotation(amplitude, expected):
+    assert turned(epoch(amplitude, 1e-3, n=512)) is expected
+
+
+def test_a_field_that_wanders_while_the_gyro_rests_is_no_turn():
+    data = epoch(0.0, 1e-3, n=512)
+    data.field_b_gauss[:, 2] += np.linspace(0, 0.05, 512)
+    assert not turned(data)

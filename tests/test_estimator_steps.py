@@ -1,0 +1,179 @@
+"""Averaging of fast streams, the intake, and thinning for the search."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ahrsd import so3
+from ahrsd.estimator import intake
+from ahrsd.estimator.intake import Intake
+from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.search import joined, thinned
+from ahrsd.estimator.steps import StepAverager, join, samples_per_step, split
+from ahrsd.samples import SampleBlock
+
+DT = 0.005
+
+
+def rows(count, seed=0):
+    """Samples (count, 11) of a violent motion."""
+    rng = np.random.default_rng(seed)
+    dt = DT * (1 + 0.1 * rng.uniform(-1, 1, count))
+    return np.column_stack([np.cumsum(dt), dt, rng.normal(size=(count, 9)) * 2.0])
+
+
+def block(samples, *, gap):
+    dt = samples[:, 1].copy()
+    if gap:
+        dt[0] = np.nan
+    return SampleBlock(
+        samples[:, 0], dt, samples[:, 0], samples[:, 2:5], samples[:, 5:8], samples[:, 8:11],
+        gap_before=gap,
+    )  # fmt: skip
+
+
+def blocks(samples, cuts):
+    edges = [0, *sorted(set(cuts)), len(samples)]
+    parts = [samples[a:b] for a, b in pairwise(edges) if b > a]
+    return [block(part, gap=i == 0) for i, part in enumerate(parts)]
+
+
+@pytest.mark.parametrize(
+    ("rate", "expected"), [(25.0, 1), (33.0, 1), (98.0, 1), (100.0, 3), (400.0, 11), (800.0, 23)]
+)
+def test_samples_per_step_is_odd_and_keeps_the_rate(rate, expected):
+    assert samples_per_step(rate, 33.0) == expected
+    assert expected == 1 or rate / expected >= 33.0
+
+
+def test_steps_are_the_exact_composition():
+    samples, n = rows(60), 5
+    steps = StepAverager(n).add(samples)
+    assert len(steps) == 12
+    np.testing.assert_array_equal(steps.time_s, samples[2::5, 0])
+    np.testing.assert_allclose(steps.field_b_gauss[3], samples[15:20, 2:5].mean(axis=0))
+    assert np.isnan(steps.dt_s[0])
+    total = np.eye(3)
+    for k in range(13, 18):  # from the middle of step 2 (sample 12) to that of step 3 (sample 17)
+        total = total @ so3.exp(samples[k, 5:8] * samples[k, 1])
+    np.testing.assert_allclose(so3.exp(steps.angle_b_rad[3]), total, atol=1e-13)
+    assert steps.dt_s[3] == pytest.approx(samples[13:18, 1].sum())
+
+
+@given(st.sampled_from([1, 3, 5]), st.lists(st.integers(1, 99), max_size=12))
+def test_any_split_gives_the_same_steps(n, cuts):
+    samples = rows(100)
+    whole = StepAverager(n).add(samples)
+    averager = StepAverager(n)
+    edges = [0, *sorted(set(cuts)), 100]
+    parts = [averager.add(samples[a:b]) for a, b in pairwise(edges)]
+    pieces = join([part for part in parts if len(part)])
+    for name in ("time_s", "field_b_gauss", "angle_b_rad", "dt_s", "accel_b_m_s2"):
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
+
+
+def test_split_is_undone_by_join():
+    steps = StepAverager(3).add(rows(99))
+    front, back = split(steps, 7)
+    assert (len(front), len(back)) == (7, 26)
+    np.testing.assert_array_equal(join([front, back]).angle_b_rad, steps.angle_b_rad)
+
+
+@given(st.lists(st.integers(1, 999), max_size=20))
+def test_any_split_gives_the_same_epochs(cuts):
+    """The rate too is measured on the same samples, one-sample blocks included."""
+    samples = rows(1000)
+    parameters = EstimatorParameters(epoch_steps=64)
+    epochs = []
+    for chosen in ([], cuts):
+        gate = Intake(parameters)
+        found = [data for b in blocks(samples, chosen) for data in gate.add(b)]
+        epochs.append((found, gate.samples, gate.duration_s, gate.averaged))
+    assert epochs[0][1:] == epochs[1][1:]
+    assert len(epochs[0][0]) == len(epochs[1][0]) == 3
+    for a, b in zip(epochs[0][0], epochs[1][0], strict=True):
+        np.testing.assert_array_equal(a.angle_b_rad, b.angle_b_rad)
+        np.testing.assert_array_equal(a.field_b_gauss, b.field_b_gauss)
+        np.testing.assert_array_equal(a.down_b, b.down_b)
+
+
+def test_samples_one_by_one_give_the_same_epochs():
+    samples = rows(400)
+    gates = [Intake(EstimatorParameters(epoch_steps=64)) for _ in range(2)]
+    (whole,) = gates[0].add(block(samples, gap=True))
+    found = [d for b in blocks(samples, range(400)) for d in gates[1].add(b)]
+    np.testing.assert_array_equal(found[0].angle_b_rad, whole.angle_b_rad)
+
+
+def test_a_gap_ends_the_epoch_and_starts_afresh():
+    gate = Intake(EstimatorParameters(epoch_steps=128))
+    (first,) = gate.add(block(rows(1000), gap=True))
+    assert (first.measures_first, len(first)) == (True, 129)
+    rest = gate.interrupt()  # 200 steps of 5 samples: 71 are left
+    assert (rest.measures_first, len(rest)) == (False, 71)
+    assert gate.interrupt() is None
+    assert gate.add(block(rows(1000), gap=True))[0].measures_first
+
+
+def test_a_piece_too_short_for_an_epoch_is_dropped():
+    gate = Intake(EstimatorParameters(epoch_steps=128))
+    assert gate.add(block(rows(319), gap=True)) == []
+    assert gate.interrupt() is None
+    assert gate.duration_s == pytest.approx(318 * DT, rel=0.01)
+
+
+@pytest.fixture
+def good():
+    return rows(10)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "text"),
+    [
+        (0, np.nan, "time_s of row 4 is not finite"),
+        (3, np.inf, "raw_b_gauss of row 4 is not finite"),
+        (6, -np.inf, "gyro_b_rad_s of row 4 is not finite"),
+        (1, np.nan, "dt_s of row 4 is not a positive step: nan"),
+        (1, 0.0, "dt_s of row 4 is not a positive step: 0.0"),
+        (1, -0.1, "dt_s of row 4"),
+        (1, np.inf, "dt_s of row 4"),
+    ],
+)
+def test_bad_samples_are_named(good, column, value, text):
+    good[4, column] = value
+    with pytest.raises(ValueError, match=text):
+        intake.check(block(good, gap=True))
+
+
+def test_an_unknown_step_is_allowed_after_a_gap_only(good):
+    intake.check(block(good, gap=True))
+    with pytest.raises(ValueError, match="dt_s of row 0"):
+        good[0, 1] = np.nan
+        intake.check(block(good, gap=False))
+
+
+def test_missing_specific_force_is_no_error(good):
+    good[:, 8:11] = np.nan
+    intake.check(block(good, gap=True))
+
+
+def test_thinning_composes_rotations_and_keeps_fields():
+    gate = Intake(EstimatorParameters(epoch_steps=64))
+    samples = rows(330)
+    samples[:, 1] = 0.03
+    data = gate.add(block(samples, gap=True))[0]
+    thin = thinned(data, 4)
+    np.testing.assert_array_equal(thin.field_b_gauss, data.field_b_gauss[::4][: len(thin)])
+    np.testing.assert_allclose(thin.dt_s[1:], 0.12)
+    total = np.eye(3)
+    for k in range(5, 9):
+        total = total @ so3.exp(data.angle_b_rad[k])
+    np.testing.assert_allclose(so3.exp(thin.angle_b_rad[2]), total, atol=1e-13)
+    both = joined([thin, thin])
+    assert len(both) == 2 * len(thin)
+    np.testing.assert_array_equal(np.flatnonzero(both.linked == 0), [0, len(thin)])
