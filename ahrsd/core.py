@@ -8,6 +8,7 @@ the same decisions; `decisions` holds them and their hash.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -39,7 +40,6 @@ from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.states import State
 from drivers.vn100.decode import Measurement, Undecodable
-from drivers.vn100.deframer import Cause
 from drivers.vn100.registers import Values
 from drivers.vn100.session import DeviceFault, Stray
 from drivers.vn100.session import Event as SessionEvent
@@ -181,24 +181,22 @@ class Core:
 
     def take(self, found: list[SessionEvent]) -> None:
         """Measurements to the stream, with what was damaged between them; the rest is counted."""
-        skipped = [
-            s for s in self.conversation.session.deframer.take_skipped() if s.cause != Cause.NOISE
-        ]
+        skipped = deque(self.conversation.session.deframer.take_skipped())
         for event in found:
             if isinstance(event, Measurement):
                 while skipped and skipped[0].offset < event.offset:
-                    self.stream.lost(max(1, round(len(skipped.pop(0).data) / 120)))
+                    self.stream.damaged(skipped.popleft())
                 for block in self.stream.take(event, self._host_s):
                     self._block(block)
             elif isinstance(event, Undecodable):
                 self.undecodable += 1
-                self.stream.lost(1)
+                self.stream.undecodable()
             elif isinstance(event, DeviceFault):
                 self._fault(event.code)
             elif isinstance(event, Stray):
                 self.strays += 1
-        if skipped:
-            self.stream.lost(len(skipped))
+        for piece in skipped:
+            self.stream.damaged(piece)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
             self._device_reset("its time fell")
@@ -353,7 +351,7 @@ class Core:
         self._out.append(events.Estimated(self.at_s, host_s, estimate))
         gates = self.calibrator.judged(
             self.at_s,
-            self.stream.health(self.conversation.session.deframer.counters),
+            self.stream.health(),
             self.basis(),
             self.writeback.margin,
         )

@@ -4,9 +4,13 @@ Rows of one layout are collected until a quarter of a second is together (by cou
 blocks do not depend on how the bytes were cut), then turned into arrays at once.
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
-the rate, with damaged or skipped bytes before a message counted as lost messages, so that nothing
-is bridged. The rate of such a stream is what the caller says, else register 7, else what the
-arrival times say, else the factory's 40 Hz.
+the rate. Damaged messages, and steps over which the device turned further than its rate can explain
+(`stream_rate.TurnWatch`), count as lost messages then, so that nothing is bridged. The rate of such
+a stream is what the caller says, else register 7, else what the arrival times say, else the
+factory's 40 Hz.
+
+How the bytes were cut into chunks changes nothing: everything here goes by the messages and by the
+damage in front of each, never by what else came with them.
 """
 
 from __future__ import annotations
@@ -19,21 +23,36 @@ import numpy as np
 from ahrsd.clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
 from ahrsd.evidence.values import HealthFacts
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.unmapping import Extractor, MissingQuantityError, RegisterEpochs, sample_blocks
+from ahrsd.stream_rate import TurnWatch, attitude_columns
+from ahrsd.unmapping import (
+    Extracted,
+    Extractor,
+    MissingQuantityError,
+    RegisterEpochs,
+    sample_blocks,
+)
 from drivers.vn100.decode import Measurement
-from drivers.vn100.deframer import Counters
+from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
 
 FACTORY_RATE_HZ = 40.0
 _BLOCK_S = 0.25
 _ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
+_MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
+_FEW_PLACES = 3  # a jump of the device's own attitude now and then is not worth a warning
 
 
 @dataclass(slots=True)
 class StreamFacts:
-    """Counters of a stream. `unusable`: saturated or not finite."""
+    """Counters of a stream.
+
+    unusable: samples that were saturated or not finite
+    damaged:  messages that were recognised and refused
+    expected: samples that would be there had none been lost
+    """
 
     samples: int = 0
     unusable: int = 0
+    damaged: int = 0
     expected: float = 0.0
     layout: str = ""
     rate_hz: float = float("nan")
@@ -67,6 +86,9 @@ class Stream:
         self._lost: list[int] = []
         self._lost_next = 0
         self._forgiven = False
+        self._attitude: list[int] | None = None
+        self._turns = TurnWatch()
+        self._turns_said = ""
 
     @property
     def restarts(self) -> int:
@@ -87,9 +109,21 @@ class Stream:
         """So many messages are missing before the next one."""
         self._lost_next += messages
 
+    def damaged(self, piece: Skipped) -> None:
+        """Bytes before the next message that were none; other devices' lines are no loss."""
+        self.facts.damaged += piece.cause in REJECTIONS
+        if piece.cause is not Cause.NOISE:
+            self.lost(max(1, round(len(piece.data) / _MESSAGE_BYTES)))
+
+    def undecodable(self) -> None:
+        """A message with a right checksum whose content is none."""
+        self.facts.damaged += 1
+        self.lost(1)
+
     def forget(self) -> None:
         """The link was away, or the output was changed: what follows does not follow on."""
         self._timeline.forget()
+        self._turns.forget()
         self._lost_next = max(self._lost_next, 1)
 
     def forgive(self) -> None:
@@ -125,6 +159,7 @@ class Stream:
             return None
         self._extractor = new
         self._clear()
+        self._attitude = None if new.has_time else attitude_columns(layout)
         self.facts.layout = layout.name
         self.warnings.update(dict.fromkeys(new.warnings))
         self.forget()
@@ -175,18 +210,42 @@ class Stream:
         if not extractor.has_time and self._steps is None and self._rate(len(self._rows)) is None:
             self._clear()  # nobody can say yet when they were
             return []
-        extracted = extractor.extract(self._rows)
+        table = np.array(self._rows, dtype=np.float64)
+        extracted = extractor.extract_table(table)
         arrivals = np.array(self._arrivals)
-        if extracted.time_s is not None:
-            time_s = extracted.time_s
-        else:
-            assert self._steps is not None
-            time_s = self._steps.times(np.array(self._lost))
+        time_s = self._times(extracted, table)
         self._clear()
         steps = self._timeline.extend(time_s, extracted.usable)
         self._note(steps)
         host_s = self._host(time_s, arrivals)
         return sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+
+    def _times(self, extracted: Extracted, table: Array) -> Array:
+        """Device times (N,); for a stream without, the number of messages, lost ones included."""
+        if extracted.time_s is not None:
+            return extracted.time_s
+        assert self._steps is not None
+        lost = np.array(self._lost)
+        if self._attitude is not None:
+            ypr, rate = np.hsplit(table[:, self._attitude], 2)
+            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s))
+            self._say_turns()
+        if not self.facts.expected:
+            lost[0] = 0  # nothing came before the first one
+        return self._steps.times(lost)
+
+    def _say_turns(self) -> None:
+        turns = self._turns
+        if turns.places < _FEW_PLACES:
+            return
+        self.warnings.pop(self._turns_said, None)
+        share = 100.0 * turns.missing / (turns.missing + self.by_layout[self.facts.layout])
+        self._turns_said = (
+            f"messages are missing without a trace in the bytes: at {turns.places} places the "
+            f"device turned further than its rate explains (about {share:.0f} % of all are "
+            "missing); the steps there are left out; was the recording computer too slow?"
+        )
+        self.warnings[self._turns_said] = None
 
     def _host(self, time_s: Array, arrivals: Array) -> Array:
         """Host times; a recording without host time (arrivals of 0) has only the device's."""
@@ -222,15 +281,16 @@ class Stream:
         if np.isnan(facts.rate_hz):
             facts.rate_hz = 1.0 / float(np.nanmedian(block.dt_s))
 
-    def health(self, counters: Counters) -> HealthFacts:
+    def health(self) -> HealthFacts:
         """Figures of the stream so far, for the gates."""
-        total = max(counters.valid + counters.rejected, 1)
+        facts = self.facts
+        total = max(self.by_layout.total() + facts.damaged, 1)
         return HealthFacts(
-            crc_error_rate=counters.rejected / total,
-            drop_rate=max(1.0 - self.facts.samples / max(self.facts.expected, 1.0), 0.0),
-            saturated=self.facts.unusable,
+            crc_error_rate=facts.damaged / total,
+            drop_rate=max(1.0 - facts.samples / max(facts.expected, 1.0), 0.0),
+            saturated=facts.unusable,
             negative_dt=self.restarts,
-            rate_hz=self.facts.rate_hz,
+            rate_hz=facts.rate_hz,
         )
 
     def check(self) -> None:
