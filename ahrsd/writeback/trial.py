@@ -67,8 +67,8 @@ class Trial:
             return Finding.GOES_ON, "worse than the old registers for the moment"
         if metrics.duration_s >= policy.duration_s or metrics.turns >= policy.turns:
             return Finding.PASSED, (
-                f"{metrics.new_figure:.4g} against {metrics.old_figure:.4g} after "
-                f"{metrics.duration_s:.0f} s and {metrics.turns:.1f} turns"
+                f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
+                f"{metrics.old_figure:.2%} ({metrics.duration_s:.0f} s, {metrics.turns:.1f} turns)"
             )
         return Finding.GOES_ON, ""
 
@@ -89,8 +89,8 @@ class Trial:
             self._worse_since_s = metrics.duration_s
         if metrics.duration_s - self._worse_since_s >= policy.worse_for_s:
             return (
-                f"{metrics.new_figure:.4g} where the old registers give "
-                f"{metrics.old_figure:.4g}, for {policy.worse_for_s:.0f} s"
+                f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
+                f"{metrics.old_figure:.2%}, for {policy.worse_for_s:.0f} s"
             )
         return None
 

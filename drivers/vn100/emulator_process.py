@@ -8,6 +8,7 @@ The process ends with `stop`, and by itself when the program that started it end
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import signal
 from multiprocessing.connection import Connection
@@ -19,6 +20,7 @@ from drivers.vn100.emulator_pty import PtyEmulator
 from drivers.vn100.emulator_scenarios import Setup, build
 
 START_S = 30.0
+OFF_S = 1.0  # device time without power in a `power_cycle`
 
 
 class EmulatorProcess:
@@ -66,6 +68,16 @@ class EmulatorProcess:
             raise answer
         return str(answer)
 
+    @property
+    def alive(self) -> bool:
+        """Whether the process still serves."""
+        return self._process.is_alive()
+
+    def power_cycle(self) -> None:
+        """Switch the device off and on: its RAM is what its flash holds. Nothing where it died."""
+        with contextlib.suppress(OSError):
+            self._pipe.send("power cycle")
+
     def stop(self) -> None:
         """Close the pty and end the process. May be called twice."""
         self._pipe.close()
@@ -103,4 +115,8 @@ def _serve(
         return
     with served:
         pipe.send(served.path)
-        pipe.poll(None)
+        with contextlib.suppress(EOFError):
+            while pipe.recv():
+                emulator, now_s = served.emulator, served.device_s
+                emulator.at(now_s, emulator.lose_power)
+                emulator.at(now_s + OFF_S, emulator.restart, any_life=True)

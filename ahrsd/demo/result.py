@@ -1,0 +1,168 @@
+"""What the demo achieved, judged by the truth that was hidden from the daemon."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.report import KeyFigure
+from ahrsd.samples import Array
+from drivers.vn100.emulator_physics import Truth
+
+LIMIT_DEG: Final = 0.5
+LIMIT_BIAS_RAD_S: Final = 3e-4
+LIMIT_SIGMAS: Final = 3.0
+_BEFORE_DEG: Final = 10.0  # a smaller error before would not prove much
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DemoResult:
+    """Before, after, truth.
+
+    present, written, written_gyro: registers 23 before, 23 and 84 as the device holds them at the
+    end; estimate: the one that was approved; live_*: (N,) deg, data that it has not seen
+    """
+
+    truth: Truth
+    present: Affine
+    written: Affine
+    written_gyro: Affine
+    read_back_exact: bool
+    estimate: Estimate | None
+    state: str
+    goal: str
+    decision_sha256: str
+    live_heading_deg: Array
+    live_before_deg: Array
+    live_after_deg: Array
+
+    @property
+    def worst_before_deg(self) -> float:
+        """Worst heading error over all level headings with the registers as found."""
+        return self.truth.heading_error_deg(self.present.matrix, self.present.offset)
+
+    @property
+    def worst_after_deg(self) -> float:
+        """The same with the registers as the device now holds them."""
+        return self.truth.heading_error_deg(self.written.matrix, self.written.offset)
+
+    @property
+    def bias_error_rad_s(self) -> Array:
+        """Gyro bias error (3,) of what register 84 now removes."""
+        return np.asarray(self.written_gyro.offset - self.truth.gyro_bias_rad_s)
+
+    @property
+    def bias_sigmas(self) -> Array:
+        """The same (3,) in standard deviations that the estimate claimed; nan without estimate."""
+        if self.estimate is None:
+            return np.full(3, np.nan)
+        return np.asarray(self.bias_error_rad_s / self.estimate.sigma[9:])
+
+    def failures(self) -> list[str]:
+        """What the demo promises and did not keep."""
+        promises = (
+            (self.state == self.goal, f"it ended in {self.state}, not in {self.goal}"),
+            (self.read_back_exact, "the device does not hold what was approved"),
+            (
+                self.worst_before_deg > _BEFORE_DEG,
+                f"the heading error before was only {self.worst_before_deg:.1f} deg",
+            ),
+            (
+                self.worst_after_deg <= LIMIT_DEG,
+                f"the heading error after is {self.worst_after_deg:.2f} deg",
+            ),
+            (
+                bool(np.all(np.abs(self.bias_error_rad_s) <= LIMIT_BIAS_RAD_S)),
+                f"the gyro bias is off by {np.max(np.abs(self.bias_error_rad_s)) * 1e3:.2f} mrad/s",
+            ),
+            (
+                bool(np.all(np.abs(self.bias_sigmas) <= LIMIT_SIGMAS)),
+                f"the gyro bias is off by {np.max(np.abs(self.bias_sigmas)):.1f} sigma",
+            ),
+        )
+        return [text for kept, text in promises if not kept]
+
+    @property
+    def good(self) -> bool:
+        """Whether the demo did what it promises."""
+        return not self.failures()
+
+
+def verdict(result: DemoResult) -> str:
+    """One sentence."""
+    if result.good:
+        return (
+            f"The worst heading error fell from {result.worst_before_deg:.1f} to "
+            f"{result.worst_after_deg:.2f} deg; the device holds exactly what was approved."
+        )
+    return f"The demo did not reach its goal: {'; '.join(result.failures())}."
+
+
+def figures(result: DemoResult) -> tuple[KeyFigure, ...]:
+    """Before, after and limit of what matters."""
+    before, after = result.truth.gyro_bias_rad_s * 1e3, result.bias_error_rad_s * 1e3
+    heading = KeyFigure(
+        "Worst heading error, level, by the truth",
+        "deg",
+        result.worst_before_deg,
+        result.worst_after_deg,
+        LIMIT_DEG,
+    )
+    limit = LIMIT_BIAS_RAD_S * 1e3
+    return (
+        heading,
+        *(
+            KeyFigure(f"Gyro bias {axis}", "mrad/s", float(b), float(a), limit)
+            for axis, b, a in zip(_AXES, before, after, strict=True)
+        ),
+    )
+
+
+def lines(result: DemoResult) -> Iterator[str]:
+    """The result for a person at a terminal."""
+    if result.estimate is not None:
+        yield from _beside_the_truth(result, result.estimate)
+    before, after = result.worst_before_deg, result.worst_after_deg
+    yield f"worst heading error  before {before:.2f} deg   after {after:.2f} deg   limit 0.5 deg"
+    exact = "exact" if result.read_back_exact else "NOT what was approved"
+    yield f"registers read back  {exact}"
+    yield f"decisions            {result.decision_sha256}"
+    yield ""
+    yield verdict(result)
+
+
+def _beside_the_truth(result: DemoResult, estimate: Estimate) -> Iterator[str]:
+    truth, sigma = result.truth, estimate.sigma
+    yield f"{'':22}{'hidden truth':>12}{'estimate':>12}{'1 sigma':>10}{'error':>10}{'limit':>8}"
+    upper = np.triu_indices(3)
+    soft = [f"soft iron {_AXES[i]}{_AXES[j]}" for i, j in zip(*upper, strict=True)]
+    rows = [
+        *zip(soft, truth.soft_iron[upper], estimate.soft_iron[upper], sigma[:6], [""] * 6),
+        *_axes("hard iron", "mG", truth.hard_iron_gauss, estimate.hard_iron_gauss, sigma[6:9], ""),
+        *_axes(
+            "gyro bias",
+            "mrad/s",
+            truth.gyro_bias_rad_s,
+            estimate.gyro_bias_rad_s,
+            sigma[9:],
+            f"{LIMIT_BIAS_RAD_S * 1e3:.2f}",
+        ),
+    ]
+    for name, true, found, one, limit in rows:
+        yield f"{name:22}{true:12.4f}{found:12.4f}{one:10.4f}{found - true:+10.4f}{limit:>8}"
+    yield ""
+
+
+_Row = tuple[str, float, float, float, str]
+
+
+def _axes(name: str, unit: str, true: Array, found: Array, sigma: Array, limit: str) -> list[_Row]:
+    return [
+        (f"{name} {axis} [{unit}]", t * 1e3, f * 1e3, s * 1e3, limit)
+        for axis, t, f, s in zip(_AXES, true, found, sigma, strict=True)
+    ]

@@ -1,0 +1,154 @@
+"""The two people of the demo, and its narrator.
+
+The operator approves the candidate by its id; somebody takes the device's power away and gives it
+back once the registers are saved. Neither knows the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ahrsd.calibration import Estimate
+from ahrsd.daemon import Daemon
+from ahrsd.events import (
+    Estimated,
+    Event,
+    GateResult,
+    Judged,
+    RegisterWritten,
+    SamplesSeen,
+    StateChanged,
+)
+from ahrsd.gates import Level, for_level
+from ahrsd.headings import tilt_compensated_heading
+from ahrsd.report import EventCollector
+from ahrsd.samples import Array, SampleBlock
+from ahrsd.writeback.states import State
+
+_SAY_EVERY_S = 60.0
+_LIVE_S = (60.0, 400.0)  # device time shown after the proof: at least, at most
+_SECTOR_DEG = 10.0
+_ENOUGH = 35 / 36  # of all headings
+_HOPELESS = frozenset({State.ROLLED_BACK, State.FAULT, State.LOCKED, State.FLASH_TORN})
+
+
+@dataclass(slots=True)
+class Scene:
+    """Listens to the core's events; `daemon` and `power_cycle` are set before it begins.
+
+    seconds: device time at most;  say: takes a line;  proof: state after which live data count
+    """
+
+    seconds: float
+    say: Callable[[str], None]
+    proof: State
+    power_cycle: Callable[[], None] = lambda: None
+    daemon: Daemon | None = None
+    collector: EventCollector = field(default_factory=EventCollector)
+    state: str = State.RECONCILING.value
+    gates: tuple[GateResult, ...] = ()
+    estimate: Estimate | None = None
+    approved: Estimate | None = None
+    proposed: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
+    live: list[tuple[Array, Array]] = field(default_factory=list)
+    shown: set[int] = field(default_factory=set)
+    proven: bool = False
+    live_s: float = 0.0
+    passed_s: float = 0.0
+    newest_s: float = math.nan
+    said_s: float = -math.inf
+
+    def __call__(self, event: Event) -> None:
+        """Watch one event."""
+        self.collector.add(event)
+        match event:
+            case SamplesSeen(block):
+                self._samples(block)
+            case Estimated(estimate=estimate):
+                self.estimate = estimate
+            case Judged(gates=gates):
+                self.gates = tuple(for_level(gates, Level.RAM))
+                self._progress()
+            case RegisterWritten(register=register, outcome=outcome):
+                self._line("", f"register {register} {outcome}")
+            case StateChanged(new=new, reason=reason):
+                self.state = new
+                self._line(new, reason)
+                self._act(new)
+
+    def _samples(self, block: SampleBlock) -> None:
+        now_s = float(block.time_s[-1])
+        step_s = now_s - self.newest_s
+        if step_s > 0.0:  # the device's time begins again when its power was away
+            self.passed_s += step_s
+        self.newest_s = now_s
+        if self.passed_s > self.seconds:
+            self._end(f"{self.seconds:.0f} s of device time are over")
+        if self.proven:
+            self._show(block, max(step_s, 0.0))
+
+    def _show(self, block: SampleBlock, step_s: float) -> None:
+        """Live samples for the picture, until every heading was driven."""
+        assert self.approved is not None
+        self.live_s += step_s
+        self.live.append((block.raw_b_gauss, block.accel_b_m_s2))
+        field_b_gauss = self.approved.correction.apply(block.raw_b_gauss[-1:])
+        heading = tilt_compensated_heading(field_b_gauss, block.accel_b_m_s2[-1:])
+        sector = math.degrees(float(heading[0])) % 360.0 // _SECTOR_DEG
+        self.shown.add(int(sector))
+        least_s, most_s = _LIVE_S
+        complete = len(self.shown) >= _ENOUGH * 360.0 / _SECTOR_DEG
+        if (complete and self.live_s > least_s) or self.live_s > most_s:
+            self._end("shown on live data")
+
+    def _act(self, state: str) -> None:
+        if state == State.QUALIFIED:
+            self._approve()
+        elif state == State.COMMITTED:
+            self._line("", "the device's power is switched off and on again")
+            self.power_cycle()
+        elif state in _HOPELESS:
+            self._end(f"ended in {state}")
+        if state == self.proof:
+            self.proven = True
+            self._line("", "live data from here on, until every heading was driven")
+
+    def _approve(self) -> None:
+        assert self.daemon is not None
+        proposal = self.daemon.shell.core.writeback.proposal
+        if proposal is None:
+            return
+        self.approved, self.proposed = self.estimate, dict(proposal.new)
+        self._line("", f"the operator approves candidate {proposal.id}, which is to send:")
+        for line in proposal.lines:
+            self.say(" " * 27 + line)
+        self.daemon.operate("approve", proposal.id)
+
+    def _progress(self) -> None:
+        if self.passed_s - self.said_s < _SAY_EVERY_S or self.estimate is None or self.proven:
+            return
+        self.said_s = self.passed_s
+        shut = [g.gate for g in self.gates if not g.ok]
+        text = f"heading known to {self.estimate.heading_sigma_deg:.2f} deg (1 sigma); "
+        text += f"{len(self.gates) - len(shut)} of {len(self.gates)} gates open"
+        self._line("", text + (f", next {shut[0]}" if shut else ""))
+
+    def _line(self, state: str, text: str) -> None:
+        at_s = 0.0 if math.isnan(self.newest_s) else self.newest_s
+        self.say(f"{at_s:8.1f} s  {state:15}{text}")
+
+    def _end(self, reason: str) -> None:
+        assert self.daemon is not None
+        self.daemon.stop(reason)
+
+
+def live_samples(scene: Scene, every: int = 5) -> tuple[Array, Array]:
+    """Raw field (N, 3) in gauss and specific force (N, 3) since the proof, thinned."""
+    if not scene.live:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    raw, accel = zip(*scene.live, strict=True)
+    return np.vstack(raw)[::every], np.vstack(accel)[::every]
