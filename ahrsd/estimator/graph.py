@@ -7,9 +7,9 @@ elimination, which leaves one factor on (c, y 1) that holds all that the past sa
 
 Traps of the wrapper that shaped this file: HessianFactor's linear term is minus the gradient; views
 that it returns die with their owner, so they are copied at once; a rank-deficient system raises
-RuntimeError; and a block counts as rank-deficient where its last two pivots differ by more than
-2^12 (choleskyPartial), as they do where little is known. So nodes are eliminated before c, while c
-counts as known, and the block of c ends in two idle coordinates with pivots of 1.
+RuntimeError; and a block counts as rank-deficient where its last pivot is 2^12 below the others, as
+it is where little is known. So GTSAM eliminates the nodes but the newest, in units in which their
+pivots are alike, and what is left on c and the newest node (14 numbers) is solved here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from ahrsd.estimator.factors import NODE, SIZE, Factor, Node, Point
+from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point
 from ahrsd.samples import Array
 
 
@@ -26,9 +26,8 @@ class SingularError(ValueError):
 
 
 _C = gtsam.symbol("c", 0)
-_IDLE = 2
-_WIDE = 9 + _IDLE
-_USED = np.r_[0:9, _WIDE : SIZE + _IDLE]  # where a factor's rows go, the idle ones left out
+# Unit of the gyro bias inside GTSAM: (rad/s) / 100, which brings its pivots near the directions'.
+_UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.0]
 _HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
@@ -39,10 +38,9 @@ def _y(j: int) -> int:
 def _hessian(factor: Factor, H: Array, g: Array) -> gtsam.HessianFactor:
     if not (np.isfinite(H).all() and np.isfinite(g).all()):
         raise SingularError("a factor is not finite")
-    G, linear = np.zeros((SIZE + _IDLE, SIZE + _IDLE)), np.zeros(SIZE + _IDLE)
-    G[np.ix_(_USED, _USED)] = H
-    linear[_USED] = -g
-    c, a, b = slice(0, _WIDE), slice(_WIDE, _WIDE + NODE), slice(_WIDE + NODE, _WIDE + 2 * NODE)
+    G = H * np.outer(_UNITS, _UNITS)
+    linear = -g * _UNITS
+    c, a, b = C, Y_A, Y_B
     if factor.a == factor.b:
         return gtsam.HessianFactor(
             _C, _y(factor.a), G[c, c], G[c, a], linear[c], G[a, a], linear[a], 0.0
@@ -116,10 +114,8 @@ class Graph:
         linear = information @ (self.anchor[0] - self.c)
         if not np.isfinite(linear).all():
             raise SingularError("the calibration is not finite")
-        block, vector = np.eye(_WIDE), np.zeros(_WIDE)
-        block[:9, :9] = information + np.diag(damping / self.anchor[1] ** 2)
-        vector[:9] = linear
-        hessian = gtsam.HessianFactor(_C, block, vector, 0.0)
+        information += np.diag(damping / self.anchor[1] ** 2)
+        hessian = gtsam.HessianFactor(_C, information, linear, 0.0)
         graph.add(gtsam.LinearContainerFactor(hessian, self._values(factors)))
         return graph
 
@@ -146,7 +142,7 @@ class Graph:
     @staticmethod
     def _values(factors: list[Factor]) -> gtsam.Values:
         values = gtsam.Values()
-        values.insert(_C, np.zeros(_WIDE))
+        values.insert(_C, np.zeros(9))
         for j in sorted({k for f in factors for k in (f.a, f.b)}):
             values.insert(_y(j), np.zeros(NODE))
         return values
@@ -162,13 +158,16 @@ class Graph:
         Raises SingularError where the graph does not determine all of it.
         """
         factors = self._all()
-        graph = self._anchored(factors, self.hold, damping)
-        try:
-            delta = graph.linearize(self._values(factors)).optimize(self._order(with_all=True))
-        except RuntimeError as error:
-            raise _singular(error) from error
-        dy = {j: np.array(delta.at(_y(j))) for j in self.nodes}
-        return np.array(delta.at(_C), dtype=np.float64)[:9], dy
+        linear = self._anchored(factors, self.hold, damping).linearize(self._values(factors))
+        net, rest = _eliminated(linear, self._older())
+        H, g = _information(rest)
+        solved = -_inverse(H[:14, :14]) @ g[:14]
+        given = gtsam.VectorValues()
+        given.insert(_C, solved[C])
+        given.insert(_y(self.last), solved[Y_A] / _UNITS[Y_A])
+        delta = net.optimize(given)
+        dy = {j: np.array(delta.at(_y(j))) * _UNITS[Y_A] for j in self.nodes}
+        return np.asarray(solved[C], dtype=np.float64), dy
 
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
         """Move all values by a step."""
@@ -182,22 +181,14 @@ class Graph:
         """
         factors = self._all()
         linear = self._anchored(factors, np.zeros((9, 9))).linearize(self._values(factors))
-        rest = _eliminated(linear, self._order(with_all=False))
-        H, _ = _information(rest)
-        try:
-            joint = np.linalg.inv(H[:14, :14])
-        except np.linalg.LinAlgError as error:
-            raise SingularError(str(error)) from error
-        return np.asarray(joint[:12, :12], dtype=np.float64)
+        H, _ = _information(_eliminated(linear, self._older())[1])
+        return _inverse(H[:14, :14])[:12, :12]
 
-    def _order(self, *, with_all: bool) -> gtsam.Ordering:
-        """Nodes from old to new, then c; without the newest node and c unless `with_all`."""
+    def _older(self) -> gtsam.Ordering:
+        """All nodes but the newest, from old to new."""
         ordering = gtsam.Ordering()
-        nodes = sorted(self.nodes)
-        for j in nodes if with_all else nodes[:-1]:
+        for j in sorted(self.nodes)[:-1]:
             ordering.push_back(_y(j))
-        if with_all:
-            ordering.push_back(_C)
         return ordering
 
     def fold_oldest(self) -> None:
@@ -209,7 +200,7 @@ class Graph:
         linear = self._linear(factors).linearize(self._values(factors))
         ordering = gtsam.Ordering()
         ordering.push_back(_y(old))
-        H, g = _information(_eliminated(linear, ordering))
+        H, g = _information(_eliminated(linear, ordering)[1])
         node = self.nodes[new]
         self.prior = Factor(new, new, H, g, Point(self.c.copy(), node.copy(), node.copy()))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]
@@ -218,27 +209,35 @@ class Graph:
 
 def _eliminated(
     linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
-) -> gtsam.GaussianFactorGraph:
-    """What is left of a graph without the variables of `ordering`."""
+) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
+    """The variables of `ordering` as conditionals, and what is left of the graph without them."""
     try:
-        return linear.eliminatePartialSequential(ordering)[1]
+        net, rest = linear.eliminatePartialSequential(ordering)
     except RuntimeError as error:
         raise _singular(error) from error
+    return net, rest
 
 
 def _information(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
     """H and gradient (SIZE) on [c, one node] of what an elimination left."""
     hessian = gtsam.HessianFactor(rest)
     augmented = np.array(hessian.augmentedInformation())
-    rows, kept, at = [], [], 0
     keys: list[int] = list(hessian.keys())
-    for key in keys:
-        first, size, idle = (0, 9, _IDLE) if key == _C else (9, NODE, 0)
-        rows.append(np.arange(first, first + size))
-        kept.append(np.arange(at, at + size))
-        at += size + idle
-    into, of = np.concatenate(rows), np.concatenate(kept)
+    rows = np.concatenate([np.arange(9) if k == _C else np.arange(9, 9 + NODE) for k in keys])
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-    H[np.ix_(into, into)] = augmented[np.ix_(of, of)]
-    g[into] = -augmented[of, -1]
-    return H, g
+    H[np.ix_(rows, rows)] = augmented[:-1, :-1]
+    g[rows] = -augmented[:-1, -1]
+    return H / np.outer(_UNITS, _UNITS), g / _UNITS
+
+
+def _inverse(H: Array) -> Array:
+    """Inverse of a positive definite matrix whose rows may have very different units."""
+    diagonal = np.diag(H)
+    if not np.all(diagonal > 0.0):
+        raise SingularError("a direction is determined by neither data nor prior")
+    scale = 1.0 / np.sqrt(diagonal)
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(H * np.outer(scale, scale)))
+    except np.linalg.LinAlgError as error:
+        raise SingularError("calibration and newest node are not determined") from error
+    return np.asarray(root.T @ root * np.outer(scale, scale), dtype=np.float64)

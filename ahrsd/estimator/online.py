@@ -116,13 +116,17 @@ class Estimator:
         """Other starts compete with the present answer, until they agree on good data."""
         found = search(self.parameters, window, self._present_bias, [e.data for e in window.epochs])
         unsettled = window.step_sigmas > _SETTLED
-        if found.gain > _GAIN_FOLDED * window.graph.temper or (
-            found.away > (_AWAY_UNSETTLED if unsettled else _AWAY) and not window.folded
+        better = found.gain > _GAIN_FOLDED * window.graph.temper
+        if (
+            better
+            or (unsettled and found.away > _AWAY_UNSETTLED)
+            or (not window.folded and found.away > _AWAY)
         ):
             window.restart_at(found.c, found.bias)
             window.track()
         self._agreed = found.agreed
-        self._searching = not (found.agreed and self._sure(window))
+        settled = window.step_sigmas < _SETTLED
+        self._searching = not (found.agreed and settled and self._sure(window))
 
     @staticmethod
     def _sure(window: Window) -> bool:

@@ -138,8 +138,8 @@ class Window:
             and sum(len(e.data) for e in self.epochs) > self.parameters.window_steps
         ):
             old = self.epochs.pop(0)
-            self.folded = True
             if old.turned:
+                self.folded = True
                 self.misfit.remember(old.factor, self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
@@ -241,7 +241,8 @@ class Window:
         Stops at the iteration limit or where damping alone no longer finds a lower cost; the
         window is then at the best point found. Never raises on hopeless data: `step_sigmas` says.
         """
-        present = all(np.array_equal(e.factor.point.c, self.graph.c) for e in self.epochs)
+        c = self.graph.c
+        present = all(np.array_equal(e.factor.point.c, c) for e in self.epochs if e.turned)
         cost = self.cost() if present else self._cost_here()
         for _ in range(steps):
             kept = self.snapshot()
@@ -268,9 +269,9 @@ class Window:
         """Cost after a step, everything linearised there; infinite where M is not positive."""
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
             return float(np.inf)
-        directions = [self._moved_directions(e) for e in self.epochs]
-        for k, u in enumerate(directions):
-            self._replace(k, u, self.epochs[k].used, self.epochs[k].weights)
+        for k, epoch in enumerate(self.epochs):
+            if epoch.turned:  # the others do not depend on c
+                self._replace(k, self._moved_directions(epoch), epoch.used, epoch.weights)
         return self.cost()
 
     def track(self, *, everything: bool = False) -> None:
@@ -303,7 +304,7 @@ class Window:
 
         The next epoch goes on from wherever this ends.
         """
-        n = len(self.epochs)
+        n = max(1, sum(e.turned for e in self.epochs))
         steps = min(_MAX_STEPS, self._work // n - 1)
         if steps < 1:
             return False
@@ -316,7 +317,7 @@ class Window:
         moved = [
             k
             for k, e in enumerate(self.epochs)
-            if sigmas(c - e.factor.point.c, information) > _STALE
+            if e.turned and sigmas(c - e.factor.point.c, information) > _STALE
         ]
         return moved or [len(self.epochs) - 1]
 

@@ -68,8 +68,8 @@ def rotation(angles: Array) -> Array:
 def angles(kind: str, motion: str, time_s: Array, rng: np.random.Generator) -> Array:
     """Roll, pitch, yaw (n, 3) in rad of a set ("wam", "mam", "lam", "planar") in a motion."""
     if kind == "planar":
-        zero = np.zeros_like(time_s)
-        return np.stack([zero + 0.01, zero - 0.02, 0.25 * time_s], axis=1)
+        zero = np.zeros_like(time_s)  # a minute at rest, which tells the gyro's bias, then circles
+        return np.stack([zero + 0.01, zero - 0.02, 0.25 * np.maximum(time_s - 60.0, 0.0)], axis=1)
     half = np.radians(HALF_RANGE_DEG[kind])
     if motion == "slow":
         frequency = np.array([rng.uniform(5, 10), rng.uniform(5, 8), rng.uniform(4, 8)]) * 1e-3
