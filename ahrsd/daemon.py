@@ -26,6 +26,7 @@ from ahrsd.config_text import print_config
 from ahrsd.core import Core
 from ahrsd.errors import EXIT_DONE, ConfigError
 from ahrsd.interlock import InterlockFile
+from ahrsd.operator_box import OperatorBox
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
@@ -42,6 +43,7 @@ _REOPEN_S = (0.05, 2.0)  # first wait for a port to come back, longest wait
 _LONGEST_WAIT_S = 0.2
 _STOP_S = 2.5  # for putting things back; a service manager's patience is limited
 _INTERLOCK_S = 0.2
+_OPERATOR_S = 0.5
 _WALL_STEP_S = 1.0
 _VIEWER_S = 3.0
 
@@ -78,16 +80,17 @@ class Daemon:
         port_path: Path,
         clock: HostClock,
         interlock: Vehicle | None = None,
+        box: OperatorBox | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
-        self._path, self._interlock = port_path, interlock
+        self._path, self._interlock, self._box = port_path, interlock, box
         self._queue: Queue = SimpleQueue()
         self._port: SerialPort | None = None
         self._reader: SerialReader | None = None
         self._baud: int | None = None
         self._stop_reason = ""
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
-        self._next_interlock_ns = 0
+        self._next_interlock_ns = self._next_box_ns = 0
         self._wall_offset_s = float("nan")
         self.opened = 0
 
@@ -141,6 +144,10 @@ class Daemon:
         if self._interlock is not None and now >= self._next_interlock_ns:
             self._next_interlock_ns = now + int(_INTERLOCK_S * 1e9)
             self._feed(inputs.Interlock(now, self._interlock.safe()))
+        if self._box is not None and now >= self._next_box_ns:
+            self._next_box_ns = now + int(_OPERATOR_S * 1e9)
+            for verb, argument in self._box.take():
+                self._operator.put(inputs.Operator(now, verb, argument))
         while True:
             with contextlib.suppress(queue.Empty):
                 self._feed(self._operator.get_nowait())
@@ -291,13 +298,18 @@ def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
     if port is None:
         raise ConfigError(["device.port: no port is given"])
     config = with_date(config)
+    box = OperatorBox(config.state)
+    try:
+        box.prepare()
+    except OSError as error:
+        raise ConfigError([f"state_directory: {box.folder}: {error.strerror}"]) from None
     clock = HostClock()
     capture = new_capture_path(config.captures) if config.capture.enabled else None
     shell = open_shell(config, clock, capture)
     interlock = None
     if config.interlock.file is not None:
         interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
-    daemon = Daemon(config, shell, port, clock, interlock)
+    daemon = Daemon(config, shell, port, clock, interlock, box)
     try:
         with _signals(daemon):
             daemon.run()

@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     "calibrate": "Batch calibration of a recording.",
     "simulate": "A recording of a scenario, with the truth beside it.",
     "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
+    "operator": "A person's word to the running daemon: approve, lock, unlock, rollback.",
     "registers": "Read, compare, write and roll back the device's registers.",
 }
 
