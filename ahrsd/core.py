@@ -103,6 +103,7 @@ class Core:
     def handle(self, item: inputs.Input) -> list[events.Event]:
         """Take one input; everything that follows from it, in order."""
         self._host_s = max(self._host_s, item.host_ns * 1e-9)
+        self._errands.let_out(self)
         # first of all: what is sent next is judged by how old the vehicle's word is *now*
         self._errands.add(self.writeback.tick(self._host_s))
         self._handlers[type(item)](item)
@@ -253,15 +254,18 @@ class Core:
                 self._out.append(events.OpenJournal(identity.serial))
             case ConfigurationRead(values):
                 self._flush()
+                if self._unread:  # what was taken as it came does not mix with what is un-mapped
+                    self.calibrator, self._unread = Calibrator(*self._from_scratch), False
                 self._in_force(values)
                 self._rollcall.registers(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
-            case StreamChanged(text):
+            case StreamChanged(text, level):
                 self._flush()
                 self.stream.forget()
-                self._note("info", text)
+                self._note(level, text)
             case Unanswered(text):
+                self._unread = True
                 self._note("warning", f"{text}; listening only, nothing can be written")
                 self.epochs.begin(self._host_s, Compensation.unknown())
                 self._no_device()
@@ -343,6 +347,7 @@ class Core:
             self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
         if new and estimate is not None:
             self._judge()
+        self._errands.let_out(self)
 
     def _judge(self) -> None:
         estimate = self.calibrator.estimate

@@ -83,6 +83,15 @@ class Errands:
             first = self._writeback.on_journal_ok(kind, host_s)
         self._todo.extendleft(reversed(first))
 
+    def let_out(self, office: Office) -> None:
+        """Facts at the head of the line, at once: when they are told must not depend on chunks."""
+        while self._todo and not self._awaiting_journal:
+            action = self._todo[0]
+            if not isinstance(action, Emit):
+                return
+            self._todo.popleft()
+            office.emit(action.event)
+
     def work(self, office: Office, host_s: float) -> bool:
         """As far as it goes now; whether anything was done."""
         done = False
