@@ -5,7 +5,8 @@
                                                      READY <-> RUNNING (the write-back)
 ```
 In mode `passive` the port goes from CLOSED to READY at once and no byte is ever sent. A device that
-answers nothing is listened to: READY without an identity, so nothing can be written to it.
+answers nothing is listened to and asked again every `ASK_AGAIN_S`: it stays IDENTIFYING, without an
+identity, so nothing can be written to it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from enum import Enum
 
 from ahrsd.writeback.permissions import Mode, Purpose, permitted
 from drivers.vn100.calibration_stream import configure_stream
-from drivers.vn100.commands import Command, Procedure
+from drivers.vn100.commands import Command, LinkGone, Pause, Procedure
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -24,9 +25,12 @@ from drivers.vn100.procedures import (
     quiet,
     read_configuration,
     restore,
+    resume,
 )
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
+
+ASK_AGAIN_S = 10.0
 
 
 class Phase(Enum):
@@ -61,11 +65,12 @@ class StreamChanged:
     """Outputs were set up or put back: samples before and after do not follow each other."""
 
     text: str
+    level: str = "info"
 
 
 @dataclass(frozen=True, slots=True)
 class Unanswered:
-    """A procedure of the conversation's own failed; the device is only listened to."""
+    """The device does not say who it is; it is only listened to, and asked again now and then."""
 
     text: str
 
@@ -112,7 +117,7 @@ class Conversation:
         self._serial: int | None = None
         self._name = ""
         self._baud = 115200
-        self._stream_is_ours = False
+        self._touched = self._unanswered = False
         self._said: list[Said] = []
 
     def _allowed(self, command: Command) -> bool:
@@ -128,7 +133,8 @@ class Conversation:
     @property
     def may_close(self) -> bool:
         """Nothing is under way that must end before the port may be given back."""
-        return self.phase is Phase.CLOSED or self.idle
+        only_reads = self.phase in (Phase.IDENTIFYING, Phase.READING) and not self._must_restore
+        return self.phase is Phase.CLOSED or self.idle or only_reads
 
     @property
     def session_keys(self) -> frozenset[int]:
@@ -145,7 +151,6 @@ class Conversation:
     def opened(self, baud: int, now_s: float) -> list[Event]:
         """The port is open."""
         self._baud = baud
-        self._stream_is_ours = False
         if self.mode is Mode.PASSIVE:
             self.phase = Phase.READY
             return []
@@ -153,7 +158,6 @@ class Conversation:
 
     def identify_again(self, now_s: float) -> list[Event]:
         """The device may be another one, or itself after a reset: ask it everything again."""
-        self._stream_is_ours = False  # what we set up in RAM may be gone
         if self.mode is Mode.PASSIVE or self.phase is Phase.DONE:
             return []
         events = self._abandon(now_s)
@@ -204,21 +208,46 @@ class Conversation:
         """The user's own outputs are back for a save: set the session's up again."""
         if not (self.change_stream and self.idle):
             return []
-        self.phase = Phase.SETTING_UP
-        procedure = configure_stream(self.rate_hz, self._baud)
-        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
+        return self._digest(self._set_up(now_s), now_s)
 
     def restore_and_close(self, now_s: float) -> list[Event]:
-        """Put back what was changed for the session, then say Closed."""
-        if self.phase is Phase.CLOSED or not self._stream_is_ours:
+        """Put back what was changed for the session, then say Closed. Ends mere reading."""
+        known = self.phase is not Phase.CLOSED and self.identity is not None
+        events = [] if self.idle else self._abandon(now_s)
+        if not (self._must_restore and known):
             self.phase = Phase.DONE
-            self._said.append(Closed(None))
-            return []
+            self._said.append(Closed(LinkGone() if self._must_restore else None))
+            return events
         self.phase = Phase.RESTORING
         procedure = quiet(restore(self.saved, SESSION_SETTINGS))
-        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
+        return events + self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
+
+    def amends(self) -> Procedure[object] | None:
+        """What puts the device's output back after this program broke down; None: nothing need be.
+
+        Not for `run`: whoever calls this trusts no state of the conversation but what was saved.
+        """
+        if self._must_restore and self.identity is not None:
+            return quiet(restore(self.saved, SESSION_SETTINGS))
+        paused = self.phase in (Phase.RUNNING, Phase.RESTORING) and self.mode >= Mode.STAGE
+        return resume() if paused else None
+
+    def allows_amends(self, command: Command) -> bool:
+        """The gate of `amends`."""
+        purpose = Purpose.STREAM if self.change_stream else Purpose.ROLL_BACK
+        return permitted(command, self.mode, self.change_stream, purpose)
 
     # -- inside ----------------------------------------------------------------------------------
+
+    @property
+    def _must_restore(self) -> bool:
+        """The device that was read, and no other, may hold settings of this session."""
+        return self._touched and bool(self.saved)
+
+    def _set_up(self, now_s: float) -> list[Event]:
+        self.phase = Phase.SETTING_UP
+        self._touched = True  # from the first byte on, also where it breaks off half way
+        return self._start(configure_stream(self.rate_hz, self._baud), Purpose.STREAM, now_s)
 
     def _start(self, procedure: Procedure[object], purpose: Purpose, now_s: float) -> list[Event]:
         self._purpose = purpose
@@ -246,22 +275,31 @@ class Conversation:
             return []
         if phase is Phase.RESTORING:
             self.phase = Phase.DONE
-            self._stream_is_ours = False
-            self._said.append(StreamChanged("outputs put back as they were"))
+            if error is None:
+                self._touched = False
+                self._said.append(StreamChanged("outputs put back as they were"))
             self._said.append(Closed(error))
             return []
         if phase is Phase.CLOSED:
             return []
-        if error is not None:
+        if phase is Phase.SETTING_UP and error is not None:
             self.phase = Phase.READY
-            self._said.append(Unanswered(f"{phase.value}: {error}"))
+            text = f"the session's output cannot be set up, the device's own stays: {error}"
+            self._said.append(StreamChanged(text, "warning"))
             return []
+        if error is not None:
+            if not self._unanswered:
+                self._said.append(Unanswered(f"{phase.value}: {error}"))
+            self._unanswered = True
+            self.phase = Phase.IDENTIFYING
+            return self._start(_identify_later(), Purpose.READ, now_s)
         return self._next(phase, result, now_s)
 
     def _next(self, phase: Phase, result: object, now_s: float) -> list[Event]:
         if phase is Phase.IDENTIFYING and isinstance(result, Identity):
             if result.serial != self._serial:
                 self.saved = {}  # another device: nothing of the first one's is put back to it
+                self._touched = False
             self.identity, self._serial = result, result.serial
             self._said.append(Identified(result))
             self.phase = Phase.READING
@@ -269,13 +307,16 @@ class Conversation:
         if phase is Phase.READING and isinstance(result, dict):
             if not self.saved:
                 self.saved = dict(result)
+            self._unanswered = False
             self._said.append(ConfigurationRead(result))
-            if self.change_stream and not self._stream_is_ours:
-                self.phase = Phase.SETTING_UP
-                procedure = configure_stream(self.rate_hz, self._baud)
-                return self._start(procedure, Purpose.STREAM, now_s)
+            if self.change_stream:
+                return self._set_up(now_s)
         if phase is Phase.SETTING_UP:
-            self._stream_is_ours = True
             self._said.append(StreamChanged(f"output set up for the session: {result}"))
         self.phase = Phase.READY
         return []
+
+
+def _identify_later() -> Procedure[Identity]:
+    yield Pause(ASK_AGAIN_S)
+    return (yield from identify())

@@ -74,7 +74,7 @@ class Core:
         self.undecodable = 0
         self._host_s = 0.0
         self._stopping = ""
-        self._closing = self._uptime_due = False
+        self._closing = self._uptime_due = self._unread = False
         self._restarts = 0
         self._serial: int | None = None
         self._rollcall = Rollcall()

@@ -24,26 +24,30 @@ from ahrsd import inputs
 from ahrsd.config import CONFIG_KEY, Config
 from ahrsd.config_text import print_config
 from ahrsd.core import Core
-from ahrsd.errors import EXIT_DONE, ConfigError
+from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.interlock import InterlockFile
-from ahrsd.operator_box import OperatorBox
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
-from ahrsd.serial_reader import Bytes, Lost, SerialReader
+from ahrsd.serial_reader import Bytes, Lost, SerialLink, find_device
 from ahrsd.settings import core_settings, with_date
 from ahrsd.shell import JournalKeeper, Shell, journal_in
 from ahrsd.summary import summary_lines
-from drivers.serial_port import LinkLost, PortError, SerialPort, detect_baud
+from ahrsd.watch import Watch
+from drivers.serial_port import LinkLost, PortError
 from drivers.usb import latency_timer_ms
+from drivers.vn100.device import Device
+from drivers.vn100.errors import DriverError
 
 log = logging.getLogger("ahrsd")
 
-_REOPEN_S = (0.05, 2.0)  # first wait for a port to come back, longest wait
+_REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
+_STEADY_S = 2.0  # a link that lived so long may be reopened at once again
 _LONGEST_WAIT_S = 0.2
-_STOP_S = 2.5  # for putting things back; a service manager's patience is limited
+_STOP_S = 2.0  # for putting things back; a service manager's patience is limited
+_AMENDS_S = 2.0
 _INTERLOCK_S = 0.2
-_OPERATOR_S = 0.5
+_WATCH_S = 1.0
 _WALL_STEP_S = 1.0
 _VIEWER_S = 3.0
 
@@ -53,9 +57,6 @@ class Vehicle(Protocol):
 
     def safe(self) -> bool:
         """The word; anything that goes wrong is no."""
-
-
-Queue = SimpleQueue[Bytes | Lost | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,10 @@ class HostClock:
 
 
 class Daemon:
-    """Runs one device until `stop` is called. `listeners` on the shell see every event."""
+    """Runs one device until `stop` is called. `listeners` on the shell see every event.
+
+    baud: of the port where it was found already, else as the configuration says
+    """
 
     def __init__(
         self,
@@ -80,19 +84,24 @@ class Daemon:
         port_path: Path,
         clock: HostClock,
         interlock: Vehicle | None = None,
-        box: OperatorBox | None = None,
+        *,
+        baud: int | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
-        self._path, self._interlock, self._box = port_path, interlock, box
-        self._queue: Queue = SimpleQueue()
-        self._port: SerialPort | None = None
-        self._reader: SerialReader | None = None
-        self._baud: int | None = None
+        self._may_query = config.mode != "passive"
+        said = None if config.device.baud == "auto" else config.device.baud
+        known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
+        self._link = SerialLink(port_path, known, clock.now_ns)
+        self._queue = self._link.queue
+        self._interlock = interlock
+        self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
-        self._next_interlock_ns = self._next_box_ns = 0
+        self._next_interlock_ns = 0
         self._wall_offset_s = float("nan")
-        self.opened = 0
+        self._watch = Watch(time.monotonic())
+        self._next_watch_s = self._opened_s = self._retry_s = 0.0
+        self._wait_s = _REOPEN_S[0]
 
     # -- from outside ------------------------------------------------------------------------------
 
@@ -110,22 +119,27 @@ class Daemon:
 
     def run(self) -> None:
         """Until stopped. Raises PortError only where the port cannot be opened the first time."""
-        self._tell_wall()
-        self._open()
         try:
+            self._tell_wall()
+            self._open()
             while not self._stop_reason:
-                if self._port is None:
-                    self._wait_for_port()
-                    continue
                 self._turn(_LONGEST_WAIT_S)
             self._finish()
+        except PortError:
+            raise
+        except Exception:
+            self._make_amends()
+            raise
         finally:
-            self._close()
+            self._link.close()
+            self.shell.folded.finish()
 
     def _turn(self, longest_s: float) -> None:
         """One wait and what it brought."""
+        if not self._link.is_open:
+            self._reopen()
         try:
-            item = self._queue.get(timeout=self._wait_s(longest_s))
+            item = self._queue.get(timeout=self._patience_s(longest_s))
         except queue.Empty:
             item = None
         self._around()
@@ -133,34 +147,35 @@ class Daemon:
             self._feed(inputs.Received(item.host_ns, item.data))
         elif isinstance(item, Lost):
             self._lost(item.host_ns, item.reason)
-        if self._queue.empty():  # else what is waited for may lie in the queue already
-            now, deadline = self.clock.now_ns(), self.shell.core.deadline_ns
-            if deadline is not None and now >= deadline:
-                self._feed(inputs.Tick(now))
+        # what is waited for may lie in the queue already: it is late only against what was taken
+        behind = item is not None and not self._queue.empty()
+        self._tick(item.host_ns if item is not None and behind else self.clock.now_ns())
+        self._look()
+
+    def _tick(self, now_ns: int) -> None:
+        deadline = self.shell.core.deadline_ns
+        if deadline is not None and now_ns >= deadline:
+            self._feed(inputs.Tick(now_ns))
 
     def _around(self) -> None:
         """The vehicle's word, operators and the wall clock: before bytes are judged by them."""
         now = self.clock.now_ns()
         if self._interlock is not None and now >= self._next_interlock_ns:
-            self._next_interlock_ns = now + int(_INTERLOCK_S * 1e9)
+            self._next_interlock_ns = now + int(self._interlock_s * 1e9)
             self._feed(inputs.Interlock(now, self._interlock.safe()))
-        if self._box is not None and now >= self._next_box_ns:
-            self._next_box_ns = now + int(_OPERATOR_S * 1e9)
-            for verb, argument in self._box.take():
-                self._operator.put(inputs.Operator(now, verb, argument))
-        while True:
-            with contextlib.suppress(queue.Empty):
-                self._feed(self._operator.get_nowait())
-                continue
-            break
+        while not self._operator.empty():
+            self._feed(self._operator.get())
         self._tell_wall()
 
-    def _wait_s(self, longest_s: float) -> float:
+    def _patience_s(self, longest_s: float) -> float:
+        """How long to wait for bytes: until somebody wants to be woken."""
+        if not self._link.is_open:
+            longest_s = min(longest_s, self._retry_s - time.monotonic())
         deadline = self.shell.core.deadline_ns
-        if deadline is None:
-            return longest_s
-        left_s = (deadline - self.clock.now_ns()) * 1e-9 / self.clock.speed
-        return min(max(left_s, 0.0), longest_s)
+        if deadline is not None:
+            left_s = (deadline - self.clock.now_ns()) * 1e-9 / self.clock.speed
+            longest_s = min(longest_s, left_s)
+        return max(longest_s, 0.0)
 
     def _tell_wall(self) -> None:
         """The wall clock, at the start and when it was set: budgets count days by it."""
@@ -172,86 +187,94 @@ class Daemon:
 
     def _feed(self, item: inputs.Input) -> None:
         output = self.shell.feed(item)
-        if output and self._port is not None:
+        if output:
             try:
-                self._port.write(output)
+                self._link.write(output)
             except LinkLost as error:
                 self._lost(self.clock.now_ns(), str(error))
+
+    def _look(self) -> None:
+        """Once a second: what a person should hear."""
+        now_s = time.monotonic()
+        if now_s < self._next_watch_s:
+            return
+        self._next_watch_s = now_s + _WATCH_S
+        capture, now_ns = self.shell.capture, self.clock.now_ns()
+        error = "" if capture is None else capture.status.error
+        for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
+            self.shell.say(remark.level, remark.text, now_ns)
+        self.shell.folded.settle(now_ns * 1e-9)
+        if self._watch.garbage and self.config.device.baud == "auto":
+            self._link.doubt()
+            self._lost(now_ns, "no message in what arrives: looking for the rate")
 
     # -- the port ----------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        self._baud = self._find_baud()
-        port = SerialPort(self._path, self._baud)
-        self._port = port
-        self._reader = SerialReader(port, self._queue, self.clock.now_ns)
-        self.opened += 1
-        latency = latency_timer_ms(self._path)
-        now = self.clock.now_ns()
-        self._feed(inputs.LinkOpened(now, str(self._path), self._baud, latency))
-
-    def _find_baud(self) -> int:
-        said = self.config.device.baud
-        if said != "auto":
-            return said
-        if self._baud is not None:
-            return self._baud
-        found = detect_baud(self._path, may_query=self.config.mode != "passive")
-        log.info("%s", found)
-        return found.baud
+        self._link.open(may_query=self._may_query)
+        self._opened_s = time.monotonic()
+        self._watch.link_opened(self._opened_s)
+        path, now = self._link.path, self.clock.now_ns()
+        self._feed(inputs.LinkOpened(now, str(path), self._link.baud, latency_timer_ms(path)))
 
     def _lost(self, host_ns: int, reason: str) -> None:
-        self._close()
+        self._link.close()
+        if self._stop_reason:  # the mark that `stop` left went with the queue
+            self._queue.put(None)
+        now_s = time.monotonic()
+        if now_s - self._opened_s > _STEADY_S:
+            self._wait_s = _REOPEN_S[0]
+        self._retry_s = now_s + self._wait_s
         self._feed(inputs.LinkLost(host_ns, reason))
 
-    def _wait_for_port(self) -> None:
-        """Try again and again, quickly first; one line in the log, not one per try."""
-        wait_s, said = _REOPEN_S[0], ""
-        while not self._stop_reason:
-            try:
-                self._open()
-            except PortError as error:
-                if str(error) != said:
-                    said = str(error)
-                    log.warning("waiting for the device: %s", said)
-            else:
-                return
-            with contextlib.suppress(queue.Empty):
-                self._queue.get(timeout=wait_s)
-            self._around()
-            wait_s = min(wait_s * 1.5, _REOPEN_S[1])
+    def _reopen(self) -> None:
+        """Try again and again, quickly first."""
+        if time.monotonic() < self._retry_s:
+            return
+        self._wait_s = min(self._wait_s * 1.5, _REOPEN_S[1])
+        self._retry_s = time.monotonic() + self._wait_s
+        try:
+            self._open()
+        except PortError as error:
+            self.shell.say(logging.WARNING, f"waiting for the device: {error}", self.clock.now_ns())
 
-    def _close(self) -> None:
-        reader, port = self._reader, self._port
-        self._reader = self._port = None
-        if reader is not None:
-            reader.stop()
-        if port is not None:
-            port.close()
-        while True:  # what the reader still put there belongs to a link that is gone
-            try:
-                self._queue.get_nowait()
-            except queue.Empty:
-                break
-        if self._stop_reason:
-            self._queue.put(None)
+    # -- the end -----------------------------------------------------------------------------------
 
     def _finish(self) -> None:
         """Let the core put back what it changed; bounded in time."""
-        self._feed(inputs.Stop(self.clock.now_ns(), self._stop_reason))
         until = time.monotonic() + _STOP_S
-        while not self.shell.finished and time.monotonic() < until and self._port is not None:
+        self._feed(inputs.Stop(self.clock.now_ns(), self._stop_reason))
+        while not self.shell.finished and time.monotonic() < until:
             self._turn(0.05)
         if not self.shell.finished:
-            log.error("stopped without having put everything back: %s", self._stop_reason)
+            text = f"stopped ({self._stop_reason}) without having put everything back"
+            self.shell.say(logging.ERROR, text, self.clock.now_ns())
+
+    def _make_amends(self) -> None:
+        """After a bug of ours: the device streams again as before, whatever the core believes."""
+        log.exception("internal error; putting the device's output back")
+        talk = self.shell.core.conversation
+        procedure, port = talk.amends(), self._link.take_port()
+        if port is None:
+            return
+        try:
+            with Device(port, talk.allows_amends) as device:
+                if procedure is not None:
+                    device.run(procedure, _AMENDS_S)
+        except DriverError as error:
+            log.error("the device's output is not as it was: %s", error)
+
+
+class _Stopped(Exception):
+    """A signal came before there was anything to put back."""
 
 
 @contextlib.contextmanager
-def _signals(daemon: Daemon) -> Iterator[None]:
-    """SIGTERM and SIGINT end the run in an orderly way."""
+def _signals(stop: Callable[[str], None]) -> Iterator[None]:
+    """SIGTERM and SIGINT call `stop` with their name."""
 
     def handler(number: int, _: FrameType | None) -> None:
-        daemon.stop(signal.Signals(number).name)
+        stop(signal.Signals(number).name)
 
     before = {s: signal.signal(s, handler) for s in (signal.SIGTERM, signal.SIGINT)}
     try:
@@ -261,23 +284,39 @@ def _signals(daemon: Daemon) -> Iterator[None]:
             signal.signal(number, old)
 
 
+def _stop_searching(name: str) -> None:
+    raise _Stopped(name)
+
+
 def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
-    """The core with its capture, journal and viewer, as the configuration says."""
-    writer = None
-    if capture is not None:
-        capture.parent.mkdir(parents=True, exist_ok=True)
-        writer = CaptureWriter(
-            capture,
-            {"program": "ahrsd run", CONFIG_KEY: print_config(config)},
-            part_bytes=config.capture.part_megabytes * 1_000_000,
-            keep_bytes=config.capture.keep_megabytes * 1_000_000,
-        )
+    """The core with its capture, journal and viewer, as the configuration says.
+
+    Raises CaptureError where there can be no capture.
+    """
+    core = Core(core_settings(config))
+    writer = None if capture is None else _open_capture(config, capture)
     viewer = None
     if config.rerun.file is not None or config.rerun.serve:
         limits = RerunLimits(server_bytes=config.rerun.memory_megabytes * 1_000_000)
         viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port, limits=limits)
     keeper = JournalKeeper(journal_in(config.state), clock.now_ns)
-    return Shell(Core(core_settings(config)), writer, keeper, viewer)
+    return Shell(core, writer, keeper, viewer)
+
+
+def _open_capture(config: Config, path: Path) -> CaptureWriter:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CaptureError(
+            f"{path.parent}: the folder of the captures cannot be made: {error.strerror}; set "
+            "capture.directory, or capture.enabled = false"
+        ) from error
+    return CaptureWriter(
+        path,
+        {"program": "ahrsd run", CONFIG_KEY: print_config(config)},
+        part_bytes=config.capture.part_megabytes * 1_000_000,
+        keep_bytes=config.capture.keep_megabytes * 1_000_000,
+    )
 
 
 def close_shell(shell: Shell) -> None:
@@ -293,25 +332,32 @@ def close_shell(shell: Shell) -> None:
 
 
 def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
-    """`ahrsd run`: until a signal; returns the exit code."""
+    """`ahrsd run`: until a signal; returns the exit code.
+
+    A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
+    PortError, ConfigError, CaptureError.
+    """
     port = config.device.port
     if port is None:
         raise ConfigError(["device.port: no port is given"])
-    config = with_date(config)
-    box = OperatorBox(config.state)
+    said = None if config.device.baud == "auto" else config.device.baud
     try:
-        box.prepare()
-    except OSError as error:
-        raise ConfigError([f"state_directory: {box.folder}: {error.strerror}"]) from None
+        with _signals(_stop_searching):
+            found = find_device(port, said, may_query=config.mode != "passive")
+    except _Stopped as stopped:
+        log.info("stopped (%s) before a device was found", stopped)
+        return EXIT_DONE
+    log.info("%s: %s", port, found.why)
+    config = with_date(config)
     clock = HostClock()
     capture = new_capture_path(config.captures) if config.capture.enabled else None
     shell = open_shell(config, clock, capture)
     interlock = None
     if config.interlock.file is not None:
         interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
-    daemon = Daemon(config, shell, port, clock, interlock, box)
+    daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud)
     try:
-        with _signals(daemon):
+        with _signals(daemon.stop):
             daemon.run()
     finally:
         close_shell(shell)

@@ -7,7 +7,7 @@ before the core sees it, carries out what the core answers, and returns the byte
 from __future__ import annotations
 
 import logging
-import time
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,8 @@ from ahrsd.recording.capture import CaptureWriter
 log = logging.getLogger("ahrsd")
 
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
+_FOLD_S = 60.0
+_FOLD_TEXTS = 64
 
 
 class Viewer(Protocol):
@@ -36,6 +38,41 @@ Listener = Callable[[events.Event], None]  # somebody else who wants every event
 
 
 @dataclass(slots=True)
+class FoldedLog:
+    """The log, in which a text that comes again within a minute is only counted."""
+
+    write: Callable[[int, str], None] = lambda level, text: log.log(level, "%s", text)
+    _open: OrderedDict[tuple[int, str], tuple[float, int]] = field(default_factory=OrderedDict)
+
+    def say(self, level: int, text: str, now_s: float) -> None:
+        """Write it now, or count it."""
+        self.settle(now_s)
+        key = (level, text)
+        if key in self._open:
+            since_s, count = self._open[key]
+            self._open[key] = (since_s, count + 1)
+            return
+        self.write(level, text)
+        self._open[key] = (now_s, 0)
+        if len(self._open) > _FOLD_TEXTS:
+            self._end(*self._open.popitem(last=False))
+
+    def settle(self, now_s: float) -> None:
+        """Write the counts whose minute is over."""
+        while self._open and now_s - next(iter(self._open.values()))[0] >= _FOLD_S:
+            self._end(*self._open.popitem(last=False))
+
+    def finish(self) -> None:
+        """The end: write every count."""
+        while self._open:
+            self._end(*self._open.popitem(last=False))
+
+    def _end(self, key: tuple[int, str], value: tuple[float, int]) -> None:
+        if value[1]:
+            self.write(key[0], f"{key[1]} ({value[1]} more times)")
+
+
+@dataclass(slots=True)
 class JournalKeeper:
     """Opens the journal of the device that answers, appends, and says how it went."""
 
@@ -45,10 +82,10 @@ class JournalKeeper:
 
     def opened(self, serial: int) -> JournalOpened:
         """Open the journal of a device; an error is an answer, not an exception."""
+        self.journal = None
         try:
             self.journal = self.open(serial)
         except JournalError as error:
-            self.journal = None
             return JournalOpened(self.now_ns(), serial, [], str(error))
         records: list[dict[str, object]] = [
             {"kind": r.kind, "facts": dict(r.facts)} for r in self.journal.records()
@@ -76,7 +113,7 @@ class Shell:
     viewer: Viewer | None = None
     listeners: list[Listener] = field(default_factory=list)
     finished: bool = False
-    core_s: float = 0.0
+    folded: FoldedLog = field(default_factory=FoldedLog)
 
     def feed(self, item: Input) -> bytes:
         """One input through the core; returns what must be written to the port."""
@@ -86,12 +123,16 @@ class Shell:
             one = waiting.pop(0)
             if self.capture is not None:
                 self.capture.write(one)
-            started = time.process_time()
-            answers = self.core.handle(one)
-            self.core_s += time.process_time() - started
-            for event in answers:
+            for event in self.core.handle(one):
                 output += self._carry_out(event, one.host_ns, waiting)
         return bytes(output)
+
+    def say(self, level: int, text: str, host_ns: int) -> None:
+        """A fact of the shell's own, for the log and the record."""
+        self.folded.say(level, text, host_ns * 1e-9)
+        if self.capture is not None:
+            name = logging.getLevelName(level).lower()
+            self.capture.write_event(host_ns, {"note": text, "level": name})
 
     def _carry_out(self, event: events.Event, host_ns: int, waiting: list[Input]) -> bytes:
         if self.viewer is not None:
@@ -116,28 +157,25 @@ class Shell:
         return b""
 
     def _log(self, event: events.Event, host_ns: int) -> None:
-        fact: dict[str, object] | None = None
+        line: tuple[int, str] | None = None
         match event:
             case events.Noted(at_s, _, level, text):
-                log.log(_LEVELS[level], "%s", text, extra={"device_s": round(at_s, 3)})
-                fact = {"note": text, "level": level, "at_s": at_s}
+                line = (_LEVELS[level], text)
+                fact: dict[str, object] = {"note": text, "level": level, "at_s": at_s}
             case events.StateChanged(at_s, _, old, new, reason):
-                log.info("%s -> %s: %s", old, new, reason, extra={"device_s": round(at_s, 3)})
+                line = (logging.INFO, f"{old} -> {new}: {reason}")
                 fact = {"state": new, "from": old, "reason": reason, "at_s": at_s}
             case events.RegisterWritten(at_s, _, register, old_values, new_values, outcome):
-                log.info("register %d %s: %s", register, outcome, new_values)
-                fact = {
-                    "register": register,
-                    "old": old_values,
-                    "new": new_values,
-                    "outcome": outcome,
-                    "at_s": at_s,
-                }
+                line = (logging.INFO, f"register {register} {outcome}: {new_values}")
+                values = {"old": old_values, "new": new_values}
+                fact = {"register": register, **values, "outcome": outcome, "at_s": at_s}
             case events.Judged(at_s, _, gates):
                 fact = {"at_s": at_s, "gates": {g.gate: [g.value, g.limit, g.ok] for g in gates}}
             case _:
                 return
-        if self.capture is not None and fact is not None:
+        if line is not None:
+            self.folded.say(*line, host_ns * 1e-9)
+        if self.capture is not None:
             self.capture.write_event(host_ns, fact)
 
 
@@ -146,7 +184,6 @@ def journal_in(directory: Path) -> Callable[[int], Journal]:
     from ahrsd.journal import journal_path
 
     def opener(serial: int) -> Journal:
-        directory.mkdir(parents=True, exist_ok=True)
         return Journal.open(journal_path(directory, serial))
 
     return opener
