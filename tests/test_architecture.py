@@ -33,6 +33,7 @@ SHELL = (
     "ahrsd.interlock",
     "ahrsd.journal",
     "ahrsd.logs",
+    "ahrsd.montecarlo",
     "ahrsd.operator_box",
     "ahrsd.recording",
     "ahrsd.replay",

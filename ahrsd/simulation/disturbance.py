@@ -62,7 +62,7 @@ def disturbed(experiment: Experiment, wanted: Disturbances, rng: np.random.Gener
     if wanted.gap_at_s is None:
         return changed
     inside = (time_s > wanted.gap_at_s) & (time_s < wanted.gap_at_s + wanted.gap_length_s)
-    return changed.taken(np.asarray(~inside))
+    return changed.taken(~inside)
 
 
 def _outliers(count: int, wanted: Disturbances, rng: np.random.Generator) -> Array:

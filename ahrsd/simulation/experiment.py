@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.samples import Array, SampleBlock
@@ -40,12 +41,11 @@ class Experiment:
         """Row 0 and every row behind a gap."""
         return [0, *(np.flatnonzero(np.isnan(self.samples.dt_s[1:])) + 1).tolist()]
 
-    def before(self, time_s: float) -> Experiment:
-        """The part up to `time_s` after the first sample."""
-        first_s = self.samples.time_s[0]
-        return self.taken(self.samples.time_s <= first_s + time_s + 1e-9)
+    def first(self, count: int) -> Experiment:
+        """The first `count` samples."""
+        return self.taken(np.arange(len(self)) < count)
 
-    def taken(self, rows: Array) -> Experiment:
+    def taken(self, rows: NDArray[np.bool]) -> Experiment:
         """The rows for which `rows` (N,) bool is true; steps over left-out rows become unknown."""
         index = np.flatnonzero(rows)
         new = index[np.flatnonzero(np.diff(index) > 1) + 1]

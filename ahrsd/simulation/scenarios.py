@@ -9,7 +9,7 @@ import numpy as np
 from ahrsd.simulation import motion
 from ahrsd.simulation.disturbance import Disturbances, disturbed
 from ahrsd.simulation.experiment import Experiment, measured
-from ahrsd.simulation.truth import Iron
+from ahrsd.simulation.truth import Iron, Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,11 @@ class Settings:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0 and (value > 0 or name != "rate_hz")):
                 raise ValueError(f"{name} is {value}: it must be a positive number")
+
+    @property
+    def truth(self) -> Truth:
+        """What is hidden, before any disturbance."""
+        return self.iron.truth(self.noise_mag_gauss, self.noise_gyro_rad_s)
 
 
 def generator(seed: int, purpose: int) -> np.random.Generator:

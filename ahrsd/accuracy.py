@@ -1,0 +1,149 @@
+"""How far a calibration is from the truth, in the figures of the theses.
+
+hard iron, gyro bias: norm of the error ([R] Table 5.1); soft iron: Frobenius norm, and the
+affine-invariant distance | log eig(A^-1 B) | (the geodesic of positive definite matrices); heading:
+RMS over the trajectory ([R] Table 5.2); NEES: e^T P^-1 e, whose mean is its degrees of freedom
+where the covariance P is honest. Every soft iron is taken to det A = 1 first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.headings import tilt_compensated_heading, wrapped
+from ahrsd.samples import Array
+from ahrsd.simulation import Experiment, Truth
+
+_STEEPEST_SIN = float(np.sin(np.radians(80.0)))  # beyond this pitch nobody asks for a heading
+_TABLE_5_2_NOISE_GAUSS = 0.010
+_EVERY = 5  # samples: neighbours say nothing new about a heading
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What a method says; None where it does not estimate that part.
+
+    soft_iron: A (3, 3), any volume; covariance: (12, 12) as `Estimate.covariance`
+    """
+
+    soft_iron: Array | None
+    hard_iron_gauss: Array | None
+    gyro_bias_rad_s: Array | None
+    covariance: Array | None = None
+    converged: bool = True
+
+    @staticmethod
+    def of(estimate: Estimate) -> Answer:
+        """The estimator's answer."""
+        return Answer(
+            estimate.soft_iron,
+            estimate.hard_iron_gauss,
+            estimate.gyro_bias_rad_s,
+            estimate.covariance,
+            estimate.converged,
+        )
+
+
+def unit_volume(soft_iron: Array) -> Array:
+    """A / det(A)^(1/3).  ValueError where A (3, 3) is not finite or turns space inside out."""
+    volume = float(np.linalg.det(soft_iron))
+    if not (np.isfinite(volume) and volume > 0):
+        raise ValueError(f"a soft iron of determinant {volume:.3g} cannot be one")
+    return np.asarray(soft_iron / np.cbrt(volume))
+
+
+def geodesic(A: Array, B: Array) -> float:
+    """Affine-invariant distance of two symmetric positive definite matrices.
+
+    Raises LinAlgError where B is not positive definite.
+    """
+    return float(np.linalg.norm(np.log(eigh((A + A.T) / 2, (B + B.T) / 2, eigvals_only=True))))
+
+
+def nees(error: Array, covariance: Array, soft_iron: Array) -> float:
+    """e^T P^+ e over its 11 degrees of freedom: (12,), (12, 12), A with det A = 1.
+
+    det A = 1 takes one direction away, the gradient of det in A's upper triangle: what the
+    covariance is there, is rounding. Off-diagonal entries count twice in that gradient.
+    """
+    gradient = np.zeros(12)
+    inverse = np.linalg.inv(soft_iron)
+    gradient[:6] = (inverse * (2.0 - np.eye(3)))[np.triu_indices(3)]
+    scale = np.sqrt(np.diag(covariance))
+    normal = gradient * scale  # in units of each parameter's sigma, which are wide apart
+    _, _, Vt = np.linalg.svd(normal[None, :])
+    Q = Vt[1:]
+    P = Q @ (covariance / np.outer(scale, scale)) @ Q.T
+    z = Q @ (error / scale)
+    return float(z @ np.linalg.solve(P, z)) / len(z)
+
+
+def heading_rms_deg(
+    experiment: Experiment, soft_iron: Array, hard_iron_gauss: Array, noise_gauss: float = 0.0
+) -> float:
+    """RMS heading error over the trajectory, up to 80 deg of pitch, with level attitude known.
+
+    The field is free of noise unless asked; the noise is the same draw for every method.
+    """
+    rows = slice(None, None, _EVERY)
+    R_nb, field_b, truth = experiment.R_nb[rows], experiment.field_b[rows], experiment.truth
+    usable = np.abs(R_nb[:, 2, 0]) < _STEEPEST_SIN
+    up = -R_nb[usable, 2, :]
+    field_b = field_b[usable]
+    read = field_b @ truth.soft_iron.T + truth.hard_iron_gauss
+    if noise_gauss > 0:
+        read += noise_gauss * np.random.default_rng(0).standard_normal(read.shape)
+    corrected = Affine(np.asarray(np.linalg.inv(soft_iron), float), hard_iron_gauss).apply(read)
+    error = wrapped(tilt_compensated_heading(corrected, up) - tilt_compensated_heading(field_b, up))
+    return float(np.degrees(np.sqrt(np.mean(np.square(error)))))
+
+
+def figures(answer: Answer, experiment: Experiment) -> dict[str, float | None]:
+    """All errors of an answer by name; None where the answer does not say that part.
+
+    Raises ValueError (LinAlgError is one) where what it says is no calibration.
+    """
+    truth = experiment.truth
+    out: dict[str, float | None] = dict.fromkeys(FIGURES)
+    A, b, bias = answer.soft_iron, answer.hard_iron_gauss, answer.gyro_bias_rad_s
+    for name, value, true in (
+        ("hard_iron_gauss", b, truth.hard_iron_gauss),
+        ("gyro_bias_rad_s", bias, truth.gyro_bias_rad_s),
+    ):
+        if value is not None:
+            out[name] = _finite(name, float(np.linalg.norm(value - true)))
+    if A is not None:
+        A = unit_volume(A)
+        out["soft_iron"] = float(np.linalg.norm(A - truth.soft_iron))
+        out["soft_iron_geodesic"] = geodesic(A, truth.soft_iron)
+    if A is not None and b is not None:
+        out["heading_deg"] = heading_rms_deg(experiment, A, b)
+        noise = _TABLE_5_2_NOISE_GAUSS
+        out["heading_10mg_deg"] = heading_rms_deg(experiment, A, b, noise)
+        if bias is not None and answer.covariance is not None:
+            found = Truth(A, b, bias, truth.field_gauss, 0.0, 0.0).parameters
+            out["nees"] = nees(found - truth.parameters, answer.covariance, A)
+    return out
+
+
+def _finite(name: str, value: float) -> float:
+    if not np.isfinite(value):
+        raise ValueError(f"{name} is not finite")
+    return value
+
+
+#: name -> words and unit for a table, and the factor from the SI value to that unit
+FIGURES: Mapping[str, tuple[str, float]] = {
+    "hard_iron_gauss": ("hard iron mG", 1e3),
+    "soft_iron": ("soft iron F", 1.0),
+    "soft_iron_geodesic": ("geodesic", 1.0),
+    "gyro_bias_rad_s": ("gyro mrad/s", 1e3),
+    "heading_deg": ("heading deg", 1.0),
+    "heading_10mg_deg": ("at 10 mG deg", 1.0),
+    "nees": ("NEES/dof", 1.0),
+}

@@ -1,0 +1,271 @@
+"""Monte Carlo: methods on many seeds of one scenario, against truth and the Cramer-Rao bound.
+
+One run is one seed: simulate, compute the bound, let every method answer at every time asked for.
+Runs go to separate processes; each finished run is one line of a file, so that a stopped
+experiment goes on where it was (`resume`). The record of a seed does not depend on the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from ahrsd.accuracy import Answer, figures, unit_volume
+from ahrsd.bound import Trajectory, UnobservableError, cramer_rao
+from ahrsd.errors import AhrsdError
+from ahrsd.estimator.online import Estimator
+from ahrsd.samples import Array
+from ahrsd.simulation import Experiment, Iron, Settings, simulate
+
+Record = dict[str, Any]  # one run, as it stands in the file: see `run_one`
+Batch = Callable[[Experiment], Answer]
+
+STREAM = "magyc-stream"
+_CHUNK = 25  # samples handed to the stream at a time
+_THREADS = "OPENBLAS_NUM_THREADS"
+
+
+class MethodError(AhrsdError):
+    """A method that does not answer, in its own words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What every run does.
+
+    at_s: times at which the methods answer, from the samples up to then; the last one is the length
+    offset_behind_iron: b = m_b as in [R]'s Table 5.1, else b = A m_b
+    """
+
+    scenario: str
+    motion: str = "slow"
+    methods: tuple[str, ...] = ("magyc", STREAM)
+    at_s: tuple[float, ...] = (50.0, 100.0, 200.0, 400.0)
+    rate_hz: float = 25.0
+    noise_mag_gauss: float = 1e-3
+    noise_gyro_rad_s: float = 5e-3
+    offset_behind_iron: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for times that do not increase; the rest is checked by `Settings`."""
+        if not self.at_s or any(b <= a for a, b in zip((0.0, *self.at_s), self.at_s)):
+            raise ValueError(f"times must be positive and increase: {list(self.at_s)}")
+        self.settings(0)
+
+    def settings(self, seed: int) -> Settings:
+        """The experiment of a seed."""
+        return Settings(
+            scenario=self.scenario,
+            motion=self.motion,
+            seed=seed,
+            samples=self.samples(self.at_s[-1]),
+            rate_hz=self.rate_hz,
+            noise_mag_gauss=self.noise_mag_gauss,
+            noise_gyro_rad_s=self.noise_gyro_rad_s,
+            iron=Iron(offset_behind_iron=self.offset_behind_iron),
+        )
+
+    def samples(self, at_s: float) -> int:
+        """How many samples there are up to a time."""
+        return round(at_s * self.rate_hz)
+
+    @property
+    def key(self) -> str:
+        """Names the file of this plan's runs; another plan never shares it."""
+        text = json.dumps(asdict(self), sort_keys=True)
+        return f"{self.scenario}-{self.motion}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+
+
+def magyc(experiment: Experiment) -> Answer:
+    """Every sample, iterated to the end.  Raises MethodError."""
+    estimator = Estimator()
+    for block in experiment.blocks(1000):
+        estimator.add(block)
+    estimate = estimator.finish()
+    if estimate is None:
+        raise MethodError("no estimate")
+    return Answer.of(estimate)
+
+
+BATCH: dict[str, Batch] = {"magyc": magyc}
+
+
+def known_methods() -> tuple[str, ...]:
+    """Ids of all methods, ours first."""
+    return (*BATCH, STREAM)
+
+
+def run_one(plan: Plan, seed: int) -> Record:
+    """One seed: `bounds` by time, and `results` by method and time."""
+    experiment = simulate(plan.settings(seed))
+    results: list[Record] = []
+    for method in plan.methods:
+        answers = _streamed if method == STREAM else _in_batches
+        results += answers(plan, method, experiment)
+    return {"seed": seed, "bounds": [_bound(plan, experiment, t) for t in plan.at_s]} | {
+        "results": results
+    }
+
+
+def _bound(plan: Plan, experiment: Experiment, at_s: float) -> Record:
+    truth = experiment.truth
+    whole = Trajectory(experiment.field_b, experiment.rate_b_rad_s, experiment.samples.dt_s)
+    part = whole.before(plan.samples(at_s))
+    try:
+        bound = cramer_rao(part, truth.soft_iron, plan.noise_mag_gauss, plan.noise_gyro_rad_s)
+    except UnobservableError:
+        return {"at_s": at_s, "hard_iron_gauss": None, "soft_iron": None, "gyro_bias_rad_s": None}
+    return {
+        "at_s": at_s,
+        "hard_iron_gauss": bound.hard_iron_gauss,
+        "soft_iron": bound.soft_iron,
+        "gyro_bias_rad_s": bound.gyro_bias_rad_s,
+    }
+
+
+def _in_batches(plan: Plan, method: str, experiment: Experiment) -> Iterator[Record]:
+    answer = BATCH[method]
+    for at_s in plan.at_s:
+        part = experiment.first(plan.samples(at_s))
+        yield _result(method, at_s, experiment, lambda part=part: answer(part))  # type: ignore[misc]
+
+
+def _streamed(plan: Plan, method: str, experiment: Experiment) -> Iterator[Record]:
+    """The stream as the daemon feeds it, asked at the given times and never stopped."""
+    estimator = Estimator()
+    begun_s = time.process_time()
+    waiting = list(plan.at_s)
+    fed = 0
+    for block in experiment.blocks(_CHUNK):
+        estimator.add(block)
+        fed += len(block)
+        while waiting and fed >= plan.samples(waiting[0]):
+            yield _result(method, waiting.pop(0), experiment, lambda: _present(estimator), begun_s)
+
+
+def _present(estimator: Estimator) -> Answer:
+    estimate = estimator.estimate()
+    if estimate is None:
+        raise MethodError("no estimate yet")
+    return Answer.of(estimate)
+
+
+def _result(
+    method: str,
+    at_s: float,
+    experiment: Experiment,
+    ask: Callable[[], Answer],
+    begun_s: float | None = None,
+) -> Record:
+    """An answer with its errors, or the failure in words; CPU seconds since `begun_s` or now."""
+    since_s = time.process_time() if begun_s is None else begun_s
+    out: Record = {"method": method, "at_s": at_s, "failure": None}
+    try:
+        answer = ask()
+        out["cpu_s"] = time.process_time() - since_s
+        out["errors"] = figures(answer, experiment)
+    except (AhrsdError, ValueError, ArithmeticError, RuntimeError) as error:
+        # RuntimeError is what GTSAM throws; LinAlgError is a ValueError
+        words = str(error).splitlines()
+        return out | {
+            "failure": words[0] if words else type(error).__name__,
+            "cpu_s": time.process_time() - since_s,
+        }
+    A = answer.soft_iron
+    return out | {
+        "converged": bool(answer.converged),
+        "soft_iron": None if A is None else unit_volume(A).tolist(),
+        "hard_iron_gauss": _listed(answer.hard_iron_gauss),
+        "gyro_bias_rad_s": _listed(answer.gyro_bias_rad_s),
+    }
+
+
+def _listed(value: Array | None) -> list[float] | None:
+    return None if value is None else value.tolist()
+
+
+def run_many(
+    plan: Plan,
+    seeds: Sequence[int],
+    *,
+    jobs: int = 1,
+    resume: Path | None = None,
+    done: Callable[[int, int], None] | None = None,
+) -> list[Record]:
+    """All runs in the order of the seeds; those already in `resume` are read, not run again.
+
+    done: called with the number of runs finished and of all. Raises AhrsdError where the file
+    cannot be used or a process died.
+    """
+    path = None if resume is None else resume / f"{plan.key}.jsonl"
+    records = {} if path is None else _kept(path)
+    missing = [seed for seed in seeds if seed not in records]
+    finished = len(seeds) - len(missing)
+    if done is not None:
+        done(finished, len(seeds))
+    for record in _computed(plan, missing, jobs):
+        records[record["seed"]] = record
+        if path is not None:
+            _keep(path, record)
+        finished += 1
+        if done is not None:
+            done(finished, len(seeds))
+    return [records[seed] for seed in seeds]
+
+
+def _computed(plan: Plan, seeds: Sequence[int], jobs: int) -> Iterator[Record]:
+    if jobs == 1 or len(seeds) < 2:
+        for seed in seeds:
+            yield run_one(plan, seed)
+        return
+    os.environ.setdefault(_THREADS, "1")  # read by the children when they load numpy
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+    try:
+        for future in as_completed([pool.submit(run_one, plan, seed) for seed in seeds]):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise AhrsdError("a process of the Monte Carlo died; --resume goes on from here") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _kept(path: Path) -> dict[int, Record]:
+    """Finished runs; a last line that was cut short by a kill is run again."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be read: {error.strerror}") from error
+    records = {}
+    for line in text.split("\n")[:-1]:
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        records[int(record["seed"])] = record
+    return records
+
+
+def _keep(path: Path, record: Record) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torn = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
+        with path.open("a", encoding="utf-8") as file:
+            file.write(("\n" if torn else "") + json.dumps(record) + "\n")
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def plans(plan: Plan, scenarios: Sequence[str], motions: Sequence[str]) -> list[Plan]:
+    """The same plan for every scenario in every motion."""
+    return [replace(plan, scenario=s, motion=m) for s in scenarios for m in motions]
