@@ -135,8 +135,8 @@ def test_rise_integrates_the_gradient():
     assert sides[0] - sides[1] == pytest.approx(2 * g @ h, rel=1e-5)
 
 
-def test_an_epoch_that_does_not_calibrate_says_nothing_of_c():
-    """Its factor is the marginal over c: what it says of the rest holds whatever c is."""
+def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
+    """The marginal over its borders at the present c, and a token on the borders themselves."""
     rng = np.random.default_rng(0)
     J = rng.normal(size=(40, 16)) * 100
 
@@ -146,20 +146,21 @@ def test_an_epoch_that_does_not_calibrate_says_nothing_of_c():
 
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
     factor = epoch_factor(Quadratic, 0, Point(np.zeros(9), node, node), 0.0, calibrates=False)
-    assert not factor.H[C].any()
-    assert not factor.g[C].any()
-    rest = np.r_[9:12, 12:14, 17:19]
-    covariance = np.linalg.inv(Quadratic.H)[9:, 9:]
-    np.testing.assert_allclose(
-        np.linalg.inv(factor.H[np.ix_(rest, rest)]), covariance, rtol=1e-4, atol=1e-9
-    )
-    solution = np.linalg.solve(factor.H[np.ix_(rest, rest)], factor.g[rest])
-    np.testing.assert_allclose(solution, np.linalg.solve(Quadratic.H, Quadratic.g)[9:], rtol=1e-4)
+    own = Quadratic.H[9:, 9:]
+    expected = np.zeros((SIZE, SIZE))
+    expected[9:12, 9:12] = np.linalg.inv(np.linalg.inv(own)[:3, :3])
+    expected[[12, 13, 17, 18], [12, 13, 17, 18]] = 1.0
+    np.testing.assert_allclose(factor.H, expected, atol=1e-6)
+    solution = np.linalg.solve(expected[9:12, 9:12], factor.g[9:12])
+    np.testing.assert_allclose(solution, np.linalg.solve(own, Quadratic.g[9:])[:3], rtol=1e-6)
+    assert not np.delete(factor.g, [9, 10, 11]).any()
 
 
 def test_chain_step_picks_the_numbers_of_an_epoch():
     z = np.arange(19.0)
     np.testing.assert_array_equal(chain_step(z), np.r_[0:12, 12:14, 17:19])
+    bias_only = np.r_[np.zeros(9), 9.0, 10.0, 11.0, np.zeros(4)]
+    np.testing.assert_array_equal(chain_step(z, calibrates=False), bias_only)
 
 
 def test_a_gap_links_nothing_but_the_bias():

@@ -21,7 +21,9 @@ NODE = 5
 Y_A = slice(9, 14)
 Y_B = slice(14, 19)
 SIZE = 19
-_VAGUE = 1e-2  # information on c, 1/gauss^2: next to nothing, but invertible
+_BIAS = slice(9, 12)
+_BORDERS = np.r_[12:14, 17:19]
+_TOKEN = 1.0  # information on a direction, 1/rad^2
 # where chain.Quadratic's 16 numbers go among the factor's 19
 _FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
 
@@ -113,23 +115,28 @@ def epoch_factor(
 ) -> Factor:
     """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
 
-    One that does not calibrate speaks of the gyro's bias only, whatever c is: c is marginalised.
+    One that does not calibrate speaks of the gyro's bias only. At rest that holds whatever c is:
+    the rate that was read is the bias. Its borders keep a token of information, to stay determined.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     H[np.ix_(_FROM_CHAIN, _FROM_CHAIN)] = q.H
     g[_FROM_CHAIN] = q.g
     if not calibrates:
-        gain = np.linalg.solve(H[C, C] + _VAGUE * np.eye(9), np.column_stack([H[C], g[C]]))
-        cross = H[:, C].copy()
-        H -= cross @ gain[:, :SIZE]
-        g -= cross @ gain[:, SIZE]
-        H[C, :], H[:, C], g[C] = 0.0, 0.0, 0.0
+        gain = np.linalg.solve(H[_BORDERS][:, _BORDERS], np.c_[H[_BORDERS][:, _BIAS], g[_BORDERS]])
+        cross = H[_BIAS][:, _BORDERS]
+        H_bias, g_bias = H[_BIAS, _BIAS] - cross @ gain[:, :3], g[_BIAS] - cross @ gain[:, 3]
+        H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+        H[_BIAS, _BIAS], g[_BIAS] = H_bias, g_bias
+        H[_BORDERS, _BORDERS] = _TOKEN
     return Factor(a, a + 1, H, g, point, walk)
 
 
-def chain_step(z: Array) -> Array:
-    """The 16 numbers of `chain.move` out of a factor's 19."""
-    return np.asarray(z[_FROM_CHAIN])
+def chain_step(z: Array, *, calibrates: bool = True) -> Array:
+    """The 16 numbers of `chain.move` out of a factor's 19; only the bias for `not calibrates`."""
+    step = np.array(z[_FROM_CHAIN])
+    if not calibrates:
+        step[C], step[12:] = 0.0, 0.0
+    return step
 
 
 def gap_factor(a: int, c: Array, node_a: Node, node_b: Node, walk: float) -> Factor:

@@ -39,7 +39,7 @@ _LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
 _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
-BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
+BLIND = 0.3  # posterior over prior sigma above which a direction counts as not determined
 _FINISH_WORK = 6  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
@@ -138,9 +138,8 @@ class Window:
             and sum(len(e.data) for e in self.epochs) > self.parameters.window_steps
         ):
             old = self.epochs.pop(0)
-            if old.turned:
-                self.folded = True
-                self.misfit.remember(old.factor, self.graph)
+            self.folded |= old.turned
+            self.misfit.remember(old.factor, self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
 
@@ -178,7 +177,7 @@ class Window:
     def _moved_directions(self, epoch: Epoch) -> Array:
         graph = self.graph
         z, _ = epoch.factor.offset(graph.c, graph.nodes[epoch.a], graph.nodes[epoch.b])
-        return chain.move(epoch.u, epoch.quadratic, chain_step(z))
+        return chain.move(epoch.u, epoch.quadratic, chain_step(z, calibrates=epoch.turned))
 
     def refresh(self, which: list[int]) -> None:
         """Linearise epochs again at the present values, with fresh noise and outlier weights."""
@@ -328,7 +327,7 @@ class Window:
         """
         graph = self.graph
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
-        factors = [e.factor for e in self.epochs if e.turned]
+        factors = [e.factor for e in self.epochs]
         self.found_misfit = self.misfit.value(factors, graph, graph.step())
         graph.temper = max(1.0, self.found_misfit)
         covariance = graph.covariance()[:9, :9] * graph.temper
