@@ -23,19 +23,14 @@ from ahrsd.accuracy import Answer, figures, unit_volume
 from ahrsd.bound import Trajectory, UnobservableError, cramer_rao
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.online import Estimator
+from ahrsd.montecarlo_methods import OURS, STREAM, batch_method, is_known, known_methods, present
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, Iron, Settings, simulate
 
 Record = dict[str, Any]  # one run, as it stands in the file: see `run_one`
-Batch = Callable[[Experiment], Answer]
 
-STREAM = "magyc-stream"
 _CHUNK = 25  # samples handed to the stream at a time
 _THREADS = "OPENBLAS_NUM_THREADS"
-
-
-class MethodError(AhrsdError):
-    """A method that does not answer, in its own words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +43,7 @@ class Plan:
 
     scenario: str
     motion: str = "slow"
-    methods: tuple[str, ...] = ("magyc", STREAM)
+    methods: tuple[str, ...] = (OURS, STREAM)
     at_s: tuple[float, ...] = (50.0, 100.0, 200.0, 400.0)
     rate_hz: float = 25.0
     noise_mag_gauss: float = 1e-3
@@ -56,9 +51,12 @@ class Plan:
     offset_behind_iron: bool = False
 
     def __post_init__(self) -> None:
-        """Raises ValueError for times that do not increase; the rest is checked by `Settings`."""
+        """Raises ValueError naming the method, the time or the setting that cannot be."""
         if not self.at_s or any(b <= a for a, b in zip((0.0, *self.at_s), self.at_s)):
             raise ValueError(f"times must be positive and increase: {list(self.at_s)}")
+        for name in self.methods:
+            if not is_known(name):
+                raise ValueError(f"no method {name!r}; there are {', '.join(known_methods())}")
         self.settings(0)
 
     def settings(self, seed: int) -> Settings:
@@ -83,25 +81,6 @@ class Plan:
         """Names the file of this plan's runs; another plan never shares it."""
         text = json.dumps(asdict(self), sort_keys=True)
         return f"{self.scenario}-{self.motion}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-
-
-def magyc(experiment: Experiment) -> Answer:
-    """Every sample, iterated to the end.  Raises MethodError."""
-    estimator = Estimator()
-    for block in experiment.blocks(1000):
-        estimator.add(block)
-    estimate = estimator.finish()
-    if estimate is None:
-        raise MethodError("no estimate")
-    return Answer.of(estimate)
-
-
-BATCH: dict[str, Batch] = {"magyc": magyc}
-
-
-def known_methods() -> tuple[str, ...]:
-    """Ids of all methods, ours first."""
-    return (*BATCH, STREAM)
 
 
 def run_one(plan: Plan, seed: int) -> Record:
@@ -133,7 +112,7 @@ def _bound(plan: Plan, experiment: Experiment, at_s: float) -> Record:
 
 
 def _in_batches(plan: Plan, method: str, experiment: Experiment) -> Iterator[Record]:
-    answer = BATCH[method]
+    answer = batch_method(method)
     for at_s in plan.at_s:
         part = experiment.first(plan.samples(at_s))
         yield _result(method, at_s, experiment, lambda part=part: answer(part))  # type: ignore[misc]
@@ -149,14 +128,7 @@ def _streamed(plan: Plan, method: str, experiment: Experiment) -> Iterator[Recor
         estimator.add(block)
         fed += len(block)
         while waiting and fed >= plan.samples(waiting[0]):
-            yield _result(method, waiting.pop(0), experiment, lambda: _present(estimator), begun_s)
-
-
-def _present(estimator: Estimator) -> Answer:
-    estimate = estimator.estimate()
-    if estimate is None:
-        raise MethodError("no estimate yet")
-    return Answer.of(estimate)
+            yield _result(method, waiting.pop(0), experiment, lambda: present(estimator), begun_s)
 
 
 def _result(

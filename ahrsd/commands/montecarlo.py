@@ -39,7 +39,7 @@ def _times(_context: click.Context, _option: click.Parameter, text: str) -> tupl
     multiple=True,
     default=("magyc", "magyc-stream"),
     show_default=True,
-    help="A method's id, or all; may be repeated.",
+    help="A method's id, or all; may be repeated. +savgol behind it smooths the readings first.",
 )
 @click.option("--motion", type=click.Choice(["slow", "rov", _ALL]), default="slow")
 @click.option("--at", "at_s", default="50,100,200,400", show_default=True, callback=_times)
@@ -73,12 +73,11 @@ def command(
 
     Exit 1 where a method had no answer at the last time in some run.
     """
-    from ahrsd.montecarlo import Plan, known_methods, plans
+    from ahrsd.montecarlo import Plan, plans
+    from ahrsd.montecarlo_methods import known_methods
 
-    chosen = known_methods() if _ALL in methods else tuple(dict.fromkeys(methods))
-    unknown = [name for name in chosen if name not in known_methods()]
-    if unknown:
-        raise AhrsdError(f"no method {unknown[0]!r}; there are {', '.join(known_methods())}")
+    everyone = known_methods() if _ALL in methods else ()
+    chosen = tuple(dict.fromkeys(name for name in (*everyone, *methods) if name != _ALL))
     try:
         base = Plan(
             "wam",
