@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from ahrsd.samples import Array
 
-DerivativeName = Literal["median", "savgol"]
+Derivative = Literal["median", "savgol"]
+Constraint = Literal["trace", "fang"]
 
 
 class MethodError(ValueError):
@@ -76,6 +77,8 @@ class Settings:
     known_gyro_bias_rad_s: for magical-ls, which does not estimate it [0]
     derivative:        "median" as in the seeds: first differences, their median per window.
                        "savgol": readings smoothed by a Savitzky-Golay filter first
+    ellipsoid_constraint: "trace": a + b + c = -3, as [R]. "fang": 4 a b - (2 h)^2 = 1, as Fang et
+                       al.; far better where z varies little ["trace"]
     window:            theta, samples per factor [25]
     update_every:      Gamma, factors per optimisation of the incremental methods [10]
     savgol_window:     samples of the Savitzky-Golay filter, of order 2 [51]
@@ -86,7 +89,8 @@ class Settings:
     sigma_mag_gauss: float | None = None
     sigma_field_gauss: float = 1.5e-3
     known_gyro_bias_rad_s: Array = field(default_factory=_zero)
-    derivative: DerivativeName = "median"
+    derivative: Derivative = "median"
+    ellipsoid_constraint: Constraint = "trace"
     window: int = 25
     update_every: int = 10
     savgol_window: int = 51
@@ -105,8 +109,10 @@ class Settings:
         for name, minimum in least.items():
             if getattr(self, name) < minimum:
                 raise MethodError(f"{name} is {getattr(self, name)}: at least {minimum}")
-        if self.derivative not in ("median", "savgol"):
-            raise MethodError(f'derivative is {self.derivative}: "median" or "savgol"')
+        words = {"derivative": get_args(Derivative), "ellipsoid_constraint": get_args(Constraint)}
+        for name, known in words.items():
+            if getattr(self, name) not in known:
+                raise MethodError(f"{name} is {getattr(self, name)}: one of {', '.join(known)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

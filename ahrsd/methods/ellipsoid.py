@@ -2,7 +2,9 @@
 
     a x^2 + b y^2 + c z^2 + 2f yz + 2g xz + 2h xy + 2p x + 2q y + 2r z + d = 0,   a + b + c = -3
 
-is linear once a = -3 - b - c is put in. With Q = [[a h g] [h b f] [g f c]] and n = [p q r],
+is linear once a = -3 - b - c is put in. That constraint rewards a large coefficient along an axis
+in which the readings vary little; Fang's own, 4 a b - (2 h)^2 = 1, does not where that axis is z,
+and can be chosen (`Settings.ellipsoid_constraint`). With Q = [[a h g] [h b f] [g f c]] and n = [p q r],
 
     hard iron = -Q^-1 n,    C^T C = Q up to scale and sign
 
@@ -21,21 +23,40 @@ from ahrsd.methods.soft_iron import answer
 from ahrsd.samples import Array
 
 _RANK = 1e-9  # smallest eigenvalue over the largest that still counts as not zero
+_MANY = "the readings fit many quadrics: turn about more axes"
 
 
 def quadric(field: Array) -> tuple[Array, Array, float]:
-    """Q (3, 3), n (3,) and d of readings (N, 3) that are near the origin and of size about 1."""
+    """Q (3, 3), n (3,) and d of readings (N, 3) near the origin, of size about 1; trace Q = -3."""
     x, y, z = field.T
     columns = [
         y * y - x * x, z * z - x * x, 2 * y * z, 2 * x * z, 2 * x * y,
         2 * x, 2 * y, 2 * z, np.ones(len(x)),
     ]  # fmt: skip
-    found, _, rank, _ = np.linalg.lstsq(np.column_stack(columns), 3 * x * x, rcond=1e-10)
+    found, _, rank, _ = np.linalg.lstsq(np.column_stack(columns), 3 * x * x, rcond=_RANK)
     if rank < 9:
-        raise MethodError("the readings fit many quadrics: turn about more axes")
+        raise MethodError(_MANY)
     b, c, f, g, h, p, q, r, d = found
     Q = np.array([[-3 - b - c, h, g], [h, b, f], [g, f, c]])
     return Q, np.array([p, q, r]), float(d)
+
+
+def fang_quadric(field: Array) -> tuple[Array, Array, float]:
+    """The same with 4 a b - (2 h)^2 = 1: a 3x3 eigenvalue problem in (a, 2h, b), as Fang et al."""
+    x, y, z = field.T
+    ones = np.ones(len(x))
+    # first the seven free coefficients, which follow from the three: R22^T R22 is left for these
+    S = np.column_stack([z * z, y * z, x * z, x, y, z, ones, x * x, x * y, y * y])
+    R = np.asarray(np.linalg.qr(S).R)
+    if np.min(np.abs(np.diag(R))) < _RANK * np.max(np.abs(np.diag(R))):
+        raise MethodError(_MANY)
+    constraint = np.array([[0.0, 0.0, 2.0], [0.0, -1.0, 0.0], [2.0, 0.0, 0.0]])
+    values, vectors = np.linalg.eig(np.linalg.solve(constraint, R[7:, 7:].T @ R[7:, 7:]))
+    three = np.real(vectors[:, int(np.argmax(np.real(values)))])  # the only positive one
+    c, f2, g2, p2, q2, r2, d = -np.linalg.solve(R[:7, :7], R[:7, 7:] @ three)
+    a, h2, b = three
+    Q = np.array([[a, h2 / 2, g2 / 2], [h2 / 2, b, f2 / 2], [g2 / 2, f2 / 2, c]])
+    return Q, np.array([p2, q2, r2]) / 2, float(d)
 
 
 def refuse_other_quadrics(Q: Array, n: Array, d: float) -> None:
@@ -54,11 +75,11 @@ def refuse_other_quadrics(Q: Array, n: Array, d: float) -> None:
 
 def estimate(data: Data, settings: Settings) -> Fit:
     """A of unit volume and b.  MethodError where the readings fit no ellipsoid."""
-    del settings
     middle = data.raw_b_gauss.mean(axis=0)
     field = data.raw_b_gauss - middle
     size = float(np.sqrt(np.mean(field * field)))
-    Q, n, d = quadric(field / size)
+    fit = fang_quadric if settings.ellipsoid_constraint == "fang" else quadric
+    Q, n, d = fit(field / size)
     refuse_other_quadrics(Q, n, d)
     values, vectors = np.linalg.eigh(Q if Q[0, 0] > 0 else -Q)
     C = vectors @ np.diag(np.sqrt(values)) @ vectors.T
