@@ -1,17 +1,25 @@
-"""Batch calibration: every sample of a recording in one estimate, iterated to the end."""
+"""Batch calibration: every sample of a recording in one estimate, iterated to the end.
+
+Byte streams, tables and captures of `ahrsd capture` go through a core that holds nothing out. In a
+capture of the daemon the core must decide as it did then, so that each sample is un-mapped through
+the registers of its time; all of its samples then go through an estimator of their own.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ahrsd.calibration import Estimate
+from ahrsd.calibrator import Calibrator
 from ahrsd.config import Config
 from ahrsd.core import Core
-from ahrsd.events import Estimated, Event
-from ahrsd.replay import replay
-from ahrsd.result import calibration_json
+from ahrsd.errors import AhrsdError
+from ahrsd.events import Estimated, Event, SamplesSeen
+from ahrsd.replay import Replayed, replay
+from ahrsd.result import calibration_json, why_not_converged
+from ahrsd.summary import said_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +44,11 @@ class BatchResult:
 
     def said(self) -> list[str]:
         """Warnings of recording and stream."""
-        return [*self.warnings, *self.core.stream.warnings]
+        return said_of(self.core, self.warnings)
+
+    def reasons(self) -> list[str]:
+        """Why it has not converged; empty where it has."""
+        return why_not_converged(self.estimate)
 
     def json(self, method: str) -> dict[str, object]:
         """The contract's calibration.json."""
@@ -51,7 +63,7 @@ class BatchResult:
         )
 
     def write_report(self, path: Path) -> None:
-        """A page with pictures."""
+        """A page with pictures.  AhrsdError where it cannot be written."""
         from ahrsd.report import EventCollector, write_report
 
         collector = EventCollector()
@@ -59,11 +71,15 @@ class BatchResult:
             collector.add(event)
         report = collector.report(
             f"Calibration of {self.name}",
-            verdict="" if self.converged else "The motion does not determine the calibration.",
+            verdict=" ".join(f"{text[:1].upper()}{text[1:]}." for text in self.reasons()),
             good=self.converged,
             command=f"ahrsd calibrate {self.name}",
+            warnings=tuple(self.said()),
         )
-        write_report(path, report)
+        try:
+            write_report(path, report)
+        except OSError as error:
+            raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def calibrate(
@@ -78,7 +94,22 @@ def calibrate(
     done = replay(
         path, config, rate_hz=rate_hz, listeners=[seen.append], progress=progress, held_out=False
     )
-    estimate = done.core.calibrator.finish()
+    estimate = _of_everything(done, seen).finish()
     if estimate is not None:
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
     return BatchResult(path.name, done.core, estimate, tuple(seen), tuple(done.warnings))
+
+
+def _of_everything(done: Replayed, seen: list[Event]) -> Calibrator:
+    """A calibrator that has had every sample."""
+    core = done.core
+    if not done.of_daemon:
+        return core.calibrator
+    settings = replace(core.settings.calibrator, held_out=False)
+    calibrator = Calibrator(
+        settings, core.calibrator.present, core.calibrator.present_gyro_bias_rad_s
+    )
+    for event in seen:
+        if isinstance(event, SamplesSeen):
+            calibrator.take(event.block)
+    return calibrator

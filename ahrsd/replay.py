@@ -1,7 +1,8 @@
 """Replay: a recording through the same shell and core as a live run.
 
-A capture is fed its own inputs, ticks and answers included, so the decisions are those of the run.
-Byte streams and tables have nobody to talk to: they are taken as a passive run over what they hold.
+A capture of the daemon is fed its own inputs, ticks and answers included, so the decisions are
+those of the run. Everything else has nobody to talk to and is taken as a passive run over what it
+holds; the registers that `ahrsd capture` read first hold for the bytes that came meanwhile, too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from ahrsd.config import CONFIG_KEY, Config, recorded_config
 from ahrsd.core import Core
 from ahrsd.core_settings import CoreSettings
 from ahrsd.errors import RecordingError
-from ahrsd.inputs import Input, Received, Samples
+from ahrsd.inputs import Input, Received, RegistersKnown, Samples
 from ahrsd.recording.bytestream import read_chunks
 from ahrsd.recording.opening import Kind, Recording, open_recording
 from ahrsd.settings import core_settings
@@ -36,6 +37,11 @@ class Replayed:
     recording: Recording
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def of_daemon(self) -> bool:
+        """Whether it is a capture of the daemon, which decided for itself what to do."""
+        return CONFIG_KEY in self.recording.header
+
 
 def replay(
     path: Path,
@@ -51,20 +57,25 @@ def replay(
 ) -> Replayed:
     """Feed a recording to a core; speed 0 is as fast as it goes, 1 real time.
 
-    settings: of the core, else those of `config`. Raises RecordingError where nothing in the
-    recording can be calibrated.
+    settings: of the core, else those of `config`; a capture of the daemon brings its own
+    configuration, and its own `held_out`. Raises RecordingError where nothing in the recording can
+    be calibrated.
     """
     recording = open_recording(path, rate_hz)
-    warnings = list(recording.notes)
     core = Core(settings or _settings(recording, config, rate_hz, held_out))
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
-    for item in _paced(recording.inputs(), core, speed):
+    done = Replayed(core, recording, list(recording.notes))
+    items = recording.inputs() if done.of_daemon else _registers_first(recording)
+    for item in _paced(items, core, speed):
         shell.feed(item)
         if progress is not None and isinstance(item, Received):
             progress(len(item.data))
     _refuse_empty(core, path)
-    warnings += [note for note in recording.notes if note not in warnings]
-    return Replayed(core, recording, warnings)
+    done.warnings += [note for note in recording.notes if note not in done.warnings]
+    cut = core.conversation.session.deframer.pending
+    if recording.kind is Kind.BYTES and cut:
+        done.warnings.append(f"the last {cut} bytes begin a message that is cut off")
+    return done
 
 
 def _settings(
@@ -72,13 +83,29 @@ def _settings(
 ) -> CoreSettings:
     """A capture of the daemon says itself how it was made; the others are passive."""
     if text := recording.header.get(CONFIG_KEY):
-        return core_settings(recorded_config(text), stream_rate_hz=rate_hz)
-    found = None
-    if rate_hz is None and recording.kind is Kind.BYTES:
-        found = rate_of(read_chunks(recording.path))
+        own = recorded_config(text)
+        if config not in (Config(), own):
+            recording.notes.append("the configuration in the capture was used, not the given one")
+        return core_settings(own)
+    if recording.kind is not Kind.BYTES:
+        return core_settings(config, policy=_PASSIVE, held_out=held_out)
+    found = None if rate_hz is not None else rate_of(read_chunks(recording.path))
     rate = rate_hz if found is None else found[0]
     settings = core_settings(config, stream_rate_hz=rate, policy=_PASSIVE, held_out=held_out)
     return settings if found is None else replace(settings, stream_rate_source=found[1])
+
+
+def _registers_first(recording: Recording) -> Iterator[Input]:
+    """The inputs; registers that were read at the beginning are known from the first byte on."""
+    if recording.kind is not Kind.CAPTURE:
+        yield from recording.inputs()
+        return
+    found = next((i for i in recording.inputs() if isinstance(i, RegistersKnown)), None)
+    if found is not None:
+        yield replace(found, host_ns=0)
+    for item in recording.inputs():
+        if item != found:
+            yield item
 
 
 def _paced(items: Iterator[Input], core: Core, speed: float) -> Iterator[Input]:

@@ -6,11 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.composition import UnwritableError, compose
 from drivers.vn100.registers import Values
 
 MAG, GYRO = 23, 84
+_HOPELESS_DEG = 5.0  # worst heading sigma beyond which the estimator calls nothing converged
+_SIGMAS = ("soft_iron", "hard_iron_gauss", "gyro_bias_rad_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +46,7 @@ def calibration_json(
     if estimate is None:
         return base | _nothing(warnings)
     written, refusal = _registers(estimate, registers, gyro_is_raw)
-    said = [*warnings, *estimate.warnings, *refusal]
-    if estimate.observability.unobservable:
-        blind = "; ".join(estimate.observability.unobservable)
-        said.append(f"this motion does not determine: {blind}")
+    said = [*warnings, *estimate.warnings, *refusal, *why_not_converged(estimate)]
     found = heading or HeadingErrors()
     sigma = estimate.sigma
     return base | {
@@ -59,9 +60,7 @@ def calibration_json(
         "field_gauss": _number(estimate.field_gauss),
         "field_known": estimate.field_known,
         "standard_deviation": {
-            "soft_iron": sigma[:6].tolist(),
-            "hard_iron_gauss": sigma[6:9].tolist(),
-            "gyro_bias_rad_s": sigma[9:].tolist(),
+            name: part.tolist() for name, part in zip(_SIGMAS, np.split(sigma, [6, 9]), strict=True)
         },
         "noise": {
             "mag_gauss": _number(estimate.noise_mag_gauss),
@@ -81,6 +80,25 @@ def calibration_json(
         "registers": written,
         "warnings": said,
     }
+
+
+def why_not_converged(estimate: Estimate | None) -> list[str]:
+    """Reasons, one clause each; empty where it has converged."""
+    if estimate is None:
+        return ["too few samples for an estimate"]
+    if estimate.converged:
+        return []
+    if blind := estimate.observability.unobservable:
+        return [f"this motion does not determine: {'; '.join(blind)}"]
+    if estimate.heading_sigma_deg >= _HOPELESS_DEG:
+        return [
+            f"not converged: headings would be known to {estimate.heading_sigma_deg:.1f} deg only "
+            f"(limit {_HOPELESS_DEG:.0f}); turn further, about more than one axis"
+        ]
+    return [
+        "not converged: the data still allow more than one answer; turn further, about more than "
+        "one axis, away from steel and magnets"
+    ]
 
 
 def _registers(
@@ -111,11 +129,11 @@ def _nothing(warnings: Sequence[str]) -> dict[str, object]:
         **dict.fromkeys(keys),
         "converged": False,
         "field_known": False,
-        "standard_deviation": {},
+        "standard_deviation": dict.fromkeys(_SIGMAS),
         "heading_error_deg": {"expected_worst": None, "before_rms": None, "after_rms": None},
         "observability": {},
         "registers": {},
-        "warnings": [*warnings, "too few samples for an estimate"],
+        "warnings": [*warnings, *why_not_converged(None)],
     }
 
 

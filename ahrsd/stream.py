@@ -48,12 +48,14 @@ class StreamFacts:
     unusable: samples that were saturated or not finite
     damaged:  messages that were recognised and refused
     expected: samples that would be there had none been lost
+    duration_s: steps and gaps together; time of which nobody knows the length is not in it
     """
 
     samples: int = 0
     unusable: int = 0
     damaged: int = 0
     expected: float = 0.0
+    duration_s: float = 0.0
     layout: str = ""
     rate_hz: float = float("nan")
     rate_source: str = ""
@@ -89,6 +91,8 @@ class Stream:
         self._attitude: list[int] | None = None
         self._turns = TurnWatch()
         self._turns_said = ""
+        self._given_s: float | None = None
+        self._given_steps, self._given_step_s = 0, 0.0
 
     @property
     def restarts(self) -> int:
@@ -261,6 +265,7 @@ class Stream:
         facts.samples += kept
         facts.unusable += len(steps.keep) - kept
         facts.expected += kept
+        facts.duration_s += float(np.nansum(steps.dt_s)) + sum(gap.length_s for gap in steps.gaps)
         period = self._timeline.period_s
         if np.isfinite(period) and period > 0:
             lost = [max(gap.length_s / period - 1.0, 0.0) for gap in steps.gaps]
@@ -275,11 +280,20 @@ class Stream:
     def given(self, block: SampleBlock) -> None:
         """Samples of a table: nothing to decode, only to count."""
         facts = self.facts
-        facts.layout, facts.rate_source = "table", "table"
+        facts.layout, facts.rate_source = "table", "time_s"
+        if block.gap_before and self._given_s is not None:
+            length_s = float(block.time_s[0]) - self._given_s
+            self.gaps.append(Gap(self._given_s, length_s))
+            facts.duration_s += length_s
+            facts.expected += max(length_s * facts.rate_hz - 1.0, 0.0)
+        self._given_s = float(block.time_s[-1])
         facts.samples += len(block)
         facts.expected += len(block)
-        if np.isnan(facts.rate_hz):
-            facts.rate_hz = 1.0 / float(np.nanmedian(block.dt_s))
+        self._given_step_s += float(np.nansum(block.dt_s))
+        self._given_steps += int(np.count_nonzero(np.isfinite(block.dt_s)))
+        facts.duration_s += float(np.nansum(block.dt_s))
+        if self._given_step_s > 0.0:
+            facts.rate_hz = self._given_steps / self._given_step_s
 
     def health(self) -> HealthFacts:
         """Figures of the stream so far, for the gates."""

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+
+import numpy as np
 
 from ahrsd.calibration import Estimate
 from ahrsd.core import Core
-from ahrsd.result import HeadingErrors, calibration_json
+from ahrsd.events import GateResult
+from ahrsd.result import HeadingErrors, calibration_json, why_not_converged
+from ahrsd.unmapping import Compensation
+
+_TABLE_IS_RAW = (
+    "a table says nothing of registers: it was taken as raw, so the result holds on top of "
+    "whatever registers 23, 26 and 84 did to it"
+)
+_NAMES = (*(f"hard iron {a}" for a in "xyz"), *(f"gyro bias {a}" for a in "xyz"))
+_DIGITS = 6  # of times in the summary: microseconds
 
 
 def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> dict[str, object]:
     """The contract's `ahrsd.replay/1`."""
     counters = core.conversation.session.deframer.counters
     facts = core.stream.facts
-    said = [*warnings, *core.stream.warnings]
-    by_type: Counter[str] = Counter(core.stream.by_layout)
     return {
         "schema": "ahrsd.replay/1",
         "recording": recording,
@@ -24,14 +32,17 @@ def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> di
         "packets": {
             "valid": counters.valid,
             "rejected": counters.rejected + core.undecodable,
-            "by_type": dict(by_type),
+            "by_type": dict(core.stream.by_layout),
         },
         "skipped_bytes": counters.skipped_bytes,
         "samples": facts.samples,
-        "duration_s": round(core.at_s - core.first_s, 6),
-        "rate_hz": facts.rate_hz if facts.rate_hz == facts.rate_hz else None,
+        "duration_s": round(facts.duration_s, _DIGITS),
+        "rate_hz": _finite(facts.rate_hz),
         "rate_source": facts.rate_source,
-        "gaps": [{"at_s": g.at_s, "length_s": g.length_s} for g in core.stream.gaps],
+        "gaps": [
+            {"at_s": round(gap.at_s, _DIGITS), "length_s": round(gap.length_s, _DIGITS)}
+            for gap in core.stream.gaps
+        ],
         "device_restarts": core.stream.restarts,
         "state": core.writeback.state.value,
         "calibration": calibration_json(
@@ -41,11 +52,20 @@ def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> di
             samples=facts.samples,
             gyro_is_raw=not core.stream.compensated_gyro,
             heading=heading_errors(core),
-            warnings=said,
+            warnings=said_of(core, warnings),
         ),
         "decisions": core.decisions.entries,
         "decision_sha256": core.decisions.sha256,
     }
+
+
+def said_of(core: Core, warnings: Iterable[str] = ()) -> list[str]:
+    """What a reader of the result must know: of the recording, the stream and the registers."""
+    said = [*warnings, *core.stream.warnings]
+    if not core.registers:
+        is_table = not core.stream.by_layout
+        said += [_TABLE_IS_RAW] if is_table else Compensation.unknown().warnings
+    return list(dict.fromkeys(said))
 
 
 def heading_errors(core: Core) -> HeadingErrors:
@@ -64,40 +84,68 @@ def _finite(value: float) -> float | None:
 def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> list[str]:
     """What a person wants to know first."""
     counters = core.conversation.session.deframer.counters
-    facts = core.stream.facts
-    rejected = counters.rejected + core.undecodable
-    rate = f"{facts.rate_hz:.4g} Hz" if facts.rate_hz == facts.rate_hz else "unknown rate"
+    facts, stream = core.stream.facts, core.stream
+    rate = f"{facts.rate_hz:.4g} Hz" if math.isfinite(facts.rate_hz) else "unknown rate"
+    source = f", {facts.rate_source}" if facts.rate_source else ""
     lines = [
-        f"{recording}: {facts.samples} samples in {core.at_s - core.first_s:.1f} s ({rate}, "
-        f"{facts.rate_source or 'no stream'})",
-        f"  messages: {counters.valid} valid, {rejected} rejected, {counters.skipped_bytes} bytes "
-        f"skipped; {len(core.stream.gaps)} gaps, {core.stream.restarts} restarts",
+        f"{recording}: {_count(facts.samples, 'sample')} in {facts.duration_s:.1f} s "
+        f"({rate}{source})"
     ]
+    if counters.fed_bytes:
+        rejected = counters.rejected + core.undecodable
+        lines.append(
+            f"  messages: {counters.valid} valid, {rejected} rejected, "
+            f"{_count(counters.skipped_bytes, 'byte')} skipped"
+        )
+    if stream.gaps or stream.restarts:
+        lost_s = sum(gap.length_s for gap in stream.gaps)
+        lines.append(
+            f"  {_count(len(stream.gaps), 'gap')}, {lost_s:.1f} s in all; "
+            f"{_count(stream.restarts, 'restart')} of the device"
+        )
     lines += estimate_lines(core.calibrator.estimate)
-    for gate in core.calibrator.gates:
-        if not gate.ok:
-            lines.append(f"  gate {gate.gate}: {gate.value:.4g} {gate.unit}: {gate.advice}")
-    lines += [f"  warning: {text}" for text in (*warnings, *core.stream.warnings)]
+    lines += _gate_lines(core.calibrator.gates)
+    lines += [f"  warning: {text}" for text in said_of(core, warnings)]
     lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
     return lines
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def _gate_lines(gates: Sequence[GateResult]) -> list[str]:
+    """Gates that are shut, those with the same advice together."""
+    shut: dict[str, list[str]] = {}
+    for gate in gates:
+        if not gate.ok:
+            shut.setdefault(gate.advice, []).append(gate.gate)
+    if not shut:
+        return []
+    number = sum(len(names) for names in shut.values())
+    head = f"  {number} of {len(gates)} gates hold a write back:"
+    return [head, *(f"    {', '.join(names)}: {advice}" for advice, names in shut.items())]
 
 
 def estimate_lines(estimate: Estimate | None) -> list[str]:
     """An estimate in the units of a field engineer."""
     if estimate is None:
         return ["  no estimate: too few samples"]
-    sigma = estimate.sigma
-    b, w = estimate.hard_iron_gauss * 1e3, estimate.gyro_bias_rad_s * 1e3
-    lines = [
-        "  hard iron  "
-        + ", ".join(f"{v:+.2f} +- {s * 1e3:.2f}" for v, s in zip(b, sigma[6:9], strict=True))
-        + " mG",
-        "  gyro bias  "
-        + ", ".join(f"{v:+.3f} +- {s * 1e3:.3f}" for v, s in zip(w, sigma[9:], strict=True))
-        + " mrad/s",
-        f"  worst heading sigma {estimate.heading_sigma_deg:.2f} deg; "
-        + ("converged" if estimate.converged else "not converged"),
+    numbers = np.concatenate([estimate.hard_iron_gauss, estimate.gyro_bias_rad_s]) * 1e3
+    sigmas = estimate.sigma[6:] * 1e3
+    blind = [name in estimate.observability.unobservable for name in _NAMES]
+    values = [
+        _value(number, sigma, 2 if k < 3 else 3) if not blind[k] else "not determined"
+        for k, (number, sigma) in enumerate(zip(numbers, sigmas, strict=True))
     ]
-    if estimate.observability.unobservable:
-        lines.append("  not observable: " + "; ".join(estimate.observability.unobservable))
-    return lines
+    return [
+        f"  hard iron  {', '.join(values[:3])} mG",
+        f"  gyro bias  {', '.join(values[3:])} mrad/s",
+        f"  heading    known to {estimate.heading_sigma_deg:.2f} deg (1 sigma, worst direction)",
+        *(f"  {text}" for text in why_not_converged(estimate)),
+    ]
+
+
+def _value(value: float, sigma: float, digits: int) -> str:
+    """Value and sigma; never -0.00."""
+    return f"{round(value, digits) + 0.0:+.{digits}f} +- {sigma:.{digits}f}"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ahrsd.commands.json_output import write_json
+from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.config import Config, load_config
 from ahrsd.errors import EXIT_DONE, EXIT_NO
@@ -36,9 +36,10 @@ def command(
     from ahrsd.batch import calibrate
     from ahrsd.summary import estimate_lines
 
+    refuse_unwritable(json_path)
+    refuse_unwritable(report_path)
     config = load_config(path) if path else Config()
-    size = recording.stat().st_size if recording.is_file() else 0
-    with byte_progress(recording.name, size) as progress:
+    with byte_progress(recording) as progress:
         result = calibrate(recording, config, rate_hz=rate_hz, progress=progress)
     if report_path is not None:
         result.write_report(report_path)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ahrsd.commands.json_output import write_json
+from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.config import Config, load_config
 
@@ -36,11 +36,12 @@ def command(
     from ahrsd.rerun_sink import RerunSink
     from ahrsd.summary import summary_json, summary_lines
 
+    refuse_unwritable(json_path)
+    refuse_unwritable(rerun_path)
     config = load_config(path) if path else Config()
     viewer = None if rerun_path is None else RerunSink(rerun_path, wait=True)
-    size = recording.stat().st_size if recording.is_file() else 0
     try:
-        with byte_progress(recording.name, size) as progress:
+        with byte_progress(recording) as progress:
             done = replay(
                 recording, config, rate_hz=rate_hz, speed=speed, viewer=viewer, progress=progress
             )
