@@ -30,7 +30,7 @@ from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
 
 _SAY_EVERY_S = 60.0
-_LIVE_S = (60.0, 400.0)  # device time shown after the proof: at least, at most
+_AFTER_S = (10.0, 300.0)  # device time shown after the restart: at least, at most
 _SECTOR_DEG = 10.0
 _ENOUGH = 35 / 36  # of all headings
 _HOPELESS = frozenset({State.ROLLED_BACK, State.FAULT, State.LOCKED, State.FLASH_TORN})
@@ -40,12 +40,11 @@ _HOPELESS = frozenset({State.ROLLED_BACK, State.FAULT, State.LOCKED, State.FLASH
 class Scene:
     """Listens to the core's events; `daemon` and `power_cycle` are set before it begins.
 
-    seconds: device time at most;  say: takes a line;  proof: state after which live data count
+    seconds: device time at most;  say: takes a line;  live: samples since the write
     """
 
     seconds: float
     say: Callable[[str], None]
-    proof: State
     power_cycle: Callable[[], None] = lambda: None
     daemon: Daemon | None = None
     collector: EventCollector = field(default_factory=EventCollector)
@@ -56,8 +55,9 @@ class Scene:
     proposed: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
     live: list[tuple[Array, Array]] = field(default_factory=list)
     shown: set[int] = field(default_factory=set)
-    proven: bool = False
-    live_s: float = 0.0
+    written: bool = False
+    confirmed: bool = False
+    after_s: float = 0.0
     passed_s: float = 0.0
     newest_s: float = math.nan
     said_s: float = -math.inf
@@ -88,22 +88,23 @@ class Scene:
         self.newest_s = now_s
         if self.passed_s > self.seconds:
             self._end(f"{self.seconds:.0f} s of device time are over")
-        if self.proven:
-            self._show(block, max(step_s, 0.0))
+        if self.written:
+            self._show(block)
+        if self.confirmed:
+            self.after_s += max(step_s, 0.0)
+            least_s, most_s = _AFTER_S
+            complete = len(self.shown) >= _ENOUGH * 360.0 / _SECTOR_DEG
+            if (complete and self.after_s > least_s) or self.after_s > most_s:
+                self._end("shown on live data")
 
-    def _show(self, block: SampleBlock, step_s: float) -> None:
-        """Live samples for the picture, until every heading was driven."""
+    def _show(self, block: SampleBlock) -> None:
+        """Live samples for the picture, and the headings that they cover."""
         assert self.approved is not None
-        self.live_s += step_s
         self.live.append((block.raw_b_gauss, block.accel_b_m_s2))
         field_b_gauss = self.approved.correction.apply(block.raw_b_gauss[-1:])
         heading = tilt_compensated_heading(field_b_gauss, block.accel_b_m_s2[-1:])
         sector = math.degrees(float(heading[0])) % 360.0 // _SECTOR_DEG
         self.shown.add(int(sector))
-        least_s, most_s = _LIVE_S
-        complete = len(self.shown) >= _ENOUGH * 360.0 / _SECTOR_DEG
-        if (complete and self.live_s > least_s) or self.live_s > most_s:
-            self._end("shown on live data")
 
     def _act(self, state: str) -> None:
         if state == State.QUALIFIED:
@@ -113,9 +114,8 @@ class Scene:
             self.power_cycle()
         elif state in _HOPELESS:
             self._end(f"ended in {state}")
-        if state == self.proof:
-            self.proven = True
-            self._line("", "live data from here on, until every heading was driven")
+        self.written = self.written or state == State.TRIAL
+        self.confirmed = state == State.CONFIRMED
 
     def _approve(self) -> None:
         assert self.daemon is not None
@@ -129,7 +129,7 @@ class Scene:
         self.daemon.operate("approve", proposal.id)
 
     def _progress(self) -> None:
-        if self.passed_s - self.said_s < _SAY_EVERY_S or self.estimate is None or self.proven:
+        if self.passed_s - self.said_s < _SAY_EVERY_S or self.estimate is None:
             return
         self.said_s = self.passed_s
         shut = [g.gate for g in self.gates if not g.ok]
@@ -147,7 +147,7 @@ class Scene:
 
 
 def live_samples(scene: Scene, every: int = 5) -> tuple[Array, Array]:
-    """Raw field (N, 3) in gauss and specific force (N, 3) since the proof, thinned."""
+    """Raw field (N, 3) in gauss and specific force (N, 3) since the write, thinned."""
     if not scene.live:
         return np.zeros((0, 3)), np.zeros((0, 3))
     raw, accel = zip(*scene.live, strict=True)

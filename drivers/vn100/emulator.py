@@ -328,6 +328,11 @@ class Emulator:
         self._fall_silent()
 
     @property
+    def streaming(self) -> bool:
+        """Whether the host lets asynchronous output through."""
+        return self._interpreter.streaming
+
+    @property
     def powered(self) -> bool:
         """Whether the device runs or is about to."""
         return self._awake_s < math.inf

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import signal
+from ctypes import c_double
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
@@ -42,9 +43,10 @@ class EmulatorProcess:
         build(setup)  # refuse here what cannot be
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
+        self._device_s = context.RawValue("d", 0.0)
         self._process = context.Process(
             target=_serve,
-            args=(setup, theirs),
+            args=(setup, theirs, self._device_s),
             kwargs={"link": link, "speed": speed, "lossless": lossless, "check_baud": check_baud},
             name="vn100-emulator",
             daemon=True,
@@ -67,6 +69,10 @@ class EmulatorProcess:
             self.stop()
             raise answer
         return str(answer)
+
+    def device_s(self) -> float:
+        """True time of the emulated world in seconds; goes on through restarts of the device."""
+        return float(self._device_s.value)
 
     @property
     def alive(self) -> bool:
@@ -98,6 +104,7 @@ class EmulatorProcess:
 def _serve(
     setup: Setup,
     pipe: Connection,
+    shown_s: c_double,
     *,
     link: Path | None,
     speed: float,
@@ -105,10 +112,19 @@ def _serve(
     check_baud: bool,
 ) -> None:
     """The other process: serve until the pipe closes."""
+
+    def show(device_s: float) -> None:
+        shown_s.value = device_s
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to both; the pipe decides
     try:
         served = PtyEmulator(
-            build(setup), link=link, speed=speed, lossless=lossless, check_baud=check_baud
+            build(setup),
+            link=link,
+            speed=speed,
+            lossless=lossless,
+            check_baud=check_baud,
+            on_time=show,
         )
     except (ValueError, OSError) as error:
         pipe.send(error)

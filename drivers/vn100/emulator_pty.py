@@ -37,6 +37,7 @@ from drivers.vn100.emulator_faults import garble
 TURN_S = 1e-3  # real time between two looks at the line
 CATCH_UP_S = 0.02  # lossless: a stall of the process is not made up for beyond this
 OVERRUN_BYTES = 65536
+TALK_SPEED = 2.0  # lossless: at most, while the host has paused the output to change something
 UNREAD_BYTES = 512  # lossless: time stands still while the host has left more than this unread
 DESERTED_S = 1.0  # lossless: nobody has read for so long; the port may be opened again
 
@@ -148,6 +149,7 @@ class PtyEmulator:
     lossless:   see above
     check_baud: garble what passes while the host's bit rate is not the device's
     report:     called with one line whenever something happens (plugged, reset, faults)
+    on_time:    called with the device's time whenever it was moved on
     overrun_bytes counts what was lost because the host read too slowly.
     """
 
@@ -160,6 +162,7 @@ class PtyEmulator:
         lossless: bool = False,
         check_baud: bool = True,
         report: Callable[[str], None] | None = None,
+        on_time: Callable[[float], None] | None = None,
     ) -> None:
         if not speed > 0:
             raise ValueError(f"speed must be positive, not {speed:g}")
@@ -171,6 +174,7 @@ class PtyEmulator:
         self._lossless = lossless
         self._check_baud = check_baud
         self._report = report or (lambda _: None)
+        self._on_time = on_time or (lambda _: None)
         self._draw = np.random.default_rng(0)
         self._backlog = bytearray()
         self._line: Line | None = None
@@ -223,6 +227,7 @@ class PtyEmulator:
             heard = self._listen()
             now = time.monotonic()
             self._pass_time(now - last, now)
+            self._on_time(self.device_s)
             last = now
             if heard:
                 self.emulator.receive(heard, self.device_s)
@@ -281,7 +286,8 @@ class PtyEmulator:
                 self._read_at = now
             return
         self._read_at = now
-        self.device_s += min(elapsed_s, CATCH_UP_S) * self._speed
+        speed = self._speed if self.emulator.streaming else min(self._speed, TALK_SPEED)
+        self.device_s += min(elapsed_s, CATCH_UP_S) * speed
 
     def _send(self, messages: list[tuple[int, bytes]]) -> None:
         line = self._line

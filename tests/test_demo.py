@@ -1,0 +1,168 @@
+"""The demo does the whole job: every figure that the README promises, one seed or five."""
+
+import json
+import math
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from ahrsd import demo
+from ahrsd.config import Config
+from ahrsd.demo import FILES, demo_config, lines, run_demo
+from ahrsd.errors import DeviceError
+from ahrsd.replay import replay
+from drivers.vn100.emulator_process import EmulatorProcess
+
+SEEDS = range(5)
+# Sixty seconds is the promise on a machine that does nothing else; a loaded one gets more.
+LONGEST_S = 60.0 * (1 if os.environ.get("PYTEST_XDIST_WORKER") is None else 3)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """One demo for all tests of the short form: (directory, result, what it said, seconds)."""
+    directory = tmp_path_factory.mktemp("demo")
+    said: list[str] = []
+    started = time.monotonic()
+    result = run_demo(directory, seed=1, say=said.append)
+    return directory, result, said, time.monotonic() - started
+
+
+def assert_kept(result):
+    assert result.state == "CONFIRMED"  # in flash, read after a restart
+    assert result.worst_before_deg > 10.0
+    assert result.worst_after_deg <= 0.5
+    assert np.max(np.abs(result.bias_error_rad_s)) <= 3e-4
+    assert np.max(np.abs(result.bias_sigmas)) <= 3.0
+    assert result.read_back_exact
+    assert result.good, result.failures()
+
+
+def test_what_is_promised(done):
+    _, result, said, seconds = done
+    assert_kept(result)
+    assert seconds <= LONGEST_S
+    assert sum("operator approves" in line for line in said) == 1
+
+
+def test_before_and_after_on_every_heading_of_unseen_data(done):
+    result = done[1]
+    sectors = np.unique(np.mod(result.live_heading_deg, 360.0) // 10.0)
+    assert len(sectors) >= 34
+    assert np.max(np.abs(result.live_before_deg)) > 10.0
+    assert np.max(np.abs(result.live_after_deg)) <= 0.5
+
+
+def test_it_leaves_exactly_these_files(done):
+    directory = done[0]
+    assert sorted(p.name for p in directory.iterdir()) == sorted(FILES)
+    assert all((directory / name).stat().st_size > 1000 for name in FILES)
+    body = json.loads((directory / "calibration.json").read_text())
+    assert body["schema"] == "ahrsd.calibration/1"
+    assert body["converged"] is True
+    assert sorted(body["registers"]) == ["23", "84"]
+    page = (directory / "report.html").read_text()
+    assert page.index("before and after") < page.index("Field strength")  # the picture comes first
+
+
+def test_the_journal_tells_the_whole_way(done):
+    records = [json.loads(r) for r in (done[0] / "journal.jsonl").read_text().splitlines()]
+    assert [r["kind"] for r in records] == [
+        "PREPARED", "RAM_VERIFIED", "PROVEN", "FLASH_SENT", "FLASH_ACKED", "CONFIRMED",
+    ]  # fmt: skip
+    assert records[0]["approver"] == "operator"
+    assert {*records[0]["new"]} == {"23", "84"}
+
+
+def test_a_replay_takes_the_same_decisions(done):
+    directory, result, *_ = done
+    replayed = replay(directory / "capture.mcap", Config())
+    assert replayed.core.decisions.sha256 == result.decision_sha256
+    assert replayed.core.writeback.state.value == "CONFIRMED"
+
+
+def test_the_truth_stands_beside_the_estimate(done):
+    result = done[1]
+    text = "\n".join(lines(result))
+    for axis in range(3):
+        assert f"{result.truth.hard_iron_gauss[axis] * 1e3:.4f}" in text
+        assert f"{result.truth.gyro_bias_rad_s[axis] * 1e3:.4f}" in text
+    assert result.decision_sha256 in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_five_seeds_in_a_row(tmp_path, seed):
+    started = time.monotonic()
+    result = run_demo(tmp_path, seed=seed, say=lambda _: None)
+    assert_kept(result)
+    assert time.monotonic() - started <= LONGEST_S
+
+
+def test_a_device_that_dies_ends_it_in_seconds(tmp_path, monkeypatch):
+    processes = []
+
+    class Mortal(EmulatorProcess):
+        def __init__(self, *args, **options):
+            super().__init__(*args, **options)
+            processes.append(self._process)
+
+    monkeypatch.setattr(demo, "EmulatorProcess", Mortal)
+    said = threading.Event()
+
+    def kill():
+        assert said.wait(60.0)
+        os.kill(processes[0].pid, signal.SIGKILL)
+        killed.append(time.monotonic())
+
+    killed: list[float] = []
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(DeviceError, match="the emulated device died") as caught:
+        run_demo(tmp_path, say=lambda _: said.set())
+    killer.join()
+    assert time.monotonic() - killed[0] < 15.0
+    assert caught.value.exit_code == 75
+    assert "\n" not in str(caught.value)
+
+
+def test_no_device_is_one_line(tmp_path, monkeypatch, run, capsys):
+    def refuse(*_args, **_options):
+        raise OSError(2, "out of pty devices")
+
+    monkeypatch.setattr(demo, "EmulatorProcess", refuse)
+    assert run("demo", "--output", tmp_path / "d") == 75
+    assert capsys.readouterr().err == ("ahrsd: no emulated device: [Errno 2] out of pty devices\n")
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path, run, capsys):
+    (tmp_path / "d").write_text("mine")
+    assert run("demo", "--output", tmp_path / "d") == 2
+    assert (tmp_path / "d").read_text() == "mine"
+
+
+def test_an_output_below_a_file_is_one_line(tmp_path, run, capsys):
+    (tmp_path / "d").write_text("mine")
+    assert run("demo", "--output", tmp_path / "d" / "e") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"ahrsd: {tmp_path / 'd' / 'e'}: ")
+    assert error.count("\n") == 1
+
+
+def test_a_demo_without_enough_time_says_no(tmp_path, run, capsys):
+    assert run("demo", "--output", tmp_path, "--seconds", "90", "--seed", "3") == 1
+    out = capsys.readouterr().out
+    assert "The demo did not reach its goal: it ended in " in out
+    assert "NOT what was approved" in out
+
+
+def test_the_configuration_allows_for_the_speed(tmp_path):
+    slow, fast = demo_config(tmp_path, 1.0), demo_config(tmp_path, 40.0)
+    assert slow.mode == fast.mode == "commit"
+    assert slow.interlock.max_age_s == 1.0
+    assert fast.interlock.max_age_s == 20.0
+    assert math.isclose(fast.device.reply_timeout_s, 4.0)
