@@ -72,8 +72,8 @@ class Settings:
     """What the publications leave to the user; the defaults are theirs.
 
     sigma_mag_gauss:   noise of one reading per axis; None: measured on the data [None]
-    sigma_field_gauss: noise of the given |H_k|, for np-uncertain-field [1.5e-3, about what the
-                       world magnetic model's error budget says of the total intensity]
+    sigma_field_gauss: noise of the given |H_k|, one number or (N,), for np-uncertain-field [1.5e-3, about
+                       the world magnetic model's error of the total intensity]
     known_gyro_bias_rad_s: for magical-ls, which does not estimate it [0]
     derivative:        "median" as in the seeds: first differences, their median per window.
                        "savgol": readings smoothed by a Savitzky-Golay filter first
@@ -87,7 +87,7 @@ class Settings:
     """
 
     sigma_mag_gauss: float | None = None
-    sigma_field_gauss: float = 1.5e-3
+    sigma_field_gauss: float | Array = 1.5e-3
     known_gyro_bias_rad_s: Array = field(default_factory=_zero)
     derivative: Derivative = "median"
     ellipsoid_constraint: Constraint = "trace"
@@ -103,7 +103,7 @@ class Settings:
             "sigma_field_gauss": self.sigma_field_gauss,
         }
         for name, value in positive.items():
-            if value is not None and not (np.isfinite(value) and value > 0):
+            if value is not None and not np.all(np.isfinite(value) & (np.asarray(value) > 0)):
                 raise MethodError(f"{name} is {value}: it must be a positive number of gauss")
         least = {"window": 2, "update_every": 1, "savgol_window": 5}
         for name, minimum in least.items():

@@ -4,7 +4,8 @@
 
 is linear once a = -3 - b - c is put in. That constraint rewards a large coefficient along an axis
 in which the readings vary little; Fang's own, 4 a b - (2 h)^2 = 1, does not where that axis is z,
-and can be chosen (`Settings.ellipsoid_constraint`). With Q = [[a h g] [h b f] [g f c]] and n = [p q r],
+and can be chosen (`Settings.ellipsoid_constraint`). With Q = [[a h g] [h b f] [g f c]] and
+n = [p q r],
 
     hard iron = -Q^-1 n,    C^T C = Q up to scale and sign
 
@@ -48,7 +49,8 @@ def fang_quadric(field: Array) -> tuple[Array, Array, float]:
     # first the seven free coefficients, which follow from the three: R22^T R22 is left for these
     S = np.column_stack([z * z, y * z, x * z, x, y, z, ones, x * x, x * y, y * y])
     R = np.asarray(np.linalg.qr(S).R)
-    if np.min(np.abs(np.diag(R))) < _RANK * np.max(np.abs(np.diag(R))):
+    scales = np.linalg.svd(R, compute_uv=False)  # the last one is 0 where the fit is perfect
+    if scales[8] < _RANK * scales[0]:
         raise MethodError(_MANY)
     constraint = np.array([[0.0, 0.0, 2.0], [0.0, -1.0, 0.0], [2.0, 0.0, 0.0]])
     values, vectors = np.linalg.eig(np.linalg.solve(constraint, R[7:, 7:].T @ R[7:, 7:]))

@@ -1,8 +1,9 @@
-"""The thesis' experiment, written again here so that the methods are judged by something of their own."""
+"""The thesis' experiment, written again here so that the methods are judged independently."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,8 +48,8 @@ def simulate(
         phase = rng.uniform(0, 2 * np.pi, 3)
         angles = np.radians(HALF_RANGE_DEG[kind]) * np.sin(2 * np.pi * f * t[:, None] + phase)
     else:
-        angles = np.zeros((n + 1, 3)) + [0.01, -0.02, 0.0]
-        angles[:, 2] = 0.3 * t if kind == "planar" else 1.0
+        angles = np.tile([0.01, -0.02, 1.0], (n + 1, 1))
+        angles[:, 2] += 0.3 * t if kind == "planar" else 0.0
     R = Rotation.from_euler("ZYX", angles[:, ::-1])  # R_nb
     rate = (R[:-1].inv() * R[1:]).as_rotvec() * rate_hz
     field = R[1:].inv().apply(FIELD)
@@ -77,7 +78,7 @@ def blocks(data: Data, sizes: tuple[int, ...], gaps: tuple[int, ...] = ()) -> li
     edges = np.cumsum([0, *sizes])
     assert edges[-1] == len(data)
     cut = []
-    for i, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for i, (a, b) in enumerate(pairwise(edges)):
         cut.append(
             SampleBlock(
                 time_s=data.time_s[a:b],
