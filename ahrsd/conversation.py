@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ahrsd.writeback.permissions import Mode, Purpose, permitted
-from drivers.vn100.calibration_stream import configure_stream
+from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
 from drivers.vn100.commands import Command, LinkGone, Pause, Procedure
+from drivers.vn100.decode import Measurement
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -30,7 +31,8 @@ from drivers.vn100.procedures import (
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
 
-ASK_AGAIN_S = 10.0
+ASK_AGAIN_S = 5.0
+_FOREIGN = 20  # messages without one of the session's own output: it is gone
 
 
 class Phase(Enum):
@@ -118,6 +120,7 @@ class Conversation:
         self._name = ""
         self._baud = 115200
         self._touched = self._unanswered = False
+        self._own, self._foreign = "", 0  # layout of the session's output; others without it
         self._said: list[Said] = []
 
     def _allowed(self, command: Command) -> bool:
@@ -166,7 +169,12 @@ class Conversation:
 
     def received(self, data: bytes, now_s: float) -> list[Event]:
         """Bytes came; returns measurements, faults and strays, in order."""
-        return self._digest(self.session.receive(data, now_s), now_s)
+        events = self._digest(self.session.receive(data, now_s), now_s)
+        if self._own and self._own_is_gone(events) and self.idle:
+            text = "the session's output is gone: the device restarted, or somebody changed it"
+            self._said.append(StreamChanged(text, "warning"))
+            events += self.identify_again(now_s)
+        return events
 
     def tick(self, now_s: float) -> list[Event]:
         """Time passed."""
@@ -182,6 +190,7 @@ class Conversation:
 
     def _abandon(self, now_s: float) -> list[Event]:
         """End what runs without another byte; only the write-back is told how its own ended."""
+        self._own = ""
         if self.phase not in (Phase.RUNNING, Phase.RESTORING):
             self.phase = Phase.CLOSED
         return self._digest(self.session.link_lost(now_s), now_s)
@@ -244,6 +253,11 @@ class Conversation:
         """The device that was read, and no other, may hold settings of this session."""
         return self._touched and bool(self.saved)
 
+    def _own_is_gone(self, events: list[Event]) -> bool:
+        names = [event.layout.name for event in events if isinstance(event, Measurement)]
+        self._foreign = 0 if self._own in names else self._foreign + len(names)
+        return self._foreign >= _FOREIGN
+
     def _set_up(self, now_s: float) -> list[Event]:
         self.phase = Phase.SETTING_UP
         self._touched = True  # from the first byte on, also where it breaks off half way
@@ -288,12 +302,17 @@ class Conversation:
             self._said.append(StreamChanged(text, "warning"))
             return []
         if error is not None:
-            if not self._unanswered:
-                self._said.append(Unanswered(f"{phase.value}: {error}"))
-            self._unanswered = True
+            self._say_unanswered(f"{phase.value}: {error}")
             self.phase = Phase.IDENTIFYING
             return self._start(_identify_later(), Purpose.READ, now_s)
         return self._next(phase, result, now_s)
+
+    def _say_unanswered(self, text: str) -> None:
+        """Once. What a device that was known sends now is not used: its registers will be read."""
+        if not self._unanswered:
+            known = StreamChanged(f"{text}; asking again", "warning")
+            self._said.append(Unanswered(text) if self._serial is None else known)
+        self._unanswered = True
 
     def _next(self, phase: Phase, result: object, now_s: float) -> list[Event]:
         if phase is Phase.IDENTIFYING and isinstance(result, Identity):
@@ -311,7 +330,8 @@ class Conversation:
             self._said.append(ConfigurationRead(result))
             if self.change_stream:
                 return self._set_up(now_s)
-        if phase is Phase.SETTING_UP:
+        if isinstance(result, CalibrationStream):
+            self._own, self._foreign = result.layout, 0
             self._said.append(StreamChanged(f"output set up for the session: {result}"))
         self.phase = Phase.READY
         return []

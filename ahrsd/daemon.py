@@ -26,6 +26,7 @@ from ahrsd.config_text import print_config
 from ahrsd.core import Core
 from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.interlock import InterlockFile
+from ahrsd.operator_box import OperatorBox
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
@@ -86,6 +87,7 @@ class Daemon:
         interlock: Vehicle | None = None,
         *,
         baud: int | None = None,
+        box: OperatorBox | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -93,7 +95,7 @@ class Daemon:
         known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
         self._link = SerialLink(port_path, known, clock.now_ns)
         self._queue = self._link.queue
-        self._interlock = interlock
+        self._interlock, self._box = interlock, box
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
@@ -194,19 +196,24 @@ class Daemon:
                 self._lost(self.clock.now_ns(), str(error))
 
     def _look(self) -> None:
-        """Once a second: what a person should hear."""
+        """Once a second: what a person said, and what one should hear."""
         now_s = time.monotonic()
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + _WATCH_S
+        for verb, argument in self._box.take() if self._box is not None else ():
+            self.operate(verb, argument)
         capture, now_ns = self.shell.capture, self.clock.now_ns()
         error = "" if capture is None else capture.status.error
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
             self.shell.say(remark.level, remark.text, now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
-        if self._watch.garbage and self.config.device.baud == "auto":
+        device = self.config.device
+        if self._watch.garbage and device.baud == "auto":
             self._link.doubt()
             self._lost(now_ns, "no message in what arrives: looking for the rate")
+        elif self._watch.silent and device.configure_stream and self._may_query:
+            self._lost(now_ns, "silence: asking the device again for its output")
 
     # -- the port ----------------------------------------------------------------------------------
 
@@ -319,6 +326,19 @@ def _open_capture(config: Config, path: Path) -> CaptureWriter:
     )
 
 
+def _open_box(config: Config) -> OperatorBox | None:
+    """Where a person may speak to the daemon; a run that writes nothing needs none."""
+    if config.mode not in ("stage", "commit"):
+        return None
+    box = OperatorBox(config.state)
+    try:
+        box.prepare()
+    except OSError as error:
+        log.warning("%s cannot be made, nobody can approve: %s", box.folder, error.strerror)
+        return None
+    return box
+
+
 def close_shell(shell: Shell) -> None:
     """Close what `open_shell` opened, each bounded in time."""
     if isinstance(shell.viewer, RerunSink):
@@ -355,7 +375,8 @@ def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
     interlock = None
     if config.interlock.file is not None:
         interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
-    daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud)
+    box = _open_box(config)
+    daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud, box=box)
     try:
         with _signals(daemon.stop):
             daemon.run()

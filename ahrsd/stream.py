@@ -1,7 +1,7 @@
 """Messages to raw samples: one stream, its clock, its gaps, the registers that were in force.
 
-Rows of one layout are collected until a quarter of a second is together (by count, so that the
-blocks do not depend on how the bytes were cut), then turned into arrays at once.
+Rows of one layout are collected until a quarter of a second is together, at least four (by count,
+so that the blocks do not depend on how the bytes were cut), then turned into arrays at once.
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
 the rate. Damaged messages, and steps over which the device turned further than its rate can explain
@@ -36,6 +36,7 @@ from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
 
 FACTORY_RATE_HZ = 40.0
 _BLOCK_S = 0.25
+_LEAST_ROWS, _MOST_ROWS = 4, 256
 _ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _FEW_PLACES = 3  # a jump of the device's own attitude now and then is not worth a warning
@@ -87,6 +88,7 @@ class Stream:
         self._arrivals: list[float] = []
         self._lost: list[int] = []
         self._lost_next = 0
+        self._want = 1
         self._forgiven = False
         self._attitude: list[int] | None = None
         self._turns = TurnWatch()
@@ -125,7 +127,15 @@ class Stream:
         self.lost(1)
 
     def forget(self) -> None:
-        """The link was away, or the output was changed: what follows does not follow on."""
+        """The link was away, or the output was changed: what follows does not follow on.
+
+        It may be another message, and a worse one: a device that restarted, or another device.
+        """
+        self._extractor = None
+        self._clear()
+        self._cut()
+
+    def _cut(self) -> None:
         self._timeline.forget()
         self._turns.forget()
         self._lost_next = max(self._lost_next, 1)
@@ -147,7 +157,10 @@ class Stream:
         self._arrivals.append(host_s)
         self._lost.append(self._lost_next)
         self._lost_next = 0
-        return self.flush() if len(self._rows) >= self._wanted(extractor) else []
+        if len(self._rows) < self._want:
+            return []
+        self._want = self._wanted(extractor)
+        return self.flush() if len(self._rows) >= self._want else []
 
     def _accept(self, measurement: Measurement) -> Extractor | None:
         """The first layout that has what is needed is the stream; a better one replaces it."""
@@ -162,26 +175,30 @@ class Stream:
         if self._extractor is not None and not _better(new, self._extractor):
             return None
         self._extractor = new
+        if new.has_time:
+            self._steps = None  # the rate of what came before says nothing
         self._clear()
         self._attitude = None if new.has_time else attitude_columns(layout)
         self.facts.layout = layout.name
         self.warnings.update(dict.fromkeys(new.warnings))
-        self.forget()
+        self._cut()
         return new
 
     def _clear(self) -> None:
         self._rows.clear()
         self._arrivals.clear()
         self._lost.clear()
+        self._want = 1
 
     def _wanted(self, extractor: Extractor) -> int:
+        """Rows of the next block, as known now; asked only when the last answer is reached."""
         if extractor.has_time:
             period = self._timeline.period_s
-            return 16 if not np.isfinite(period) else max(1, min(256, int(_BLOCK_S / period)))
+            return 16 if not np.isfinite(period) else _rows(1.0 / period)
         if self._steps is None and self._rate(len(self._rows)) is None:
             return len(self._rows) + 1
         rate = self.facts.rate_hz
-        return max(1, min(256, int(_BLOCK_S * rate))) if np.isfinite(rate) else 1
+        return _rows(rate) if np.isfinite(rate) else 1
 
     def _rate(self, count: int) -> float | None:
         """Rate of a stream without device time, None while it must still be watched."""
@@ -314,6 +331,11 @@ class Stream:
         reasons = "; ".join(str(error) for error in self.refused.values())
         if reasons:
             raise NoSamplesError(reasons)
+
+
+def _rows(rate_hz: float) -> int:
+    """Rows of a block."""
+    return max(_LEAST_ROWS, min(_MOST_ROWS, int(_BLOCK_S * rate_hz)))
 
 
 def _better(new: Extractor, old: Extractor) -> bool:

@@ -45,7 +45,8 @@ class Watch:
     """See the module. Times are of the host's clock, in s."""
 
     started_s: float
-    garbage: bool = False  # bytes have been arriving without a message
+    silent: bool = False  # no byte for some time
+    garbage: bool = False  # bytes, and no message for some time
     _said: str = ""
     _status_s: float = field(init=False)
     _samples: tuple[float, int] = field(init=False)
@@ -63,11 +64,12 @@ class Watch:
         self._bytes = _Count(-1.0, now_s)
         self._messages = _Count(-1.0, now_s)
         self._taken = _Count(-1.0, now_s)
-        self.garbage = False
+        self.silent = self.garbage = False
 
     def look(self, core: Core, now_s: float, capture_error: str, is_open: bool) -> list[Remark]:
         """What is to be said now."""
-        remarks = self._amiss(self._reason(core, now_s, is_open), capture_error)
+        reason = self._reason(core, now_s, is_open)
+        remarks = self._amiss(reason, capture_error, self._taken.since_s == now_s)
         if now_s - self._status_s >= STATUS_S:
             self._status_s = now_s
             remarks.append(Remark(logging.INFO, self._status(core, now_s)))
@@ -79,24 +81,24 @@ class Watch:
         silent_s = self._bytes.stuck_s(counters.fed_bytes, now_s)
         deaf_s = self._messages.stuck_s(counters.valid, now_s)
         idle_s = self._taken.stuck_s(core.stream.facts.samples, now_s)
-        self.garbage = False
+        self.silent = is_open and silent_s >= _AMISS_S
+        self.garbage = is_open and deaf_s >= _AMISS_S and not self.silent
         if not is_open:
             return ""  # that the port is gone is said elsewhere
-        if silent_s >= _AMISS_S:
+        if self.silent:
             return _SILENT
-        if deaf_s >= _AMISS_S:
-            self.garbage = True
+        if self.garbage:
             return _DEAF
         if idle_s >= _AMISS_S:
             return _no_samples(core)
         return ""
 
-    def _amiss(self, stream: str, capture_error: str) -> list[Remark]:
+    def _amiss(self, stream: str, capture_error: str, flowing: bool) -> list[Remark]:
         capture = f"capture: {capture_error}, records are being lost" if capture_error else ""
         now = "; ".join(text for text in (stream, capture) if text)
-        before, self._said = self._said, now
-        if now == before:
+        if now == self._said or not (now or flowing):  # after reopening nothing is known yet
             return []
+        self._said = now
         return [Remark(logging.WARNING, now) if now else Remark(logging.INFO, "all is well again")]
 
     def _status(self, core: Core, now_s: float) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -67,3 +69,116 @@ def emulated() -> Callable[..., AbstractContextManager[tuple[object, str]]]:
             yield emulator, server.path
 
     return serve
+
+
+class LiveDaemon:
+    """An emulated VN-100 and the daemon, both in threads of this process, in real time.
+
+    `heard` is what the device was sent, `events` what the core answered.
+    """
+
+    def __init__(self, folder: Path, setup: dict[str, object], tables: dict[str, object]) -> None:
+        from ahrsd.config import check_config
+        from ahrsd.daemon import Daemon, HostClock, open_shell
+        from drivers.vn100.emulator_pty import PtyEmulator
+        from drivers.vn100.emulator_scenarios import Setup, build
+
+        self.port = folder / "vn100"
+        device = {"baud": 115200, "port": str(self.port), **tables.pop("device", {})}
+        body = {"state_directory": str(folder), **tables, "device": device}
+        self.emulator = build(Setup(**setup))
+        self.before = dict(self.emulator.memory.ram)
+        self.heard = bytearray()
+        self.served = PtyEmulator(self.emulator, link=self.port)
+        receive = self.emulator.receive
+
+        def listen(data: bytes, now_s: float) -> object:
+            self.heard.extend(data)
+            return receive(data, now_s)
+
+        self.emulator.receive = listen
+        config, clock = check_config(body, "test"), HostClock()
+        self.capture = folder / "capture.mcap"
+        self.shell = open_shell(config, clock, self.capture)
+        self.core = self.shell.core
+        self.events: list[object] = []
+        self.shell.listeners.append(self.events.append)
+        self.daemon = Daemon(config, self.shell, self.port, clock, self)
+        self.error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="live-daemon")
+
+    def safe(self) -> bool:
+        """The vehicle's word."""
+        return True
+
+    def _run(self) -> None:
+        try:
+            self.daemon.run()
+        except Exception as error:  # noqa: BLE001 - handed to the test
+            self.error = error
+
+    def __enter__(self) -> LiveDaemon:
+        self.served.start()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        from ahrsd.daemon import close_shell
+
+        self.stop()
+        close_shell(self.shell)
+        self.served.stop()
+
+    def stop(self) -> float:
+        """Seconds that it took the daemon to end."""
+        asked = time.monotonic()
+        self.daemon.stop("test")
+        return self.ended() - asked
+
+    def ended(self) -> float:
+        """When the daemon ended."""
+        self._thread.join(30.0)
+        assert not self._thread.is_alive()
+        return time.monotonic()
+
+    def until(self, condition: Callable[[], object], seconds: float = 15.0) -> None:
+        """Wait for it, while the daemon runs."""
+        end = time.monotonic() + seconds
+        while not condition():
+            assert self._thread.is_alive(), self.error
+            assert time.monotonic() < end, "it did not happen in time"
+            time.sleep(0.005)
+
+    @property
+    def samples(self) -> int:
+        """How many the core has taken."""
+        return int(self.core.stream.facts.samples)
+
+    def flowing(self, seconds: float = 15.0) -> None:
+        """Wait until further samples come."""
+        count = self.samples
+        self.until(lambda: self.samples > count, seconds)
+
+    def noted(self, text: str) -> bool:
+        """Whether the core noted something with this text."""
+        return text in self.notes
+
+    @property
+    def notes(self) -> str:
+        """All that the core noted."""
+        return "\n".join(str(getattr(event, "text", "")) for event in list(self.events))
+
+    @property
+    def states(self) -> list[str]:
+        """The write-back's states, as they came."""
+        return [e.new for e in list(self.events) if type(e).__name__ == "StateChanged"]
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Callable[..., LiveDaemon]:
+    """`with live({"rate_hz": 40}, mode="observe") as daemon`: see LiveDaemon."""
+
+    def make(setup: dict[str, object] | None = None, **tables: object) -> LiveDaemon:
+        return LiveDaemon(tmp_path, setup or {}, tables)
+
+    return make

@@ -1,0 +1,175 @@
+"""The daemon against an emulated device: lost samples, processor time, memory.
+
+    python tests/benchmarks/bench_run.py --rate 200 --seconds 600
+
+The daemon is the real command in a process of its own, with its capture; figures of the process
+are read from outside. Its start (imports) is left out of the processor time, its end is not.
+Samples are counted twice: by the daemon, and in the capture by the device's own time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from ahrsd.inputs import Received
+from ahrsd.recording.capture import CaptureReader
+from drivers.vn100.decode import Measurement, decode
+from drivers.vn100.deframer import Deframer
+from drivers.vn100.emulator_process import EmulatorProcess
+from drivers.vn100.emulator_scenarios import Setup
+
+BAUD = 921600
+SETTLE_S = 3.0
+LOOK_S = 2.0
+
+
+@dataclass(frozen=True)
+class Figures:
+    """expected: by the device's time; in_capture, taken: what the record and the daemon have."""
+
+    rate_hz: int
+    seconds: float
+    expected: int
+    in_capture: int
+    taken: int
+    cpu_s: float
+    parse_s: float
+    rss_start_mb: float
+    rss_end_mb: float
+    rss_slope_kb_min: float
+    threads: int
+    descriptors: int
+    exit_code: int
+    stop_s: float
+
+    @property
+    def cpu_percent(self) -> float:
+        """Of one core, of the whole process."""
+        return 100.0 * self.cpu_s / self.seconds
+
+    @property
+    def lost(self) -> int:
+        """Samples that are missing in the capture or in the daemon's count."""
+        return self.expected - min(self.in_capture, self.taken)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.rate_hz} Hz, {self.seconds:.0f} s: {self.expected} samples expected, "
+            f"{self.in_capture} in the capture, {self.taken} taken, {self.lost} lost\n"
+            f"  CPU {self.cpu_percent:.2f} % of one core, {self.cpu_s / self.parse_s:.1f} x parsing "
+            f"alone\n"
+            f"  RSS {self.rss_start_mb:.1f} MB at the start, {self.rss_end_mb:.1f} at the end, "
+            f"slope of the second half {self.rss_slope_kb_min:+.0f} kB/min\n"
+            f"  {self.threads} threads, {self.descriptors} descriptors; exit {self.exit_code} "
+            f"{self.stop_s:.2f} s after SIGTERM"
+        )
+
+
+def measure(rate_hz: int, seconds: float, folder: Path, *, verbose: bool = False) -> Figures:
+    """Run the daemon for so long and count."""
+    setup = Setup("rov", seed=1, output="binary", rate_hz=rate_hz, baud=BAUD)
+    with EmulatorProcess(setup, link=folder / "vn100") as emulated:
+        config = folder / "ahrsd.toml"
+        config.write_text(
+            f'state_directory = "{folder}"\n[device]\nport = "{emulated.path}"\nbaud = {BAUD}\n'
+        )
+        command = [sys.executable, "-m", "ahrsd", "-v", "run", "--config", str(config)]
+        log = (folder / "log").open("wb")
+        with log, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log) as daemon:
+            process = psutil.Process(daemon.pid)
+            _wait_for(folder / "log", b"OBSERVING")
+            time.sleep(SETTLE_S)
+            watched = _watch(process, seconds, verbose)
+            asked = time.monotonic()
+            daemon.send_signal(signal.SIGTERM)
+            said = daemon.communicate()[0].decode()
+            stop_s = time.monotonic() - asked
+    count = re.search(r": (\d+) samples in", said)
+    assert count is not None, said
+    taken = int(count[1])
+    expected, in_capture, parse_s_per_sample = count_in_capture(folder)
+    rss, cpu_s, lasted_s, threads, descriptors = watched
+    half = rss[len(rss) // 2 :]
+    slope = np.polyfit([t for t, _ in half], [b for _, b in half], 1)[0] if len(half) > 2 else 0.0
+    return Figures(
+        rate_hz=rate_hz,
+        seconds=lasted_s,
+        expected=expected,
+        in_capture=in_capture,
+        taken=taken,
+        cpu_s=cpu_s,
+        parse_s=parse_s_per_sample * rate_hz * lasted_s,
+        rss_start_mb=rss[0][1] / 1e6,
+        rss_end_mb=rss[-1][1] / 1e6,
+        rss_slope_kb_min=float(slope) * 60 / 1e3,
+        threads=threads,
+        descriptors=descriptors,
+        exit_code=daemon.returncode,
+        stop_s=stop_s,
+    )
+
+
+def _wait_for(log: Path, text: bytes, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while text not in log.read_bytes():
+        assert time.monotonic() < end, log.read_text()
+        time.sleep(0.05)
+
+
+def _watch(
+    process: psutil.Process, seconds: float, verbose: bool
+) -> tuple[list[tuple[float, int]], float, float, int, int]:
+    """RSS over time, processor time, how long, threads, descriptors."""
+    began, before = time.monotonic(), process.cpu_times()
+    rss = [(0.0, process.memory_info().rss)]
+    while (at := time.monotonic() - began) < seconds:
+        time.sleep(min(LOOK_S, seconds - at))
+        rss.append((time.monotonic() - began, process.memory_info().rss))
+        if verbose and len(rss) % 15 == 0:
+            now = process.cpu_times()
+            used = now.user + now.system - before.user - before.system
+            at, size = rss[-1]
+            print(f"{at:6.0f} s  CPU {100 * used / at:5.2f} %  RSS {size / 1e6:.1f} MB", flush=True)
+    after = process.cpu_times()
+    cpu_s = after.user + after.system - before.user - before.system
+    return rss, cpu_s, time.monotonic() - began, process.num_threads(), process.num_fds()
+
+
+def count_in_capture(folder: Path) -> tuple[int, int, float]:
+    """Samples by the device's time, samples found, and what parsing one takes (s)."""
+    (path,) = sorted((folder / "captures").glob("*.mcap"))
+    chunks = [item.data for item in CaptureReader(path) if isinstance(item, Received)]
+    deframer, times, started = Deframer(), [], time.process_time()
+    for chunk in chunks:
+        for frame in deframer.feed(chunk):
+            event = decode(frame)
+            if isinstance(event, Measurement):
+                times.append(event.values[0])
+    used_s = time.process_time() - started
+    step_s = float(np.median(np.diff(times)))
+    expected = round((times[-1] - times[0]) / step_s) + 1
+    return expected, len(times), used_s / len(times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rate", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        print(measure(arguments.rate, arguments.seconds, Path(folder), verbose=True))
+
+
+if __name__ == "__main__":
+    main()
