@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -237,13 +238,12 @@ class StreamTimeline:
         self._last_seen_s: float | None = None
         self._last_used_s: float | None = None
         self._recent.clear()
+        self._period_s = float("nan") if self._nominal_s is None else self._nominal_s
 
     @property
     def period_s(self) -> float:
         """Median step of late; nan before two samples."""
-        if self._recent:
-            return float(np.median(self._recent))
-        return float("nan") if self._nominal_s is None else self._nominal_s
+        return self._period_s
 
     def extend(self, time_s: Array, usable: Mask | None = None) -> Steps:
         """Steps of N further samples at device times (N,).
@@ -296,5 +296,8 @@ class StreamTimeline:
         """Period with this block's own steps in it, so that the first block has one as well."""
         before = [] if self._last_seen_s is None else [self._last_seen_s]
         steps_s = np.diff(np.concatenate([before, np.asarray(time_s, float)]))
-        self._recent.extend(steps_s[steps_s > 0.0][-PERIOD_MEMORY:].tolist())
-        return self.period_s if np.isfinite(self.period_s) else np.inf
+        new_s = steps_s[steps_s > 0.0][-PERIOD_MEMORY:].tolist()
+        self._recent.extend(new_s)
+        if new_s:
+            self._period_s = median(self._recent)
+        return self._period_s if np.isfinite(self._period_s) else np.inf

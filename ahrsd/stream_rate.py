@@ -13,6 +13,7 @@ mean rate w over the same step; v = w dt. Two things follow:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
@@ -176,15 +177,16 @@ class TurnWatch:
         R = _rotations(np.vstack([self._last[:3], ypr_rad]))
         speed = np.linalg.norm(np.vstack([self._last[3:], gyro_rad_s]), axis=1)
         self._last = table[-1]
-        turned = np.linalg.norm(so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:]), axis=1)
+        trace = np.einsum("nij,nij->n", R[:-1], R[1:])  # of R_k^T R_(k+1): 1 + 2 cos(angle)
+        turned = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
         said = np.maximum(speed[1:], speed[:-1]) * step_s
         found = np.zeros(len(table), dtype=np.int64)
         jumps = (turned - said > _MISSING_RAD) & (turned > _MISSING_RATIO * said)
         weight = min(step_s / _SPEED_S, 1.0)
-        for k, now in enumerate(speed[1:].tolist()):
-            if np.isfinite(now):
+        for k, (now, jumped) in enumerate(zip(speed[1:].tolist(), jumps.tolist(), strict=True)):
+            if math.isfinite(now):
                 self._speed_rad_s += weight * (now - self._speed_rad_s)
-            if jumps[k]:
+            if jumped:
                 steps = turned[k] / max(self._speed_rad_s * step_s, 1e-9)
                 found[k] = max(1, round(min(steps, _LONGEST_LOSS_S / step_s)) - 1)
         self.places += int(np.count_nonzero(found))
@@ -196,9 +198,9 @@ def _rotations(ypr_rad: Array) -> Array:
     """R_nb of yaw, pitch, roll (3-2-1)."""
     y, p, r = ypr_rad.T
     cy, sy, cp, sp, cr, sr = np.cos(y), np.sin(y), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return np.stack([value for row in rows for value in row], axis=1).reshape(-1, 3, 3)
