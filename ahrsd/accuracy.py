@@ -50,9 +50,11 @@ class Answer:
 
 
 def unit_volume(soft_iron: Array) -> Array:
-    """A / det(A)^(1/3).  ValueError where A (3, 3) is not finite or turns space inside out."""
+    """A / det(A)^(1/3).  ValueError where A (3, 3) is not finite or its determinant not positive."""
+    if not np.isfinite(soft_iron).all():
+        raise ValueError("the soft iron is not finite")
     volume = float(np.linalg.det(soft_iron))
-    if not (np.isfinite(volume) and volume > 0):
+    if volume <= 0:
         raise ValueError(f"a soft iron of determinant {volume:.3g} cannot be one")
     return np.asarray(soft_iron / np.cbrt(volume))
 
@@ -60,9 +62,12 @@ def unit_volume(soft_iron: Array) -> Array:
 def geodesic(A: Array, B: Array) -> float:
     """Affine-invariant distance of two symmetric positive definite matrices.
 
-    Raises LinAlgError where B is not positive definite.
+    Raises ValueError where one is not positive definite.
     """
-    return float(np.linalg.norm(np.log(eigh((A + A.T) / 2, (B + B.T) / 2, eigvals_only=True))))
+    ratios = eigh((A + A.T) / 2, (B + B.T) / 2, eigvals_only=True)
+    if ratios[0] <= 0:
+        raise ValueError("the soft iron is not positive definite")
+    return float(np.linalg.norm(np.log(ratios)))
 
 
 def nees(error: Array, covariance: Array, soft_iron: Array) -> float:
