@@ -50,7 +50,7 @@ class Answer:
 
 
 def unit_volume(soft_iron: Array) -> Array:
-    """A / det(A)^(1/3).  ValueError where A (3, 3) is not finite or its determinant not positive."""
+    """A / det(A)^(1/3).  ValueError where A (3, 3) is not finite or det A <= 0."""
     if not np.isfinite(soft_iron).all():
         raise ValueError("the soft iron is not finite")
     volume = float(np.linalg.det(soft_iron))
