@@ -52,6 +52,10 @@ class Calibrator:
             self.estimator = Estimator(self.settings.estimator, present, present_gyro_bias_rad_s)
         self.present, self.present_gyro_bias_rad_s = present, present_gyro_bias_rad_s
 
+    def anew(self) -> Calibrator:
+        """One that has seen nothing: what follows cannot be mixed with what came before."""
+        return Calibrator(self.settings, self.present, self.present_gyro_bias_rad_s)
+
     def take(self, block: SampleBlock) -> bool:
         """Samples in order; true where there is a new estimate."""
         new = False

@@ -336,6 +336,8 @@ class Core:
         if self._uptime_due and self.stream.facts.rate_source == "device time":
             self._uptime_due = False  # the first one since the device was read: did it restart?
             self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
+        if self.stream.take_replaced():
+            self.calibrator = self.calibrator.anew()
         calibrator = self.calibrator
         new = calibrator.take(block)
         estimate = calibrator.estimate
@@ -355,10 +357,7 @@ class Core:
         host_s = self._host_s or self.at_s
         self._out.append(events.Estimated(self.at_s, host_s, estimate))
         gates = self.calibrator.judged(
-            self.at_s,
-            self.stream.health(),
-            self.basis(),
-            self.writeback.margin,
+            self.at_s, self.stream.health(), self.basis(), self.writeback.margin
         )
         self._out.append(events.Judged(self.at_s, host_s, gates))
         self.decisions.add(

@@ -90,6 +90,7 @@ class Stream:
         self._lost_next = 0
         self._want = 1
         self._forgiven = False
+        self._replaced = False
         self._attitude: list[int] | None = None
         self._turns = TurnWatch()
         self._turns_said = ""
@@ -172,8 +173,11 @@ class Stream:
         except MissingQuantityError as error:
             self.refused[layout.name] = error
             return None
-        if self._extractor is not None and not _better(new, self._extractor):
-            return None
+        old = self._extractor
+        if old is not None:
+            if not _better(new, old):
+                return None
+            self._replace(old, new)
         self._extractor = new
         if new.has_time:
             self._steps = None  # the rate of what came before says nothing
@@ -183,6 +187,20 @@ class Stream:
         self.warnings.update(dict.fromkeys(new.warnings))
         self._cut()
         return new
+
+    def _replace(self, old: Extractor, new: Extractor) -> None:
+        """Other quantities begin: what the old message gave must not mix with them."""
+        if _quantities(old) == _quantities(new):
+            return
+        for text in old.warnings:
+            self.warnings.pop(text, None)
+        self.warnings[f"{old.layout.name} was left out when {new.layout.name} began"] = None
+        self._replaced = self.facts.samples > 0
+
+    def take_replaced(self) -> bool:
+        """Whether blocks from now on hold other quantities than those before; true once."""
+        replaced, self._replaced = self._replaced, False
+        return replaced
 
     def _clear(self) -> None:
         self._rows.clear()
@@ -331,6 +349,10 @@ class Stream:
         reasons = "; ".join(str(error) for error in self.refused.values())
         if reasons:
             raise NoSamplesError(reasons)
+
+
+def _quantities(extractor: Extractor) -> tuple[bool, bool]:
+    return extractor.mag_compensated, extractor.gyro_compensated
 
 
 def _rows(rate_hz: float) -> int:
