@@ -81,6 +81,15 @@ def pooled(
     return _floored(_pooled(mag), min(_pooled(gyro), limit), parameters)
 
 
+def at_least(usual: chain.Noise, gyro_rad_s: float) -> chain.Noise:
+    """The usual noise with a gyro that is not quieter than this.
+
+    In steady motion an epoch tells so little of the gyro's noise (a few degrees of freedom) that
+    the pooled level can shrink from one pass to the next until the gyro counts as perfect.
+    """
+    return chain.Noise(usual.mag_gauss, max(usual.gyro_rad_s, gyro_rad_s))
+
+
 def median(guesses: Sequence[chain.Noise]) -> chain.Noise:
     """The middle of several first guesses."""
     return chain.Noise(

@@ -39,13 +39,14 @@ _LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
 _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
-BLIND = 0.3  # posterior over prior sigma above which a direction counts as not determined
+BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
 _FINISH_WORK = 6  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
 _DAMPING = 1e-3
 _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
+_GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
 _SHORTEST_GAP_S = 0.1
 
@@ -191,7 +192,10 @@ class Window:
             )
             self._replace(k, u, used, weights)
         found = [e.residuals for e in self.epochs]
-        self.usual = noise.pooled(found, noise.median(self._guesses), self.parameters)
+        guess = noise.median(self._guesses)
+        self.usual = noise.at_least(
+            noise.pooled(found, guess, self.parameters), _GYRO_LEAST * guess.gyro_rad_s
+        )
 
     # -- moving ----------------------------------------------------------------------------------
 
