@@ -161,8 +161,8 @@ def test_a_demo_without_enough_time_says_no(tmp_path, run, capsys):
 
 
 def test_the_configuration_allows_for_the_speed(tmp_path):
-    slow, fast = demo_config(tmp_path, 1.0), demo_config(tmp_path, 40.0)
+    slow, fast = demo_config(tmp_path, 1.0), demo_config(tmp_path, 10.0)
     assert slow.mode == fast.mode == "commit"
-    assert slow.interlock.max_age_s == 1.0
-    assert fast.interlock.max_age_s == 20.0
-    assert math.isclose(fast.device.reply_timeout_s, 4.0)
+    assert slow.interlock.max_age_s == 3.0
+    assert fast.interlock.max_age_s == 30.0
+    assert math.isclose(fast.device.reply_timeout_s, 1.0)

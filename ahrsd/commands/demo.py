@@ -41,7 +41,7 @@ def _program(name: str) -> str:
 @click.option(
     "--speed",
     type=click.FloatRange(1.0, 100.0),
-    default=40.0,
+    default=20.0,
     show_default=True,
     help="Device seconds per second.",
 )

@@ -50,7 +50,7 @@ from drivers.vn100.registers import same
 
 __all__ = ["FILES", "SPEED", "DemoResult", "demo_config", "figures", "lines", "run_demo", "verdict"]
 
-SPEED = 40.0
+SPEED = 20.0
 FILES = ("report.html", "run.rrd", "capture.mcap", "calibration.json", "journal.jsonl")
 _BAUD = 115200
 _RATE_HZ = 50
@@ -60,6 +60,7 @@ _MOTION = (("survey", 244.0),) * 10
 # On the Black Sea, where the world model has the emulator's field: 0.49 G, 60 deg down.
 _PLACE = {"latitude_deg": 42.0, "longitude_deg": 34.2, "date": datetime.date(2026, 1, 1)}
 _REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `speed` times faster
+_LONGEST_AGE_S = 60.0  # of the vehicle's word, as far as the configuration goes
 _WATCH_S = 0.5
 
 
@@ -88,7 +89,7 @@ def demo_config(directory: Path, speed: float = 1.0) -> Config:
     What is asked of the host in seconds (how old the vehicle's word and the newest sample may be,
     how long a reply takes) is asked of a clock that runs `speed` times faster here.
     """
-    age_s = float(max(speed / 2, 1.0))
+    age_s = float(min(max(3.0 * speed, 1.0), _LONGEST_AGE_S))
     body = {
         "mode": "commit",
         "state_directory": str(directory),

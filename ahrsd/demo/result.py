@@ -107,7 +107,7 @@ def figures(result: DemoResult) -> tuple[KeyFigure, ...]:
     """Before, after and limit of what matters."""
     before, after = result.truth.gyro_bias_rad_s * 1e3, result.bias_error_rad_s * 1e3
     heading = KeyFigure(
-        "Worst heading error, level, by the truth",
+        "Worst heading error, all headings, level",
         "deg",
         result.worst_before_deg,
         result.worst_after_deg,

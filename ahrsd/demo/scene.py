@@ -19,6 +19,7 @@ from ahrsd.events import (
     Event,
     GateResult,
     Judged,
+    Noted,
     RegisterWritten,
     SamplesSeen,
     StateChanged,
@@ -64,7 +65,8 @@ class Scene:
 
     def __call__(self, event: Event) -> None:
         """Watch one event."""
-        self.collector.add(event)
+        if not self._planned(event):
+            self.collector.add(event)
         match event:
             case SamplesSeen(block):
                 self._samples(block)
@@ -79,6 +81,14 @@ class Scene:
                 self.state = new
                 self._line(new, reason)
                 self._act(new)
+
+    def _planned(self, event: Event) -> bool:
+        """Whether it is the warning of the restart that this scene brought about."""
+        return (
+            self.state == State.COMMITTED
+            and isinstance(event, Noted)
+            and event.text.startswith("the device restarted")
+        )
 
     def _samples(self, block: SampleBlock) -> None:
         now_s = float(block.time_s[-1])

@@ -99,7 +99,7 @@ def heading(data: HeadingError, title: str) -> Figure:
             enlarged.axhline(sign * data.limit_deg, color=TRUTH, linewidth=1.2, linestyle="--")
     reach = max(float(np.max(np.abs(data.after_deg))), data.limit_deg or 0.0, 1e-3)
     enlarged.set_ylim(-1.25 * reach, 1.25 * reach)
-    both.legend(loc="upper right", ncols=2)
+    both.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2)
     both.set_title(title)
     limit = "" if data.limit_deg is None else f" (dashed: limit {data.limit_deg:g} deg)"
     enlarged.set_title(f"After, enlarged{limit}")
