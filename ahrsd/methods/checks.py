@@ -18,7 +18,8 @@ _RATE_RAD_S = 70.0  # twice what the VN-100's gyroscope can measure
 _STUCK = 0.05  # part of the samples at an axis' very largest or smallest reading
 _NOISE_SPREADS = 5.0  # a direction needs this many sigmas of spread to count as moved in
 _LEAST_NOISE_GAUSS = 1e-9  # simulated readings may have none
-_FLATNESS = 0.015  # third spread over first; large-scale tests of boats have 0.05 and more
+_FLATNESS = 0.015  # third spread over first; a car that circles has 0.05 to 0.09, LAM 0.13 to 0.2
+_WEAK = 0.1  # the same, below which the answer across that plane rests on little
 
 
 def mag_noise(data: Data, settings: Settings) -> float:
@@ -60,8 +61,11 @@ def spreads(field: Array) -> Array:
     return np.asarray(scales / np.sqrt(len(field)), dtype=np.float64)
 
 
-def moved(data: Data, settings: Settings, axes: int) -> None:
-    """MethodError unless the field's readings vary along `axes` principal directions (1 to 3)."""
+def moved(data: Data, settings: Settings, axes: int) -> str:
+    """A remark where the motion is weak, else "".
+
+    MethodError unless the field's readings vary along `axes` principal directions (2 or 3).
+    """
     spread = spreads(data.raw_b_gauss)
     noise = mag_noise(data, settings)
     if spread[1] < max(_NOISE_SPREADS * noise, 1e-4):
@@ -79,3 +83,6 @@ def moved(data: Data, settings: Settings, axes: int) -> None:
         for limit in (values.min(), values.max()):
             if np.mean(values == limit) > _STUCK:
                 raise MethodError(f"readings of {axis} stick at {limit:.4g} gauss: saturated")
+    if axes >= 3 and spread[2] < _WEAK * spread[0]:
+        return f"weak motion: readings leave a plane by {1e3 * spread[2]:.2g} mG only"
+    return ""

@@ -72,8 +72,8 @@ class Settings:
     """What the publications leave to the user; the defaults are theirs.
 
     sigma_mag_gauss:   noise of one reading per axis; None: measured on the data [None]
-    sigma_field_gauss: noise of the given |H_k|, one number or (N,), for np-uncertain-field [1.5e-3, about
-                       the world magnetic model's error of the total intensity]
+    sigma_field_gauss: noise of the given |H_k|, one number or (N,), for np-uncertain-field [1.5e-3,
+                       about the world magnetic model's error of the total intensity]
     known_gyro_bias_rad_s: for magical-ls, which does not estimate it [0]
     derivative:        "median" as in the seeds: first differences, their median per window.
                        "savgol": readings smoothed by a Savitzky-Golay filter first

@@ -1,10 +1,13 @@
-"""MAGICAL-LS: iterative least squares for soft and hard iron, gyro bias known.
+"""MAGICAL-LS: iterative least squares for soft and hard iron, gyro bias known ([R]).
 
     minimise sum |[w]x (C m - b') + C m'|^2
 
 over the six terms of the symmetric A (C = A^-1) and b', by Gauss-Newton from A = I and b' = 0; A is
 rescaled to unit volume after each step, A (l0 l1 l2)^(-1/3). The sum alone is least at C = 0, so a
 step is the shortest that solves the linear problem: none along A itself, where nothing changes.
+
+With the bias known the residual is Phi [c, b'], linear, and Phi = Q R: all steps need is R (9, 9).
+They are many where the derivative is noise, because the residual that stays is large.
 """
 
 from __future__ import annotations
@@ -13,47 +16,48 @@ import numpy as np
 
 from ahrsd.estimator.chain import symmetric, upper_triangle
 from ahrsd.methods.data import Data, Fit, MethodError, Settings
-from ahrsd.methods.magical_nls import model
-from ahrsd.methods.soft_iron import rescaled
-from ahrsd.methods.windows import Kinematics, per_sample
+from ahrsd.methods.kinematic import residual
+from ahrsd.methods.soft_iron import answer, positive, rescaled, unit_volume
+from ahrsd.methods.windows import per_sample
 from ahrsd.samples import Array
 
-_MAX_STEPS = 100
+_MAX_STEPS = 5000
 _MAX_HALVINGS = 30
-_TOLERANCE = 1e-9  # of the step, in units of A and gauss
+_TOLERANCE = 1e-7  # of a step, in units of A and gauss
 
 
 def estimate(data: Data, settings: Settings) -> Fit:
     """A and b; the note says which gyro bias was taken as known."""
-    kin = per_sample(data, settings)
     known = settings.known_gyro_bias_rad_s
-    m = model()
-    x = m.start.copy()
-    x[9:] = known
+    _, phi = residual(per_sample(data, settings), np.zeros(6), np.zeros(3), known)
+    R = np.asarray(np.linalg.qr(phi[:, :9]).R)
+    x = np.concatenate([upper_triangle(np.eye(3)), np.zeros(3)])
     for count in range(1, _MAX_STEPS + 1):
-        r, J = m.residual(kin, x)
-        step = np.zeros(12)
+        r, J = _rows(R, x)
         # rcond drops the direction along A, whose singular value is rounding only
-        step[:9] = np.linalg.lstsq(J[:, :9], -r, rcond=1e-10)[0]
-        x, moved = _taken(kin, x, step, float(r @ r))
+        step = np.asarray(np.linalg.lstsq(J, -r, rcond=1e-10)[0])
+        x, moved = _taken(R, x, step, float(r @ r))
         if moved < _TOLERANCE:
-            fit = m.fit(x, count)
-            note = "gyro bias taken as zero" if not np.any(known) else "gyro bias taken as given"
-            return Fit(fit.soft_iron, fit.hard_iron_gauss, None, count, note)
+            A, b = answer(unit_volume(x[:6])[0], x[6:])
+            note = "gyro bias taken as given" if np.any(known) else "gyro bias taken as zero"
+            return Fit(A, b, None, count, note)
     raise MethodError(f"no end after {_MAX_STEPS} steps")
 
 
-def _taken(kin: Kinematics, x: Array, step: Array, cost: float) -> tuple[Array, float]:
+def _rows(R: Array, x: Array) -> tuple[Array, Array]:
+    """Residual (9,) of x = [A (6), b' (3)] and its derivative (9, 9)."""
+    c6, J6 = unit_volume(x[:6])
+    return R @ np.concatenate([c6, x[6:]]), np.hstack([R[:, :6] @ J6, R[:, 6:]])
+
+
+def _taken(R: Array, x: Array, step: Array, cost: float) -> tuple[Array, float]:
     """x after the longest halving of the step that does not raise the cost, and how far it went."""
-    m = model()
     for halving in range(_MAX_HALVINGS):
         part = step / 2**halving
         new = x + part
-        A = symmetric(new[:6])
-        if np.linalg.eigvalsh(A)[0] <= 0:
-            continue
-        new[:6] = upper_triangle(rescaled(A))
-        r, _ = m.residual(kin, new)
-        if r @ r <= cost:
-            return new, float(np.linalg.norm(part))
+        if positive(new[:6]):
+            new[:6] = upper_triangle(rescaled(symmetric(new[:6])))
+            r, _ = _rows(R, new)
+            if r @ r <= cost:
+                return new, float(np.linalg.norm(part))
     return x, 0.0

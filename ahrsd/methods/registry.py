@@ -83,7 +83,7 @@ def run(
     try:
         chosen = settings or Settings()
         usable(data)
-        moved(data, chosen, row.axes)
+        remark = moved(data, chosen, row.axes)
         fit = row.function(data, chosen)
         _finite(fit)
     except MethodError as error:
@@ -96,7 +96,7 @@ def run(
         fit.hard_iron_gauss,
         fit.gyro_bias_rad_s,
         True,
-        fit.note,
+        "; ".join(text for text in (fit.note, remark) if text),
         fit.iterations,
         seconds,
     )

@@ -33,6 +33,17 @@ def test_the_closed_form_gives_the_constrained_answer(kind, soft_iron):
     assert np.allclose(a.hard_iron_gauss, b.hard_iron_gauss, atol=1e-9)
 
 
+@pytest.mark.parametrize("wrong", [0.7, 1.3])
+def test_they_agree_where_the_given_magnitude_is_far_off(wrong):
+    data = replace(
+        simulate("wam", 2, n=3000).data, field_n_gauss=None, field_norm_gauss=wrong * SIZE
+    )
+    a, b = run("np", data), run("fnp", data)
+    assert a.converged
+    assert a.iterations < 30
+    assert np.allclose(a.hard_iron_gauss, b.hard_iron_gauss, atol=1e-8)
+
+
 def test_the_readings_that_preserve_the_norm_are_the_same():
     field, norms = noisy_sphere(200)
     b, B, _ = np_constrained.solve(field, norms, linear_centre(field))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulation import clean, simulate
+from simulation import HARD_IRON, clean, simulate
 
 from ahrsd.methods import METHODS, MethodError, Settings, run
 
@@ -36,6 +36,16 @@ def changed(data, name, row, value):
 def test_a_planar_turn(method, noise):
     data = simulate("planar", n=4000, sigma_mag=noise).data
     assert "turned about one axis only" in refused(method, data)
+
+
+@pytest.mark.parametrize("method", ["fnp", "magical-ls"])
+def test_weak_motion_is_remarked(method):
+    """A car that circles: readings leave their plane by a twentieth of what they span in it."""
+    data = clean(soft_iron=np.eye(3)).data
+    spread = data.raw_b_gauss.std(axis=0)
+    flat = HARD_IRON + (data.raw_b_gauss - HARD_IRON) * [1.0, 1.0, 0.05 * spread[0] / spread[2]]
+    result = run(method, replace(data, raw_b_gauss=flat))
+    assert "weak motion: readings leave a plane by" in result.reason
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
