@@ -2,7 +2,9 @@
 
 hard iron, gyro bias: norm of the error ([R] Table 5.1); soft iron: Frobenius norm, and the
 affine-invariant distance | log eig(A^-1 B) | (the geodesic of positive definite matrices); heading:
-RMS over the trajectory ([R] Table 5.2); NEES: e^T P^-1 e, whose mean is its degrees of freedom
+RMS over the trajectory ([R] Table 5.2); field spread: standard deviation of the corrected field's
+magnitude over its mean ([R] 4.4); constraint: RMS of that magnitude less |h| ([L]'s constraint
+error); NEES: e^T P^-1 e, whose mean is its degrees of freedom
 where the covariance P is honest. Every soft iron is taken to det A = 1 first.
 """
 
@@ -108,6 +110,18 @@ def heading_rms_deg(
     return float(np.degrees(np.sqrt(np.mean(np.square(error)))))
 
 
+def field_errors(
+    experiment: Experiment, soft_iron: Array, hard_iron_gauss: Array
+) -> tuple[float, float]:
+    """Spread of the corrected field's magnitude over its mean, and RMS of magnitude less |h|."""
+    truth = experiment.truth
+    read = experiment.field_b[::_EVERY] @ truth.soft_iron.T + truth.hard_iron_gauss
+    corrected = Affine(np.asarray(np.linalg.inv(soft_iron), float), hard_iron_gauss).apply(read)
+    size = np.linalg.norm(corrected, axis=1)
+    rms = float(np.sqrt(np.mean(np.square(size - truth.field_gauss))))
+    return float(np.std(size) / np.mean(size)), rms
+
+
 def figures(answer: Answer, experiment: Experiment) -> dict[str, float | None]:
     """All errors of an answer by name; None where the answer does not say that part.
 
@@ -126,13 +140,15 @@ def figures(answer: Answer, experiment: Experiment) -> dict[str, float | None]:
         A = unit_volume(A)
         out["soft_iron"] = float(np.linalg.norm(A - truth.soft_iron))
         out["soft_iron_geodesic"] = geodesic(A, truth.soft_iron)
-    if A is not None and b is not None:
-        out["heading_deg"] = heading_rms_deg(experiment, A, b)
+    if b is not None:
+        applied = np.eye(3) if A is None else A  # what would be written to the register
         noise = _TABLE_5_2_NOISE_GAUSS
-        out["heading_10mg_deg"] = heading_rms_deg(experiment, A, b, noise)
-        if bias is not None and answer.covariance is not None:
-            found = Truth(A, b, bias, truth.field_gauss, 0.0, 0.0).parameters
-            out["nees"] = nees(found - truth.parameters, answer.covariance, A)
+        out["heading_deg"] = heading_rms_deg(experiment, applied, b)
+        out["heading_10mg_deg"] = heading_rms_deg(experiment, applied, b, noise)
+        out["field_spread"], out["constraint_gauss"] = field_errors(experiment, applied, b)
+    if A is not None and b is not None and bias is not None and answer.covariance is not None:
+        found = Truth(A, b, bias, truth.field_gauss, 0.0, 0.0).parameters
+        out["nees"] = nees(found - truth.parameters, answer.covariance, A)
     return out
 
 
@@ -150,5 +166,7 @@ FIGURES: Mapping[str, tuple[str, float]] = {
     "gyro_bias_rad_s": ("gyro mrad/s", 1e3),
     "heading_deg": ("heading deg", 1.0),
     "heading_10mg_deg": ("at 10 mG deg", 1.0),
+    "field_spread": ("field spread", 1.0),
+    "constraint_gauss": ("constraint mG", 1e3),
     "nees": ("NEES/dof", 1.0),
 }

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ class Plan:
 
     at_s: times at which the methods answer, from the samples up to then; the last one is the length
     offset_behind_iron: b = m_b as in [R]'s Table 5.1, else b = A m_b
+    hard_iron_scale: times [R]'s hard iron
     """
 
     scenario: str
@@ -49,6 +51,7 @@ class Plan:
     noise_mag_gauss: float = 1e-3
     noise_gyro_rad_s: float = 5e-3
     offset_behind_iron: bool = False
+    hard_iron_scale: float = 1.0
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the method, the time or the setting that cannot be."""
@@ -69,12 +72,23 @@ class Plan:
             rate_hz=self.rate_hz,
             noise_mag_gauss=self.noise_mag_gauss,
             noise_gyro_rad_s=self.noise_gyro_rad_s,
-            iron=Iron(offset_behind_iron=self.offset_behind_iron),
+            iron=Iron(offset_behind_iron=self.offset_behind_iron).scaled(self.hard_iron_scale),
         )
 
     def samples(self, at_s: float) -> int:
         """How many samples there are up to a time."""
         return round(at_s * self.rate_hz)
+
+    @property
+    def name(self) -> str:
+        """What it is, for people: only what differs from the thesis is named."""
+        usual = Plan(self.scenario)
+        said = [f"{self.scenario.upper()} {self.motion}"]
+        if self.noise_mag_gauss != usual.noise_mag_gauss:
+            said.append(f"{self.noise_mag_gauss * 1e3:g} mG noise")
+        if self.hard_iron_scale != usual.hard_iron_scale:
+            said.append(f"hard iron x {self.hard_iron_scale:g}")
+        return ", ".join(said)
 
     @property
     def key(self) -> str:
@@ -238,6 +252,15 @@ def _keep(path: Path, record: Record) -> None:
         raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def plans(plan: Plan, scenarios: Sequence[str], motions: Sequence[str]) -> list[Plan]:
-    """The same plan for every scenario in every motion."""
-    return [replace(plan, scenario=s, motion=m) for s in scenarios for m in motions]
+def plans(
+    plan: Plan,
+    scenarios: Sequence[str],
+    motions: Sequence[str],
+    noise_mag_gauss: Sequence[float],
+    hard_iron_scales: Sequence[float],
+) -> list[Plan]:
+    """The plan for every combination. A seed keeps its trajectory and its draws of noise."""
+    return [
+        replace(plan, scenario=s, motion=m, noise_mag_gauss=noise, hard_iron_scale=scale)
+        for s, m, noise, scale in product(scenarios, motions, noise_mag_gauss, hard_iron_scales)
+    ]

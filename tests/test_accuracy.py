@@ -32,7 +32,18 @@ def test_errors_are_norms():
     assert found["hard_iron_gauss"] == pytest.approx(5e-3)
     assert found["gyro_bias_rad_s"] == pytest.approx(2e-3)
     assert found["soft_iron"] is None
-    assert found["heading_deg"] is None
+    assert found["heading_deg"] > 1.0  # without a soft iron the register gets the identity
+
+
+def test_field_spread_and_constraint_error_of_a_hard_iron():
+    """A hard iron of d too much leaves |h + d|, about |h| + u.d: its spread is that of u.d."""
+    d = np.array([0.0, 1e-4, 0.0])
+    made = EXPERIMENT
+    off = Answer(TRUTH.soft_iron, TRUTH.hard_iron_gauss - TRUTH.soft_iron @ d, None)
+    found = figures(off, made)
+    along = (made.field_b[::5] / TRUTH.field_gauss) @ d
+    assert found["field_spread"] == pytest.approx(np.std(along) / TRUTH.field_gauss, rel=2e-3)
+    assert found["constraint_gauss"] == pytest.approx(np.sqrt(np.mean(along**2)), rel=2e-3)
 
 
 def test_geodesic_is_affine_invariant():

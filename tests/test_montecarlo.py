@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from ahrsd.accuracy import FIGURES
 from ahrsd.errors import AhrsdError
 from ahrsd.montecarlo import Plan, run_many, run_one
 from ahrsd.montecarlo_methods import is_known, known_methods
@@ -87,10 +88,7 @@ def test_failures_are_counted_in_their_own_words_and_leave_no_number():
 
 def test_the_summary_is_arithmetic():
     def record(error, bound, nees):
-        errors = dict.fromkeys(
-            ("hard_iron_gauss", "soft_iron", "soft_iron_geodesic", "gyro_bias_rad_s",
-             "heading_deg", "heading_10mg_deg", "nees")
-        )  # fmt: skip
+        errors = dict.fromkeys(FIGURES)
         result = {
             "method": "m", "at_s": 9.0, "failure": None, "cpu_s": 2.0, "converged": error < 3e-3,
             "errors": errors | {"hard_iron_gauss": error, "nees": nees},
@@ -142,7 +140,7 @@ def test_the_command_writes_tables_json_and_figure(run, tmp_path, capsys):
     methods = ("--method", "magyc", "--method", "ellipsoid")
     assert run("montecarlo", "wam", *arguments, *files, *methods) == 0
     out = capsys.readouterr().out
-    assert "WAM, rov motion, 2 runs" in out
+    assert "WAM rov, 2 runs" in out
     assert out.count("\nbound ") == 2
     written = json.loads((tmp_path / "m.json").read_text())
     assert written["schema"] == "ahrsd.montecarlo/1"
@@ -157,6 +155,22 @@ def test_the_command_writes_tables_json_and_figure(run, tmp_path, capsys):
     assert (tmp_path / "m.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+def test_sweeps_over_noise_and_hard_iron(run, tmp_path):
+    path = tmp_path / "m.json"
+    arguments = ("--motion", "rov", "--runs", 3, "--at", "60", "--jobs", 1, "--method", "ellipsoid")
+    assert run(
+        "montecarlo", "wam", *arguments, "--noise-mag", "1,4", "--bias-scale", "1,3", "--json", path
+    ) in (0, 1)
+    sets = json.loads(path.read_text())["sets"]
+    assert [(s["noise_mag_gauss"], s["hard_iron_scale"]) for s in sets] == [
+        (1e-3, 1.0), (1e-3, 3.0), (4e-3, 1.0), (4e-3, 3.0),
+    ]  # fmt: skip
+    bounds = [s["rows"][0]["against_bound"]["hard_iron_gauss"]["bound"] for s in sets]
+    assert bounds[1] == pytest.approx(bounds[0])  # hard iron does not matter to the bound
+    assert 1.5 < bounds[2] / bounds[0] < 4.0  # the gyro's noise stays
+    assert sets[1]["truth"]["hard_iron_gauss"] == pytest.approx([0.1128, 0.3282, 0.339])
+
+
 def test_an_answer_that_is_missing_at_the_end_is_exit_1(run, capsys):
     arguments = ("--runs", 2, "--at", "5", "--jobs", 1, "--method", "ellipsoid")
     assert run("montecarlo", "lam", *arguments) == 1
@@ -166,7 +180,7 @@ def test_an_answer_that_is_missing_at_the_end_is_exit_1(run, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--at", "a"), "seconds separated by commas"),
+        (("--at", "a"), "numbers separated by commas"),
         (("--method", "magic"), "no method 'magic'"),
         (("--noise-mag", "nan"), "noise_mag_gauss is nan"),
     ],

@@ -22,11 +22,11 @@ _ALL = "all"
 _MG, _MRAD = 1e-3, 1e-3
 
 
-def _times(_context: click.Context, _option: click.Parameter, text: str) -> tuple[float, ...]:
+def _list(_context: click.Context, _option: click.Parameter, text: str) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise click.BadParameter(f"{text!r}: seconds separated by commas") from None
+        raise click.BadParameter(f"{text!r}: numbers separated by commas") from None
 
 
 @click.command()
@@ -42,9 +42,24 @@ def _times(_context: click.Context, _option: click.Parameter, text: str) -> tupl
     help="A method's id, or all; may be repeated. +savgol behind it smooths the readings first.",
 )
 @click.option("--motion", type=click.Choice(["slow", "rov", _ALL]), default="slow")
-@click.option("--at", "at_s", default="50,100,200,400", show_default=True, callback=_times)
+@click.option("--at", "at_s", default="50,100,200,400", show_default=True, callback=_list)
 @click.option("--rate", "rate_hz", default=25.0, show_default=True, help="Samples per second.")
-@click.option("--noise-mag", "mag_mg", default=1.0, show_default=True, help="mG per sample.")
+@click.option(
+    "--noise-mag",
+    "noise_mg",
+    default="1",
+    show_default=True,
+    callback=_list,
+    help="mG per sample; several, separated by commas, are a sweep.",
+)
+@click.option(
+    "--bias-scale",
+    "scales",
+    default="1",
+    show_default=True,
+    callback=_list,
+    help="Times the hard iron; several are a sweep.",
+)
 @click.option(
     "--noise-gyro", "gyro_mrad", default=5.0, show_default=True, help="mrad/s per sample."
 )
@@ -61,7 +76,8 @@ def command(
     motion: str,
     at_s: tuple[float, ...],
     rate_hz: float,
-    mag_mg: float,
+    noise_mg: tuple[float, ...],
+    scales: tuple[float, ...],
     gyro_mrad: float,
     hard_iron_as_read: bool,
     jobs: int,
@@ -84,16 +100,16 @@ def command(
             methods=chosen,
             at_s=at_s,
             rate_hz=rate_hz,
-            noise_mag_gauss=mag_mg * _MG,
             noise_gyro_rad_s=gyro_mrad * _MRAD,
             offset_behind_iron=hard_iron_as_read,
         )
+        scenarios = ("wam", "mam", "lam") if scenario == _ALL else (scenario,)
+        motions = ("slow", "rov") if motion == _ALL else (motion,)
+        wanted = plans(base, scenarios, motions, [mg * _MG for mg in noise_mg], scales)
     except ValueError as error:
         raise AhrsdError(str(error)) from None
-    scenarios = ("wam", "mam", "lam") if scenario == _ALL else (scenario,)
-    motions = ("slow", "rov") if motion == _ALL else (motion,)
     sets = []
-    for plan in plans(base, scenarios, motions):
+    for plan in wanted:
         rows = _run(plan, range(seed, seed + runs), jobs, resume)
         sets.append((plan, rows))
         if json_path != "-":
@@ -110,7 +126,7 @@ def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[Row]:
     from ahrsd.montecarlo import run_many
     from ahrsd.montecarlo_summary import summarise
 
-    with _progress(f"{plan.scenario} {plan.motion}") as done:
+    with _progress(plan.name) as done:
         return summarise(run_many(plan, seeds, jobs=jobs, resume=resume, done=done))
 
 
@@ -123,7 +139,7 @@ def _say(plan: Plan, rows: list[Row]) -> None:
         *(1e3 * truth.hard_iron_gauss).tolist(),
         *(1e3 * truth.gyro_bias_rad_s).tolist(),
     ]
-    click.echo(f"\n{plan.scenario.upper()}, {plan.motion} motion, {rows[0].runs} runs")
+    click.echo(f"\n{plan.name}, {rows[0].runs} runs")
     for line in [*accuracy_lines(rows), *bound_lines(rows)]:
         click.echo(line)
     click.echo(
@@ -145,6 +161,7 @@ def _json(sets: list[tuple[Plan, list[Row]]], seed: int, runs: int) -> dict[str,
                 "rate_hz": plan.rate_hz,
                 "noise_mag_gauss": plan.noise_mag_gauss,
                 "noise_gyro_rad_s": plan.noise_gyro_rad_s,
+                "hard_iron_scale": plan.hard_iron_scale,
                 "hard_iron_is": "m_b" if plan.offset_behind_iron else "A m_b",
                 "truth": plan.settings(0).truth.json(),
                 "rows": [row.json() for row in rows],
@@ -158,9 +175,7 @@ def _draw(path: Path, sets: list[tuple[Plan, list[Row]]]) -> None:
     from ahrsd.report.montecarlo_figure import write_montecarlo_figure
 
     try:
-        write_montecarlo_figure(
-            path, [(f"{plan.scenario.upper()} {plan.motion}", rows) for plan, rows in sets]
-        )
+        write_montecarlo_figure(path, [(plan.name, rows) for plan, rows in sets])
     except OSError as error:
         raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -2,8 +2,8 @@
 
 `truth` says what is hidden, `motion` how the sensor turns, `scenarios` makes experiments WAM, MAM
 and LAM of [R], `recorded` [L]'s experiment from a recorded gyro stream, `disturbance` adds what
-goes wrong on real streams, `sweep` varies noise or bias, `tabular` lays an experiment out in the
-columns of a table recording. Pure: nothing here reads or writes a file.
+goes wrong on real streams, `tabular` lays an experiment out in the columns of a table recording.
+Pure: nothing here reads or writes a file.
 
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023; [L] Lichlyter, thesis, Mississippi State 2022.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -76,6 +76,10 @@ class Iron:
         if self.offset_behind_iron:
             return self.pseudo_hard_iron_gauss
         return np.asarray(self.soft_iron @ self.pseudo_hard_iron_gauss)
+
+    def scaled(self, scale: float) -> Iron:
+        """The same sensor with `scale` times the hard iron ([L]'s range of biases)."""
+        return replace(self, pseudo_hard_iron_gauss=scale * self.pseudo_hard_iron_gauss)
 
     def truth(self, noise_mag_gauss: float, noise_gyro_rad_s: float) -> Truth:
         """The same sensor with det A = 1: the field's magnitude takes the volume."""

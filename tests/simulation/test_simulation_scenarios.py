@@ -13,7 +13,6 @@ from ahrsd.simulation import Iron, Settings, simulate
 from ahrsd.simulation.experiment import predicted_directions
 from ahrsd.simulation.motion import MOTIONS, SCENARIOS, SUBSTEPS, mean_rate, rotation_nb, sinusoids
 from ahrsd.simulation.scenarios import generator
-from ahrsd.simulation.sweep import bias_sweep, noise_sweep
 
 SETS = [(scenario, motion) for scenario in SCENARIOS for motion in MOTIONS]
 
@@ -114,11 +113,11 @@ def test_the_same_seed_gives_the_same_bits_and_another_another_motion():
 
 def test_sweeps_keep_the_trajectory_and_scale_the_same_noise():
     base = Settings("mam", samples=100)
-    quiet, loud = (simulate(s) for s in noise_sweep(base, [1e-3, 1e-2]))
+    quiet, loud = (simulate(replace(base, noise_mag_gauss=n)) for n in (1e-3, 1e-2))
     truth = quiet.field_b @ quiet.truth.soft_iron.T + quiet.truth.hard_iron_gauss
     small, large = (e.samples.raw_b_gauss - truth for e in (quiet, loud))
     assert large == pytest.approx(10 * small, rel=1e-9, abs=1e-12)
-    none, double = (simulate(s) for s in bias_sweep(base, [0.0, 2.0]))
+    none, double = (simulate(replace(base, iron=Iron().scaled(s))) for s in (0.0, 2.0))
     shift = double.samples.raw_b_gauss - none.samples.raw_b_gauss
     assert shift * 1e3 == pytest.approx(np.tile([75.2, 218.8, 226.0], (100, 1)))
 
