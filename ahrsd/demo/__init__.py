@@ -55,8 +55,9 @@ FILES = ("report.html", "run.rrd", "capture.mcap", "calibration.json", "journal.
 _BAUD = 115200
 _RATE_HZ = 50
 _MAG, _GYRO = 23, 84
-# Four minutes of pirouettes, again and again: whenever the write comes, all headings follow it.
-_MOTION = (("survey", 244.0),) * 10
+# Pirouettes until a calibration should be proven; then a minute's rest, in which it can be saved,
+# and pirouettes again, so that all headings follow the write.
+_MOTION = (("survey", 240.0), ("survey", 160.0), *(("static", 60.0), ("survey", 120.0)) * 10)
 # On the Black Sea, where the world model has the emulator's field: 0.49 G, 60 deg down.
 _PLACE = {"latitude_deg": 42.0, "longitude_deg": 34.2, "date": datetime.date(2026, 1, 1)}
 _REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `speed` times faster

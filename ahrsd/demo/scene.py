@@ -31,7 +31,8 @@ from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
 
 _SAY_EVERY_S = 60.0
-_AFTER_S = (10.0, 300.0)  # device time shown after the restart: at least, at most
+_LONGEST_S = 300.0  # device time after the save in which every heading should be driven
+_AFTER_S = 2.0  # device time after the restart
 _SECTOR_DEG = 10.0
 _ENOUGH = 35 / 36  # of all headings
 _HOPELESS = frozenset({State.ROLLED_BACK, State.FAULT, State.LOCKED, State.FLASH_TORN})
@@ -57,7 +58,7 @@ class Scene:
     live: list[tuple[Array, Array]] = field(default_factory=list)
     shown: set[int] = field(default_factory=set)
     written: bool = False
-    confirmed: bool = False
+    cut: bool = False
     after_s: float = 0.0
     passed_s: float = 0.0
     newest_s: float = math.nan
@@ -85,9 +86,7 @@ class Scene:
     def _planned(self, event: Event) -> bool:
         """Whether it is the warning of the restart that this scene brought about."""
         return (
-            self.state == State.COMMITTED
-            and isinstance(event, Noted)
-            and event.text.startswith("the device restarted")
+            self.cut and isinstance(event, Noted) and event.text.startswith("the device restarted")
         )
 
     def _samples(self, block: SampleBlock) -> None:
@@ -100,12 +99,16 @@ class Scene:
             self._end(f"{self.seconds:.0f} s of device time are over")
         if self.written:
             self._show(block)
-        if self.confirmed:
+        if self.state in (State.COMMITTED, State.CONFIRMED):
             self.after_s += max(step_s, 0.0)
-            least_s, most_s = _AFTER_S
+        if self.state == State.COMMITTED and not self.cut:
             complete = len(self.shown) >= _ENOUGH * 360.0 / _SECTOR_DEG
-            if (complete and self.after_s > least_s) or self.after_s > most_s:
-                self._end("shown on live data")
+            if complete or self.after_s > _LONGEST_S:
+                self._line("", "shown on every heading; its power is switched off and on again")
+                self.cut, self.after_s = True, 0.0
+                self.power_cycle()
+        if self.state == State.CONFIRMED and self.after_s > _AFTER_S:
+            self._end("saved, and read after a restart")
 
     def _show(self, block: SampleBlock) -> None:
         """Live samples for the picture, and the headings that they cover."""
@@ -119,13 +122,9 @@ class Scene:
     def _act(self, state: str) -> None:
         if state == State.QUALIFIED:
             self._approve()
-        elif state == State.COMMITTED:
-            self._line("", "the device's power is switched off and on again")
-            self.power_cycle()
         elif state in _HOPELESS:
             self._end(f"ended in {state}")
         self.written = self.written or state == State.TRIAL
-        self.confirmed = state == State.CONFIRMED
 
     def _approve(self) -> None:
         assert self.daemon is not None
