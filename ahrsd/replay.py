@@ -25,6 +25,7 @@ from ahrsd.stream import NoSamplesError
 from ahrsd.stream_rate import rate_of
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from drivers.vn100.deframer import Cause
 
 _PASSIVE = WriteBackPolicy(mode=Mode.PASSIVE)
 
@@ -72,9 +73,8 @@ def replay(
             progress(len(item.data))
     _refuse_empty(core, path)
     done.warnings += [note for note in recording.notes if note not in done.warnings]
-    cut = core.conversation.session.deframer.pending
-    if recording.kind is Kind.BYTES and cut:
-        done.warnings.append(f"the last {cut} bytes begin a message that is cut off")
+    if recording.kind is Kind.BYTES and _cut_off(core):
+        done.warnings.append("the recording ends in the middle of a message")
     return done
 
 
@@ -117,6 +117,12 @@ def _paced(items: Iterator[Input], core: Core, speed: float) -> Iterator[Input]:
             if ahead_s > 0:
                 time.sleep(ahead_s)
         yield item
+
+
+def _cut_off(core: Core) -> bool:
+    """Whether bytes were left that begin a message; silence cannot cut one in a byte stream."""
+    deframer = core.conversation.session.deframer
+    return deframer.pending > 0 or Cause.CUT in deframer.counters.damage
 
 
 def _refuse_empty(core: Core, path: Path) -> None:

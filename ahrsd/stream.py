@@ -192,8 +192,8 @@ class Stream:
         """Other quantities begin: what the old message gave must not mix with them."""
         if _quantities(old) == _quantities(new):
             return
-        for text in old.warnings:
-            self.warnings.pop(text, None)
+        for text in [text for text in self.warnings if text.startswith(old.layout.name)]:
+            del self.warnings[text]
         self.warnings[f"{old.layout.name} was left out when {new.layout.name} began"] = None
         self._replaced = self.facts.samples > 0
 

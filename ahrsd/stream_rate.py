@@ -31,6 +31,7 @@ _MOST_TURNED_RAD = 2.0
 _SPAN = 8  # messages per pair: quantisation of the printed angles matters less over several
 _LEAST_PAIRS = 200
 _PLENTY = 800  # pairs; then nobody needs to read on
+_SPREAD = 0.15  # quartiles' distance beyond which the attitude filter is still settling
 _LEAST_STRONG, _STRONG = 20, 0.99  # fewer pairs will do where they lie on one line, so correlated
 _CHECK_MESSAGES = 2000
 _WANTED_MESSAGES = 32000
@@ -98,7 +99,9 @@ def _median_step(R: Array, rate: Array, least: int) -> float | None:
     good = (speed > _LEAST_RATE_RAD_S) & (np.linalg.norm(v, axis=1) < _MOST_TURNED_RAD)
     if np.count_nonzero(good) < least:
         return None
-    return float(np.median(np.sum(v * w, axis=1)[good] / speed[good] ** 2)) / _SPAN
+    steps = np.sum(v * w, axis=1)[good] / speed[good] ** 2 / _SPAN
+    low, middle_s, high = np.percentile(steps, (25, 50, 75))
+    return float(middle_s) if high - low < _SPREAD * middle_s else None
 
 
 def _strong_step(R: Array, rate: Array) -> float | None:
