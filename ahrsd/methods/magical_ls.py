@@ -21,7 +21,7 @@ from ahrsd.methods.soft_iron import answer, positive, rescaled, unit_volume
 from ahrsd.methods.windows import per_sample
 from ahrsd.samples import Array
 
-_MAX_STEPS = 5000
+_MAX_STEPS = 20_000
 _MAX_HALVINGS = 30
 _TOLERANCE = 1e-7  # of a step, in units of A and gauss
 
