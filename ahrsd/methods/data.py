@@ -57,10 +57,12 @@ class Data:
             known = float(np.linalg.norm(self.field_n_gauss))
         if known is None:
             raise MethodError("needs the field's magnitude: give position and date, or the field")
-        norms = np.broadcast_to(np.asarray(known, dtype=np.float64), (len(self),))
+        norms = np.asarray(known, dtype=np.float64)
+        if norms.shape not in ((), (len(self),)):
+            raise MethodError(f"the field's magnitude has {norms.shape}: one or {len(self)}")
         if not np.all(norms > 0) or not np.isfinite(norms).all():
             raise MethodError("the field's magnitude must be a positive number of gauss")
-        return np.asarray(norms)
+        return np.asarray(np.broadcast_to(norms, (len(self),)))
 
 
 def _zero() -> Array:

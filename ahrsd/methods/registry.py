@@ -86,9 +86,9 @@ def run(
         remark = moved(data, chosen, row.axes)
         fit = row.function(data, chosen)
         _finite(fit)
-    except MethodError as error:
+    except (MethodError, np.linalg.LinAlgError) as error:
         seconds = clock() - began if clock else began
-        return MethodResult(method, None, None, None, False, str(error), 0, seconds)
+        return MethodResult(method, None, None, None, False, _reason(error), 0, seconds)
     seconds = clock() - began if clock else began
     return MethodResult(
         method,
@@ -100,6 +100,12 @@ def run(
         fit.iterations,
         seconds,
     )
+
+
+def _reason(error: MethodError | np.linalg.LinAlgError) -> str:
+    if isinstance(error, np.linalg.LinAlgError):
+        return f"the motion does not determine the answer ({error})"
+    return str(error)
 
 
 def _finite(fit: Fit) -> None:

@@ -56,8 +56,8 @@ def triangle(c6: Array) -> tuple[Array, Array]:
 
 def cholesky(p: Array) -> tuple[Array, Array]:
     """c (6,) of C = L L^T and dc/dp (6, 5):  dC = dL L^T + L dL^T."""
-    x, y = np.exp(p[0]), np.exp(p[2])
-    z = np.exp(-(p[0] + p[2]))
+    with np.errstate(over="ignore"):  # infinite where a search diverges; the factor says so
+        x, y, z = np.exp(p[0]), np.exp(p[2]), np.exp(-(p[0] + p[2]))
     L = np.array([[x, 0, 0], [p[1], y, 0], [p[3], p[4], z]])
     dL = np.zeros((5, 3, 3))
     dL[0, 0, 0], dL[0, 2, 2] = x, -z

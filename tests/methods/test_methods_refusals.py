@@ -123,6 +123,8 @@ def test_saturated_readings(method):
 def test_the_field_is_not_known(method):
     data = replace(clean(n=2000).data, field_n_gauss=None, field_norm_gauss=None)
     assert "needs the field's magnitude" in refused(method, data)
+    short = replace(data, field_norm_gauss=np.full(1999, 0.4))
+    assert "one or 2000" in refused(method, short)
     negative = replace(data, field_norm_gauss=-0.4)
     assert "must be a positive number" in refused(method, negative)
 
