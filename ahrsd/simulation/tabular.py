@@ -42,24 +42,29 @@ def sentences(experiment: Experiment) -> Iterator[bytes]:
         yield encode_sentence("VNYMR", row)
 
 
-def truth_json(experiment: Experiment, settings: Settings) -> dict[str, object]:
-    """FILE.truth.json: the hidden values, and the settings that make the same file again."""
-    iron = settings.iron
+def truth_json(experiment: Experiment, made_from: dict[str, object]) -> dict[str, object]:
+    """FILE.truth.json: the hidden values, and what makes the same file again."""
     return {
         "schema": "ahrsd.truth/1",
         "name": experiment.name,
         "convention": "m = A h + b + noise with det A = 1; w_read = w + w_b + noise",
         **experiment.truth.json(),
-        "made_from": {
-            "scenario": settings.scenario,
-            "motion": settings.motion,
-            "seed": settings.seed,
-            "samples": settings.samples,
-            "rate_hz": settings.rate_hz,
-            "soft_iron": iron.soft_iron.tolist(),
-            "pseudo_hard_iron_gauss": iron.pseudo_hard_iron_gauss.tolist(),
-            "hard_iron_is": "m_b" if iron.offset_behind_iron else "A m_b",
-            "field_n_gauss": iron.field_n_gauss.tolist(),
-            "disturbances": asdict(settings.disturbances),
-        },
+        "made_from": made_from,
+    }
+
+
+def settings_json(settings: Settings) -> dict[str, object]:
+    """The settings by name, the sensor in the theses' terms."""
+    iron = settings.iron
+    return {
+        "scenario": settings.scenario,
+        "motion": settings.motion,
+        "seed": settings.seed,
+        "samples": settings.samples,
+        "rate_hz": settings.rate_hz,
+        "soft_iron": iron.soft_iron.tolist(),
+        "pseudo_hard_iron_gauss": iron.pseudo_hard_iron_gauss.tolist(),
+        "hard_iron_is": "m_b" if iron.offset_behind_iron else "A m_b",
+        "field_n_gauss": iron.field_n_gauss.tolist(),
+        "disturbances": asdict(settings.disturbances),
     }

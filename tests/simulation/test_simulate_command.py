@@ -74,6 +74,9 @@ def test_disturbances_reach_the_file(run, tmp_path):
         (("wam", "-o", "x.csv", "--seconds", "0"), "--seconds times --rate must be positive"),
         (("wam", "-o", "x.csv", "--noise-mag", "-1"), "noise_mag_gauss is -0.001"),
         (("wam", "-o", "x.csv", "--outliers", "2"), "outlier_fraction is 2"),
+        (("wam", "-o", "x.csv", "--gyro", "y.csv"), "need each other"),
+        (("recorded", "-o", "x.csv"), "need each other"),
+        (("recorded", "-o", "x.csv", "--gyro", "y.csv"), "y.csv: cannot be read"),
         (("swim", "-o", "x.csv"), "'swim' is not one of"),
     ],
 )
@@ -82,6 +85,20 @@ def test_bad_use_is_one_line(run, tmp_path, monkeypatch, capsys, arguments, said
     assert run("simulate", *arguments) == 2
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_field_on_the_motion_of_a_recording(run, tmp_path):
+    source, path = tmp_path / "s.csv", tmp_path / "x.csv"
+    assert run("simulate", "mam", "-o", source, "--seconds", 40, "--gap", 10) == 0
+    assert run("simulate", "recorded", "--gyro", source, "-o", path, "--seconds", 20) == 0
+    table = read_table(path)
+    assert table.rows.time_s[[0, -1]] == pytest.approx([12.04, 32.04])
+    made, moved = table.rows, read_table(source).rows
+    rows = np.isin(moved.time_s, made.time_s)
+    assert made.gyro_b_rad_s[1:] == pytest.approx(moved.gyro_b_rad_s[rows][1:], abs=1e-4)
+    truth = json.loads((tmp_path / "x.csv.truth.json").read_text())
+    assert truth["soft_iron"] == np.eye(3).tolist()
+    assert truth["made_from"] == {"gyro": "s.csv", "seed": 0}
 
 
 def test_quaternions_do_not_jump():
