@@ -9,6 +9,9 @@ from pathlib import Path
 
 from ahrsd.inputs import Input, Received, Stop
 from drivers.vn100.emulator import Emulator
+from drivers.vn100.emulator_motion import make_motion
+from drivers.vn100.emulator_physics import TICK_HZ, draw_truth
+from drivers.vn100.emulator_scenarios import CALIBRATION_SET
 from drivers.vn100.sentences import encode
 
 
@@ -46,3 +49,12 @@ def inputs(pieces: Sequence[bytes]) -> Iterator[Input]:
     for piece in pieces:
         yield Received(0, piece)
     yield Stop(0, "end of recording")
+
+
+def binary_device(
+    seed: int, registers: dict[int, tuple[float, ...]], motion: str = "tumble"
+) -> Emulator:
+    """A device with these registers in flash that sends the calibration set at 40 Hz."""
+    output = {5: (115200,), 6: (0,), 75: (1, TICK_HZ // 40, *CALIBRATION_SET)}
+    motions = make_motion(motion, seed)
+    return Emulator(draw_truth(seed), motions, seed=seed, presets={**output, **registers})
