@@ -61,6 +61,7 @@ _MOTION = (("survey", 240.0), ("survey", 160.0), *(("static", 60.0), ("survey", 
 # On the Black Sea, where the world model has the emulator's field: 0.49 G, 60 deg down.
 _PLACE = {"latitude_deg": 42.0, "longitude_deg": 34.2, "date": datetime.date(2026, 1, 1)}
 _REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `speed` times faster
+_REST_S = 10.0  # longer than the stops between pirouettes, which are too short for a save
 _LONGEST_AGE_S = 60.0  # of the vehicle's word, as far as the configuration goes
 _WATCH_S = 0.5
 
@@ -97,7 +98,7 @@ def demo_config(directory: Path, speed: float = 1.0) -> Config:
         "device": {"baud": _BAUD, "reply_timeout_s": max(0.4, _REPLY_S * speed)},
         "location": _PLACE,
         "interlock": {"max_age_s": age_s},
-        "still": {"max_age_s": max(2.0, age_s)},
+        "still": {"duration_s": _REST_S, "max_age_s": max(2.0, age_s)},
     }
     return check_config(body, "demo")
 
