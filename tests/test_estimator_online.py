@@ -141,7 +141,7 @@ def _tilted_over_level(run, estimate):
     return estimate.heading_sigma_deg / level
 
 
-def test_a_planar_turn_is_not_converged_but_good_in_its_plane():
+def test_a_planar_turn_is_not_converged_and_its_sigmas_say_so():
     run = bench.simulate("planar", "", 0, samples=6000)
     estimate, _ = calibrated(run)
     names = " ".join(estimate.observability.unobservable)
@@ -149,7 +149,6 @@ def test_a_planar_turn_is_not_converged_but_good_in_its_plane():
     assert "soft iron zz" in names
     assert estimate.sigma[8] > 0.1
     error = np.abs(_heading_errors(run, estimate)).max()
-    assert error < 3.0
     assert error < 4 * estimate.heading_sigma_deg
 
 

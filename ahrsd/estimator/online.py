@@ -28,7 +28,7 @@ _AWAY, _AWAY_UNSETTLED = 3.0, 0.5
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
-_MOST_SIGMAS = 100.0  # of movement that are counted
+_MOST_SIGMAS = 100.0  # of movement or disagreement that are counted
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
@@ -51,7 +51,7 @@ class Estimator:
         self._window: Window | None = None
         self._prior_sigma = np.ones(12)
         self._down: deque[Array] = deque(maxlen=64)
-        self._searching, self._agreed = True, False
+        self._searching, self._agreed, self._apart = True, False, 0.0
         self._moving_epochs, self._last_search = 0, 0
         self._next_search = _FIRST_SEARCH
 
@@ -125,7 +125,7 @@ class Estimator:
         ):
             window.restart_at(found.c, found.bias)
             window.track()
-        self._agreed = found.agreed
+        self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
         settled = window.step_sigmas < _SETTLED
         self._searching = not (found.agreed and settled and self._sure(window))
 
@@ -150,8 +150,9 @@ class Estimator:
             return None
         covariance = covariance * graph.temper
         observed = summary.observability(covariance, self._prior_sigma)
-        # An answer that still moves is no better known than it moves.
-        covariance = covariance * (1.0 + min(window.step_sigmas, _MOST_SIGMAS) ** 2)
+        # An answer that moves, or that other starts do not reach, is no better known than that.
+        doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
+        covariance = covariance * (1.0 + doubt**2)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)
         K[:9, :9] = J

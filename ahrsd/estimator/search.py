@@ -35,14 +35,19 @@ class Found:
 
     away:   sigmas between it and the answer as it stands
     gain:   in log likelihood over where a descent from the answer as it stands leads
-    agreed: two starts that know nothing of each other arrived at it
+    apart:  sigmas from it within which two starts that know nothing of each other ended
     """
 
     c: Array
     bias: Array
     away: float
     gain: float
-    agreed: bool
+    apart: float
+
+    @property
+    def agreed(self) -> bool:
+        """Two starts that know nothing of each other arrived at the best."""
+        return self.apart < _SAME
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +79,9 @@ def search(
         if c is not None
     ]
     best = min([own, *independent], key=lambda r: r.cost)
-    same = [r for r in independent if _same(r, best, graph.temper)]
+    apart = sorted(_distance(r, best, graph.temper) for r in independent)
     away = np.inf if best.information is None else sigmas(graph.c - best.c, best.information)
-    return Found(best.c, best.bias, float(away), own.cost - best.cost, len(same) > 1)
+    return Found(best.c, best.bias, float(away), own.cost - best.cost, (*apart, np.inf)[1])
 
 
 def _descend(thin: Window, c: Array, bias: Array) -> _Reached:
@@ -90,10 +95,10 @@ def _descend(thin: Window, c: Array, bias: Array) -> _Reached:
     return _Reached(cost, graph.c.copy(), graph.nodes[graph.last].bias.copy(), information)
 
 
-def _same(r: _Reached, best: _Reached, temper: float) -> bool:
+def _distance(r: _Reached, best: _Reached, temper: float) -> float:
     if best.information is None:
-        return False
-    return sigmas(r.c - best.c, best.information / temper) < _SAME
+        return float(np.inf)
+    return sigmas(r.c - best.c, best.information / temper)
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:
