@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.events import GateResult
 from ahrsd.evidence.collector import EvidenceCollector
+from ahrsd.evidence.history import Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
 from ahrsd.samples import Array, SampleBlock
@@ -60,17 +62,23 @@ class Calibrator:
         """Samples in order; true where there is a new estimate."""
         new = False
         self.started = True
-        for role, part in self.collector.parts(block):
+        parts = self.collector.parts(block)
+        for _, part in parts:
             self.collector.add(part)
-            if role == "heldout" and self.settings.held_out:
-                self._gap = True
-                continue
-            piece = replace(part, gap_before=True) if self._gap and not part.gap_before else part
-            self._gap = False
+        for piece in self._training(parts) if self.settings.held_out else [block]:
             new |= self.estimator.add(_unknown_first_step(piece))
         if new:
             self.estimate = self._scaled(self.estimator.estimate())
         return new and self.estimate is not None
+
+    def _training(self, parts: Iterable[tuple[Role, SampleBlock]]) -> Iterator[SampleBlock]:
+        """What the estimator may see; nothing is bridged over what is held out."""
+        for role, part in parts:
+            if role == "heldout":
+                self._gap = True
+                continue
+            yield replace(part, gap_before=True) if self._gap else part
+            self._gap = False
 
     def finish(self) -> Estimate | None:
         """The end of the stream: iterate to the end."""

@@ -7,6 +7,7 @@ holds; the registers that `ahrsd capture` read first hold for the bytes that cam
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -62,6 +63,8 @@ def replay(
     configuration, and its own `held_out`. Raises RecordingError where nothing in the recording can
     be calibrated.
     """
+    if rate_hz is not None and not math.isfinite(rate_hz):
+        raise RecordingError(path, f"a rate of {rate_hz} Hz is none", "give --rate in Hz")
     recording = open_recording(path, rate_hz)
     core = Core(settings or _settings(recording, config, rate_hz, held_out))
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
