@@ -5,7 +5,7 @@
                                                      READY <-> RUNNING (the write-back)
 ```
 In mode `passive` the port goes from CLOSED to READY at once and no byte is ever sent. A device that
-answers nothing is listened to and asked again every `ASK_AGAIN_S`: it stays IDENTIFYING, without an
+answers nothing is listened to and asked again now and then: it stays IDENTIFYING, without an
 identity, so nothing can be written to it.
 """
 
@@ -31,7 +31,7 @@ from drivers.vn100.procedures import (
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
 
-ASK_AGAIN_S = 5.0
+ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
 _FOREIGN = 20  # messages without one of the session's own output: it is gone
 
 
@@ -120,6 +120,7 @@ class Conversation:
         self._name = ""
         self._baud = 115200
         self._touched = self._unanswered = False
+        self._ask_again_s = ASK_AGAIN_S[0]
         self._own, self._foreign = "", 0  # layout of the session's output; others without it
         self._said: list[Said] = []
 
@@ -153,7 +154,7 @@ class Conversation:
 
     def opened(self, baud: int, now_s: float) -> list[Event]:
         """The port is open."""
-        self._baud = baud
+        self._baud, self._ask_again_s = baud, ASK_AGAIN_S[0]
         if self.mode is Mode.PASSIVE:
             self.phase = Phase.READY
             return []
@@ -304,7 +305,8 @@ class Conversation:
         if error is not None:
             self._say_unanswered(f"{phase.value}: {error}")
             self.phase = Phase.IDENTIFYING
-            return self._start(_identify_later(), Purpose.READ, now_s)
+            later, self._ask_again_s = self._ask_again_s, min(2 * self._ask_again_s, ASK_AGAIN_S[1])
+            return self._start(_identify_in(later), Purpose.READ, now_s)
         return self._next(phase, result, now_s)
 
     def _say_unanswered(self, text: str) -> None:
@@ -326,7 +328,7 @@ class Conversation:
         if phase is Phase.READING and isinstance(result, dict):
             if not self.saved:
                 self.saved = dict(result)
-            self._unanswered = False
+            self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]
             self._said.append(ConfigurationRead(result))
             if self.change_stream:
                 return self._set_up(now_s)
@@ -337,6 +339,6 @@ class Conversation:
         return []
 
 
-def _identify_later() -> Procedure[Identity]:
-    yield Pause(ASK_AGAIN_S)
+def _identify_in(seconds: float) -> Procedure[Identity]:
+    yield Pause(seconds)
     return (yield from identify())

@@ -43,7 +43,6 @@ from drivers.vn100.errors import DriverError
 log = logging.getLogger("ahrsd")
 
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
-_STEADY_S = 2.0  # a link that lived so long may be reopened at once again
 _LONGEST_WAIT_S = 0.2
 _STOP_S = 2.0  # for putting things back; a service manager's patience is limited
 _AMENDS_S = 2.0
@@ -102,7 +101,8 @@ class Daemon:
         self._next_interlock_ns = 0
         self._wall_offset_s = float("nan")
         self._watch = Watch(time.monotonic())
-        self._next_watch_s = self._opened_s = self._retry_s = 0.0
+        self._next_watch_s = self._retry_s = 0.0
+        self._messages_before = 0
         self._wait_s = _REOPEN_S[0]
 
     # -- from outside ------------------------------------------------------------------------------
@@ -219,19 +219,22 @@ class Daemon:
 
     def _open(self) -> None:
         self._link.open(may_query=self._may_query)
-        self._opened_s = time.monotonic()
-        self._watch.link_opened(self._opened_s)
+        self._messages_before = self._messages
+        self._watch.link_opened(time.monotonic())
         path, now = self._link.path, self.clock.now_ns()
         self._feed(inputs.LinkOpened(now, str(path), self._link.baud, latency_timer_ms(path)))
+
+    @property
+    def _messages(self) -> int:
+        return self.shell.core.conversation.session.deframer.counters.valid
 
     def _lost(self, host_ns: int, reason: str) -> None:
         self._link.close()
         if self._stop_reason:  # the mark that `stop` left went with the queue
             self._queue.put(None)
-        now_s = time.monotonic()
-        if now_s - self._opened_s > _STEADY_S:
+        if self._messages > self._messages_before:  # it was a device: it may be back at once
             self._wait_s = _REOPEN_S[0]
-        self._retry_s = now_s + self._wait_s
+        self._retry_s = time.monotonic() + self._wait_s
         self._feed(inputs.LinkLost(host_ns, reason))
 
     def _reopen(self) -> None:

@@ -191,8 +191,7 @@ def test_a_stalled_device_is_named_once_and_comes_back(live, caplog):
     assert caplog.text.count("nothing comes from the device") == 1
 
 
-def test_a_device_that_did_not_answer_is_asked_again(live, monkeypatch):
-    monkeypatch.setattr("ahrsd.conversation.ASK_AGAIN_S", 1.0)
+def test_a_device_that_did_not_answer_is_asked_again(live):
     with live({"output": "imu", "faults": ("lost_reply@0+4",)}) as daemon:
         daemon.until(lambda: daemon.noted("listening only"))
         daemon.until(lambda: daemon.core.conversation.identity, 20.0)

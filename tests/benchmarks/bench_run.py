@@ -59,6 +59,11 @@ class Figures:
         return 100.0 * self.cpu_s / self.seconds
 
     @property
+    def parse_ratio(self) -> float:
+        """Processor time over that of parsing the same bytes and nothing else, in this run."""
+        return self.cpu_s / self.parse_s
+
+    @property
     def lost(self) -> int:
         """Samples that are missing in the capture or in the daemon's count."""
         return self.expected - min(self.in_capture, self.taken)
@@ -67,8 +72,7 @@ class Figures:
         return (
             f"{self.rate_hz} Hz, {self.seconds:.0f} s: {self.expected} samples expected, "
             f"{self.in_capture} in the capture, {self.taken} taken, {self.lost} lost\n"
-            f"  CPU {self.cpu_percent:.2f} % of one core, {self.cpu_s / self.parse_s:.1f} x parsing "
-            f"alone\n"
+            f"  CPU {self.cpu_percent:.2f} % of one core, {self.parse_ratio:.1f} x parsing alone\n"
             f"  RSS {self.rss_start_mb:.1f} MB at the start, {self.rss_end_mb:.1f} at the end, "
             f"slope of the second half {self.rss_slope_kb_min:+.0f} kB/min\n"
             f"  {self.threads} threads, {self.descriptors} descriptors; exit {self.exit_code} "
