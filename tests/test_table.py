@@ -186,7 +186,11 @@ def test_a_wrong_table_is_refused_in_one_line(tmp_path, change, words):
         ("t.csv", b"\xff\xfe\x00\x80\n\x81\x82\n", "is no CSV table: 'utf-8' codec"),
         ("t.csv", b"time_s,time_s\n1,2\n", "has the column time_s twice"),
         ("t.parquet", b"PAR1 no", "is no Parquet table"),
-        ("t.csv.gz", gzip.compress(b"time_s,mag_x_gauss\n1,2\n" * 99, mtime=0)[:30], "is truncated"),
+        (
+            "t.csv.gz",
+            gzip.compress(b"time_s,mag_x_gauss\n1,2\n" * 99, mtime=0)[:30],
+            "is truncated",
+        ),
     ],
 )
 def test_what_is_no_table_is_refused_in_one_line(tmp_path, name, content, words):
