@@ -16,7 +16,7 @@ damage in front of each, never by what else came with them.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,7 +90,7 @@ class Stream:
         self._lost_next = 0
         self._want = 1
         self._forgiven = False
-        self._replaced = False
+        self._replaced = self._left_out = False
         self._attitude: list[int] | None = None
         self._turns = TurnWatch()
         self._turns_said = ""
@@ -257,7 +257,18 @@ class Stream:
         steps = self._timeline.extend(time_s, extracted.usable)
         self._note(steps)
         host_s = self._host(time_s, arrivals)
-        return sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+        blocks = sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+        return self._unbridged(blocks, time_s[steps.keep])
+
+    def _unbridged(self, blocks: list[SampleBlock], kept_s: Array) -> list[SampleBlock]:
+        """Samples that nobody could un-map are left out: what comes next does not follow on."""
+        if blocks and self._left_out and not blocks[0].gap_before:
+            first = blocks[0]
+            dt_s = np.concatenate([[np.nan], first.dt_s[1:]])
+            blocks[0] = replace(first, dt_s=dt_s, gap_before=True)
+        if len(kept_s):
+            self._left_out = not blocks or blocks[-1].time_s[-1] != kept_s[-1]
+        return blocks
 
     def _times(self, extracted: Extracted, table: Array) -> Array:
         """Device times (N,); for a stream without, the number of messages, lost ones included."""

@@ -1,0 +1,111 @@
+"""Figures of a trial: the new registers against the old ones on the same raw samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.calibration import Affine
+from ahrsd.live_trial import LiveTrial
+from ahrsd.samples import SampleBlock
+
+RATE_HZ = 40.0
+FIELD_N = np.array([0.24, 0.0, 0.42])
+RIGHT = Affine(np.eye(3), np.array([0.05, -0.03, 0.02]))
+IDENTITY = Affine.identity()
+NO_BIAS = np.zeros(3)
+
+
+def circle(
+    seconds: float, turns: float, *, start_s: float = 0.0, force: bool = True
+) -> SampleBlock:
+    """A level turn to the right of a sensor with hard iron `RIGHT.offset` and no noise."""
+    count = round(seconds * RATE_HZ)
+    time_s = start_s + np.arange(count) / RATE_HZ
+    rate = 2 * np.pi * turns / seconds
+    yaw = rate * (time_s - start_s)
+    R_nb = so3.exp(np.column_stack([np.zeros((count, 2)), yaw]))
+    accel = np.tile([0.0, 0.0, -9.81], (count, 1)) if force else np.full((count, 3), np.nan)
+    return SampleBlock(
+        time_s=time_s,
+        dt_s=np.full(count, 1.0 / RATE_HZ),
+        host_s=time_s,
+        raw_b_gauss=FIELD_N @ R_nb + RIGHT.offset,
+        gyro_b_rad_s=np.tile([0.0, 0.0, rate], (count, 1)),
+        accel_b_m_s2=accel,
+    )
+
+
+def pieces(block: SampleBlock, rows: int = 10) -> list[SampleBlock]:
+    return [
+        SampleBlock(*(getattr(block, name)[at : at + rows] for name in (
+            "time_s", "dt_s", "host_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2",
+        )))
+        for at in range(0, len(block), rows)
+    ]  # fmt: skip
+
+
+def run(trial: LiveTrial, block: SampleBlock):
+    for piece in pieces(block):
+        metrics = trial.take(piece)
+    return metrics
+
+
+def test_right_registers_show_no_spread_and_wrong_ones_theirs():
+    block = circle(30.0, 2.0)
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), block)
+    assert metrics.new_figure == pytest.approx(0.0, abs=1e-12)
+    norms = np.linalg.norm(block.raw_b_gauss[::4], axis=1)
+    assert metrics.old_figure == pytest.approx(norms.std() / norms.mean(), rel=0.02)
+    assert metrics.old_figure > 0.03
+    assert metrics.field_spread == metrics.new_figure
+    assert metrics.finite
+
+
+def test_turns_and_duration_are_those_of_the_motion():
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0))
+    assert metrics.turns == pytest.approx(2.0, rel=1e-6)
+    assert metrics.duration_s == pytest.approx(30.0 - 1 / RATE_HZ)
+
+
+def test_a_gyro_bias_is_no_turn():
+    still = circle(30.0, 0.0)
+    biased = SampleBlock(
+        still.time_s, still.dt_s, still.host_s, still.raw_b_gauss,
+        still.gyro_b_rad_s + np.array([0.0, 0.0, 0.05]), still.accel_b_m_s2,
+    )  # fmt: skip
+    known = run(LiveTrial(RIGHT, IDENTITY, np.array([0.0, 0.0, 0.05])), biased)
+    assert known.turns == pytest.approx(0.0, abs=1e-9)
+    assert run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), biased).turns == pytest.approx(0.2387, rel=1e-3)
+
+
+def test_the_jump_is_the_difference_of_the_headings_at_the_change():
+    """Nose north: hard iron (0.05, -0.03) turns the heading of 0.24 G by atan2(0.03, 0.29)."""
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(5.0, 0.0))
+    assert metrics.heading_jump_deg == pytest.approx(-np.degrees(np.arctan2(0.03, 0.29)), abs=1e-9)
+
+
+def test_the_jump_is_of_the_first_seconds_only():
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    early = run(trial, circle(3.0, 0.0)).heading_jump_deg
+    later = run(trial, circle(20.0, 0.5, start_s=3.0)).heading_jump_deg
+    assert later == pytest.approx(early)
+
+
+def test_without_a_specific_force_there_is_no_jump_and_no_turn_but_a_figure():
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0, force=False))
+    assert metrics.heading_jump_deg is None
+    assert metrics.turns == 0.0
+    assert metrics.new_figure == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_figure_is_of_the_newest_minute():
+    trial = LiveTrial(IDENTITY, RIGHT, NO_BIAS)
+    assert run(trial, circle(60.0, 2.0)).new_figure > 0.03
+    assert run(trial, circle(61.0, 0.0, start_s=60.0)).new_figure < 1e-12
+
+
+def test_one_sample_says_nothing_of_a_spread():
+    metrics = LiveTrial(RIGHT, IDENTITY, NO_BIAS).take(pieces(circle(1.0, 0.0), 1)[0])
+    assert not metrics.finite
