@@ -10,7 +10,6 @@ import logging
 from dataclasses import dataclass, field
 
 from ahrsd.core import Core
-from ahrsd.stream import NoSamplesError
 
 STATUS_S = 60.0
 _AMISS_S = 5.0  # something must be amiss for so long before it is said
@@ -117,8 +116,7 @@ class Watch:
 
 
 def _no_samples(core: Core) -> str:
-    try:
-        core.stream.check()
-    except NoSamplesError as error:
-        return f"{error}; or let the daemon do it: device.configure_stream = true"
-    return "messages arrive, but no samples"
+    reasons = "; ".join(str(error) for error in core.stream.refused.values())
+    if not reasons:
+        return "messages arrive, but no samples"
+    return f"{reasons}; or let the daemon do it: device.configure_stream = true"

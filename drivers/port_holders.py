@@ -93,5 +93,6 @@ def _command(process: Path) -> str:
         words = (process / "cmdline").read_bytes().split(b"\0")
     except OSError:
         return "?"
-    text = b" ".join(words).decode(errors="replace").strip()
+    text = " ".join(b" ".join(words).decode(errors="replace").split())  # one line
+    text = "".join(letter if letter.isprintable() else "?" for letter in text)
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import threading
@@ -43,7 +44,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.fixture
-def run() -> Callable[..., int]:
+def run() -> Iterator[Callable[..., int]]:
     """`run(*arguments)`: the exit code of `ahrsd ARGUMENTS`, in this process."""
     from ahrsd.__main__ import main
 
@@ -53,7 +54,10 @@ def run() -> Callable[..., int]:
         code = caught.value.code
         return code if isinstance(code, int) else 0
 
-    return call
+    root = logging.getLogger()
+    handlers = root.handlers[:]
+    yield call
+    root.handlers[:] = handlers  # the command's own writes to a stderr that ends with the test
 
 
 @pytest.fixture
@@ -98,7 +102,7 @@ class LiveDaemon:
 
         self.emulator.receive = listen
         config, clock = check_config(body, "test"), HostClock()
-        self.capture = folder / "capture.mcap"
+        self.capture = (config.capture.directory or folder) / "capture.mcap"
         self.shell = open_shell(config, clock, self.capture)
         self.core = self.shell.core
         self.events: list[object] = []
