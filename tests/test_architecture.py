@@ -37,6 +37,8 @@ SHELL = (
     "ahrsd.operator_box",
     "ahrsd.recording",
     "ahrsd.replay",
+    "ahrsd.published",
+    "ahrsd.watch",
     "ahrsd.report",
     "ahrsd.rerun_blueprint",
     "ahrsd.rerun_process",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,7 +12,13 @@ from ahrsd.commands.progress import byte_progress
 from ahrsd.config import Config, load_config
 from ahrsd.errors import EXIT_DONE, EXIT_NO
 
-_METHODS = ("magyc",)
+if TYPE_CHECKING:
+    from ahrsd.batch import BatchResult
+
+_METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow to import
+    "magyc", "all", "magyc-ifg", "magyc-bfg", "magical-ifg", "magical-bfg", "magical-ls",
+    "magical-nls", "twostep", "ellipsoid", "magfactor3", "tls", "np", "fnp", "np-uncertain-field",
+)  # fmt: skip
 
 
 @click.command()
@@ -43,6 +50,8 @@ def command(
         result = calibrate(recording, config, rate_hz=rate_hz, progress=progress)
     if report_path is not None:
         result.write_report(report_path)
+    if method != _METHODS[0]:
+        raise SystemExit(_published(result, method, json_path))
     if json_path is not None:
         write_json(json_path, result.json(method))
     if json_path != "-":
@@ -52,3 +61,24 @@ def command(
         for text in result.said():
             click.echo(f"  warning: {text}")
     raise SystemExit(EXIT_DONE if result.converged else EXIT_NO)
+
+
+def _published(result: BatchResult, method: str, json_path: str | None) -> int:
+    """One published method, or all of them beside ours in one table; the exit code."""
+    from ahrsd.published import all_methods, published_json, run_published, table
+
+    if method == "all":
+        rows = all_methods(result)
+        body = [result.json(_METHODS[0]), *(published_json(result, row) for row in rows)]
+        if json_path is not None:
+            write_json(json_path, {"schema": "ahrsd.calibrations/1", "calibrations": body})
+        lines, good = table(result, rows), result.converged
+    else:
+        row = run_published(result, method)
+        if json_path is not None:
+            write_json(json_path, published_json(result, row))
+        lines, good = table(result, [row]), row.converged
+    if json_path != "-":
+        for line in lines:
+            click.echo(line)
+    return EXIT_DONE if good else EXIT_NO
