@@ -236,6 +236,17 @@ def test_a_broken_reader_is_a_lost_link(live, monkeypatch):
     assert [i for i in CaptureReader(daemon.capture) if isinstance(i, LinkLost)]
 
 
+def test_it_says_now_and_then_how_it_stands(live, caplog, monkeypatch):
+    monkeypatch.setattr("ahrsd.watch.STATUS_S", 2.0)
+    caplog.set_level(logging.INFO, "ahrsd")
+    line = (
+        r"\d+ samples, (3[0-9]|4[0-9])\.\d Hz, 0 gaps, OBSERVING, heading sigma \d+\.\d\d deg, "
+        r"waits for motion\.\w+: drive"
+    )
+    with live({"output": "imu"}, estimator={"epoch_steps": 32, "window_steps": 128}) as daemon:
+        daemon.until(lambda: re.search(line, caplog.text), 30.0)
+
+
 def test_the_log_counts_what_comes_again():
     lines = []
     folded = FoldedLog(lambda level, text: lines.append((level, text)))
