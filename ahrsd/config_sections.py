@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.gates.limits import GateLimits
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 
@@ -87,7 +87,7 @@ class Estimator(Section):
 
     step_rate_hz: float = Field(default=_ESTIMATOR.step_rate_hz, ge=1.0, le=800.0)
     """Faster streams are averaged down to this; higher follows faster motion, costs more. [Hz]"""
-    epoch_steps: int = Field(default=_ESTIMATOR.epoch_steps, ge=16, le=65536)
+    epoch_steps: int = Field(default=_ESTIMATOR.epoch_steps, ge=MIN_EPOCH_STEPS, le=65536)
     """Steps per epoch; larger loses less at the borders and answers later. [steps]"""
     window_steps: int = Field(default=_ESTIMATOR.window_steps, ge=64, le=10**6)
     """Steps that are linearised again; larger is nearer to the batch answer. [steps]"""
@@ -108,6 +108,12 @@ class Estimator(Section):
     """Never believe less field noise than this. [gauss]"""
     gyro_noise_floor_rad_s: float = Field(default=_ESTIMATOR.gyro_noise_floor_rad_s, gt=0.0, le=1.0)
     """Never believe less rate noise than this. [rad/s]"""
+
+    @model_validator(mode="after")
+    def _window_of_epochs(self) -> Estimator:
+        if self.window_steps < self.epoch_steps:
+            raise ValueError("window_steps must not be smaller than epoch_steps")
+        return self
 
     def parameters(self) -> EstimatorParameters:
         """What the estimator takes."""
