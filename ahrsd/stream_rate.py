@@ -30,7 +30,7 @@ _LEAST_RATE_RAD_S = 0.1
 _MOST_TURNED_RAD = 2.0
 _SPAN = 8  # messages per pair: quantisation of the printed angles matters less over several
 _LEAST_PAIRS = 200
-_PLENTY = 800  # pairs; then nobody needs to read on
+_PLENTY = 400  # pairs; then nobody needs to read on
 _SPREAD = 0.15  # quartiles' distance beyond which the attitude filter is still settling
 _LEAST_STRONG, _STRONG = 20, 0.99  # fewer pairs will do where they lie on one line, so correlated
 _CHECK_MESSAGES = 2000
@@ -177,14 +177,15 @@ class TurnWatch:
         table = np.hstack([ypr_rad, gyro_rad_s])
         if self._last is None:
             self._last = table[0]
-        R = _rotations(np.vstack([self._last[:3], ypr_rad]))
-        speed = np.linalg.norm(np.vstack([self._last[3:], gyro_rad_s]), axis=1)
+        table = np.concatenate([self._last[None], table])
         self._last = table[-1]
-        trace = np.einsum("nij,nij->n", R[:-1], R[1:])  # of R_k^T R_(k+1): 1 + 2 cos(angle)
-        turned = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+        speed = np.sqrt(np.sum(table[:, 3:] ** 2, axis=1))
         said = np.maximum(speed[1:], speed[:-1]) * step_s
-        found = np.zeros(len(table), dtype=np.int64)
-        jumps = (turned - said > _MISSING_RAD) & (turned > _MISSING_RATIO * said)
+        turned = _at_most(table[:, :3])
+        if _jumps(turned, said).any():  # hardly ever: then look closely
+            turned = _turned(table[:, :3])
+        found = np.zeros(len(said), dtype=np.int64)
+        jumps = _jumps(turned, said)
         weight = min(step_s / _SPEED_S, 1.0)
         for k, (now, jumped) in enumerate(zip(speed[1:].tolist(), jumps.tolist(), strict=True)):
             if math.isfinite(now):
@@ -195,6 +196,24 @@ class TurnWatch:
         self.places += int(np.count_nonzero(found))
         self.missing += int(found.sum())
         return found
+
+
+def _jumps(turned: Array, said: Array) -> NDArray[np.bool_]:
+    """Where a step turned further than the rate explains."""
+    return (turned - said > _MISSING_RAD) & (turned > _MISSING_RATIO * said)
+
+
+def _at_most(ypr_rad: Array) -> Array:
+    """A bound of `_turned` that is cheap: the three angles' changes, one after the other."""
+    change = np.abs(ypr_rad[1:] - ypr_rad[:-1])
+    return np.asarray(np.minimum(change, 2.0 * np.pi - change).sum(axis=1))
+
+
+def _turned(ypr_rad: Array) -> Array:
+    """Angles (N - 1,) between neighbours of (N, 3) attitudes."""
+    R = _rotations(ypr_rad)
+    trace = np.einsum("nij,nij->n", R[:-1], R[1:])  # of R_k^T R_(k+1): 1 + 2 cos(angle)
+    return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
 
 
 def _rotations(ypr_rad: Array) -> Array:
