@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -19,11 +20,11 @@ _DIGITS = 9
 
 @dataclass(slots=True)
 class DecisionLog:
-    """Entries in order. The newest `keep` are kept whole; all of them are in the hash."""
+    """Entries in order. The newest `keep` are kept, as text; all of them are in the hash."""
 
-    keep: int = 4096
-    entries: list[dict[str, object]] = field(default_factory=list)
+    keep: int = 4096  # some 4 kB each
     count: int = 0
+    _lines: deque[bytes] = field(default_factory=deque)
     _hash: hashlib._Hash = field(default_factory=hashlib.sha256)
 
     def add(
@@ -44,10 +45,17 @@ class DecisionLog:
             ],
         }
         entry.update({name: _plain(value) for name, value in facts.items()})
-        self._hash.update(json.dumps(entry, sort_keys=True).encode())
+        line = json.dumps(entry, sort_keys=True).encode()
+        self._hash.update(line)
         self.count += 1
-        self.entries.append(entry)
-        del self.entries[: -self.keep]
+        self._lines.append(line)
+        if len(self._lines) > self.keep:
+            self._lines.popleft()
+
+    @property
+    def entries(self) -> list[dict[str, object]]:
+        """The newest entries, oldest first."""
+        return [json.loads(line) for line in self._lines]
 
     @property
     def sha256(self) -> str:
