@@ -12,6 +12,7 @@ Checked by tests/test_calibration.py.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,10 +34,13 @@ class Affine:
 
     matrix: Array
     offset: Array
+    _inverse: Array | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", _frozen(self.matrix, (3, 3)))
         object.__setattr__(self, "offset", _frozen(self.offset, (3,)))
+        with contextlib.suppress(np.linalg.LinAlgError):  # `undo` raises it where it matters
+            object.__setattr__(self, "_inverse", np.linalg.inv(self.matrix))
 
     @staticmethod
     def identity() -> Affine:
@@ -58,8 +62,9 @@ class Affine:
         return np.asarray((vectors - self.offset) @ self.matrix.T)
 
     def undo(self, vectors: Array) -> Array:
-        """C^-1 v + B for (..., 3) vectors."""
-        return np.asarray(vectors @ np.linalg.inv(self.matrix).T + self.offset)
+        """C^-1 v + B for (..., 3) vectors.  LinAlgError where C is singular."""
+        inverse = np.linalg.inv(self.matrix) if self._inverse is None else self._inverse
+        return np.asarray(vectors @ inverse.T + self.offset)
 
     def after(self, first: Affine) -> Affine:
         """The single register that equals `first` and then `self`: C' = C C1, B' = B1 + C1^-1 B."""

@@ -95,7 +95,11 @@ class Compensation:
         return self.accel.undo(self._unrotated(output_m_s2))
 
     def _unrotated(self, vectors: Array) -> Array:
-        return np.asarray(vectors @ np.linalg.inv(self.rotation).T)
+        return Affine(self.rotation, np.zeros(3)).undo(vectors) if self._rotated else vectors
+
+    @property
+    def _rotated(self) -> bool:
+        return not np.array_equal(self.rotation, np.eye(3))
 
 
 def _affine(values: RegisterValues, number: int, warnings: list[str]) -> Affine:
