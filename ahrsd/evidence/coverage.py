@@ -33,6 +33,13 @@ class Coverage:
     regime: Regime
     turn: str
 
+    @property
+    def tilts(self) -> str:
+        """The tilts so far, in words."""
+        if not np.isfinite([self.roll_deg, self.pitch_deg]).all():
+            return "tilt not known yet"
+        return f"so far roll +-{self.roll_deg:.0f}, pitch +-{self.pitch_deg:.0f} deg"
+
 
 _NAN = float("nan")
 UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been recorded yet")

@@ -6,7 +6,7 @@ from ahrsd.gates.row import Level, least, most, no, yes
 
 _MOVE = "drive at least two full circles in calm surroundings"
 _TILT = "pitch and roll by 30 deg if the vehicle can"
-_SEEN = "(so far roll +-{e.motion.roll_deg:.0f}, pitch +-{e.motion.pitch_deg:.0f} deg)"
+_SEEN = "({e.motion.tilts})"
 _ACCEL = "add acceleration to the stream: tilt is not known without it"
 
 STREAM = (
