@@ -28,7 +28,7 @@ def capture(path, *items) -> None:
 @pytest.mark.parametrize("zipped", [False, True])
 def test_byte_streams(tmp_path, name, zipped):
     path = tmp_path / (name + ".gz" * zipped)
-    path.write_bytes(gzip.compress(SENTENCES, mtime=0, mtime=0) if zipped else SENTENCES)
+    path.write_bytes(gzip.compress(SENTENCES, mtime=0) if zipped else SENTENCES)
     recording = open_recording(path, rate_hz=40.0)
     assert (recording.kind, recording.rate_hz, recording.notes) == (Kind.BYTES, 40.0, [])
     *received, stop = recording.inputs()
@@ -94,7 +94,7 @@ def test_a_capture_of_a_silent_device_is_refused(tmp_path):
     ],
 )
 def test_an_unknown_name_is_judged_by_its_content(tmp_path, content, kind):
-    (tmp_path / "a.logger_mixed_stream.gz").write_bytes(gzip.compress(content, mtime=0, mtime=0))
+    (tmp_path / "a.logger_mixed_stream.gz").write_bytes(gzip.compress(content, mtime=0))
     assert open_recording(tmp_path / "a.logger_mixed_stream.gz").kind is kind
 
 
@@ -107,7 +107,7 @@ def test_an_unused_rate_is_noted(tmp_path):
     ("name", "content", "words"),
     [
         ("a.vnraw", b"", "is empty"),
-        ("a.vnraw.gz", gzip.compress(SENTENCES, mtime=0, mtime=0)[:20], "truncated"),
+        ("a.vnraw.gz", gzip.compress(SENTENCES, mtime=0)[:20], "truncated"),
         ("a.mcap", SENTENCES, "is not a capture of ahrsd"),
         ("a.doc", b"hello", "by its name nor by its content"),
         ("a.csv", SENTENCES, "has no column"),
