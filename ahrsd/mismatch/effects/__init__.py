@@ -1,0 +1,1 @@
+"""The library of effects: equation, parameters, signature, columns and exact simulation of each."""

@@ -1,0 +1,47 @@
+"""A recording as the mismatch engine wants it: one clock, a row per sample, covariates by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """N samples in the sensor frame, time increasing.
+
+    time_s:        (N,)
+    dt_s:          (N,) length of the step that ends at the sample; nan at the first sample of a run
+    mag_b_gauss:   (N, 3) magnetometer readings
+    gyro_b_rad_s:  (N, 3) gyro readings, the mean rate over the step that ends at the sample
+    accel_b_m_s2:  (N, 3) specific force, None where it was not recorded
+    covariates:    (N,) columns by name (`motor_current_a`, `temperature_c`, ...); may hold nan
+    runs:          slices of the gap-free runs, in order, which cover every row
+    """
+
+    time_s: Array
+    dt_s: Array
+    mag_b_gauss: Array
+    gyro_b_rad_s: Array
+    accel_b_m_s2: Array | None
+    covariates: dict[str, Array] = field(default_factory=dict)
+    runs: tuple[slice, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last, seconds."""
+        return float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """What the user knows of the sensor; None is estimated.  Deviations are per sample."""
+
+    sigma_mag_gauss: float | None = None
+    sigma_gyro_rad_s: float | None = None
+    rate_hz: float | None = None
+    field_gauss: float | None = None

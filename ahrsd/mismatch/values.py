@@ -1,0 +1,83 @@
+"""The values that the parts of the mismatch engine pass to each other.
+
+Model of the readings, with every named term in:
+
+    mag_k  = A h_k + b + sum_terms D_k theta + white noise (sigma_mag)
+    gyro_k = w_k + w_b + sum_terms W_k theta + white noise (sigma_gyro)
+    h_k    = Exp(-w_k dt_k) h_{k-1}                       field in body axes, |h| constant
+
+A is symmetric with trace 3; the field strength is the gauge and sits in h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NullModel:
+    """The calibration and the noise of a recording: what the simulation already knows.
+
+    soft_iron (3, 3), hard_iron_gauss (3,), gyro_bias_rad_s (3,); deviations are per sample.
+    """
+
+    soft_iron: Array
+    hard_iron_gauss: Array
+    gyro_bias_rad_s: Array
+    sigma_mag_gauss: float
+    sigma_gyro_rad_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """How the readings move with the parameters of an effect, (N, 3, p); None where they do not.
+
+    mag:  d mag_b_gauss / d theta, the field in body axes held
+    gyro: d gyro_b_rad_s / d theta, the true rate held
+    """
+
+    mag: Array | None = None
+    gyro: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Context:
+    """The recording as the present model sees it: all that an effect may build its columns from.
+
+    model:        calibration and noise at which everything is linearised
+    field_b:      (N, 3) gauss, true field in body axes as filtered (A field_b + b ~ mag)
+    rate_b_rad_s: (N, 3) true rate: gyro minus bias and terms, zero-phase smoothed: it shares
+                  next to no noise with a single innovation
+    field_dot_b:  (N, 3) gauss/s, field_b x rate_b_rad_s
+    rate_dot_b:   (N, 3) rad/s^2, of the smoothed rate
+    R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
+                  is an accelerometer or a reference attitude (`world_levelled`), else fixed but
+                  of unknown orientation
+    """
+
+    track: Track
+    model: NullModel
+    field_b: Array
+    rate_b_rad_s: Array
+    field_dot_b: Array
+    rate_dot_b: Array
+    R_nb: Array
+    world_levelled: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """One named effect in a fitted model.
+
+    setting: the effect's non-linear choices (onset, time constant, covariate, ...), JSON-able
+    value, deviation: (p,) parameters and standard deviations, units of the effect's table row
+    """
+
+    identifier: str
+    value: Array
+    deviation: Array
+    setting: dict[str, Any] = field(default_factory=dict)
