@@ -23,6 +23,8 @@ class NullModel:
     """The calibration and the noise of a recording: what the simulation already knows.
 
     soft_iron (3, 3), hard_iron_gauss (3,), gyro_bias_rad_s (3,); deviations are per sample.
+    gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias, 0 where it does not wander; the bias is
+    then the one at the first sample
     """
 
     soft_iron: Array
@@ -30,6 +32,7 @@ class NullModel:
     gyro_bias_rad_s: Array
     sigma_mag_gauss: float
     sigma_gyro_rad_s: float
+    gyro_walk_rad_s_sqrt_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
