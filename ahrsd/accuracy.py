@@ -23,6 +23,7 @@ from ahrsd.simulation import Experiment, Truth
 
 _STEEPEST_SIN = float(np.sin(np.radians(80.0)))  # beyond this pitch nobody asks for a heading
 _TABLE_5_2_NOISE_GAUSS = 0.010
+_DIFFERENCE = 1e-6  # of A's entries and, in gauss, of b
 _EVERY = 5  # samples: neighbours say nothing new about a heading
 
 
@@ -97,6 +98,14 @@ def heading_rms_deg(
 
     The field is free of noise unless asked; the noise is the same draw for every method.
     """
+    error = _heading_errors(experiment, soft_iron, hard_iron_gauss, noise_gauss)
+    return float(np.degrees(np.sqrt(np.mean(np.square(error)))))
+
+
+def _heading_errors(
+    experiment: Experiment, soft_iron: Array, hard_iron_gauss: Array, noise_gauss: float
+) -> Array:
+    """In rad, of every fifth sample that is not too steep."""
     rows = slice(None, None, _EVERY)
     R_nb, field_b, truth = experiment.R_nb[rows], experiment.field_b[rows], experiment.truth
     usable = np.abs(R_nb[:, 2, 0]) < _STEEPEST_SIN
@@ -106,8 +115,30 @@ def heading_rms_deg(
     if noise_gauss > 0:
         read += noise_gauss * np.random.default_rng(0).standard_normal(read.shape)
     corrected = Affine(np.asarray(np.linalg.inv(soft_iron), float), hard_iron_gauss).apply(read)
-    error = wrapped(tilt_compensated_heading(corrected, up) - tilt_compensated_heading(field_b, up))
-    return float(np.degrees(np.sqrt(np.mean(np.square(error)))))
+    return wrapped(tilt_compensated_heading(corrected, up) - tilt_compensated_heading(field_b, up))
+
+
+def expected_heading_deg(experiment: Experiment, covariance: Array, noise_gauss: float) -> float:
+    """What `heading_rms_deg` is to be expected to be, of answers with this covariance (12, 12).
+
+    To first order: the error of the exact answer, which is the reading's noise alone, and J P J^T
+    over the trajectory, J by central differences in A's upper triangle and b.
+    """
+    truth = experiment.truth
+    floor = _heading_errors(experiment, truth.soft_iron, truth.hard_iron_gauss, noise_gauss)
+    J = np.empty((len(floor), 9))
+    for column, step in enumerate(np.eye(9) * _DIFFERENCE):
+        A = np.zeros((3, 3))
+        A[np.triu_indices(3)] = step[:6]
+        A += np.triu(A, 1).T
+        b = step[6:]
+        there, back = (
+            _heading_errors(experiment, truth.soft_iron + s * A, truth.hard_iron_gauss + s * b, 0.0)
+            for s in (1.0, -1.0)
+        )
+        J[:, column] = wrapped(there - back) / (2 * _DIFFERENCE)
+    variance = np.einsum("ni,ij,nj->n", J, covariance[:9, :9], J)
+    return float(np.degrees(np.sqrt(np.mean(np.square(floor) + variance))))
 
 
 def field_errors(
@@ -142,9 +173,8 @@ def figures(answer: Answer, experiment: Experiment) -> dict[str, float | None]:
         out["soft_iron_geodesic"] = geodesic(A, truth.soft_iron)
     if b is not None:
         applied = np.eye(3) if A is None else A  # what would be written to the register
-        noise = _TABLE_5_2_NOISE_GAUSS
-        out["heading_deg"] = heading_rms_deg(experiment, applied, b)
-        out["heading_10mg_deg"] = heading_rms_deg(experiment, applied, b, noise)
+        for name, noise_gauss in HEADINGS.items():
+            out[name] = heading_rms_deg(experiment, applied, b, noise_gauss)
         out["field_spread"], out["constraint_gauss"] = field_errors(experiment, applied, b)
     if A is not None and b is not None and bias is not None and answer.covariance is not None:
         found = Truth(A, b, bias, truth.field_gauss, 0.0, 0.0).parameters
@@ -158,6 +188,8 @@ def _finite(name: str, value: float) -> float:
     return value
 
 
+#: name -> noise of the readings that are turned into headings, gauss
+HEADINGS: Mapping[str, float] = {"heading_deg": 0.0, "heading_10mg_deg": _TABLE_5_2_NOISE_GAUSS}
 #: name -> words and unit for a table, and the factor from the SI value to that unit
 FIGURES: Mapping[str, tuple[str, float]] = {
     "hard_iron_gauss": ("hard iron mG", 1e3),

@@ -20,17 +20,21 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from ahrsd.accuracy import Answer, figures, unit_volume
+import numpy as np
+
+from ahrsd.accuracy import HEADINGS, Answer, expected_heading_deg, figures, unit_volume
 from ahrsd.bound import Trajectory, UnobservableError, cramer_rao
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.online import Estimator
 from ahrsd.montecarlo_methods import OURS, STREAM, batch_method, is_known, known_methods, present
+from ahrsd.montecarlo_summary import BOUNDED
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, Iron, Settings, simulate
 
 Record = dict[str, Any]  # one run, as it stands in the file: see `run_one`
 
 _CHUNK = 25  # samples handed to the stream at a time
+_FORMAT = 2  # of a record: bounds hold `sigma` and headings
 _THREADS = "OPENBLAS_NUM_THREADS"
 
 
@@ -93,7 +97,7 @@ class Plan:
     @property
     def key(self) -> str:
         """Names the file of this plan's runs; another plan never shares it."""
-        text = json.dumps(asdict(self), sort_keys=True)
+        text = json.dumps(asdict(self) | {"format": _FORMAT}, sort_keys=True)
         return f"{self.scenario}-{self.motion}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
@@ -104,24 +108,32 @@ def run_one(plan: Plan, seed: int) -> Record:
     for method in plan.methods:
         answers = _streamed if method == STREAM else _in_batches
         results += answers(plan, method, experiment)
-    return {"seed": seed, "bounds": [_bound(plan, experiment, t) for t in plan.at_s]} | {
+    return {"seed": seed, "bounds": [bound_at(plan, experiment, t) for t in plan.at_s]} | {
         "results": results
     }
 
 
-def _bound(plan: Plan, experiment: Experiment, at_s: float) -> Record:
+def bound_at(plan: Plan, experiment: Experiment, at_s: float) -> Record:
+    """The bound from the samples up to a time; every figure None where the motion leaves it open.
+
+    sigma (12,): of each parameter, in the order of `Truth.parameters`
+    """
     truth = experiment.truth
     whole = Trajectory(experiment.field_b, experiment.rate_b_rad_s, experiment.samples.dt_s)
     part = whole.before(plan.samples(at_s))
     try:
         bound = cramer_rao(part, truth.soft_iron, plan.noise_mag_gauss, plan.noise_gyro_rad_s)
     except UnobservableError:
-        return {"at_s": at_s, "hard_iron_gauss": None, "soft_iron": None, "gyro_bias_rad_s": None}
+        return {"at_s": at_s} | dict.fromkeys((*BOUNDED, *HEADINGS, "sigma"))
     return {
         "at_s": at_s,
         "hard_iron_gauss": bound.hard_iron_gauss,
         "soft_iron": bound.soft_iron,
         "gyro_bias_rad_s": bound.gyro_bias_rad_s,
+        "sigma": np.sqrt(np.diag(bound.covariance).clip(min=0.0)).tolist(),
+    } | {
+        name: expected_heading_deg(experiment, bound.covariance, noise_gauss)
+        for name, noise_gauss in HEADINGS.items()
     }
 
 
@@ -129,7 +141,7 @@ def _in_batches(plan: Plan, method: str, experiment: Experiment) -> Iterator[Rec
     answer = batch_method(method)
     for at_s in plan.at_s:
         part = experiment.first(plan.samples(at_s))
-        yield _result(method, at_s, experiment, lambda part=part: answer(part))  # type: ignore[misc]
+        yield scored(method, at_s, experiment, lambda part=part: answer(part))  # type: ignore[misc]
 
 
 def _streamed(plan: Plan, method: str, experiment: Experiment) -> Iterator[Record]:
@@ -142,17 +154,20 @@ def _streamed(plan: Plan, method: str, experiment: Experiment) -> Iterator[Recor
         estimator.add(block)
         fed += len(block)
         while waiting and fed >= plan.samples(waiting[0]):
-            yield _result(method, waiting.pop(0), experiment, lambda: present(estimator), begun_s)
+            yield scored(method, waiting.pop(0), experiment, lambda: present(estimator), begun_s)
 
 
-def _result(
+def scored(
     method: str,
     at_s: float,
     experiment: Experiment,
     ask: Callable[[], Answer],
     begun_s: float | None = None,
 ) -> Record:
-    """An answer with its errors, or the failure in words; CPU seconds since `begun_s` or now."""
+    """An answer with its errors, or the failure in words; CPU seconds since `begun_s` or now.
+
+    `ask` says a failure by AhrsdError, ValueError (MethodError), ArithmeticError or RuntimeError.
+    """
     since_s = time.process_time() if begun_s is None else begun_s
     out: Record = {"method": method, "at_s": at_s, "failure": None}
     try:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.accuracy import FIGURES
+from ahrsd.accuracy import FIGURES, HEADINGS
 from ahrsd.samples import Array
 
 Record = Mapping[str, Any]
@@ -46,7 +46,9 @@ class Row:
     answered: runs with an answer, of `runs`; unconverged: of those, how many the method itself does
     not trust; failures: how often which words
     mean, spread: of each of `PARAMETERS`, over the answers; None where not estimated
-    against_bound: by name of `BOUNDED`; rms: of the other figures; nees: mean per degree of freedom
+    bound_sigma: RMS over the runs of the bound's standard deviation of each of `PARAMETERS`
+    against_bound: by name of `BOUNDED` and `HEADINGS`; rms: of the other figures
+    nees: mean per degree of freedom
     """
 
     method: str
@@ -57,6 +59,7 @@ class Row:
     failures: dict[str, int]
     mean: list[float | None]
     spread: list[float | None]
+    bound_sigma: list[float | None]
     against_bound: dict[str, Ratio]
     rms: dict[str, float | None]
     nees: float | None
@@ -98,7 +101,8 @@ def _row(results: Sequence[Record], bounds: Sequence[Record]) -> Row:
         failures=dict(failures.most_common()),
         mean=_numbers(parameters.mean(axis=0)) if answers else [None] * len(PARAMETERS),
         spread=_numbers(parameters.std(axis=0)) if answers else [None] * len(PARAMETERS),
-        against_bound={name: _ratio(good, name) for name in BOUNDED},
+        bound_sigma=_bound_sigma(bounds),
+        against_bound={name: _ratio(good, name) for name in (*BOUNDED, *HEADINGS)},
         rms={
             name: _rms(_column(answers, name)) for name in FIGURES if name not in (*BOUNDED, "nees")
         },
@@ -120,6 +124,17 @@ def _parameters(answers: Sequence[Record]) -> Array:
         for r in answers
     ]
     return np.array(rows, dtype=np.float64)
+
+
+def _bound_sigma(bounds: Sequence[Record]) -> list[float | None]:
+    known = [b["sigma"] for b in bounds if b["sigma"] is not None]
+    if not known:
+        return [None] * len(PARAMETERS)
+    rms = np.sqrt(np.mean(np.square(known), axis=0))
+    entry = np.zeros((3, 3), dtype=int)
+    entry[np.triu_indices(3)] = np.arange(6)
+    entry = np.maximum(entry, entry.T)
+    return _numbers(np.r_[rms[entry.ravel()], 1e3 * rms[6:]])
 
 
 def _numbers(values: Array) -> list[float | None]:
@@ -190,20 +205,30 @@ def bound_lines(rows: Sequence[Row]) -> list[str]:
     out = []
     for at_s in dict.fromkeys(row.at_s for row in rows):
         row = next(r for r in rows if r.at_s == at_s)
-        hard, soft, gyro = (row.against_bound[name].bound for name in BOUNDED)
+        hard, soft, gyro, heading, noisy = (
+            row.against_bound[name].bound for name in (*BOUNDED, *HEADINGS)
+        )
         out.append(
             f"{'bound':<19} {at_s:>5g} {'':>9} {_text(hard, 1e3):>13} {'':>13} {_text(soft):>12} "
-            f"{'':>8} {'':>9} {_text(gyro, 1e3):>12}"
+            f"{'':>8} {'':>9} {_text(gyro, 1e3):>12} {'':>8} {_text(heading):>12} "
+            f"{_text(noisy):>8}"
         )
     return out
 
 
 def parameter_lines(rows: Sequence[Row], truth: Sequence[float]) -> list[str]:
-    """[R] Table 5.1: mean and spread over the runs of every parameter at the last time."""
+    """[R] Table 5.1: mean and spread over the runs of every parameter at the last time.
+
+    The bound's line is the smallest spread of unbiased answers.
+    """
     last = max((row.at_s for row in rows), default=0.0)
     shown = [k for k, name in enumerate(PARAMETERS) if name not in ("A21", "A31", "A32")]
     table = [f"{'':<19} " + " ".join(f"{PARAMETERS[k]:>16}" for k in shown)]
     table.append(f"{'truth':<19} " + " ".join(f"{truth[k]:>16.4f}" for k in shown))
+    if rows:
+        sigma = [next(row for row in rows if row.at_s == last).bound_sigma[k] for k in shown]
+        cells = ["-" if value is None else f"+-{value:.4f}" for value in sigma]
+        table.append(f"{'bound':<19} " + " ".join(f"{cell:>16}" for cell in cells))
     for row in rows:
         if row.at_s == last and row.answered:
             cells = [_cell(row.mean[k], row.spread[k]) for k in shown]
