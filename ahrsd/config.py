@@ -24,8 +24,10 @@ from ahrsd.config_sections import (
     Gates,
     Interlock,
     Location,
+    Metrics,
     Rerun,
     Section,
+    Socket,
     Still,
     Trial,
     WriteBack,
@@ -57,6 +59,8 @@ class Config(Section):
     device: Device = Device()
     capture: Capture = Capture()
     rerun: Rerun = Rerun()
+    socket: Socket = Socket()
+    metrics: Metrics = Metrics()
     estimator: Estimator = Estimator()
     gates: Gates = Gates()
     interlock: Interlock = Interlock()

@@ -79,6 +79,24 @@ class Rerun(Section):
     """What the live view keeps for viewers that connect late. [MB]"""
 
 
+class Socket(Section):
+    """The Unix socket that `ahrsd status`, `watch` and `explain` ask (docs/socket.md)."""
+
+    enabled: bool = True
+    """Serve; who may connect is decided by the permissions of the socket's file."""
+    path: Path | None = None
+    """Its file; default: $RUNTIME_DIRECTORY/socket (systemd), else in the state directory."""
+
+
+class Metrics(Section):
+    """Numbers for Prometheus, over HTTP on 127.0.0.1 only."""
+
+    enabled: bool = False
+    """Serve /metrics."""
+    port: int = Field(default=9190, ge=1024, le=65535)
+    """TCP port."""
+
+
 _ESTIMATOR = EstimatorParameters()
 
 

@@ -8,32 +8,22 @@ changed for the session.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import queue
-import signal
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
-from types import FrameType
 from typing import Protocol
 
 from ahrsd import inputs
-from ahrsd.config import CONFIG_KEY, Config
-from ahrsd.config_text import print_config
-from ahrsd.core import Core
-from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
-from ahrsd.interlock import InterlockFile
+from ahrsd.config import Config
 from ahrsd.operator_box import OperatorBox
-from ahrsd.recording.capture import CaptureWriter
-from ahrsd.recording.retention import new_capture_path
-from ahrsd.rerun_sink import RerunLimits, RerunSink
+from ahrsd.rerun_sink import RerunSink
 from ahrsd.serial_reader import Bytes, Lost, SerialLink, find_device
-from ahrsd.settings import core_settings, with_date
-from ahrsd.shell import JournalKeeper, Shell, journal_in
-from ahrsd.summary import summary_lines
+from ahrsd.serving.public import Public
+from ahrsd.serving.status import LinkFacts
+from ahrsd.shell import Shell
 from ahrsd.watch import Watch
 from drivers.serial_port import LinkLost, PortError
 from drivers.usb import latency_timer_ms
@@ -49,7 +39,6 @@ _AMENDS_S = 2.0
 _INTERLOCK_S = 0.2
 _WATCH_S = 1.0
 _WALL_STEP_S = 1.0
-_VIEWER_S = 3.0
 
 
 class Vehicle(Protocol):
@@ -87,6 +76,7 @@ class Daemon:
         *,
         baud: int | None = None,
         box: OperatorBox | None = None,
+        public: Public | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -94,7 +84,9 @@ class Daemon:
         known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
         self._link = SerialLink(port_path, known, clock.now_ns)
         self._queue = self._link.queue
-        self._interlock, self._box = interlock, box
+        self._interlock, self._box, self._public = interlock, box, public
+        self._safe: bool | None = None
+        self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
@@ -153,6 +145,8 @@ class Daemon:
         behind = item is not None and not self._queue.empty()
         self._tick(item.host_ns if item is not None and behind else self.clock.now_ns())
         self._look()
+        if self._public is not None:
+            self._public.turn()
 
     def _tick(self, now_ns: int) -> None:
         deadline = self.shell.core.deadline_ns
@@ -164,7 +158,8 @@ class Daemon:
         now = self.clock.now_ns()
         if self._interlock is not None and now >= self._next_interlock_ns:
             self._next_interlock_ns = now + int(self._interlock_s * 1e9)
-            self._feed(inputs.Interlock(now, self._interlock.safe()))
+            self._safe = self._interlock.safe()
+            self._feed(inputs.Interlock(now, self._safe))
         while not self._operator.empty():
             self._feed(self._operator.get())
         self._tell_wall()
@@ -208,12 +203,29 @@ class Daemon:
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
             self.shell.say(remark.level, remark.text, now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
+        if self._public is not None:
+            self._public.look(self.shell.core, self._link_facts(error), now_s)
         device = self.config.device
         if self._watch.garbage and device.baud == "auto":
             self._link.doubt()
             self._lost(now_ns, "no message in what arrives: looking for the rate")
         elif self._watch.silent and device.configure_stream and self._may_query:
             self._lost(now_ns, "silence: asking the device again for its output")
+
+    def _link_facts(self, capture_error: str) -> LinkFacts:
+        capture, viewer = self.shell.capture, self.shell.viewer
+        counters = viewer.counters if isinstance(viewer, RerunSink) else None
+        return LinkFacts(
+            port=str(self._link.path),
+            baud=self._link.baud,
+            is_open=self._link.is_open,
+            latency_timer_ms=self._latency_timer_ms,
+            capture="" if capture is None else str(capture.path),
+            capture_error=capture_error,
+            viewer_dropped=0 if counters is None else counters.dropped,
+            viewer_fault="" if counters is None else counters.last_fault,
+            interlock={None: "none", True: "safe", False: "not safe"}[self._safe],
+        )
 
     # -- the port ----------------------------------------------------------------------------------
 
@@ -222,7 +234,8 @@ class Daemon:
         self._messages_before = self._messages
         self._watch.link_opened(time.monotonic())
         path, now = self._link.path, self.clock.now_ns()
-        self._feed(inputs.LinkOpened(now, str(path), self._link.baud, latency_timer_ms(path)))
+        self._latency_timer_ms = latency_timer_ms(path)
+        self._feed(inputs.LinkOpened(now, str(path), self._link.baud, self._latency_timer_ms))
 
     @property
     def _messages(self) -> int:
@@ -253,6 +266,8 @@ class Daemon:
     def _finish(self) -> None:
         """Let the core put back what it changed; bounded in time."""
         until = time.monotonic() + _STOP_S
+        if self._public is not None:
+            self._public.stopping()
         self._feed(inputs.Stop(self.clock.now_ns(), self._stop_reason))
         while not self.shell.finished and time.monotonic() < until:
             self._turn(0.05)
@@ -273,118 +288,3 @@ class Daemon:
                     device.run(procedure, _AMENDS_S)
         except DriverError as error:
             log.error("the device's output is not as it was: %s", error)
-
-
-class _Stopped(Exception):
-    """A signal came before there was anything to put back."""
-
-
-@contextlib.contextmanager
-def _signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """SIGTERM and SIGINT call `stop` with their name."""
-
-    def handler(number: int, _: FrameType | None) -> None:
-        stop(signal.Signals(number).name)
-
-    before = {s: signal.signal(s, handler) for s in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
-
-
-def _stop_searching(name: str) -> None:
-    raise _Stopped(name)
-
-
-def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
-    """The core with its capture, journal and viewer, as the configuration says.
-
-    Raises CaptureError where there can be no capture.
-    """
-    core = Core(core_settings(config))
-    writer = None if capture is None else _open_capture(config, capture)
-    viewer = None
-    if config.rerun.file is not None or config.rerun.serve:
-        limits = RerunLimits(server_bytes=config.rerun.memory_megabytes * 1_000_000)
-        viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port, limits=limits)
-    keeper = JournalKeeper(journal_in(config.state), clock.now_ns)
-    return Shell(core, writer, keeper, viewer)
-
-
-def _open_capture(config: Config, path: Path) -> CaptureWriter:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CaptureError(
-            f"{path.parent}: the folder of the captures cannot be made: {error.strerror}; set "
-            "capture.directory, or capture.enabled = false"
-        ) from error
-    return CaptureWriter(
-        path,
-        {"program": "ahrsd run", CONFIG_KEY: print_config(config)},
-        part_bytes=config.capture.part_megabytes * 1_000_000,
-        keep_bytes=config.capture.keep_megabytes * 1_000_000,
-    )
-
-
-def _open_box(config: Config) -> OperatorBox | None:
-    """Where a person may speak to the daemon; a run that writes nothing needs none."""
-    if config.mode not in ("stage", "commit"):
-        return None
-    box = OperatorBox(config.state)
-    try:
-        box.prepare()
-    except OSError as error:
-        log.warning("%s cannot be made, nobody can approve: %s", box.folder, error.strerror)
-        return None
-    return box
-
-
-def close_shell(shell: Shell) -> None:
-    """Close what `open_shell` opened, each bounded in time."""
-    if isinstance(shell.viewer, RerunSink):
-        shell.viewer.close(_VIEWER_S)
-        if fault := shell.viewer.counters.last_fault:
-            log.warning("rerun: %s", fault)
-    if shell.capture is not None:
-        status = shell.capture.close()
-        if not status.complete:
-            log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
-
-
-def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
-    """`ahrsd run`: until a signal; returns the exit code.
-
-    A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
-    PortError, ConfigError, CaptureError.
-    """
-    port = config.device.port
-    if port is None:
-        raise ConfigError(["device.port: no port is given"])
-    said = None if config.device.baud == "auto" else config.device.baud
-    try:
-        with _signals(_stop_searching):
-            found = find_device(port, said, may_query=config.mode != "passive")
-    except _Stopped as stopped:
-        log.info("stopped (%s) before a device was found", stopped)
-        return EXIT_DONE
-    log.info("%s: %s", port, found.why)
-    config = with_date(config)
-    clock = HostClock()
-    capture = new_capture_path(config.captures) if config.capture.enabled else None
-    shell = open_shell(config, clock, capture)
-    interlock = None
-    if config.interlock.file is not None:
-        interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
-    box = _open_box(config)
-    daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud, box=box)
-    try:
-        with _signals(daemon.stop):
-            daemon.run()
-    finally:
-        close_shell(shell)
-    for line in summary_lines(shell.core, str(capture or port)):
-        say(line)
-    return EXIT_DONE

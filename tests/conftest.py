@@ -83,7 +83,8 @@ class LiveDaemon:
 
     def __init__(self, folder: Path, setup: dict[str, object], tables: dict[str, object]) -> None:
         from ahrsd.config import check_config
-        from ahrsd.daemon import Daemon, HostClock, open_shell
+        from ahrsd.daemon import Daemon, HostClock
+        from ahrsd.service import open_shell
         from drivers.vn100.emulator_pty import PtyEmulator
         from drivers.vn100.emulator_scenarios import Setup, build
 
@@ -127,7 +128,7 @@ class LiveDaemon:
         return self
 
     def __exit__(self, *_: object) -> None:
-        from ahrsd.daemon import close_shell
+        from ahrsd.service import close_shell
 
         self.stop()
         close_shell(self.shell)

@@ -16,10 +16,11 @@ from pathlib import Path
 
 from ahrsd.config import Config, check_config
 from ahrsd.config_sections import Gates
-from ahrsd.daemon import Daemon, HostClock, close_shell, open_shell
+from ahrsd.daemon import Daemon, HostClock
 from ahrsd.events import SamplesSeen, StateChanged
 from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.replay import replay
+from ahrsd.service import close_shell, open_shell
 from ahrsd.writeback.states import State
 from drivers.serial_port import SerialPort
 from drivers.vn100.device import Device

@@ -21,6 +21,10 @@ COMMANDS: dict[str, str] = {
     "simulate": "A recording of a scenario, with the truth beside it.",
     "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
     "operator": "A person's word to the running daemon: approve, lock, unlock, rollback.",
+    "status": "How the running daemon stands.",
+    "watch": "The running daemon, live on a terminal.",
+    "explain": "Which gate holds a write back, since when, and what would open it.",
+    "bundle": "A support archive: journal, newest capture, status, versions.",
     "registers": "Read, compare, write and roll back the device's registers.",
 }
 

@@ -38,7 +38,7 @@ def command(path: Path | None, port: Path | None, mode: Mode | None, print_only:
     if config.device.port is None:
         raise click.UsageError("no port: give --port, or device.port in the configuration")
     from ahrsd.commands.device_access import driver_errors
-    from ahrsd.daemon import run_daemon
+    from ahrsd.service import run_daemon
 
     with driver_errors():
         raise SystemExit(run_daemon(config))

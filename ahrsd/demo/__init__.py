@@ -24,7 +24,7 @@ from ahrsd.calibration import Affine
 from ahrsd.config import CONFIG_KEY, Config, check_config
 from ahrsd.config_text import print_config
 from ahrsd.core import Core
-from ahrsd.daemon import Daemon, HostClock, close_shell
+from ahrsd.daemon import Daemon, HostClock
 from ahrsd.demo.result import LIMIT_DEG, DemoResult, figures, lines, verdict
 from ahrsd.demo.scene import Scene, live_samples
 from ahrsd.errors import EXIT_BUSY, DeviceError
@@ -35,6 +35,7 @@ from ahrsd.report import EventCollector, HeadingError, write_report
 from ahrsd.rerun_sink import RerunSink
 from ahrsd.result import calibration_json
 from ahrsd.samples import Array
+from ahrsd.service import close_shell
 from ahrsd.settings import core_settings
 from ahrsd.shell import JournalKeeper, Shell
 from ahrsd.summary import heading_errors

@@ -20,8 +20,9 @@ import numpy as np
 import psutil
 
 from ahrsd.config import check_config
-from ahrsd.daemon import Daemon, HostClock, close_shell, open_shell
+from ahrsd.daemon import Daemon, HostClock
 from ahrsd.events import Event, SamplesSeen
+from ahrsd.service import close_shell, open_shell
 from drivers.vn100.emulator_pty import PtyEmulator
 from drivers.vn100.emulator_scenarios import Setup, build
 

@@ -1,0 +1,111 @@
+"""`ahrsd watch`: the running daemon, live on a terminal."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from ahrsd.commands.running import connected, socket_options
+from ahrsd.serving.explain import explain_json
+from ahrsd.serving.lines import status_lines
+
+_EVENTS = 8  # lines of what happened
+
+
+@click.command()
+@socket_options
+@click.option("--raw", is_flag=True, help="The records as JSON lines, as they come.")
+@click.option("--samples", is_flag=True, help="With --raw: the samples too.")
+def command(path: Path | None, directory: Path | None, raw: bool, samples: bool) -> None:
+    """Rates, errors, what motion is missing, estimates, gates: until Ctrl-C.
+
+    Where stdout is not a terminal, one status is printed every time it changes by a line.
+    """
+    streams = ("status", "events", "samples") if samples else ("status", "events")
+    with connected(path, directory) as daemon:
+        records = daemon.watch(streams)
+        try:
+            if raw:
+                _raw(records)
+            else:
+                _show(records)
+        except KeyboardInterrupt:
+            return
+
+
+def _raw(records: Iterator[Mapping[str, Any]]) -> None:
+    import json
+
+    for record in records:
+        click.echo(json.dumps(record, separators=(",", ":")))
+
+
+def _show(records: Iterator[Mapping[str, Any]]) -> None:
+    console, happened = Console(), deque[str](maxlen=_EVENTS)
+    status: Mapping[str, Any] | None = None
+    said: list[str] = []
+    if not console.is_terminal:
+        for record in records:
+            if record.get("record") == "status" and (lines := status_lines(record)) != said:
+                said = lines
+                click.echo("\n".join(lines) + "\n")
+        return
+    with Live(console=console, refresh_per_second=4, screen=True) as live:
+        for record in records:
+            if record.get("record") == "status":
+                status = record
+            elif line := event_line(record):
+                happened.append(line)
+            if status is not None:
+                live.update(screen(status, happened))
+
+
+def event_line(record: Mapping[str, Any]) -> str:
+    """One line for what happened; empty for what the status shows anyway."""
+    match record.get("record"):
+        case "note":
+            return f"{record['level']}: {record['text']}"
+        case "state":
+            return f"{record['old']} -> {record['new']}: {record['reason']}"
+        case "register":
+            return f"register {record['register']} {record['outcome']}"
+        case "gap":
+            return f"(this terminal was too slow: {record['lost']} records lost)"
+    return ""
+
+
+def screen(status: Mapping[str, Any], happened: deque[str]) -> RenderableType:
+    """Status on top, the gates, what happened last."""
+    explained = explain_json(status)
+    head = Panel("\n".join(status_lines(status)), title="ahrsd")
+    todo = Panel(Text(str(explained["next"]), style="bold"), title="what to do next")
+    log = Panel("\n".join(happened) or "nothing yet", title="what happened")
+    return Group(head, todo, _gates(status), log)
+
+
+def _gates(status: Mapping[str, Any]) -> RenderableType:
+    table = Table("gate", "value", "limit", "for", expand=True, title="gates that are shut")
+    shut = [gate for gate in status["gates"] if not gate["ok"]]
+    for gate in shut:
+        table.add_row(gate["gate"], _value(gate, "value"), _value(gate, "limit"), _for(gate))
+    passed = len(status["gates"]) - len(shut)
+    table.caption = f"{passed} of {len(status['gates'])} gates are open"
+    return table
+
+
+def _value(gate: Mapping[str, Any], key: str) -> str:
+    value = gate[key]
+    return "not measured" if value is None else f"{value:.3g} {gate['unit']}".strip()
+
+
+def _for(gate: Mapping[str, Any]) -> str:
+    return "" if gate["for_s"] is None else f"{gate['for_s']:.0f} s"

@@ -1,0 +1,159 @@
+"""`ahrsd run`: what the daemon is made of, as the configuration says, and how it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+from ahrsd.config import CONFIG_KEY, Config
+from ahrsd.config_text import print_config
+from ahrsd.core import Core
+from ahrsd.daemon import Daemon, HostClock
+from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
+from ahrsd.interlock import InterlockFile
+from ahrsd.operator_box import OperatorBox
+from ahrsd.recording.capture import CaptureWriter
+from ahrsd.recording.retention import new_capture_path
+from ahrsd.rerun_sink import RerunLimits, RerunSink
+from ahrsd.serial_reader import find_device
+from ahrsd.serving.public import Public
+from ahrsd.settings import core_settings, with_date
+from ahrsd.shell import JournalKeeper, Shell, journal_in
+from ahrsd.summary import summary_lines
+
+log = logging.getLogger("ahrsd")
+
+_VIEWER_S = 3.0
+
+
+class _Stopped(Exception):
+    """A signal came before there was anything to put back."""
+
+
+@contextlib.contextmanager
+def _signals(stop: Callable[[str], None]) -> Iterator[None]:
+    """SIGTERM and SIGINT call `stop` with their name."""
+
+    def handler(number: int, _: FrameType | None) -> None:
+        stop(signal.Signals(number).name)
+
+    before = {s: signal.signal(s, handler) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _stop_searching(name: str) -> None:
+    raise _Stopped(name)
+
+
+def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
+    """The core with its capture, journal and viewer, as the configuration says.
+
+    Raises CaptureError where there can be no capture.
+    """
+    core = Core(core_settings(config))
+    writer = None if capture is None else _open_capture(config, capture)
+    viewer = None
+    if config.rerun.file is not None or config.rerun.serve:
+        limits = RerunLimits(server_bytes=config.rerun.memory_megabytes * 1_000_000)
+        viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port, limits=limits)
+    keeper = JournalKeeper(journal_in(config.state), clock.now_ns)
+    return Shell(core, writer, keeper, viewer)
+
+
+def _open_capture(config: Config, path: Path) -> CaptureWriter:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CaptureError(
+            f"{path.parent}: the folder of the captures cannot be made: {error.strerror}; set "
+            "capture.directory, or capture.enabled = false"
+        ) from error
+    return CaptureWriter(
+        path,
+        {"program": "ahrsd run", CONFIG_KEY: print_config(config)},
+        part_bytes=config.capture.part_megabytes * 1_000_000,
+        keep_bytes=config.capture.keep_megabytes * 1_000_000,
+    )
+
+
+def _open_box(config: Config) -> OperatorBox | None:
+    """Where a person may speak to the daemon; a run that writes nothing needs none."""
+    if config.mode not in ("stage", "commit"):
+        return None
+    box = OperatorBox(config.state)
+    try:
+        box.prepare()
+    except OSError as error:
+        log.warning("%s cannot be made, nobody can approve: %s", box.folder, error.strerror)
+        return None
+    return box
+
+
+def open_public(config: Config, shell: Shell) -> Public:
+    """What tells the world how the daemon stands, as the configuration says."""
+    public = Public(time.monotonic())
+    if config.socket.enabled:
+        public.open_socket(config.socket.path, config.state)
+    if config.metrics.enabled:
+        public.open_metrics(config.metrics.port)
+    shell.listeners.append(public.event)
+    return public
+
+
+def close_shell(shell: Shell) -> None:
+    """Close what `open_shell` opened, each bounded in time."""
+    if isinstance(shell.viewer, RerunSink):
+        shell.viewer.close(_VIEWER_S)
+        if fault := shell.viewer.counters.last_fault:
+            log.warning("rerun: %s", fault)
+    if shell.capture is not None:
+        status = shell.capture.close()
+        if not status.complete:
+            log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
+
+
+def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
+    """`ahrsd run`: until a signal; returns the exit code.
+
+    A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
+    PortError, ConfigError, CaptureError.
+    """
+    port = config.device.port
+    if port is None:
+        raise ConfigError(["device.port: no port is given"])
+    said = None if config.device.baud == "auto" else config.device.baud
+    try:
+        with _signals(_stop_searching):
+            found = find_device(port, said, may_query=config.mode != "passive")
+    except _Stopped as stopped:
+        log.info("stopped (%s) before a device was found", stopped)
+        return EXIT_DONE
+    log.info("%s: %s", port, found.why)
+    config = with_date(config)
+    clock = HostClock()
+    capture = new_capture_path(config.captures) if config.capture.enabled else None
+    shell = open_shell(config, clock, capture)
+    interlock = None
+    if config.interlock.file is not None:
+        interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
+    box = _open_box(config)
+    public = open_public(config, shell)
+    daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud, box=box, public=public)
+    try:
+        with _signals(daemon.stop):
+            daemon.run()
+    finally:
+        public.close()
+        close_shell(shell)
+    for line in summary_lines(shell.core, str(capture or port)):
+        say(line)
+    return EXIT_DONE

@@ -1,0 +1,121 @@
+"""Why nothing is written, in words: which gate holds, since when, and what would open it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+SCHEMA = "ahrsd.explain/1"
+
+#: state of the write-back -> what it means to somebody who stands beside the vehicle
+STATES: dict[str, str] = {
+    "RECONCILING": "the device is being read and compared with the journal",
+    "OBSERVING": "watching; there is no calibration that is worth a write yet",
+    "CANDIDATE": "there is a calibration worth writing; some gates hold it back",
+    "QUALIFIED": "a calibration passed every gate and waits for approval",
+    "PREPARING": "a write is being journalled; nothing was sent",
+    "CHECKING": "the device is read once more before the write; nothing was changed",
+    "STAGING": "registers 23 and 84 are being written",
+    "STAGED": "the device holds the new values in RAM",
+    "TRIAL": "the new values are on trial against the old ones, on live data",
+    "PROVEN": "the new values are proven better; they are in RAM, not in flash",
+    "SAVE_PREPARING": "the save to flash is being journalled",
+    "SAVING": "the flash is being written",
+    "COMMITTED": "saved; the next reading after a power cycle confirms it",
+    "CONFIRMED": "saved, and read back after a restart of the device",
+    "ROLLING_BACK": "the old values are being put back",
+    "ROLLED_BACK": "the old values are in force again",
+    "FAULT": "ALARM: the device is in a state that this program cannot mend alone",
+    "FLASH_TORN": "ALARM: the flash holds neither the old nor the new values",
+    "LOCKED": "locked: nothing is written until a person unlocks",
+}
+
+_NEXT = {
+    "FAULT": "look at `ahrsd registers diff`, then `ahrsd operator rollback` or `unlock`",
+    "FLASH_TORN": "see `ahrsd registers history`, write the old values back, then unlock",
+    "LOCKED": "find out why (`ahrsd registers history`), then `ahrsd operator unlock REASON`",
+}
+
+
+def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
+    """`ahrsd.explain/1` out of a status: the state, what holds, and what to do next."""
+    back = status["write_back"]
+    state = str(back["state"])
+    shut = [gate for gate in status["gates"] if not gate["ok"]]
+    said = {f"gate {gate['gate']}: {gate['advice']}" for gate in shut}
+    return {
+        "schema": SCHEMA,
+        "state": state,
+        "meaning": STATES[state],
+        "mode": status["mode"],
+        "mode_now": status["mode_now"],
+        "stream": _stream(status),
+        "gates": shut,
+        "others": [text for text in back["holds"] if text not in said],
+        "next": _next(status, state, shut),
+    }
+
+
+def _stream(status: Mapping[str, Any]) -> str:
+    """What is wrong with the stream; empty where nothing is."""
+    if not status["link"]["open"]:
+        return f"no device on {status['link']['port']}: waiting for it"
+    refused = status["stream"]["refused"]
+    if refused and not status["stream"]["samples"]:
+        return str(refused[0])
+    if not status["stream"]["samples"]:
+        return "no samples yet"
+    return ""
+
+
+def _next(status: Mapping[str, Any], state: str, shut: Sequence[Mapping[str, Any]]) -> str:
+    """One thing to do: what is nearest to the cause comes first."""
+    if wrong := _stream(status):
+        return wrong
+    if state in _NEXT:
+        return _NEXT[state]
+    if shut:
+        return str(shut[0]["advice"])
+    holds = status["write_back"]["holds"]
+    if not status["gates"]:
+        return "drive two full circles in calm surroundings: there is no estimate to judge yet"
+    if not holds:
+        return "nothing: the next step is taken by itself"
+    proposal = status["write_back"]["proposal"]
+    asks = [text for text in holds if "operator must approve" in text]
+    if proposal is not None and asks == list(holds):
+        return f"look at it (`ahrsd status`), then: ahrsd operator approve {proposal['id']}"
+    return str(holds[0])
+
+
+def explain_lines(explained: Mapping[str, Any]) -> list[str]:
+    """The same for a terminal."""
+    mode = explained["mode"]
+    if explained["mode_now"] != mode:
+        mode = f"{mode} (now {explained['mode_now']})"
+    lines = [f"{explained['state']}: {explained['meaning']}", f"mode {mode}"]
+    if explained["stream"]:
+        lines.append(f"stream: {explained['stream']}")
+    gates: Sequence[Mapping[str, Any]] = explained["gates"]
+    if gates:
+        lines.append(f"{len(gates)} gates hold a write back:")
+        lines += [_gate_line(gate) for gate in gates]
+    if explained["others"]:
+        lines.append("also:" if gates else "what holds a write back:")
+        lines += [f"  {text}" for text in explained["others"]]
+    return [*lines, f"next: {explained['next']}"]
+
+
+def _gate_line(gate: Mapping[str, Any]) -> str:
+    value, unit = gate["value"], f" {gate['unit']}" if gate["unit"] else ""
+    shown = "not measured" if value is None else f"{value:.3g}{unit}"
+    held = f", since {_span(gate['for_s'])}" if gate["for_s"] is not None else ""
+    limit = gate["limit"]
+    allowed = "" if limit is None else f" (limit {limit:.3g}{unit})"
+    return f"  {gate['gate']:<28} {shown}{allowed}{held}: {gate['advice']}"
+
+
+def _span(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{max(seconds, 0.0):.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"

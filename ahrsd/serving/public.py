@@ -1,0 +1,78 @@
+"""Everything that the daemon tells the world, behind one object: socket, metrics, systemd.
+
+None of it is needed for the work: where one cannot be had, that is logged and the daemon goes on.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from ahrsd import events
+from ahrsd.core import Core
+from ahrsd.sdnotify import Notifier
+from ahrsd.serving.client import default_socket_path
+from ahrsd.serving.lines import service_line
+from ahrsd.serving.metrics import MetricsServer
+from ahrsd.serving.server import SocketServer
+from ahrsd.serving.status import LinkFacts, StatusMaker
+
+log = logging.getLogger("ahrsd")
+
+
+class Public:
+    """See the module. Used by the daemon's thread alone."""
+
+    def __init__(self, now_s: float, notifier: Notifier | None = None) -> None:
+        self.notifier = notifier or Notifier()
+        self.socket: SocketServer | None = None
+        self.metrics: MetricsServer | None = None
+        self._maker = StatusMaker(now_s)
+        self._is_ready = False
+
+    def open_socket(self, path: Path | None, state: Path) -> None:
+        """Serve the socket, at its default place where no path is given."""
+        place = path or default_socket_path(state)
+        try:
+            self.socket = SocketServer(place)
+        except OSError as error:
+            log.warning("%s: %s; status, watch and explain find no daemon", place, error)
+
+    def open_metrics(self, port: int) -> None:
+        """Serve the metrics."""
+        try:
+            self.metrics = MetricsServer(port)
+        except OSError as error:
+            log.warning("metrics: 127.0.0.1:%d: %s; set metrics.port", port, error.strerror)
+
+    def event(self, event: events.Event) -> None:
+        """Something happened in the core."""
+        if self.socket is not None:
+            self.socket.publish(event)
+
+    def turn(self) -> None:
+        """The daemon's loop turned once."""
+        self.notifier.feed()
+
+    def look(self, core: Core, link: LinkFacts, now_s: float) -> None:
+        """About once a second: the newest status for everybody who asks."""
+        status = self._maker.make(core, link, now_s)
+        line = service_line(status)
+        if not self._is_ready:
+            self._is_ready = True
+            self.notifier.ready(line)
+        self.notifier.status(line)
+        if self.socket is not None:
+            self.socket.status(status)
+        if self.metrics is not None:
+            self.metrics.status(status)
+
+    def stopping(self) -> None:
+        """The daemon ends; what it puts back takes a moment."""
+        self.notifier.stopping()
+
+    def close(self) -> None:
+        """Tell no more."""
+        for server in (self.socket, self.metrics):
+            if server is not None:
+                server.close()
