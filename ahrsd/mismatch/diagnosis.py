@@ -1,0 +1,208 @@
+"""The answer of a diagnosis, field for field as the contract's section 5, and what a report draws.
+
+`to_json` gives the contract's object; arrays and working values are left out of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ahrsd.mismatch.locate import Located
+from ahrsd.mismatch.values import NullModel, Term
+from ahrsd.samples import Array
+
+SCHEMA = "ahrsd.diagnosis/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """How well the calibration alone predicts; NIS is 1 where model and noise are right."""
+
+    heldout_rms_gauss: float
+    heldout_nll_per_sample: float
+    normalised_innovation: float
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A name with its probability."""
+
+    effect: str
+    confidence: float
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """The address of a mismatch.  frame: sensor, world, gyro, link or noise."""
+
+    intervals_s: tuple[tuple[float, float], ...]
+    axes: tuple[str, ...]
+    frame: str
+    regime: str | None = None
+    band_hz: tuple[float, float] | None = None
+    direction: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """One coefficient with its standard deviation."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Heldout:
+    """What the model gains on blocks that it was not fitted to.
+
+    placebo_gain: that of the same effect moved in time (99th percentile), nats per sample
+    """
+
+    rms_before_gauss: float
+    rms_after_gauss: float
+    nll_gain_per_sample: float
+    placebo_gain: float
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What the calibration would be off by without the effect in the model."""
+
+    hard_iron_shift_gauss: float
+    heading_error_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One named effect."""
+
+    effect: str
+    confidence: float
+    alternatives: tuple[Share, ...]
+    where: Where
+    parameters: tuple[Value, ...]
+    heldout: Heldout
+    cost_if_left_out: Cost
+    separate_from: str | None
+    words: str = ""
+    equation: str = ""
+    setting: dict[str, Any] = field(default_factory=dict)
+    evidence_nats: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Suspect:
+    """A logged channel that moves with an unexplained course."""
+
+    channel: str
+    correlation: float
+    p_value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unexplained:
+    """What the library has no name for: located, with its course in time."""
+
+    detected: bool
+    where: Where | None = None
+    heldout: Heldout | None = None
+    size: float | None = None
+    unit: str = ""
+    single_source_share: float | None = None
+    follows: tuple[Suspect, ...] = ()
+    evidence_nats: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One statistic of the recording against simulations of the null and the repaired model."""
+
+    value: float
+    band: tuple[float, float]
+    inside_before: bool
+    inside_after: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """The smallest effect that this recording would have shown, per parameter; None: not at all."""
+
+    effect: str
+    parameter: str
+    smallest: float | None
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """What the report draws; rows as in the (thinned) track.
+
+    time_s (N,); before, after (N, 3): whitened innovations of the null and the repaired model;
+    contributions (N, 3) gauss by effect; courses: the agnostic frames' after the named terms;
+    evidence: nats of every candidate in the first round, best setting.
+    """
+
+    time_s: Array
+    before: Array
+    after: Array
+    contributions: dict[str, Array]
+    courses: tuple[Located, ...]
+    evidence: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnosis:
+    """The whole answer."""
+
+    recording: str
+    baseline: Baseline | None
+    mismatch: bool
+    p_value: float
+    findings: tuple[Finding, ...]
+    unexplained: Unexplained
+    posterior_predictive: dict[str, Check]
+    sensitivity: tuple[Limit, ...] = ()
+    notes: tuple[str, ...] = ()
+    model: NullModel | None = None
+    terms: tuple[Term, ...] = ()
+    drawn: Drawn | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract's object, plus notes, sensitivity and the repaired model."""
+        out: dict[str, Any] = {
+            "schema": SCHEMA,
+            "recording": self.recording,
+            "baseline": _plain(self.baseline),
+            "mismatch": self.mismatch,
+            "p_value": self.p_value,
+            "findings": [_plain(finding) for finding in self.findings],
+            "unexplained": _plain(self.unexplained),
+            "posterior_predictive": {k: _plain(v) for k, v in self.posterior_predictive.items()},
+            "sensitivity": [_plain(limit) for limit in self.sensitivity],
+            "notes": list(self.notes),
+        }
+        if self.model is not None:
+            out["model"] = {**_plain(self.model), "terms": [_plain(term) for term in self.terms]}
+        return out
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - any of the records above
+    """Dataclasses to dictionaries, arrays to lists, numbers to Python's own."""
+    if isinstance(value, np.ndarray):
+        return [_plain(item) for item in value.tolist()]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
+    return value

@@ -1,0 +1,41 @@
+"""Every threshold on which a verdict rests, each with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Smaller probabilities and more nats make the engine more silent.
+
+    family_p:       family-wise probability below which a candidate may be named; times the number
+                    of candidates and settings tried it is the chance of a false name, 1 in 500
+                    before the other gates
+    robust_family_p: the same for the block-robust test, whose tails are heavy with few blocks; it
+                    guards against coloured and bursty noise, where the score test does not
+    evidence_nats:  evidence over the calibration alone: odds 20 to 1 for every candidate's size
+    lead_nats:      two candidates closer than this are told as one set (odds of 20 to 1)
+    cv_gain:        held-out gain, nats per sample, must be above this
+    placebo_beaten: share of time-shifted copies of a candidate that it must beat
+    coverage:       share of the agnostic statistic of its own frame that a time-shaped name must
+                    explain, else it is a stand-in for an unlogged source
+    unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
+    unknown_p:      its probability under coloured noise
+    most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
+    deflation:      beyond this colour of the innovations no term is named before the noise is told
+    """
+
+    family_p: float = 2e-3
+    robust_family_p: float = 2e-2
+    evidence_nats: float = 3.0
+    lead_nats: float = 3.0
+    cv_gain: float = 0.0
+    placebo_beaten: float = 0.99
+    coverage: float = 0.9
+    unknown_nats: float = 8.0
+    unknown_p: float = 1e-4
+    most_terms: int = 5
+
+
+LIMITS = Limits()

@@ -1,0 +1,107 @@
+"""Which name may be given: the acceptance gate, the ranking, the set that cannot be told apart.
+
+Evidence ranks; it does not accept.  A candidate is named only if its family-wise score and robust
+tests, its evidence, its held-out gain, its time-shifted copies and its physical bounds all allow
+it: on a real drone log the score test alone would name four terms, this gate one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.mismatch.evidence import log_bayes, posterior
+from ahrsd.mismatch.gram import Gram
+from ahrsd.mismatch.limits import Limits
+from ahrsd.mismatch.regression import Base, Candidate, without_known
+from ahrsd.mismatch.score import Score, chi2_p, robust_p, score, shift_statistics
+from ahrsd.mismatch.validate import Gain, heldout
+from ahrsd.samples import Array
+
+#: shifts shorter than this are the effect itself a moment later
+MINIMUM_SHIFT_SHARE = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """A candidate with all that the gate looks at; `refused` names what it failed."""
+
+    candidate: Candidate
+    what: Score
+    evidence: float
+    family_p: float
+    robust_family_p: float
+    gain: Gain
+    placebo_beaten: float
+    placebo_gain: float
+    refused: tuple[str, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it may be named."""
+        return not self.refused
+
+
+def rank(candidates: Sequence[Candidate], projected: Gram, colour: float) -> dict[str, float]:
+    """Evidence of every candidate, its setting paid for, strongest first, nats."""
+    found = {
+        c.name: log_bayes(score(projected, c.name, c.scale), colour) - np.log(c.tried)
+        for c in candidates
+    }
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def judge(
+    candidate: Candidate,
+    gram: Gram,
+    columns: Array,
+    basis: Base,
+    tried: int,
+    limits: Limits,
+) -> Judged:
+    """Hold one candidate against the gate.
+
+    gram: with the known groups in;  columns (N, 3, p) whitened;  tried: size of the library
+    """
+    known = list(basis.groups)
+    what = score(
+        gram.select([*known, candidate.name]).project(known), candidate.name, candidate.scale
+    )
+    evidence = log_bayes(what, basis.colour) - float(np.log(candidate.tried))
+    tests = tried * candidate.tried
+    family = min(1.0, tests * chi2_p(what, basis.colour))
+    robust = min(1.0, tests * robust_p(what))
+    gain = heldout(gram, known, candidate.name, candidate.scale)
+    found, shifted = shift_statistics(
+        *without_known(basis, columns), round(MINIMUM_SHIFT_SHARE * len(columns))
+    )
+    beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
+    bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
+    checks = (
+        ("family-wise probability", family < limits.family_p),
+        ("block-robust probability", robust < limits.robust_family_p),
+        ("evidence", evidence > limits.evidence_nats),
+        ("held-out gain", gain.nats_per_sample > limits.cv_gain),
+        ("time-shifted copies", beaten >= limits.placebo_beaten),
+        ("physical bounds", bool(np.all(np.abs(what.value) <= bounds))),
+    )
+    usual = float(np.quantile(shifted, 0.99)) if len(shifted) else 0.0
+    return Judged(
+        candidate,
+        what,
+        evidence,
+        family,
+        robust,
+        gain,
+        beaten,
+        max(0.0, (usual - what.rank) / (2.0 * len(columns))),
+        tuple(name for name, passed in checks if not passed),
+    )
+
+
+def confusable(evidence: Mapping[str, float], name: str, lead_nats: float) -> dict[str, float]:
+    """`name` and all within `lead_nats` of it, with their shares of the probability."""
+    near = {k: v for k, v in evidence.items() if v > evidence[name] - lead_nats}
+    return dict(sorted(posterior(near, {}).items(), key=lambda item: -item[1]))

@@ -1,0 +1,222 @@
+"""The recording as a regression: whitened columns of calibration, terms, candidates and frames.
+
+Every effect is tried in every setting it offers with totals only (a few small matrices each); the
+best setting goes on into the Gram with a matrix per block, from which all the tests are computed.
+An onset is then sought more closely, to a fraction of a second.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.mismatch.effects.base import Effect, Setting
+from ahrsd.mismatch.evidence import log_bayes
+from ahrsd.mismatch.gram import Gram, block_edges, gram, solve
+from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.mismatch.score import Score, score
+from ahrsd.mismatch.values import Columns, Context
+from ahrsd.samples import Array
+
+CALIBRATION = "calibration"
+#: columns that pass the filter at once: as much as stays in the processor's cache
+BATCH_COLUMNS = 96
+ONSET_STEPS = 12
+ONSET_PASSES = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """An effect in one setting.  tried: alternatives among which the setting was chosen."""
+
+    effect: Effect
+    setting: Setting
+    tried: int
+    evidence: float
+
+    @property
+    def name(self) -> str:
+        """Its identifier, which is also its group in a Gram."""
+        return self.effect.identifier
+
+    @property
+    def scale(self) -> Array:
+        """(p,) one prior deviation per parameter."""
+        return np.array([parameter.scale for parameter in self.effect.parameters])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Base:
+    """What every candidate is measured against: innovations with calibration and terms taken out.
+
+    known (N, 3, q): whitened columns of the calibration and of the named terms, in `groups` order;
+    innovation (N, 3): whitened, 0 in unused rows.
+    """
+
+    context: Context
+    filtered: Filtered
+    groups: Mapping[str, slice]
+    known: Array
+    colour: float
+
+    @property
+    def innovation(self) -> Array:
+        """(N, 3) whitened."""
+        return self.filtered.whitened
+
+
+def base(
+    context: Context,
+    filtered: Filtered,
+    terms: Sequence[tuple[str, Columns]],
+    colour: float,
+) -> Base:
+    """Whiten the columns of calibration and named terms (group name, columns)."""
+    parts = [(CALIBRATION, sensitivities(filtered, nuisance_columns(filtered)))]
+    parts += [(name, sensitivities(filtered, columns)) for name, columns in terms]
+    ends = np.cumsum([part.shape[2] for _, part in parts]).tolist()
+    groups = {
+        name: slice(end - part.shape[2], end) for (name, part), end in zip(parts, ends, strict=True)
+    }
+    return Base(
+        context, filtered, groups, np.concatenate([part for _, part in parts], axis=2), colour
+    )
+
+
+def whiten(filtered: Filtered, columns: Sequence[Columns]) -> list[Array]:
+    """The columns through the filter, several at a time; a width of 0 stays 0."""
+    out: list[Array] = []
+    at = 0
+    while at < len(columns):
+        end, width = at, 0
+        while end < len(columns) and (end == at or width + _width(columns[end]) <= BATCH_COLUMNS):
+            width += _width(columns[end])
+            end += 1
+        joined = sensitivities(filtered, _joined(columns[at:end], len(filtered.track)))
+        edges = np.cumsum([0, *(_width(part) for part in columns[at:end])])
+        out += [joined[:, :, a:b] for a, b in itertools.pairwise(edges)]
+        at = end
+    return out
+
+
+def best_settings(
+    basis: Base, library: Mapping[str, Effect], taken: Sequence[tuple[str, Setting]]
+) -> list[Candidate]:
+    """Every effect that can be computed here, in its best setting; strongest evidence first."""
+    found = []
+    for name, effect in library.items():
+        options = effect.settings(basis.context) if effect.kind == "mean" else ()
+        options = tuple(option for option in options if (name, option) not in taken)
+        if not options:
+            continue
+        best = max(_scan(basis, effect, options), key=lambda candidate: candidate.evidence)
+        found.append(_with_onset(basis, best, options) if "onset_s" in best.setting else best)
+    return sorted(found, key=lambda candidate: -candidate.evidence)
+
+
+def candidate_gram(
+    basis: Base, candidates: Sequence[Candidate], block_s: float
+) -> tuple[Gram, dict[str, Array]]:
+    """Gram of calibration, terms and candidates with a matrix per block, and the columns."""
+    columns = whiten(
+        basis.filtered,
+        [candidate.effect.columns(basis.context, candidate.setting) for candidate in candidates],
+    )
+    groups = {name: basis.known[:, :, where] for name, where in basis.groups.items()}
+    found = {c.name: part for c, part in zip(candidates, columns, strict=True)}
+    time_s = basis.context.track.time_s
+    return gram({**groups, **found}, basis.innovation, time_s, block_edges(time_s, block_s)), found
+
+
+def group_gram(basis: Base, groups: Mapping[str, Columns], block_s: float | None = None) -> Gram:
+    """Gram of the given groups, calibration and terms projected out; one block by default."""
+    whitened = whiten(basis.filtered, list(groups.values()))
+    known = {name: basis.known[:, :, where] for name, where in basis.groups.items()}
+    time_s = basis.context.track.time_s
+    edges = [0, len(time_s)] if block_s is None else block_edges(time_s, block_s)
+    whole = gram(
+        {**known, **dict(zip(groups, whitened, strict=True))}, basis.innovation, time_s, edges
+    )
+    return whole.project(list(known))
+
+
+def without_known(basis: Base, columns: Array) -> tuple[Array, Array]:
+    """Columns (N, 3, p) and innovation (N, 3) with calibration and terms regressed out."""
+    flat = basis.known.reshape(-1, basis.known.shape[2])
+    stacked = np.concatenate([columns, basis.innovation[:, :, None]], axis=2)
+    other = stacked.reshape(len(flat), -1)
+    left = other - flat @ solve(flat.T @ flat, flat.T @ other)
+    cube = left.reshape(stacked.shape)
+    return cube[:, :, :-1], cube[:, :, -1]
+
+
+def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candidate]:
+    """Evidence of each setting, its choice paid for."""
+    columns = [effect.columns(basis.context, option) for option in options]
+    whitened = whiten(basis.filtered, columns)
+    Z = basis.known.reshape(-1, basis.known.shape[2])
+    inner = Z.T @ Z
+    known_e = Z.T @ basis.innovation.ravel()
+    scale = np.array([parameter.scale for parameter in effect.parameters])
+    out = []
+    for option, part in zip(options, whitened, strict=True):
+        X = part.reshape(-1, part.shape[2])
+        cross = Z.T @ X
+        M = solve(inner, cross)
+        G = X.T @ X - cross.T @ M
+        s = X.T @ basis.innovation.ravel() - M.T @ known_e
+        what = _total_score(G, s, np.einsum("ij,ij->j", X, X), scale)
+        cost = np.log(len(options)) + np.log(float(option.get("searched", 1)))
+        evidence = log_bayes(what, basis.colour) - cost
+        out.append(Candidate(effect, option, len(options), evidence))
+    return out
+
+
+def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Candidate:
+    """The candidate with its onset sought between the neighbours of the coarse grid."""
+    times = np.unique([option["onset_s"] for option in options if "onset_s" in option])
+    if len(times) < 2:
+        return best
+    reach = float(np.median(np.diff(times)))
+    time_s = basis.context.track.time_s
+    for _ in range(ONSET_PASSES):
+        grid = best.setting["onset_s"] + reach * np.linspace(-1, 1, ONSET_STEPS + 1)
+        inside = grid[(grid > time_s[0]) & (grid < time_s[-1])]
+        closer = [{**best.setting, "onset_s": round(float(t), 4)} for t in inside]
+        finer = max(_scan(basis, best.effect, closer), key=lambda candidate: candidate.evidence)
+        paid = finer.evidence + np.log(len(closer)) - np.log(len(options) * 4)
+        if paid > best.evidence:
+            best = Candidate(best.effect, finer.setting, len(options) * 4, paid)
+        reach *= 2.0 / ONSET_STEPS
+    return best
+
+
+def _total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
+    whole = np.zeros((1, len(s) + 1, len(s) + 1))
+    whole[0, :-1, :-1], whole[0, :-1, -1], whole[0, -1, :-1] = G, s, s
+    one = Gram({"x": slice(0, len(s))}, whole, np.ones(1), np.zeros((1, 2)), information)
+    return score(one, "x", scale)
+
+
+def _width(columns: Columns) -> int:
+    if columns.mag is not None:
+        return int(columns.mag.shape[2])
+    return 0 if columns.gyro is None else int(columns.gyro.shape[2])
+
+
+def _joined(parts: Sequence[Columns], count: int) -> Columns:
+    """Columns side by side; zeros on a side that only some of them have."""
+
+    def side(values: list[Array | None]) -> Array | None:
+        if all(value is None for value in values):
+            return None
+        filled = [
+            np.zeros((count, 3, _width(part))) if value is None else value
+            for part, value in zip(parts, values, strict=True)
+        ]
+        return np.concatenate(filled, axis=2)
+
+    return Columns(side([part.mag for part in parts]), side([part.gyro for part in parts]))

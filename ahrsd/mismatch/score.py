@@ -1,0 +1,142 @@
+"""Tests of one group of columns, everything else projected out: score, robust, bootstrap.
+
+In units of one prior deviation per parameter (theta = scale * phi) the projected information is
+diagonalised, G = V diag(l) V^T; directions that one prior deviation would not show (l < 1) are left
+out, so the tests have the degrees of freedom that the motion offers and no others.
+
+    score (LM):  sum_i s_i^2 / l_i ~ chi2_r under white noise
+    robust:      Hotelling's T^2 of the block scores with the group fitted, jackknifed (CR3):
+                 u_b = (I - G_b G^-1)^-1 (s_b - G_b phi), V = sum u_b u_b^T, T = s^T V^-1 s.
+                 Correlated or heavy-tailed noise changes V and with it T; many blocks that agree
+                 do not (with the group not fitted they would look like variance).
+    bootstrap:   signs of whole blocks flipped at random, for groups too wide for T^2
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from ahrsd.mismatch.gram import RANK_SHARE, Gram
+from ahrsd.samples import Array
+
+#: 1 - leverage of a block is not taken smaller: a block that alone carries an effect proves little.
+MINIMUM_FREEDOM = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """What the data say on one group; r observable directions of its p parameters.
+
+    basis:       (p, r) theta = basis @ z, z in prior deviations
+    information: (r,) of z;  score: (r,) sum of the block scores
+    block_information:     (B, r, r); block_s: (B, r)
+    share:       information left of the unprojected one, 0..1: the rest is absorbed
+    """
+
+    basis: Array
+    information: Array
+    score: Array
+    block_information: Array
+    block_s: Array
+    share: float
+
+    @property
+    def rank(self) -> int:
+        """Observable directions."""
+        return len(self.information)
+
+    @property
+    def statistic(self) -> float:
+        """The score statistic, chi2 of `rank` under white noise."""
+        return float(np.sum(self.score**2 / self.information))
+
+    @property
+    def value(self) -> Array:
+        """(p,) least-squares parameters, zero in unobservable directions."""
+        return np.asarray(self.basis @ (self.score / self.information))
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p) of `value` under white noise of unit variance."""
+        return np.asarray((self.basis / self.information) @ self.basis.T)
+
+
+def score(gram: Gram, name: str, scale: Array, minimum_information: float = 1.0) -> Score:
+    """The group's score in a Gram from which all else is projected out; scale (p,)."""
+    columns = gram.groups[name]
+    blocks = gram.blocks[:, columns, columns] * scale[:, None] * scale
+    scores = gram.blocks[:, columns, -1] * scale
+    whole = blocks.sum(axis=0)
+    before = gram.information[columns] * scale**2
+    values, vectors = np.linalg.eigh((whole + whole.T) / 2)
+    kept = values > max(minimum_information, RANK_SHARE * float(before.sum()))
+    V = vectors[:, kept]
+    block_s = scores @ V
+    return Score(
+        basis=scale[:, None] * V,
+        information=values[kept],
+        score=block_s.sum(axis=0),
+        block_information=V.T @ blocks @ V,
+        block_s=block_s,
+        share=float(np.clip(np.trace(whole) / max(float(before.sum()), 1e-300), 0.0, 1.0)),
+    )
+
+
+def chi2_p(what: Score, colour: float = 1.0) -> float:
+    """Probability of a larger score statistic under noise whose power is `colour` times white."""
+    return float(stats.chi2.sf(what.statistic / colour, what.rank)) if what.rank else 1.0
+
+
+def robust_p(what: Score) -> float:
+    """Probability of a larger T^2; 1 where there are too few effective blocks for the rank."""
+    B, r = len(what.block_s), what.rank
+    if r == 0:
+        return 1.0
+    root = 1.0 / np.sqrt(what.information)
+    H = what.block_information * root[:, None] * root
+    s = what.block_s * root
+    residual = s - np.einsum("bij,j->bi", H, s.sum(axis=0))
+    values, vectors = np.linalg.eigh(H)
+    freedom = np.maximum(1.0 - values, MINIMUM_FREEDOM)
+    turned = np.einsum("bji,bj->bi", vectors, residual) / freedom
+    u = np.einsum("bij,bj->bi", vectors, turned)
+    leverage = np.einsum("bii->b", H) / r
+    blocks = min(float(B), 1.0 / float(np.sum(leverage**2)))
+    if blocks <= r + 1:
+        return 1.0
+    V = u.T @ u
+    T = float(s.sum(axis=0) @ np.linalg.pinv(V, hermitian=True) @ s.sum(axis=0))
+    return float(stats.f.sf(T * (blocks - r) / (r * blocks), r, blocks - r))
+
+
+def bootstrap_p(what: Score, rng: np.random.Generator, flips: int = 1000) -> float:
+    """Share of random block-sign flips whose score statistic is at least the one found."""
+    if what.rank == 0:
+        return 1.0
+    s = what.block_s / np.sqrt(what.information)
+    signs = rng.choice([-1.0, 1.0], size=(flips, len(s)))
+    found = float(np.sum(s.sum(axis=0) ** 2))
+    drawn = np.sum((signs @ s) ** 2, axis=1)
+    return (1.0 + float(np.sum(drawn >= found))) / (1.0 + flips)
+
+
+def shift_statistics(columns: Array, innovation: Array, minimum_shift: int) -> tuple[float, Array]:
+    """Score statistic, and those with the innovations shifted in time around the circle.
+
+    columns (N, 3, p) and innovation (N, 3) with everything else projected out.  Shifts shorter
+    than `minimum_shift` samples are left out: an effect resembles itself a moment later.
+    """
+    count, _, width = columns.shape
+    flat = columns.reshape(-1, width)
+    values, vectors = np.linalg.eigh(flat.T @ flat)
+    kept = values > RANK_SHARE * max(float(values[-1]), 1e-300)
+    X = columns @ (vectors[:, kept] / np.sqrt(values[kept]))
+    spectrum = np.fft.rfft(X, axis=0)
+    other = np.fft.rfft(innovation, axis=0)[:, :, None]
+    s = np.fft.irfft(np.sum(np.conj(spectrum) * other, axis=1), n=count, axis=0)
+    power = np.sum(s**2, axis=1)
+    inside = slice(minimum_shift, max(minimum_shift, count - minimum_shift))
+    return float(power[0]), np.asarray(power[inside])

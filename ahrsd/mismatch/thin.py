@@ -1,0 +1,77 @@
+"""A track at a lower rate with next to all of its information.
+
+Every m samples (m odd) become one: readings averaged around the middle sample, the gyro's turns
+from middle to middle multiplied.  Noise stays white; an average of the field over m dt loses
+(m dt)^2 / 24 of its curvature, so m is kept small against the motion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd import so3
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+
+
+def thin_factor(track: Track, wanted_hz: float) -> int:
+    """The largest odd m that leaves at least `wanted_hz`, 1 where nothing can be saved."""
+    steps = track.dt_s[np.isfinite(track.dt_s)]
+    rate_hz = 1.0 / float(np.median(steps)) if len(steps) else wanted_hz
+    ratio = max(1, int(rate_hz / wanted_hz))
+    return ratio if ratio % 2 else ratio - 1
+
+
+def thinned(track: Track, m: int) -> Track:
+    """The track with every m samples made one; runs shorter than 2 m samples are left out.
+
+    ValueError where m is not odd and positive.
+    """
+    if m < 1 or m % 2 == 0:
+        raise ValueError(f"thinning by {m}: an odd number is needed")
+    if m == 1:
+        return track
+    parts = [_thinned_run(track, run, m) for run in track.runs if run.stop - run.start >= 2 * m]
+    lengths = [len(part["time_s"]) for part in parts]
+    ends = np.cumsum(lengths).tolist()
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    accel = joined.pop("accel") if track.accel_b_m_s2 is not None else None
+    fields = {name: joined.pop(name) for name in ("time_s", "dt_s", "mag", "gyro")}
+    return Track(
+        fields["time_s"],
+        fields["dt_s"],
+        fields["mag"],
+        fields["gyro"],
+        accel,
+        joined,
+        tuple(slice(end - size, end) for end, size in zip(ends, lengths, strict=True)),
+    )
+
+
+def _thinned_run(track: Track, run: slice, m: int) -> dict[str, Array]:
+    groups = (run.stop - run.start) // m
+    rows = slice(run.start, run.start + groups * m)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(values[rows].reshape(groups, m, *values.shape[1:]).mean(axis=1))
+
+    half = m // 2
+    step = track.dt_s[rows]
+    increments = so3.exp(track.gyro_b_rad_s[rows] * np.nan_to_num(step)[:, None])
+    shifted = np.arange(groups - 1)[:, None] * m + half + 1 + np.arange(m)
+    product = increments[shifted[:, 0]]
+    for k in range(1, m):
+        product = product @ increments[shifted[:, k]]
+    dt = step[shifted].sum(axis=1)
+    gyro = np.empty((groups, 3))
+    gyro[1:] = so3.log(product) / dt[:, None]
+    gyro[0] = gyro[1]
+    out = {
+        "time_s": track.time_s[rows][half::m],
+        "dt_s": np.concatenate([[np.nan], dt]),
+        "mag": mean(track.mag_b_gauss),
+        "gyro": gyro,
+    }
+    if track.accel_b_m_s2 is not None:
+        out["accel"] = mean(track.accel_b_m_s2)
+    return out | {name: mean(values) for name, values in track.covariates.items()}
