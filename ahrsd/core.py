@@ -54,9 +54,10 @@ class Core:
 
     def __init__(self, settings: CoreSettings) -> None:
         self.settings = settings
-        self.decisions = DecisionLog()
+        self.decisions = DecisionLog(settings.keep)
         self.epochs = RegisterEpochs()
-        self.stream = Stream(self.epochs, settings.stream_rate_hz, settings.stream_rate_source)
+        rate, source = settings.stream_rate_hz, settings.stream_rate_source
+        self.stream = Stream(self.epochs, rate, source, keep_gaps=settings.keep)
         self.conversation = Conversation(
             settings.policy.mode,
             change_stream=settings.policy.configure_stream,

@@ -16,6 +16,9 @@ class CoreSettings:
     output_rate_hz:  of the stream that `configure_stream` sets up
     reply_timeout_s: how long a reply may take
     stream_rate_hz, stream_rate_source: of streams without time, and how it is known
+    keep: how many decisions, and how many of the first and of the newest gaps, stay in memory for
+        a summary; None: all, for a recording, whose length is known. Counts and hash are always
+        those of everything.
     """
 
     calibrator: CalibratorSettings
@@ -24,6 +27,7 @@ class CoreSettings:
     reply_timeout_s: float = 0.4
     stream_rate_hz: float | None = None
     stream_rate_source: str = "as given"
+    keep: int | None = None
 
     @property
     def level(self) -> Level:

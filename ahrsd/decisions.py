@@ -20,9 +20,11 @@ _DIGITS = 9
 
 @dataclass(slots=True)
 class DecisionLog:
-    """Entries in order. The newest `keep` are kept, as text; all of them are in the hash."""
+    """Entries in order, all of them in the hash. The newest `keep` stay, as text of some 4 kB each;
+    None: all.
+    """
 
-    keep: int = 4096  # some 4 kB each
+    keep: int | None = None
     count: int = 0
     _lines: deque[bytes] = field(default_factory=deque)
     _hash: hashlib._Hash = field(default_factory=hashlib.sha256)
@@ -49,7 +51,7 @@ class DecisionLog:
         self._hash.update(line)
         self.count += 1
         self._lines.append(line)
-        if len(self._lines) > self.keep:
+        if self.keep is not None and len(self._lines) > self.keep:
             self._lines.popleft()
 
     @property

@@ -7,6 +7,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -29,6 +30,7 @@ from ahrsd.summary import summary_lines
 log = logging.getLogger("ahrsd")
 
 _VIEWER_S = 3.0
+_KEEP = 64  # decisions and gaps in memory; the capture has them all
 
 
 class _Stopped(Exception):
@@ -59,7 +61,7 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
 
     Raises CaptureError where there can be no capture.
     """
-    core = Core(core_settings(config))
+    core = Core(replace(core_settings(config), keep=_KEEP))
     writer = None if capture is None else _open_capture(config, capture)
     viewer = None
     if config.rerun.file is not None or config.rerun.serve:

@@ -16,13 +16,14 @@ damage in front of each, never by what else came with them.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ahrsd.clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
 from ahrsd.evidence.values import HealthFacts
 from ahrsd.samples import Array, SampleBlock
+from ahrsd.stream_facts import Gaps, StreamFacts
 from ahrsd.stream_rate import TurnWatch, attitude_columns
 from ahrsd.unmapping import (
     Extracted,
@@ -39,27 +40,9 @@ _BLOCK_S = 0.25
 _LEAST_ROWS, _MOST_ROWS = 4, 256
 _ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
+_MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
+OTHERS = "others"
 _FEW_PLACES = 3  # a jump of the device's own attitude now and then is not worth a warning
-
-
-@dataclass(slots=True)
-class StreamFacts:
-    """Counters of a stream.
-
-    unusable: samples that were saturated or not finite
-    damaged:  messages that were recognised and refused
-    expected: samples that would be there had none been lost
-    duration_s: steps and gaps together; time of which nobody knows the length is not in it
-    """
-
-    samples: int = 0
-    unusable: int = 0
-    damaged: int = 0
-    expected: float = 0.0
-    duration_s: float = 0.0
-    layout: str = ""
-    rate_hz: float = float("nan")
-    rate_source: str = ""
 
 
 class NoSamplesError(ValueError):
@@ -67,15 +50,23 @@ class NoSamplesError(ValueError):
 
 
 class Stream:
-    """Measurements in, `SampleBlock`s out; time is an argument, nothing is read or written."""
+    """Measurements in, `SampleBlock`s out; time is an argument, nothing is read or written.
+
+    keep_gaps: as in `Gaps`
+    """
 
     def __init__(
-        self, epochs: RegisterEpochs, rate_hz: float | None = None, rate_source: str = "as given"
+        self,
+        epochs: RegisterEpochs,
+        rate_hz: float | None = None,
+        rate_source: str = "as given",
+        *,
+        keep_gaps: int | None = None,
     ) -> None:
         self.epochs = epochs
         self.clock = DeviceClock()
         self.facts = StreamFacts()
-        self.gaps: list[Gap] = []
+        self.all_gaps = Gaps(keep_gaps)
         self.by_layout: Counter[str] = Counter()
         self.warnings: dict[str, None] = {}
         self.refused: dict[str, MissingQuantityError] = {}
@@ -96,6 +87,11 @@ class Stream:
         self._turns_said = ""
         self._given_s: float | None = None
         self._given_steps, self._given_step_s = 0, 0.0
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """The gaps that are kept; `all_gaps` counts every one."""
+        return self.all_gaps.kept
 
     @property
     def restarts(self) -> int:
@@ -148,9 +144,11 @@ class Stream:
     def take(self, measurement: Measurement, host_s: float) -> list[SampleBlock]:
         """One message that arrived at host_s (0 for a recording without host time)."""
         layout = measurement.layout
-        self.by_layout[layout.name] += 1
         extractor = self._extractor
-        if extractor is None or layout is not extractor.layout:
+        if extractor is not None and layout is extractor.layout:
+            self.by_layout[layout.name] += 1
+        else:
+            self._count(layout.name)
             extractor = self._accept(measurement)
             if extractor is None:
                 return []
@@ -163,6 +161,11 @@ class Stream:
         self._want = self._wanted(extractor)
         return self.flush() if len(self._rows) >= self._want else []
 
+    def _count(self, name: str) -> None:
+        """One message; a name too many is one of the `OTHERS`."""
+        known = name in self.by_layout or len(self.by_layout) < _MOST_NAMES
+        self.by_layout[name if known else OTHERS] += 1
+
     def _accept(self, measurement: Measurement) -> Extractor | None:
         """The first layout that has what is needed is the stream; a better one replaces it."""
         layout = measurement.layout
@@ -171,7 +174,8 @@ class Stream:
         try:
             new = Extractor(layout)
         except MissingQuantityError as error:
-            self.refused[layout.name] = error
+            if len(self.refused) < _MOST_NAMES:
+                self.refused[layout.name] = error
             return None
         old = self._extractor
         if old is not None:
@@ -321,7 +325,8 @@ class Stream:
             facts.expected += sum(lost)
             if self._steps is None:
                 facts.rate_hz, facts.rate_source = 1.0 / period, "device time"
-        self.gaps.extend(steps.gaps)
+        for gap in steps.gaps:
+            self.all_gaps.add(gap)
 
     def given(self, block: SampleBlock) -> None:
         """Samples of a table: nothing to decode, only to count."""
@@ -329,7 +334,7 @@ class Stream:
         facts.layout, facts.rate_source = "table", "time_s"
         if block.gap_before and self._given_s is not None:
             length_s = float(block.time_s[0]) - self._given_s
-            self.gaps.append(Gap(self._given_s, length_s))
+            self.all_gaps.add(Gap(self._given_s, length_s))
             facts.duration_s += length_s
             facts.expected += max(length_s * facts.rate_hz - 1.0, 0.0)
         self._given_s = float(block.time_s[-1])

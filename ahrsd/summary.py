@@ -97,10 +97,10 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
             f"  messages: {counters.valid} valid, {rejected} rejected, "
             f"{_count(counters.skipped_bytes, 'byte')} skipped"
         )
-    if stream.gaps or stream.restarts:
-        lost_s = sum(gap.length_s for gap in stream.gaps)
+    gaps = stream.all_gaps
+    if gaps.count or stream.restarts:
         lines.append(
-            f"  {_count(len(stream.gaps), 'gap')}, {lost_s:.1f} s in all; "
+            f"  {_count(gaps.count, 'gap')}, {gaps.length_s:.1f} s in all; "
             f"{_count(stream.restarts, 'restart')} of the device"
         )
     lines += estimate_lines(core.calibrator.estimate)

@@ -110,7 +110,7 @@ class Watch:
         shut = next((gate for gate in core.calibrator.gates if not gate.ok), None)
         waits = "" if shut is None else f", waits for {shut.gate}: {shut.advice}"
         return (
-            f"{facts.samples} samples, {rate:.1f} Hz, {len(core.stream.gaps)} gaps, "
+            f"{facts.samples} samples, {rate:.1f} Hz, {core.stream.all_gaps.count} gaps, "
             f"{core.writeback.state.value}, heading sigma {sigma}{waits}"
         )
 

@@ -63,5 +63,6 @@ def test_only_the_newest_are_kept_and_all_are_in_the_hash():
         short.add(float(k), "OBSERVING")
         whole.add(float(k), "OBSERVING")
     assert [entry["at_s"] for entry in short.entries] == [7.0, 8.0, 9.0]
+    assert [entry["at_s"] for entry in whole.entries] == [float(k) for k in range(10)]
     assert short.count == 10
     assert short.sha256 == whole.sha256

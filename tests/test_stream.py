@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.stream import NoSamplesError, Stream
+from ahrsd.stream import OTHERS, NoSamplesError, Stream
 from ahrsd.unmapping import Compensation, RegisterEpochs
 from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement
@@ -15,6 +17,7 @@ from drivers.vn100.deframer import Cause, Skipped
 from drivers.vn100.sentences import MESSAGES
 
 VNYMR = MESSAGES["VNYMR"]
+VNYPR = MESSAGES["VNYPR"]
 BINARY = binary_layout(0x06, (0x0001, 0x083F))  # the calibration set, with TimeStartup
 REGISTERS = {
     23: (1.1, 0.02, 0.0, 0.01, 0.95, 0.0, 0.0, 0.03, 1.0, 0.1, -0.05, 0.02),
@@ -306,3 +309,32 @@ def test_a_table_is_counted_with_its_gaps():
     (gap,) = stream.gaps
     assert (gap.at_s, gap.length_s) == pytest.approx((99 / 20, 41 / 20))
     assert stream.health().drop_rate == pytest.approx(40 / 200)
+
+
+def test_a_run_of_months_keeps_the_first_and_the_newest_gaps_and_counts_all():
+    bounded, whole = Stream(RegisterEpochs(), keep_gaps=3), Stream(RegisterEpochs())
+    ticks = [k for k in range(2000) if k % 100 >= 10]  # ten messages are missing, twenty times
+    for stream in (bounded, whole):
+        for k in ticks:
+            stream.take(message(BINARY, k), 0.0)
+        stream.flush()
+    assert [len(whole.gaps), len(bounded.gaps)] == [19, 6]
+    assert bounded.gaps == [*whole.gaps[:3], *whole.gaps[-3:]]
+    for stream in (bounded, whole):
+        assert stream.all_gaps.count == 19
+        assert stream.all_gaps.length_s == pytest.approx(19 * 11 / 40)
+    assert bounded.facts == whole.facts
+
+
+def test_names_of_messages_are_bounded_and_every_message_is_counted():
+    stream = Stream(RegisterEpochs())
+    feed(stream, BINARY, range(10))
+    for field in range(100):  # other layouts, none of any use
+        name = f"FA {field}"
+        stream.take(Measurement(dataclasses.replace(VNYPR, name=name), (0.0, 0.0, 0.0), 0), 0.0)
+    assert len(stream.by_layout) == 65
+    assert stream.by_layout[OTHERS] == 100 - 63
+    assert stream.by_layout.total() == 110
+    assert len(stream.refused) == 64
+    feed(stream, BINARY, range(10, 20))
+    assert stream.by_layout[BINARY.name] == 20

@@ -93,7 +93,7 @@ class StatusMaker:
             "rejected": counters.rejected + core.undecodable,
             "skipped_bytes": counters.skipped_bytes,
             "by_type": dict(core.stream.by_layout),
-            "gaps": len(core.stream.gaps),
+            "gaps": core.stream.all_gaps.count,
             "restarts": core.stream.restarts,
             "faults": core.faults,
             "strays": core.strays,
