@@ -47,9 +47,14 @@ class Asked:
                 "user or as a service? --socket names another place",
                 EXIT_BUSY,
             ) from None
-        greeting = self._line()
-        if greeting.get("schema") != SCHEMA:
-            raise DeviceError(f"{path}: not this version's daemon: {greeting}", EXIT_BUSY)
+        try:
+            greeting = self._line()
+            if greeting.get("schema") != SCHEMA:
+                why = greeting.get("error", f"it speaks {greeting.get('schema')}, not {SCHEMA}")
+                raise DeviceError(f"{path}: {why}", EXIT_BUSY)
+        except DeviceError:
+            self._socket.close()
+            raise
 
     def __enter__(self) -> Asked:
         return self

@@ -98,7 +98,8 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
         lines.append(f"stream: {explained['stream']}")
     gates: Sequence[Mapping[str, Any]] = explained["gates"]
     if gates:
-        lines.append(f"{len(gates)} gates hold a write back:")
+        holds = "1 gate holds" if len(gates) == 1 else f"{len(gates)} gates hold"
+        lines.append(f"{holds} a write back:")
         lines += [_gate_line(gate) for gate in gates]
     if explained["others"]:
         lines.append("also:" if gates else "what holds a write back:")

@@ -1,0 +1,85 @@
+"""Words for every state, and one thing to do next."""
+
+import pytest
+
+from ahrsd.serving.explain import STATES, explain_json, explain_lines
+from ahrsd.writeback.states import State
+
+
+def status(**changes):
+    """A status of a healthy daemon, with changes."""
+    body = {
+        "mode": "commit",
+        "mode_now": "commit",
+        "link": {"open": True, "port": "/dev/vn100"},
+        "stream": {"samples": 5000, "refused": []},
+        "gates": [],
+        "write_back": {"state": "CANDIDATE", "holds": [], "proposal": None},
+    }
+    return body | changes
+
+
+GATE = {
+    "gate": "heldout_heading.rms",
+    "value": 2.71,
+    "limit": 1.5,
+    "unit": "deg",
+    "ok": False,
+    "since_s": 100.0,
+    "for_s": 720.0,
+    "advice": "turn again elsewhere",
+}
+
+
+def test_every_state_has_words():
+    assert set(STATES) == {state.value for state in State}
+
+
+def test_a_shut_gate_is_shown_with_value_limit_age_and_advice():
+    held = {"state": "CANDIDATE", "proposal": None}
+    held["holds"] = ["gate heldout_heading.rms: turn again elsewhere", "the mode is observe"]
+    lines = explain_lines(explain_json(status(gates=[GATE], write_back=held)))
+    assert lines == [
+        "CANDIDATE: there is a calibration worth writing; some gates hold it back",
+        "mode commit",
+        "1 gate holds a write back:",
+        "  heldout_heading.rms          2.71 deg (limit 1.5 deg), since 12 min: "
+        "turn again elsewhere",
+        "also:",
+        "  the mode is observe",
+        "next: turn again elsewhere",
+    ]
+
+
+def test_a_gate_that_was_not_measured_says_so():
+    missing = GATE | {"value": None, "for_s": None}
+    lines = explain_lines(explain_json(status(gates=[missing])))
+    assert "not measured (limit 1.5 deg): turn again elsewhere" in lines[3]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"link": {"open": False, "port": "/dev/vn100"}}, "no device on /dev/vn100"),
+        ({"stream": {"samples": 0, "refused": ["VNYPR has no field"]}}, "VNYPR has no field"),
+        ({"stream": {"samples": 0, "refused": []}}, "no samples yet"),
+        (
+            {"write_back": {"state": "LOCKED", "holds": ["locked"], "proposal": None}},
+            "find out why (`ahrsd registers history`), then `ahrsd operator unlock REASON`",
+        ),
+        (
+            {
+                "gates": [GATE | {"ok": True}],
+                "write_back": {
+                    "state": "QUALIFIED",
+                    "holds": ["an operator must approve 12ab34cd"],
+                    "proposal": {"id": "12ab34cd"},
+                },
+            },
+            "look at it (`ahrsd status`), then: ahrsd operator approve 12ab34cd",
+        ),
+        ({"gates": [GATE | {"ok": True}]}, "nothing: the next step is taken by itself"),
+    ],
+)
+def test_what_to_do_next(changes, words):
+    assert words in explain_json(status(**changes))["next"]
