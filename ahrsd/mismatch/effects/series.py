@@ -1,0 +1,135 @@
+"""Operations on columns of samples that know about gap-free runs: rates, delays, filters, play.
+
+A run begins where `dt_s` is nan.  Nothing here reaches over a gap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+
+from ahrsd import so3
+from ahrsd.mismatch.effects.base import Readings
+from ahrsd.samples import Array
+
+_STEADY = 1.02  # steps that differ by less count as one length in the filters
+
+
+def runs(dt_s: Array) -> list[slice]:
+    """The gap-free runs, in order."""
+    starts = [0, *(np.flatnonzero(np.isnan(dt_s[1:])) + 1).tolist()]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(dt_s)], strict=True)]
+
+
+def derivative(values: Array, time_s: Array, dt_s: Array) -> Array:
+    """d values / dt by central differences, one-sided at the ends of runs; (N,) or (N, k)."""
+    out = np.zeros_like(values)
+    for run in runs(dt_s):
+        if run.stop - run.start > 1:
+            out[run] = np.gradient(values[run], time_s[run], axis=0)
+    return out
+
+
+def instant_rate(readings: Readings) -> Array:
+    """True rate (N, 3) at the instant of the sample: the mean of the steps before and after."""
+    out = readings.rate_b_rad_s.copy()
+    for run in runs(readings.dt_s):
+        rate = readings.rate_b_rad_s[run]
+        if len(rate) > 1:
+            out[run][:-1] = (rate[:-1] + rate[1:]) / 2
+            out[run][0] = rate[1]
+    return out
+
+
+def field_dot(readings: Readings) -> Array:
+    """d field_b / dt (N, 3) gauss/s at the instant of the sample: h x w."""
+    return np.cross(readings.field_b, instant_rate(readings))
+
+
+def delayed_field(readings: Readings, delay_s: Array) -> Array:
+    """The true field (N, 3) `delay_s` (N,) ago in the body frame of that time.
+
+    Between samples the body turns at the rate of the step, so the field is known in between; before
+    the first sample of a run it is taken to have turned at the first step's rate, behind the last
+    at the last's.
+    """
+    out = np.empty_like(readings.field_b)
+    for run in runs(readings.dt_s):
+        time_s, rate = readings.time_s[run], readings.rate_b_rad_s[run].copy()
+        rate[:1] = rate[1:2] if len(rate) > 1 else rate[:1]
+        wanted = time_s - delay_s[run]
+        end = np.clip(np.searchsorted(time_s, wanted), 0, len(time_s) - 1)  # the step's last sample
+        turn = so3.exp(rate[end] * (time_s[end] - wanted)[:, None])
+        out[run] = np.einsum("nij,nj->ni", turn, readings.field_b[run][end])
+    return out
+
+
+def delayed_rate(readings: Readings, delay_s: float) -> Array:
+    """The mean rate (N, 3) over the step that ended `delay_s` ago; straight on at a run's ends."""
+    out = readings.rate_b_rad_s.copy()
+    for run in runs(readings.dt_s):
+        time_s, rate = readings.time_s[run], readings.rate_b_rad_s[run]
+        if len(rate) < 2:
+            continue
+        wanted = time_s - delay_s
+        end = np.clip(np.searchsorted(time_s, wanted), 1, len(time_s) - 1)
+        back = (time_s[end] - wanted) / (time_s[end] - time_s[end - 1])
+        out[run] = rate[end] - back[:, None] * (rate[end] - rate[end - 1])
+    return out
+
+
+def low_pass(values: Array, dt_s: Array, time_constant_s: float) -> Array:
+    """First-order low-pass of (N, k), exact for values that are straight between samples.
+
+    Each run begins settled.
+    """
+    out = np.empty_like(values)
+    for run in runs(dt_s):
+        out[run] = _low_pass(values[run], dt_s[run][1:], time_constant_s)
+    return out
+
+
+def _low_pass(x: Array, step_s: Array, time_constant_s: float) -> Array:
+    if len(x) < 2:
+        return x.copy()
+    keep = np.exp(-step_s / time_constant_s)
+    ratio = time_constant_s / step_s * (1 - keep)
+    new, old = 1 - ratio, ratio - keep
+    if step_s.max() < _STEADY * step_s.min():
+        a, b0, b1 = (float(np.mean(c)) for c in (keep, new, old))
+        start = (b1 + a) * x[:1]  # state of the filter that has seen x[0] for ever
+        tail, _ = lfilter([b0, b1], [1.0, -a], x[1:], axis=0, zi=start)
+        return np.vstack([x[:1], np.asarray(tail)])
+    y = x.copy()
+    for k in range(1, len(x)):
+        y[k] = keep[k - 1] * y[k - 1] + new[k - 1] * x[k] + old[k - 1] * x[k - 1]
+    return y
+
+
+def play(values: Array, radius: float) -> Array:
+    """The play operator (N, k): the middle of a slot of half-width `radius` that `values` drags."""
+    out = np.empty_like(values)
+    low, high = values - radius, values + radius
+    last = values[0].copy()
+    for k in range(len(values)):
+        last = np.minimum(np.maximum(last, low[k]), high[k])
+        out[k] = last
+    return out
+
+
+def moving_mean(values: Array, dt_s: Array, rows: int) -> Array:
+    """Centred mean of (N,) over about `rows` rows of the same run."""
+    out = np.empty_like(values)
+    half = max(rows // 2, 0)
+    for run in runs(dt_s):
+        total = np.concatenate([[0.0], np.cumsum(values[run])])
+        index = np.arange(run.stop - run.start)
+        first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(index))
+        out[run] = (total[last] - total[first]) / (last - first)
+    return out
+
+
+def median_step(dt_s: Array) -> float:
+    """The usual step, seconds."""
+    known = dt_s[np.isfinite(dt_s)]
+    return float(np.median(known)) if len(known) else 1.0

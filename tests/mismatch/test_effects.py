@@ -1,0 +1,114 @@
+"""Every effect: its columns are the derivative of its simulation, and its row is complete."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_motion import moving
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ahrsd.mismatch import roles
+from ahrsd.mismatch.effects.base import contribution
+from ahrsd.mismatch.effects.library import EFFECTS
+
+CONTRACT = Path(__file__).parents[2] / ".." / "shared" / "reference" / "contract.md"
+MEAN = [name for name, effect in EFFECTS.items() if effect.kind == "mean"]
+
+
+def difference(effect, readings, direction, setting, step):
+    """Central difference of simulate() at zero: magnetometer and gyro, (N, 3) each."""
+    ahead = effect.simulate(readings, step * direction, setting)
+    behind = effect.simulate(readings, -step * direction, setting)
+    return (
+        (ahead.mag_b_gauss - behind.mag_b_gauss) / (2 * step),
+        (ahead.gyro_b_rad_s - behind.gyro_b_rad_s) / (2 * step),
+    )
+
+
+@pytest.mark.parametrize("name", MEAN)
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10**6), gap=st.one_of(st.none(), st.integers(2, 118)))
+def test_columns_are_the_derivative_of_the_simulation(name, seed, gap):
+    effect = EFFECTS[name]
+    context, readings = moving(seed, rows=120, gap_at=gap)
+    scale = np.array([parameter.scale for parameter in effect.parameters])
+    direction = scale * np.random.default_rng(seed).uniform(-1, 1, len(scale))
+    choices = effect.settings(context)
+    for setting in choices:
+        columns = effect.columns(context, setting)
+        found = difference(effect, readings, direction, setting, 1e-4)
+        for given_columns, measured in zip((columns.mag, columns.gyro), found, strict=True):
+            expected = 0 * measured if given_columns is None else given_columns @ direction
+            assert expected.shape == measured.shape
+            size = np.abs(expected).max() + 1e-12
+            assert np.abs(measured - expected).max() <= 1e-6 * size + 1e-9 * np.linalg.norm(scale)
+
+
+@pytest.mark.parametrize("name", MEAN)
+def test_every_effect_can_be_computed_where_everything_is_logged(name):
+    context, readings = moving(3)
+    effect = EFFECTS[name]
+    value, setting = effect.example(readings, 1.0)
+    assert value == pytest.approx(np.array(effect.typical))
+    added = contribution(effect, context, value, setting)
+    assert max(np.abs(part).max() for part in added) > 1e-6
+    for columns in (effect.columns(context, setting),):
+        for part in (columns.mag, columns.gyro):
+            assert part is None or part.shape == (600, 3, len(effect.parameters))
+
+
+@pytest.mark.parametrize("name", list(EFFECTS))
+def test_nothing_is_added_by_a_value_of_zero(name):
+    _, readings = moving(4)
+    effect = EFFECTS[name]
+    value, setting = effect.example(readings, 0.0)
+    made = effect.simulate(readings, value, setting)
+    assert made.mag_b_gauss == pytest.approx(readings.mag_b_gauss, abs=1e-15)
+    assert made.gyro_b_rad_s == pytest.approx(readings.gyro_b_rad_s, abs=1e-15)
+
+
+@pytest.mark.parametrize("name", list(EFFECTS))
+def test_the_row_is_complete_and_refers_to_what_exists(name):
+    effect = EFFECTS[name]
+    for text in ("code", "words", "equation", "signature", "manoeuvre", "size", "source"):
+        assert getattr(effect, text).strip()
+    assert len(effect.typical) == len(effect.parameters)
+    assert len({parameter.name for parameter in effect.parameters}) == len(effect.parameters)
+    for parameter, typical in zip(effect.parameters, effect.typical, strict=True):
+        assert 0 < parameter.scale < parameter.bound
+        assert abs(typical) < parameter.bound
+    for other, separation in effect.confusers:
+        assert other in EFFECTS and other != name and separation
+    for need in effect.needs:
+        for role in need.split("|"):
+            assert role in roles.ROLES or role in roles.SENSORS
+
+
+def test_every_identifier_of_the_contract_is_there():
+    expected = {
+        "hard_iron_step", "hard_iron_drift", "soft_iron_step", "motor_current_field",
+        "current_derivative_field", "speed_field", "ac_interference", "sync_pulses",
+        "mag_bias_temperature", "mag_scale_temperature", "mag_cross_axis", "mag_nonlinearity",
+        "mag_saturation", "mag_quantisation", "hysteresis", "eddy_current",
+        "viscous_magnetisation", "mag_time_lag", "mag_low_pass", "mag_sample_hold",
+        "flexible_mount", "moving_iron", "switched_device", "rotor_field", "field_gradient",
+        "field_anomaly", "geomagnetic_drift", "altitude_field", "field_step", "gyro_scale",
+        "gyro_nonorthogonality", "mag_gyro_misalignment", "gyro_g_sensitivity",
+        "vibration_rectification", "gyro_bias_temperature", "gyro_bias_drift", "gyro_bias_step",
+        "gyro_nonlinearity", "gyro_saturation", "earth_rotation", "gyro_integration",
+        "gyro_startup", "gyro_time_lag", "clock_rate", "timestamp_jitter", "dropped_samples",
+        "stuck_magnetometer", "noise_burst", "noise_level", "frame_error", "unit_error",
+        "onboard_calibration_active",
+    }  # fmt: skip
+    assert set(EFFECTS) == expected
+    assert all(effect.identifier == name for name, effect in EFFECTS.items())
+
+
+@pytest.mark.skipif(not CONTRACT.exists(), reason="the contract is not beside the project")
+def test_the_contract_names_the_same_effects():
+    text = CONTRACT.read_text().split("Effect identifiers")[1]
+    assert set(re.findall(r"`([a-z]+(?:_[a-z]+)+)`", text)) == set(EFFECTS)
