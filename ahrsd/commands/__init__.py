@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "capture": "Record what a device sends.",
     "replay": "The pipeline of `run` over a recording.",
     "calibrate": "Batch calibration of a recording.",
+    "evaluate": "What a calibration is worth: heading, field and dead reckoning, before and after.",
     "simulate": "A recording of a scenario, with the truth beside it.",
     "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
     "operator": "A person's word to the running daemon: approve, lock, unlock, rollback.",

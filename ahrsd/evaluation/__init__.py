@@ -1,0 +1,25 @@
+"""What a calibration is worth on a recording: before and after, judged by what can be known.
+
+`track` is the recording as arrays, `stored` the calibration, `references` what the heading is
+compared with, `tilt` which way is up; `heading`, `field` and `dead_reckoning` are the figures,
+`judging` all of them together, `spoken` as JSON and as a table.
+
+Sources: [R] 2.1-2.4 and 4.4, [L]; docs/evaluate.md has the definitions.
+"""
+
+from ahrsd.evaluation.judging import Evaluation, judge
+from ahrsd.evaluation.references import Fixes, Reference
+from ahrsd.evaluation.stored import StoredCalibration, parse_calibration
+from ahrsd.evaluation.track import EvaluationError, Track, tracked
+
+__all__ = [
+    "Evaluation",
+    "EvaluationError",
+    "Fixes",
+    "Reference",
+    "StoredCalibration",
+    "Track",
+    "judge",
+    "parse_calibration",
+    "tracked",
+]

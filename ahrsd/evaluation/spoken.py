@@ -1,0 +1,158 @@
+"""An evaluation as JSON and as lines for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ahrsd.evaluation.dead_reckoning import ReckoningFigures
+from ahrsd.evaluation.field import FieldFigures
+from ahrsd.evaluation.heading import HeadingFigures
+from ahrsd.evaluation.judging import Evaluation, HeadingJudged, Reckoned
+
+SCHEMA = "ahrsd.evaluation/1"
+
+
+def evaluation_json(found: Evaluation) -> dict[str, object]:
+    """`ahrsd.evaluation/1`, see docs/evaluate.md."""
+    calibration, world, track = found.calibration, found.world, found.track
+    return {
+        "schema": SCHEMA,
+        "recording": found.recording,
+        "samples": len(track),
+        "duration_s": float(track.time_s[-1] - track.time_s[0]),
+        "calibration": {
+            "file": calibration.source,
+            "method": calibration.method,
+            "recording": calibration.recording,
+            "converged": calibration.converged,
+        },
+        "held_out": found.held_out,
+        "better": found.better,
+        "field": {
+            "before": _field_json(found.field.before),
+            "after": _field_json(found.field.after),
+        },
+        "heading": [_heading_json(judged) for judged in found.headings],
+        "dead_reckoning": None if found.reckoned is None else _reckoned_json(found.reckoned),
+        "world_field": None
+        if world is None
+        else {
+            "model": world.model,
+            "total_gauss": world.total_gauss,
+            "declination_rad": world.declination_rad,
+            "inclination_rad": world.inclination_rad,
+            "valid_until": world.valid_until,
+        },
+        "warnings": list(found.warnings),
+    }
+
+
+def _field_json(figures: FieldFigures) -> dict[str, object]:
+    return {
+        "mean_gauss": figures.mean_gauss,
+        "spread": figures.spread,
+        "fold_spread": list(figures.fold_spread),
+        "constraint_rms_gauss": figures.constraint_rms_gauss,
+        "constraint_worst_gauss": figures.constraint_worst_gauss,
+    }
+
+
+def _heading_json(judged: HeadingJudged) -> dict[str, object]:
+    def one(figures: HeadingFigures) -> dict[str, object]:
+        return {
+            "rms_deg": figures.rms_deg,
+            "worst_deg": figures.worst_deg,
+            "offset_deg": figures.offset_deg,
+            "fold_rms_deg": list(figures.fold_rms_deg),
+            "fold_spread_deg": figures.fold_spread_deg,
+        }
+
+    return {
+        "reference": judged.reference,
+        "truth": judged.truth,
+        "tilt": judged.tilt,
+        "instants": len(judged.figures.after.error_deg),
+        "before": one(judged.figures.before),
+        "after": one(judged.figures.after),
+    }
+
+
+def _reckoned_json(reckoned: Reckoned) -> dict[str, object]:
+    def one(figures: ReckoningFigures) -> dict[str, object]:
+        return {
+            "rms_percent": figures.rms_percent,
+            "final_percent": figures.final_percent,
+            "worst_m": figures.worst_m,
+            "offset_deg": figures.offset_deg,
+        }
+
+    return {
+        "velocity": reckoned.velocity,
+        "reference": reckoned.reference,
+        "distance_m": reckoned.distance_m,
+        "before": one(reckoned.figures.before),
+        "after": one(reckoned.figures.after),
+    }
+
+
+def evaluation_lines(found: Evaluation) -> list[str]:
+    """The same as a table."""
+    calibration, track = found.calibration, found.track
+    duration_s = track.time_s[-1] - track.time_s[0]
+    lines = [
+        f"{found.recording}: {len(track)} samples, {duration_s:.0f} s; calibration "
+        f"{calibration.method} of {calibration.recording or calibration.source}",
+        f"{'':44}{'before':>10}{'after':>10}",
+    ]
+    for judged in found.headings:
+        before, after = judged.figures.before, judged.figures.after
+        lines += [
+            f"heading against {judged.reference}: {len(after.error_deg)} instants, "
+            f"tilt: {judged.tilt}",
+            _line("RMS error [deg]", before.rms_deg, after.rms_deg),
+            _line("worst error [deg]", before.worst_deg, after.worst_deg),
+            _line("RMS per fifth of the time: least [deg]", *_ends(before, after, min)),
+            _line("RMS per fifth of the time: most [deg]", *_ends(before, after, max)),
+            _line("constant removed [deg]", before.offset_deg, after.offset_deg),
+        ]
+    about = "its own mean" if found.world is None else f"{found.world.model}"
+    one, other = found.field.before, found.field.after
+    lines += [
+        "field, held out" if found.held_out else "field",
+        _line("spread, std over mean [%]", 100 * one.spread, 100 * other.spread),
+        _line("mean [mG]", 1e3 * one.mean_gauss, 1e3 * other.mean_gauss),
+        _line(
+            f"constraint error about {about}, RMS [mG]",
+            1e3 * one.constraint_rms_gauss,
+            1e3 * other.constraint_rms_gauss,
+        ),
+        _line(
+            "constraint error, worst [mG]",
+            1e3 * one.constraint_worst_gauss,
+            1e3 * other.constraint_worst_gauss,
+        ),
+    ]
+    if found.reckoned is not None:
+        lines += _reckoned_lines(found.reckoned)
+    return lines + [f"  warning: {text}" for text in found.warnings]
+
+
+def _reckoned_lines(reckoned: Reckoned) -> list[str]:
+    before, after = reckoned.figures.before, reckoned.figures.after
+    return [
+        f"dead reckoning by {reckoned.velocity} over {reckoned.distance_m:.0f} m, "
+        f"against {reckoned.reference}",
+        _line("XY error, RMS [% of distance]", before.rms_percent, after.rms_percent),
+        _line("XY error at the end [% of distance]", before.final_percent, after.final_percent),
+        _line("XY error, worst [m]", before.worst_m, after.worst_m),
+    ]
+
+
+def _ends(
+    before: HeadingFigures, after: HeadingFigures, which: Callable[[tuple[float, ...]], float]
+) -> tuple[float, float]:
+    return which(before.fold_rms_deg), which(after.fold_rms_deg)
+
+
+def _line(label: str, before: float, after: float) -> str:
+    return f"  {label:42}{before:10.2f}{after:10.2f}"
