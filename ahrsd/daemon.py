@@ -9,7 +9,6 @@ changed for the session.
 from __future__ import annotations
 
 import logging
-import queue
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,7 +82,7 @@ class Daemon:
         said = None if config.device.baud == "auto" else config.device.baud
         known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
         self._link = SerialLink(port_path, known, clock.now_ns)
-        self._queue = self._link.queue
+        self._inbox = self._link.inbox
         self._interlock, self._box, self._public = interlock, box, public
         self._safe: bool | None = None
         self._latency_timer_ms: int | None = None
@@ -102,12 +101,12 @@ class Daemon:
     def stop(self, reason: str) -> None:
         """End the run; safe from a signal handler and from another thread."""
         self._stop_reason = self._stop_reason or reason
-        self._queue.put(None)
+        self._inbox.wake()
 
     def operate(self, verb: str, argument: str = "") -> None:
         """A person's command; safe from another thread."""
         self._operator.put(inputs.Operator(self.clock.now_ns(), verb, argument))
-        self._queue.put(None)
+        self._inbox.wake()
 
     # -- the run -----------------------------------------------------------------------------------
 
@@ -132,17 +131,14 @@ class Daemon:
         """One wait and what it brought."""
         if not self._link.is_open:
             self._reopen()
-        try:
-            item = self._queue.get(timeout=self._patience_s(longest_s))
-        except queue.Empty:
-            item = None
+        item = self._inbox.get(self._patience_s(longest_s))
         self._around()
         if isinstance(item, Bytes):
             self._feed(inputs.Received(item.host_ns, item.data))
         elif isinstance(item, Lost):
             self._lost(item.host_ns, item.reason)
-        # what is waited for may lie in the queue already: it is late only against what was taken
-        behind = item is not None and not self._queue.empty()
+        # what is waited for may lie in the inbox already: it is late only against what was taken
+        behind = item is not None and not self._inbox.empty
         self._tick(item.host_ns if item is not None and behind else self.clock.now_ns())
         self._look()
         if self._public is not None:
@@ -242,9 +238,10 @@ class Daemon:
         return self.shell.core.conversation.session.deframer.counters.valid
 
     def _lost(self, host_ns: int, reason: str) -> None:
-        self._link.close()
-        if self._stop_reason:  # the mark that `stop` left went with the queue
-            self._queue.put(None)
+        for item in self._link.close():  # it was heard before the link went
+            self._feed(inputs.Received(item.host_ns, item.data))
+        if self._stop_reason:  # the mark that `stop` left went with them
+            self._inbox.wake()
         if self._messages > self._messages_before:  # it was a device: it may be back at once
             self._wait_s = _REOPEN_S[0]
         self._retry_s = time.monotonic() + self._wait_s

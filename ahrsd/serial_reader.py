@@ -2,6 +2,10 @@
 
 The thread does nothing but wait, read and stamp: the solver may be busy for some milliseconds
 without a byte waiting longer for its time stamp. Losing the link is a value like any other.
+
+What waits for the core is bounded. Were the core to fall behind by `BACKLOG_BYTES`, the thread
+would give the link up: what it read is all taken, in order, and then the link counts as lost, with
+this reason. To drop bytes in between would be to bridge a gap that nobody knows of.
 """
 
 from __future__ import annotations
@@ -23,6 +27,8 @@ from drivers.serial_port import (
     detect_baud,
 )
 
+BACKLOG_BYTES = 4 << 20  # what waits costs this much memory at most: minutes at 200 Hz
+_READ_BYTES = 128  # what one read costs besides its data
 _POLL_S = 0.2
 _JOIN_S = 2.0
 _PATIENT_S = 1.1  # where nothing may be asked: a stream of 1 Hz must be heard
@@ -44,14 +50,58 @@ class Lost:
     reason: str
 
 
-Queue = SimpleQueue[Bytes | Lost | None]
+class Inbox:
+    """What was heard and not taken yet. One thread puts bytes, one takes; anybody may wake it."""
+
+    def __init__(self, limit_bytes: int = BACKLOG_BYTES) -> None:
+        self.limit_bytes = limit_bytes
+        self._queue: SimpleQueue[Bytes | Lost | None] = SimpleQueue()
+        self._put_bytes = self._taken_bytes = 0  # each is written by one thread only
+
+    @property
+    def backlog_bytes(self) -> int:
+        """Memory that what waits takes."""
+        return self._put_bytes - self._taken_bytes
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        return self._queue.empty()
+
+    def put(self, item: Bytes | Lost) -> None:
+        """From the reader."""
+        if isinstance(item, Bytes):
+            self._put_bytes += len(item.data) + _READ_BYTES
+        self._queue.put(item)
+
+    def wake(self) -> None:
+        """End a `get` that waits; safe in a signal handler."""
+        self._queue.put(None)
+
+    def get(self, timeout_s: float) -> Bytes | Lost | None:
+        """The next one; None where nothing came in time, and after a `wake`."""
+        try:
+            item = self._queue.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        if isinstance(item, Bytes):
+            self._taken_bytes += len(item.data) + _READ_BYTES
+        return item
+
+    def rest(self) -> list[Bytes]:
+        """All bytes that wait; then it is empty."""
+        found = []
+        while not self.empty:
+            if isinstance(item := self.get(0.0), Bytes):
+                found.append(item)
+        return found
 
 
 class SerialReader:
-    """Reads an open port into a queue until it is lost or `stop` is called."""
+    """Reads an open port into an inbox until it is lost or `stop` is called."""
 
-    def __init__(self, port: SerialPort, queue: Queue, now_ns: Callable[[], int]) -> None:
-        self._port, self._queue, self._now_ns = port, queue, now_ns
+    def __init__(self, port: SerialPort, inbox: Inbox, now_ns: Callable[[], int]) -> None:
+        self._port, self._inbox, self._now_ns = port, inbox, now_ns
         self._stopping = False
         self._thread = threading.Thread(target=self._work, name="serial-reader", daemon=True)
         self._thread.start()
@@ -60,16 +110,19 @@ class SerialReader:
         reason = "the reading thread broke down, see above"
         try:
             while not self._stopping:
+                if (waiting := self._inbox.backlog_bytes) > self._inbox.limit_bytes:
+                    reason = f"{waiting} bytes wait to be worked on: reading was given up"
+                    break
                 if not self._port.wait_readable(_POLL_S):
                     continue
                 data = self._port.read()
                 if data:
-                    self._queue.put(Bytes(self._now_ns(), data))
+                    self._inbox.put(Bytes(self._now_ns(), data))
         except LinkLost as error:
             reason = str(error)
         finally:  # also after a bug: a daemon that hears nothing must know it
             if not self._stopping:
-                self._queue.put(Lost(self._now_ns(), reason))
+                self._inbox.put(Lost(self._now_ns(), reason))
 
     def stop(self) -> bool:
         """End the thread; whether it ended. Only then may the port be closed."""
@@ -89,11 +142,11 @@ def find_device(path: Path, baud: int | None, *, may_query: bool) -> BaudFound:
 
 
 class SerialLink:
-    """One port, opened as often as it takes. Everything that it hears comes out of `queue`."""
+    """One port, opened as often as it takes. Everything that it hears comes out of `inbox`."""
 
     def __init__(self, path: Path, baud: int, now_ns: Callable[[], int]) -> None:
         self.path, self.baud = path, baud
-        self.queue: Queue = SimpleQueue()
+        self.inbox = Inbox()
         self._now_ns = now_ns
         self._port: SerialPort | None = None
         self._reader: SerialReader | None = None
@@ -114,7 +167,7 @@ class SerialLink:
             self.baud = find_device(self.path, next(self._doubtful), may_query=may_query).baud
             self._doubtful = None
         self._port = SerialPort(self.path, self.baud)
-        self._reader = SerialReader(self._port, self.queue, self._now_ns)
+        self._reader = SerialReader(self._port, self.inbox, self._now_ns)
 
     def write(self, data: bytes) -> None:
         """Send; nothing where the port is closed. Raises LinkLost."""
@@ -126,15 +179,11 @@ class SerialLink:
         port, reader = self._port, self._reader
         self._port = self._reader = None
         ended = reader is None or reader.stop()
-        while True:  # what the reader still put there belongs to a link that is gone
-            try:
-                self.queue.get_nowait()
-            except queue.Empty:
-                break
         return port if ended else None  # a descriptor in use must not be closed, and so used again
 
-    def close(self) -> None:
-        """Give the port back; safe to call again."""
+    def close(self) -> list[Bytes]:
+        """Give the port back, and what was read and not taken yet; safe to call again."""
         port = self.take_port()
         if port is not None:
             port.close()
+        return self.inbox.rest()
