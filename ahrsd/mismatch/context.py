@@ -1,0 +1,196 @@
+"""The recording as the present model sees it: what the effects build their columns from.
+
+Attitude: the gyro's integral U (body to a carried frame, `Filtered.orientation`) drifts.  What is
+fixed in the world stands still in the carried frame but for that drift: the field and, on average,
+the specific force.  Smoothed there over DRIFT_S both ways, they give the carried frame's attitude:
+down from the accelerometer, magnetic north from the field.  Without an accelerometer only the
+drift that turns the field is taken out.  A reference attitude (`ref_qw` ... `ref_qz`) is used as
+it is, turned so that down is +z.
+
+Rates in regressors: the raw rate shares its noise with the innovation (errors in variables), so
+everything here is made of rates smoothed without phase.  The bandwidth is the recording's own: up
+to where its motion sinks into SINK times the gyro's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from scipy import ndimage, signal
+from scipy.spatial.transform import Rotation
+
+from ahrsd.mismatch.innovation import Filtered
+from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.values import Context
+from ahrsd.samples import Array
+
+DRIFT_S = 20.0
+SINK = 4.0
+_SLOWEST_HZ = 0.5  # the smoothing is never longer than about a second
+_REFERENCE = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
+
+
+class Fit(Protocol):
+    """What a context is made of."""
+
+    @property
+    def filtered(self) -> Filtered:
+        """The filter's last pass."""
+
+    @property
+    def terms_gyro(self) -> Array | None:
+        """(N, 3) contributions of the named terms to the gyro, or None."""
+
+
+def build_context(track: Track, fit: Fit) -> Context:
+    """The context of a fit; rows as in the track."""
+    done = fit.filtered
+    rate = track.gyro_b_rad_s - done.model.gyro_bias_rad_s
+    if fit.terms_gyro is not None:
+        rate = rate - fit.terms_gyro
+    runs = track.runs or (slice(0, len(track)),)
+    smooth = smoothed_rate(rate, runs, _step_s(track), done.model.sigma_gyro_rad_s)
+    R_nb, levelled = attitude(track, done)
+    return Context(
+        track=track,
+        model=done.model,
+        field_b=done.nominal_b,
+        rate_b_rad_s=smooth,
+        field_dot_b=np.cross(done.nominal_b, _at_the_sample(smooth, runs)),
+        rate_dot_b=_derivative(smooth, runs, track.time_s),
+        R_nb=R_nb,
+        world_levelled=levelled,
+    )
+
+
+def smoothed_rate(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> Array:
+    """(N, 3) low-passed without phase, at the bandwidth of the recording's own motion."""
+    width = 1.0 / (2 * np.pi * bandwidth_hz(rate, runs, dt_s, sigma) * dt_s)
+    if width < 0.3:
+        return rate.copy()
+    out = np.empty_like(rate)
+    for run in runs:
+        out[run] = _low_passed(rate[run], width)
+    return out
+
+
+def _low_passed(values: Array, width: float) -> Array:
+    """Gaussian of `width` samples, corrected for the curvature that it takes away.
+
+    2 G - G G keeps what is slow to fourth order, which a plain Gaussian G does not.
+    """
+    if len(values) < 3:
+        return values.copy()
+    centre = values.mean(axis=0)
+    once = ndimage.gaussian_filter1d(values - centre, width, axis=0, mode="reflect")
+    twice = ndimage.gaussian_filter1d(once, width, axis=0, mode="reflect")
+    return np.asarray(2 * once - twice + centre)
+
+
+def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> float:
+    """Highest frequency at which the motion stands above SINK times the gyro's noise."""
+    longest = max(runs, key=lambda run: int(run.stop - run.start))
+    values = rate[longest]
+    nyquist = 0.5 / dt_s
+    if len(values) < 64:
+        return nyquist
+    segment = min(len(values), max(64, 2 ** round(np.log2(4.0 / dt_s))))
+    frequency, density = signal.welch(values, 1 / dt_s, nperseg=segment, axis=0)
+    floor = SINK * 2 * sigma**2 * dt_s
+    above = np.flatnonzero(density.max(axis=1) > floor)
+    top = float(frequency[above[-1]]) if len(above) else 0.0
+    # the Gaussian pair is 3 dB down at about 1.3 times its nominal corner
+    return float(np.clip(2.0 * top, _SLOWEST_HZ, nyquist))
+
+
+def attitude(track: Track, done: Filtered) -> tuple[Array, bool]:
+    """R_nb (N, 3, 3) and whether its z axis is down."""
+    accel = track.accel_b_m_s2
+    if accel is not None and not np.isfinite(accel).all():
+        accel = None
+    reference = _reference(track, accel)
+    if reference is not None:
+        return reference, True
+    U = done.orientation
+    runs = track.runs or (slice(0, len(track)),)
+    width = DRIFT_S / _step_s(track)
+    field = _carried(U, done.nominal_b, runs, width)
+    if accel is None:
+        return np.asarray(_held_by_field(field, runs) @ U), False
+    down = _unit(_carried(U, -accel, runs, width))
+    east = _unit(np.cross(down, field))
+    return np.stack([np.cross(east, down), east, down], axis=1) @ U, True
+
+
+def _reference(track: Track, accel: Array | None) -> Array | None:
+    if not all(name in track.covariates for name in _REFERENCE):
+        return None
+    q = np.column_stack([track.covariates[name] for name in _REFERENCE])
+    if not np.isfinite(q).all() or np.any(np.linalg.norm(q, axis=1) < 0.5):
+        return None
+    R_wb = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    if accel is None:
+        return None
+    up = np.einsum("nij,nj->ni", R_wb, accel).mean(axis=0)
+    if up[2] > 0.8 * np.linalg.norm(up):  # the world's z is up: half a turn about x
+        return np.asarray(np.diag([1.0, -1.0, -1.0]) @ R_wb)
+    return R_wb if up[2] < -0.8 * np.linalg.norm(up) else None
+
+
+def _carried(U: Array, vectors: Array, runs: Sequence[slice], width: float) -> Array:
+    """Vectors in the carried frame, smoothed by exp(-|k| / width) within each run."""
+    moved = np.einsum("nij,nj->ni", U, vectors)
+    keep = np.exp(-1.0 / width)
+    out = np.empty_like(moved)
+    for run in runs:
+        rows = moved[run]
+        ahead = signal.lfilter([1.0], [1.0, -keep], rows, axis=0)
+        back = signal.lfilter([1.0], [1.0, -keep], rows[::-1], axis=0)[::-1]
+        out[run] = ahead + back - rows
+    return out
+
+
+def _held_by_field(field: Array, runs: Sequence[slice]) -> Array:
+    """Smallest rotations (N, 3, 3) that bring the carried field to where it was at first."""
+    unit = _unit(field)
+    out = np.empty((len(field), 3, 3))
+    for run in runs:
+        first = unit[run][0]
+        axis = np.cross(unit[run], first)
+        cosine = unit[run] @ first
+        K = np.zeros((len(axis), 3, 3))
+        K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
+        K -= np.swapaxes(K, 1, 2)
+        factor = 1.0 / np.maximum(1.0 + cosine, 1e-6)
+        out[run] = np.eye(3) + K + K @ K * factor[:, None, None]
+    return out
+
+
+def _at_the_sample(rate: Array, runs: Sequence[slice]) -> Array:
+    """Rate at the samples' instants, of the means over the steps that end at them."""
+    out = rate.copy()
+    for run in runs:
+        rows = rate[run]
+        out[run][:-1] = (rows[:-1] + rows[1:]) / 2
+        out[run][0] = rows[min(1, len(rows) - 1)]
+    return out
+
+
+def _derivative(values: Array, runs: Sequence[slice], time_s: Array) -> Array:
+    out = np.zeros_like(values)
+    for run in runs:
+        if run.stop - run.start > 2:
+            out[run] = np.gradient(values[run], time_s[run], axis=0)
+    return out
+
+
+def _unit(vectors: Array) -> Array:
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(size, 1e-300))
+
+
+def _step_s(track: Track) -> float:
+    known = track.dt_s[np.isfinite(track.dt_s)]
+    return float(np.median(known)) if len(known) else 1.0
