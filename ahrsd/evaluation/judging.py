@@ -36,6 +36,7 @@ class HeadingJudged:
     """Heading errors against one reference."""
 
     reference: str
+    detail: str
     truth: bool
     tilt: str
     figures: Pair[HeadingFigures]
@@ -116,7 +117,9 @@ def judge(
             said.append(str(error))
             continue
         source = up_source if reference.up_b is None else "reference"
-        headings.append(HeadingJudged(reference.name, reference.truth, source, figures))
+        headings.append(
+            HeadingJudged(reference.name, reference.detail, reference.truth, source, figures)
+        )
     reckoned = None
     if fixes is not None and up_b is not None:
         reckoned = _reckoned(track, fields, up_b, fixes, said)

@@ -18,6 +18,7 @@ _EARTH_M = 6_371_000.0
 _UNBROKEN = 1.6  # times the usual distance of fixes; more is a gap that is not bridged
 _LEAST_FIXES = 10
 _LEAST_INSTANTS = 10
+_OPINION = "its own filter's opinion, not the truth"
 QUATERNION = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
 POSITION = ("position_north_m", "position_east_m")
 
@@ -48,6 +49,7 @@ class Fixes:
 class Reference:
     """Headings to compare with.
 
+    name, detail: for titles; what else a reader must know
     truth:        false where it is only another opinion, such as the device's own
     time_s:       (M,) instants; each stands for the mean over time_s -+ half_width_s
     heading_rad:  (M,) from any fixed direction, positive to the east
@@ -60,10 +62,11 @@ class Reference:
     heading_rad: Array
     half_width_s: float = 0.0
     up_b: Array | None = None
+    detail: str = ""
 
 
 def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: str) -> Fixes:
-    """Fixes of a receiver.  EvaluationError where they cannot be positions in time."""
+    """Fixes of a receiver.  EvaluationError, naming `source`, where they cannot be that."""
     known = np.isfinite(time_s) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
     time_s, lat_deg, lon_deg = time_s[known], lat_deg[known], lon_deg[known]
     if len(time_s) < _LEAST_FIXES:
@@ -78,7 +81,7 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
     north = np.radians(lat_deg - lat_deg[0]) * _EARTH_M
     east = np.unwrap(np.radians(lon_deg))
     east_m = (east - east[0]) * _EARTH_M * np.cos(np.radians(lat_deg[0]))
-    return Fixes(time_s, north, east_m, source)
+    return Fixes(time_s, north, east_m, "GPS")
 
 
 def fixes_of_track(track: Track) -> Fixes | None:
@@ -94,7 +97,7 @@ def fixes_of_track(track: Track) -> Fixes | None:
     if len(first) < _LEAST_FIXES:
         return None
     north, east = north[first] - north[0], east[first] - east[0]
-    return Fixes(time_s[first], north, east, "position columns")
+    return Fixes(time_s[first], north, east, "position")
 
 
 def course(fixes: Fixes, least_speed_m_s: float) -> Reference:
@@ -106,8 +109,11 @@ def course(fixes: Fixes, least_speed_m_s: float) -> Reference:
             f"{fixes.source}: {np.count_nonzero(fast)} fixes faster than {least_speed_m_s:g} m/s, "
             f"{_LEAST_INSTANTS} are needed: no course to compare with (--min-speed sets it)"
         )
-    name = f"course of {fixes.source}, speed > {least_speed_m_s:g} m/s"
-    return Reference(name, True, time_s[fast], np.angle(velocity[fast]), half_width_s)
+    heading = np.angle(velocity[fast])
+    detail = f"speed > {least_speed_m_s:g} m/s"
+    return Reference(
+        f"{fixes.source} course", True, time_s[fast], heading, half_width_s, detail=detail
+    )
 
 
 def optical(track: Track) -> Reference | None:
@@ -135,7 +141,7 @@ def optical(track: Track) -> Reference | None:
     up_b = np.full((len(track), 3), np.nan)
     up_b[known] = np.einsum("kji,j->ki", R_wb, up_w)
     heading = np.arctan2(x_w @ right, x_w @ ahead)
-    return Reference("optical attitude (ref_q*)", True, track.time_s[known], heading, up_b=up_b)
+    return Reference("optical attitude", True, track.time_s[known], heading, up_b=up_b)
 
 
 def device_heading(track: Track) -> Reference | None:
@@ -144,8 +150,9 @@ def device_heading(track: Track) -> Reference | None:
     if attitude is None:
         return None
     known = np.isfinite(attitude[0])
-    name = "the device's own yaw (its filter's opinion, not the truth)"
-    return Reference(name, False, track.time_s[known], attitude[0][known])
+    return Reference(
+        "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_OPINION
+    )
 
 
 def column(track: Track, name: str) -> Reference:
@@ -160,8 +167,10 @@ def column(track: Track, name: str) -> Reference:
     if np.count_nonzero(known) < _LEAST_INSTANTS:
         raise EvaluationError(f"column {name} holds {np.count_nonzero(known)} numbers only")
     device = name in ("vn_yaw_deg", "yaw_rad")
-    label = f"column {name}" + (" (the device's own attitude, not the truth)" if device else "")
-    return Reference(label, not device, track.time_s[known], values[known])
+    detail = _OPINION if device else ""
+    return Reference(
+        f"column {name}", not device, track.time_s[known], values[known], detail=detail
+    )
 
 
 def _matrices(q: Array) -> Array:

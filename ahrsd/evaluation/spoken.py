@@ -69,6 +69,7 @@ def _heading_json(judged: HeadingJudged) -> dict[str, object]:
 
     return {
         "reference": judged.reference,
+        "detail": judged.detail,
         "truth": judged.truth,
         "tilt": judged.tilt,
         "instants": len(judged.figures.after.error_deg),
@@ -107,8 +108,8 @@ def evaluation_lines(found: Evaluation) -> list[str]:
     for judged in found.headings:
         before, after = judged.figures.before, judged.figures.after
         lines += [
-            f"heading against {judged.reference}: {len(after.error_deg)} instants, "
-            f"tilt: {judged.tilt}",
+            f"heading against {judged.reference}: {len(after.error_deg)} instants; "
+            + "; ".join(text for text in (judged.detail, f"tilt: {judged.tilt}") if text),
             _line("RMS error [deg]", before.rms_deg, after.rms_deg),
             _line("worst error [deg]", before.worst_deg, after.worst_deg),
             _line("RMS per fifth of the time: least [deg]", *_ends(before, after, min)),

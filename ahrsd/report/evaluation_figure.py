@@ -85,7 +85,7 @@ def _way(axes: Axes, reckoned: Reckoned) -> None:
     axes.set_xlabel("east [m]")
     axes.set_ylabel("north [m]")
     axes.set_title(
-        f"Way (grey: {reckoned.reference}): error {pair.before.rms_percent:.1f} %, "
+        f"Way, grey {reckoned.reference}: RMS error {pair.before.rms_percent:.1f} %, "
         f"{pair.after.rms_percent:.1f} %"
     )
 
