@@ -37,7 +37,7 @@ def test_columns_are_the_derivative_of_the_simulation(name, seed, gap):
     context, readings = moving(seed, rows=120, gap_at=gap)
     scale = np.array([parameter.scale for parameter in effect.parameters])
     direction = scale * np.random.default_rng(seed).uniform(-1, 1, len(scale))
-    choices = effect.settings(context)
+    choices = effect.settings(context) or (effect.example(readings, 1.0)[1],)
     for setting in choices:
         columns = effect.columns(context, setting)
         found = difference(effect, readings, direction, setting, 1e-4)
@@ -111,4 +111,4 @@ def test_every_identifier_of_the_contract_is_there():
 @pytest.mark.skipif(not CONTRACT.exists(), reason="the contract is not beside the project")
 def test_the_contract_names_the_same_effects():
     text = CONTRACT.read_text().split("Effect identifiers")[1]
-    assert set(re.findall(r"`([a-z]+(?:_[a-z]+)+)`", text)) == set(EFFECTS)
+    assert set(re.findall(r"`([a-z_]+)`", text)) == set(EFFECTS)

@@ -138,6 +138,38 @@ class Linear(Effect):
         return strength * np.array(self.typical), choices[len(choices) // 2]
 
 
+class Scatter(Effect):
+    """An effect that changes how much the magnetometer scatters and nothing of the mean."""
+
+    kind: Kind = "variance"
+
+    @abstractmethod
+    def variance(self, context: Context, setting: Setting) -> Array:
+        """(N, 3, p) gauss^2 per squared unit of the parameter."""
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """None: there is nothing to regress the readings on."""
+        return ()
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """None."""
+        return Columns()
+
+
+class Discrete(Effect):
+    """A fault that is there or not; looked for before any physics."""
+
+    kind: Kind = "discrete"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """None: there is nothing to regress the readings on."""
+        return ()
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """None."""
+        return Columns()
+
+
 def lacking(effect: Effect) -> str:
     """What an effect needs, in words."""
     needs = [f"a column of {' or '.join(need.split('|'))}" for need in effect.needs]

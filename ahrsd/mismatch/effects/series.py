@@ -5,7 +5,10 @@ A run begins where `dt_s` is nan.  Nothing here reaches over a gap.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ahrsd import so3
@@ -133,3 +136,23 @@ def median_step(dt_s: Array) -> float:
     """The usual step, seconds."""
     known = dt_s[np.isfinite(dt_s)]
     return float(np.median(known)) if len(known) else 1.0
+
+
+def kept(readings: Readings, rows: NDArray[np.bool]) -> Readings:
+    """The rows (N,) bool that are left; a step reaches over what was left out, a gap stays one."""
+    index = np.flatnonzero(rows)
+    run = np.cumsum(np.isnan(readings.dt_s))[index]
+    time_s = readings.time_s[index]
+    step = np.concatenate([[np.nan], np.where(np.diff(run) > 0, np.nan, np.diff(time_s))])
+    return replace(
+        readings,
+        time_s=time_s,
+        dt_s=step,
+        mag_b_gauss=readings.mag_b_gauss[index],
+        gyro_b_rad_s=readings.gyro_b_rad_s[index],
+        accel_b_m_s2=readings.accel_b_m_s2[index],
+        rate_b_rad_s=readings.rate_b_rad_s[index],
+        field_b=readings.field_b[index],
+        R_nb=readings.R_nb[index],
+        covariates={name: values[index] for name, values in readings.covariates.items()},
+    )

@@ -96,6 +96,11 @@ def since(readings: Readings, setting: Setting) -> Array:
     return np.where(readings.time_s >= setting["onset_s"], 1.0, 0.0)[:, None]
 
 
+def middle_s(readings: Readings) -> float:
+    """The time halfway through, to a millisecond."""
+    return round(float(readings.time_s[0] + readings.time_s[-1]) / 2, 3)
+
+
 def span(readings: Readings) -> Setting:
     """Start and length of the recording, to which courses of time refer."""
     first, last = float(readings.time_s[0]), float(readings.time_s[-1])
