@@ -25,10 +25,14 @@ class Notifier:
         self.period_s = asked_us * 1e-6 / 3.0
         self._next_s = 0.0
         self._said = ""
+        self._is_ready = False
 
     def ready(self, status: str) -> None:
-        """The service is up: a device was heard."""
-        self._said = status
+        """The service is up: it hears a device, or waits for one. Later only the status counts."""
+        if self._is_ready:
+            self.status(status)
+            return
+        self._is_ready, self._said = True, status
         self._send(f"READY=1\nSTATUS={status}")
 
     def status(self, status: str) -> None:

@@ -16,20 +16,24 @@ from ahrsd.config_text import print_config
 from ahrsd.core import Core
 from ahrsd.daemon import Daemon, HostClock
 from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
+from ahrsd.heap import needed_bytes, take_heap
 from ahrsd.interlock import InterlockFile
 from ahrsd.operator_box import OperatorBox
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
+from ahrsd.sdnotify import Notifier
 from ahrsd.serial_reader import find_device
 from ahrsd.serving.public import Public
 from ahrsd.settings import core_settings, with_date
 from ahrsd.shell import JournalKeeper, Shell, journal_in
 from ahrsd.summary import summary_lines
+from drivers.serial_port import BaudFound, PortError
 
 log = logging.getLogger("ahrsd")
 
 _VIEWER_S = 3.0
+_SEARCH_AGAIN_S = 0.5
 _KEEP = 64  # decisions and gaps in memory; the capture has them all
 
 
@@ -100,9 +104,9 @@ def _open_box(config: Config) -> OperatorBox | None:
     return box
 
 
-def open_public(config: Config, shell: Shell) -> Public:
+def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
     """What tells the world how the daemon stands, as the configuration says."""
-    public = Public(time.monotonic())
+    public = Public(time.monotonic(), notifier)
     if config.socket.enabled:
         public.open_socket(config.socket.path, config.state)
     if config.metrics.enabled:
@@ -123,19 +127,36 @@ def close_shell(shell: Shell) -> None:
             log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
 
 
-def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
+def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudFound:
+    """The device's rate. Raises PortError where there is none and `wait` is false."""
+    said = None if config.device.baud == "auto" else config.device.baud
+    before = ""
+    while True:
+        try:
+            return find_device(port, said, may_query=config.mode != "passive")
+        except PortError as error:
+            if not wait:
+                raise
+            if str(error) != before:
+                before = str(error)
+                log.warning("waiting for the device: %s", before)
+            notifier.ready(f"waiting for the device: {before}")
+        notifier.feed()
+        time.sleep(_SEARCH_AGAIN_S)
+
+
+def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool = False) -> int:
     """`ahrsd run`: until a signal; returns the exit code.
 
     A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
-    PortError, ConfigError, CaptureError.
+    PortError (not with `wait`: then it looks again and again), ConfigError, CaptureError.
     """
-    port = config.device.port
+    port, notifier = config.device.port, Notifier()
     if port is None:
         raise ConfigError(["device.port: no port is given"])
-    said = None if config.device.baud == "auto" else config.device.baud
     try:
         with _signals(_stop_searching):
-            found = find_device(port, said, may_query=config.mode != "passive")
+            found = _search(config, port, notifier, wait)
     except _Stopped as stopped:
         log.info("stopped (%s) before a device was found", stopped)
         return EXIT_DONE
@@ -143,12 +164,13 @@ def run_daemon(config: Config, say: Callable[[str], None] = print) -> int:
     config = with_date(config)
     clock = HostClock()
     capture = new_capture_path(config.captures) if config.capture.enabled else None
+    take_heap(needed_bytes(config.estimator.parameters()))
     shell = open_shell(config, clock, capture)
     interlock = None
     if config.interlock.file is not None:
         interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
     box = _open_box(config)
-    public = open_public(config, shell)
+    public = open_public(config, shell, notifier)
     daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud, box=box, public=public)
     try:
         with _signals(daemon.stop):

@@ -15,8 +15,11 @@ from ahrsd.config_text import print_config
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
 @click.option("--port", type=click.Path(path_type=Path), help="Serial port of the device.")
 @click.option("--mode", type=click.Choice(get_args(Mode)), help="How far the daemon may go.")
+@click.option("--wait", is_flag=True, help="Wait for a device that is not there (for a service).")
 @click.option("--print-config", "print_only", is_flag=True, help="Print the configuration, stop.")
-def command(path: Path | None, port: Path | None, mode: Mode | None, print_only: bool) -> None:
+def command(
+    path: Path | None, port: Path | None, mode: Mode | None, wait: bool, print_only: bool
+) -> None:
     """Calibrate the device on a port from its own stream, and write back as far as the mode allows.
 
     \b
@@ -41,4 +44,4 @@ def command(path: Path | None, port: Path | None, mode: Mode | None, print_only:
     from ahrsd.service import run_daemon
 
     with driver_errors():
-        raise SystemExit(run_daemon(config))
+        raise SystemExit(run_daemon(config, wait=wait))

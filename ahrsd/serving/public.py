@@ -28,7 +28,6 @@ class Public:
         self.socket: SocketServer | None = None
         self.metrics: MetricsServer | None = None
         self._maker = StatusMaker(now_s)
-        self._is_ready = False
 
     def open_socket(self, path: Path | None, state: Path) -> None:
         """Serve the socket, at its default place where no path is given."""
@@ -57,11 +56,7 @@ class Public:
     def look(self, core: Core, link: LinkFacts, now_s: float) -> None:
         """About once a second: the newest status for everybody who asks."""
         status = self._maker.make(core, link, now_s)
-        line = service_line(status)
-        if not self._is_ready:
-            self._is_ready = True
-            self.notifier.ready(line)
-        self.notifier.status(line)
+        self.notifier.ready(service_line(status))
         if self.socket is not None:
             self.socket.status(status)
         if self.metrics is not None:

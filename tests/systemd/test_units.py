@@ -1,0 +1,161 @@
+"""The units as systemd itself reads them, and the daemon under a real one."""
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from real_systemd import RealSystemd, why_not
+
+PROJECT = Path(__file__).parents[2]
+UNITS = PROJECT / "systemd"
+ANALYZE = shutil.which("systemd-analyze")
+analyzed = pytest.mark.skipif(ANALYZE is None, reason="systemd-analyze is not installed")
+
+
+@analyzed
+@pytest.mark.parametrize("unit", ["ahrsd.service", "ahrsd@.service"])
+def test_the_unit_verifies_and_is_hardened(unit, tmp_path):
+    instance = unit.replace("@.", "@vn100-FT000000.")
+    text = (UNITS / unit).read_text().replace("/opt/ahrsd/bin/ahrsd", "/bin/true")
+    (tmp_path / instance).write_text(text)
+    checked = subprocess.run(
+        [ANALYZE, "verify", "--man=no", str(tmp_path / instance)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (checked.returncode, checked.stderr) == (0, "")
+    secure = [ANALYZE, "security", "--offline=true", "--threshold=15", str(tmp_path / instance)]
+    judged = subprocess.run(secure, capture_output=True, text=True, check=False)
+    assert judged.returncode == 0, judged.stdout
+    score = re.search(r"exposure level for \S+: ([0-9.]+)", judged.stdout)
+    assert float(score[1]) <= 1.0
+
+
+def test_the_template_differs_from_the_unit_only_where_an_instance_must():
+    plain = (UNITS / "ahrsd.service").read_text().splitlines()
+    template = (UNITS / "ahrsd@.service").read_text().splitlines()
+    extra = [line for line in template if line not in plain]
+    assert all("%i" in line or line.startswith("#") for line in extra)
+    missing = [line for line in plain if line not in template]
+    assert all("ahrsd" in line or line.startswith("Description") for line in missing)
+
+
+def test_the_rules_touch_no_adapter_that_is_not_named():
+    for line in (UNITS / "60-ahrsd.rules").read_text().splitlines():
+        assert line.startswith("#")
+        if "SYMLINK" in line or "ATTR{" in line or "ENV{ID_MM" in line:
+            assert "FT000000" in line
+
+
+# What a development environment needs beyond the unit: it lies in folders that the unit hides, and
+# the device is a pty.
+_DROP_IN = """[Service]
+ExecStart=
+ExecStart={program} -v run --wait --config /etc/ahrsd.toml
+ProtectHome=tmpfs
+BindReadOnlyPaths={paths}
+DeviceAllow=char-pts rw
+Environment=PYTHONDONTWRITEBYTECODE=1
+WatchdogSec=6
+"""
+# TIOCEXCL goes with the last close of a port; a pty whose master is open never sees its last close.
+_UNLOCK = "import fcntl, termios; fcntl.ioctl(open('/run/vn100'), termios.TIOCNXCL)"
+_CONFIG = """mode = "observe"
+[device]
+port = "/run/vn100"
+baud = 115200
+configure_stream = true
+rate_hz = 50.0
+[capture]
+keep_megabytes = 64
+part_megabytes = 8
+"""
+
+
+@pytest.fixture(scope="module")
+def machine():
+    """A booted systemd that has our unit."""
+    if reason := why_not():
+        pytest.skip(f"no real systemd here: {reason}")
+    program = Path(sys.executable).parent / "ahrsd"
+    if not program.exists():
+        pytest.skip("ahrsd is not installed beside this Python")
+    hidden = {sys.prefix, sys.base_prefix, str(PROJECT)}
+    drop_in = _DROP_IN.format(program=program, paths=" ".join(sorted(hidden)))
+    units = {
+        "ahrsd.service": (UNITS / "ahrsd.service").read_text(),
+        "ahrsd.service.d/test.conf": drop_in,
+        "ahrsd.toml": _CONFIG,
+    }
+    with RealSystemd(units) as booted:
+        booted.run("cp", "/etc/systemd/system/ahrsd.toml", "/etc/ahrsd.toml")
+        booted.program = str(program)
+        yield booted
+
+
+def emulate(machine):
+    """An emulated VN-100 inside, whose pty everybody may open."""
+    process = subprocess.Popen(
+        machine.command(machine.program, "emulate", "--link", "/run/vn100"),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    port = process.stdout.readline().split()[-1]
+    machine.run("chmod", "666", port)
+    return process
+
+
+def unplug(machine, device):
+    """The emulator ends at once, and its pty with it; nsenter ends with its child."""
+    machine.run("pkill", "-KILL", "-f", "ahrsd emulate", check=False)
+    device.wait(10)
+    device.stdout.close()
+
+
+@pytest.mark.timeout(240)
+def test_the_daemon_under_a_real_systemd(machine):
+    status = lambda: machine.show("ahrsd", "StatusText")  # noqa: E731
+    machine.run("systemctl", "start", "ahrsd")  # returns when READY=1 came
+    assert machine.show("ahrsd", "ActiveState") == "active"
+    assert "waiting for the device" in status()
+
+    device = emulate(machine)
+    try:
+        machine.until(lambda: status().startswith("OBSERVING"), 40, "a device that is seen")
+        pid = machine.show("ahrsd", "MainPID")
+        owner = machine.run("stat", "-c", "%u", f"/proc/{pid}").stdout.strip()
+        assert 61184 <= int(owner) <= 65519  # DynamicUser's range
+        captures = machine.run("ls", "/var/lib/ahrsd/captures").stdout
+        assert ".mcap" in captures
+        assert machine.run("stat", "-c", "%G %a", "/run/ahrsd/socket").stdout.split() == [
+            "dialout",
+            "660",
+        ]
+        asked = machine.run(machine.program, "status", "--socket", "/run/ahrsd/socket").stdout
+        assert "stream: " in asked
+
+        # a loop that is stuck is killed and comes back
+        machine.run("kill", "-STOP", pid)
+        machine.until(lambda: machine.show("ahrsd", "NRestarts") == "1", 60, "a restart")
+        machine.run(sys.executable, "-c", _UNLOCK)
+        machine.until(lambda: status().startswith("OBSERVING"), 40, "a device that is seen again")
+        assert machine.show("ahrsd", "MainPID") != pid
+
+        # a device that is gone is waited for: longer than the watchdog's patience
+        pid = machine.show("ahrsd", "MainPID")
+        unplug(machine, device)
+        machine.until(lambda: "waiting for the device" in status(), 20, "the loss being told")
+        time.sleep(8.0)
+        assert machine.show("ahrsd", "MainPID") == pid
+        assert machine.show("ahrsd", "ActiveState") == "active"
+    finally:
+        unplug(machine, device)
+    began = time.monotonic()
+    machine.run("systemctl", "stop", "ahrsd")
+    assert time.monotonic() - began <= 3.0
+    assert machine.show("ahrsd", "Result") == "success"
