@@ -96,7 +96,8 @@ def heading_rms_deg(
 ) -> float:
     """RMS heading error over the trajectory, up to 80 deg of pitch, with level attitude known.
 
-    The field is free of noise unless asked; the noise is the same draw for every method.
+    The field is free of noise unless asked; the noise is the experiment's own, the same draw for
+    every method.
     """
     error = _heading_errors(experiment, soft_iron, hard_iron_gauss, noise_gauss)
     return float(np.degrees(np.sqrt(np.mean(np.square(error)))))
@@ -113,7 +114,8 @@ def _heading_errors(
     field_b = field_b[usable]
     read = field_b @ truth.soft_iron.T + truth.hard_iron_gauss
     if noise_gauss > 0:
-        read += noise_gauss * np.random.default_rng(0).standard_normal(read.shape)
+        own = experiment.samples.raw_b_gauss[0].view(np.uint64)
+        read += noise_gauss * np.random.default_rng(own).standard_normal(read.shape)
     corrected = Affine(np.asarray(np.linalg.inv(soft_iron), float), hard_iron_gauss).apply(read)
     return wrapped(tilt_compensated_heading(corrected, up) - tilt_compensated_heading(field_b, up))
 
