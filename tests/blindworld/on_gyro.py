@@ -1,0 +1,112 @@
+"""Errors of the gyro."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blindworld.chain import Planted, xyz
+from blindworld.motion import DEG
+from blindworld.on_sensor import after, moment, stepped
+from blindworld.rotations import direction, to_body
+from blindworld.world import BEFORE_S
+
+EARTH_RAD_S = 7.292115e-5
+
+
+def gyro_scale(world, stages, strength, rng):
+    """Scale factors."""
+    scale = direction(rng) * strength
+    stages.rate.append(lambda w: w * (1 + scale))
+    return Planted("gyro", xyz("scale", scale, "1"))
+
+
+def gyro_nonorthogonality(world, stages, strength, rng):
+    """Axes that are not at right angles."""
+    yz, xz, xy = direction(rng) * strength
+    S = np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+    stages.rate.append(lambda w: w + w @ S.T)
+    return Planted(
+        "gyro", (("xy", float(xy), "rad"), ("xz", float(xz), "rad"), ("yz", float(yz), "rad"))
+    )
+
+
+def gyro_g_sensitivity(world, stages, strength, rng):
+    """A rate that follows specific force; strength in rad/s per m/s^2."""
+    G = rng.normal(size=(3, 3))
+    G *= strength / np.linalg.norm(G) * np.sqrt(3)
+    stages.gyro_bias.append(world.motion.force_b @ G.T)
+    return Planted("gyro")
+
+
+def vibration_rectification(world, stages, strength, rng):
+    """A rate that follows the vibration's power; strength at the strongest."""
+    bias = direction(rng) * strength
+    power = (world.vibration / world.vibration.max()) ** 2
+    stages.gyro_bias.append(power[:, None] * bias)
+    return Planted("gyro")
+
+
+def gyro_bias_temperature(world, stages, strength, rng):
+    """A bias that follows temperature, rad/s per degree."""
+    per_degree = direction(rng) * strength
+    stages.gyro_bias.append((world.temperature - world.temperature.mean())[:, None] * per_degree)
+    return Planted("gyro", xyz("per_degree", per_degree, "rad/s/degC"))
+
+
+def gyro_bias_drift(world, stages, strength, rng):
+    """A bias that walks at random; strength is the standard deviation at the end."""
+    t = world.time_s
+    knots = np.arange(0, t[-1] + 2)
+    walk = np.cumsum(rng.normal(size=(len(knots), 3)), axis=0) * strength / np.sqrt(len(knots))
+    stages.gyro_bias.append(np.stack([np.interp(t, knots, walk[:, i]) for i in range(3)], axis=1))
+    return Planted("gyro")
+
+
+def gyro_bias_step(world, stages, strength, rng):
+    """A shock or a re-zeroing on board."""
+    t0, step = moment(world, rng), direction(rng) * strength
+    stages.gyro_bias.append(after(world, t0)[:, None] * step)
+    return stepped(world, t0, "gyro", xyz("step", step, "rad/s"))
+
+
+def gyro_nonlinearity(world, stages, strength, rng):
+    """Scale that depends on the size of the rate; strength at 1 rad/s."""
+    size = direction(rng) * strength
+    stages.rate.append(lambda w: w + size * np.abs(w) * w)
+    return Planted("gyro")
+
+
+def gyro_saturation(world, stages, strength, rng):
+    """The rate ends at a limit, a part `strength` below its largest value."""
+    limit = (1 - strength) * np.max(np.abs(world.motion.rate_b))
+    stages.rate.append(lambda w: np.clip(w, -limit, limit))
+    return Planted("gyro", (("limit", float(limit), "rad/s"),))
+
+
+def earth_rotation(world, stages, strength, rng):
+    """What a gyro reads of the Earth's own rotation; strength in rad/s, it has but one value."""
+    latitude = rng.uniform(-70, 70) * DEG
+    rate_n = strength * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
+    stages.gyro_bias.append(to_body(world.motion.R_nb, rate_n))
+    return Planted(
+        "gyro", (("north", float(rate_n[0]), "rad/s"), ("down", float(rate_n[2]), "rad/s"))
+    )
+
+
+def gyro_integration(world, stages, strength, rng):
+    """The rate at the instant of the sample instead of its mean over the step."""
+    stages.gyro_at_instant = True
+    return Planted("gyro")
+
+
+def gyro_startup(world, stages, strength, rng):
+    """A bias that settles after power-on."""
+    bias, tau = direction(rng) * strength, rng.uniform(25, 80)
+    stages.gyro_bias.append(np.exp(-(world.time_s - BEFORE_S) / tau)[:, None] * bias)
+    return Planted("gyro", (*xyz("start", bias, "rad/s"), ("time_constant", tau, "s")))
+
+
+def gyro_time_lag(world, stages, strength, rng):
+    """A delay of the gyro."""
+    stages.gyro_delay_s += strength
+    return Planted("gyro", (("lag", strength, "s"),))
