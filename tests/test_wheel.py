@@ -43,6 +43,7 @@ def test_the_unit_and_the_rules_are_data(wheel):
     data = {name for name in wheel.namelist() if ".data/" in name}
     assert data == {
         "ahrsd-0.1.0.data/data/lib/systemd/system/ahrsd.service",
+        "ahrsd-0.1.0.data/data/lib/systemd/system/ahrsd@.service",
         "ahrsd-0.1.0.data/data/lib/udev/rules.d/60-ahrsd.rules",
     }
 
@@ -54,6 +55,6 @@ def test_the_command_is_there(wheel):
 
 def test_the_unit_starts_the_command_and_knows_its_exit_codes():
     unit = (PROJECT / "systemd" / "ahrsd.service").read_text()
-    assert "ExecStart=/opt/ahrsd/bin/ahrsd -v run --config /etc/ahrsd.toml" in unit
+    assert "ExecStart=/opt/ahrsd/bin/ahrsd -v run --wait --config /etc/ahrsd.toml" in unit
     assert "RestartPreventExitStatus=2" in unit
     assert "Environment=OPENBLAS_NUM_THREADS=1" in unit
