@@ -310,7 +310,7 @@ def _background(power: Array) -> Array:
     level = np.array([np.median(part) for part in np.array_split(power, pieces)])
     centres = (np.arange(pieces) + 0.5) * len(power) / pieces
     usual = np.interp(np.arange(len(power)), centres, level)
-    return np.maximum(usual, float(power.max()) * 1e-12)
+    return np.asarray(np.maximum(usual, float(power.max()) * 1e-12))
 
 
 def _last_update(dt_s: Array, setting: Setting) -> Rows:

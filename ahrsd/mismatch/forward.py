@@ -1,0 +1,202 @@
+"""The forward model: what magnetometer and gyro would have read along a recording's own motion.
+
+    truth_along(context)      the motion, made consistent: a body that turns in a constant field
+    simulated(truth, ...)     readings of it: calibration, named terms, noise, gaps as recorded
+
+The motion is the smoothed rate's integral, which the smoothed field holds in place over DRIFT_S:
+the headings are those of the recording, and each step turns the field exactly as the true rate says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from ahrsd import so3
+from ahrsd.mismatch.effects import series
+from ahrsd.mismatch.effects.base import Effect, Readings, readings_of
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.values import Context, NullModel, Term
+from ahrsd.samples import Array
+
+DRIFT_S = 20.0
+_RED_TIMES_S = (0.3, 1.0, 3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Scatter of the sensors, standard deviations per sample.
+
+    gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias
+    red_part:   share of the magnetometer's variance that is not white but has the time constant
+    """
+
+    mag_gauss: float
+    gyro_rad_s: float
+    gyro_walk_rad_s_sqrt_s: float = 0.0
+    red_part: float = 0.0
+    red_time_s: float = 1.0
+
+
+def noise_of(model: NullModel, whitened: Array | None = None, step_s: float = 0.0) -> Noise:
+    """The model's noise; with whitened innovations (N, 3) the colour that they still have.
+
+    The colour is that time constant, of a few, whose exponential the autocorrelation of the
+    innovations is most like; what the filter's memory takes out of slow noise is left out of
+    account, so slow noise comes out a little small.
+    """
+    white = Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, model.gyro_walk_rad_s_sqrt_s)
+    if whitened is None or len(whitened) < 100:
+        return white
+    lags = np.arange(1, min(max(round(3 * _RED_TIMES_S[-1] / step_s), 3), len(whitened) // 4))
+    power = float(np.mean(whitened**2))
+    seen = np.array([np.mean(whitened[k:] * whitened[:-k]) for k in lags]) / power
+    best, red_time_s, part = 0.0, 1.0, 0.0
+    for time_s in _RED_TIMES_S:
+        shape = np.exp(-lags * step_s / time_s)
+        amplitude = float(shape @ seen / (shape @ shape))
+        explained = amplitude * float(shape @ seen)
+        deviation = 1.0 / np.sqrt(3 * len(whitened) * float(shape @ shape))
+        if amplitude > 4 * deviation and explained > best:
+            best, red_time_s, part = explained, time_s, amplitude
+    return replace(white, red_part=min(part, 0.9), red_time_s=red_time_s)
+
+
+def truth_along(context: Context) -> Readings:
+    """Noise-free readings of the recording's motion, without any term.
+
+    field_b has a constant size, and h_k = Exp(-w_k dt_k) h_(k-1) holds exactly within runs.
+    """
+    start = readings_of(context)
+    size = float(np.mean(np.linalg.norm(start.field_b, axis=1)))
+    R_nb, rate, field_b = start.R_nb.copy(), start.rate_b_rad_s.copy(), start.field_b.copy()
+    for run in series.runs(start.dt_s):
+        R_nb[run], rate[run], field_b[run] = _settled(
+            start.R_nb[run], rate[run], start.field_b[run], start.time_s[run], size
+        )
+    model = context.model
+    return replace(
+        start,
+        R_nb=R_nb,
+        rate_b_rad_s=rate,
+        field_b=field_b,
+        mag_b_gauss=field_b @ model.soft_iron.T + model.hard_iron_gauss,
+        gyro_b_rad_s=rate + model.gyro_bias_rad_s,
+    )
+
+
+def simulated(
+    truth: Readings,
+    terms: Sequence[Term] = (),
+    noise: Noise | None = None,
+    seed: int = 0,
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Readings:
+    """Readings of a truth with terms and noise on them; the same seed gives the same readings.
+
+    Effects on the finished reading come behind the noise.  KeyError for an unknown effect.
+    """
+    named = [(library[term.identifier], term) for term in terms]
+    readings = truth
+    for effect, term in named:
+        if not effect.after_noise:
+            readings = effect.simulate(readings, term.value, term.setting)
+    if noise is not None:
+        readings = _noisy(readings, noise, seed)
+    for effect, term in named:
+        if effect.after_noise:
+            readings = effect.simulate(readings, term.value, term.setting)
+    return readings
+
+
+def track_of(readings: Readings, like: Track | None = None) -> Track:
+    """The readings as a track; covariates of `like` that no effect knows are kept."""
+    accel = readings.accel_b_m_s2 if np.isfinite(readings.accel_b_m_s2).all() else None
+    same = like is not None and len(like) == len(readings.time_s)
+    others = like.covariates if like is not None and same else {}
+    return Track(
+        time_s=readings.time_s,
+        dt_s=readings.dt_s,
+        mag_b_gauss=readings.mag_b_gauss,
+        gyro_b_rad_s=readings.gyro_b_rad_s,
+        accel_b_m_s2=accel,
+        covariates={**others, **readings.covariates},
+        runs=tuple(series.runs(readings.dt_s)),
+    )
+
+
+def _settled(
+    R_nb: Array, rate: Array, field_b: Array, time_s: Array, size: float
+) -> tuple[Array, Array, Array]:
+    """Attitude, mean rate and field of one run, consistent with each other."""
+    carried = _integrated(rate, time_s)
+    seen = np.einsum("nij,nj->ni", carried, field_b)
+    slow = _both_ways(seen, DRIFT_S, time_s)
+    direction = slow.mean(axis=0)
+    direction /= np.linalg.norm(direction)
+    turned = _smallest_turn(slow, direction) @ carried
+    step = np.diff(time_s)[:, None]
+    true_rate = rate.copy()
+    if len(rate) > 1:
+        true_rate[1:] = so3.log(np.swapaxes(turned[:-1], 1, 2) @ turned[1:]) / step
+        true_rate[0] = true_rate[1]
+    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", R_nb, turned))
+    world = left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right
+    return world @ turned, true_rate, size * np.einsum("nji,j->ni", turned, direction)
+
+
+def _integrated(rate: Array, time_s: Array) -> Array:
+    """Body to where the body was at the first row, (N, 3, 3)."""
+    out = np.empty((len(rate), 3, 3))
+    out[0] = np.eye(3)
+    turns = so3.exp(rate[1:] * np.diff(time_s)[:, None])
+    for k, turn in enumerate(turns, start=1):
+        out[k] = out[k - 1] @ turn
+    return out
+
+
+def _both_ways(values: Array, width_s: float, time_s: Array) -> Array:
+    """Smoothed (N, 3) by exp(-|t| / width), without the pull of the ends towards zero."""
+    if len(values) < 2:
+        return values
+    keep = np.exp(-float(np.median(np.diff(time_s))) / width_s)
+    stacked = np.column_stack([values, np.ones(len(values))])
+    ahead = lfilter([1.0], [1.0, -keep], stacked, axis=0)
+    back = lfilter([1.0], [1.0, -keep], stacked[::-1], axis=0)[::-1]
+    total = np.asarray(ahead + back - stacked)
+    return np.asarray(total[:, :3] / total[:, 3:])
+
+
+def _smallest_turn(vectors: Array, onto: Array) -> Array:
+    """The smallest rotations (N, 3, 3) that turn each of the vectors (N, 3) onto one direction."""
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    axis = np.cross(unit, onto)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, unit @ onto)
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 1.0)
+    return so3.exp(axis * scale[:, None])
+
+
+def _noisy(readings: Readings, noise: Noise, seed: int) -> Readings:
+    """White noise on both sensors, red noise on the magnetometer, a walk of the gyro's bias."""
+    shape = readings.mag_b_gauss.shape
+    white, gyro, walk, red = (
+        np.random.default_rng([seed, stream]).standard_normal(shape) for stream in range(4)
+    )
+    step_s = series.median_step(readings.dt_s)
+    mag = np.sqrt(1 - noise.red_part) * white
+    if noise.red_part > 0:
+        keep = np.exp(-step_s / noise.red_time_s)
+        slow = lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], red, axis=0, zi=keep * red[:1])[0]
+        mag = mag + np.sqrt(noise.red_part) * slow
+    passed = np.sqrt(np.concatenate([[0.0], np.diff(readings.time_s)]))[:, None]
+    bias = noise.gyro_walk_rad_s_sqrt_s * np.cumsum(passed * walk, axis=0)
+    return replace(
+        readings,
+        mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * mag,
+        gyro_b_rad_s=readings.gyro_b_rad_s + noise.gyro_rad_s * gyro + bias,
+    )
