@@ -58,7 +58,7 @@ class Gram:
         index = self.columns(names)
         keep = np.array([*index, self.blocks.shape[1] - 1])
         return Gram(
-            _slices([(name, len(self.columns([name]))) for name in names]),
+            slices([(name, len(self.columns([name]))) for name in names]),
             self.blocks[:, keep[:, None], keep],
             self.counts,
             self.spans_s,
@@ -86,11 +86,12 @@ class Gram:
         outer = [*self.columns(others), self.blocks.shape[1] - 1]
         whole = self.total if total is None else total
         M = solve(whole[np.ix_(inner, inner)], whole[np.ix_(inner, outer)])
-        cross = M.T @ self.blocks[:, np.array(inner)[:, None], np.array(outer)]
-        left = self.blocks[:, np.array(outer)[:, None], np.array(outer)]
-        middle = M.T @ self.blocks[:, np.array(inner)[:, None], np.array(inner)] @ M
+        rows, others_at = np.array(inner, dtype=np.intp), np.array(outer, dtype=np.intp)
+        cross = M.T @ self.blocks[:, rows[:, None], others_at]
+        left = self.blocks[:, others_at[:, None], others_at]
+        middle = M.T @ self.blocks[:, rows[:, None], rows] @ M
         return Gram(
-            _slices([(name, len(self.columns([name]))) for name in others]),
+            slices([(name, len(self.columns([name]))) for name in others]),
             left - cross - np.swapaxes(cross, 1, 2) + middle,
             self.counts,
             self.spans_s,
@@ -139,7 +140,7 @@ def gram(
     spans = [(time_s[a], time_s[b - 1]) for a, b in itertools.pairwise(edges)]
     total = np.einsum("bii->i", blocks)[:-1]
     return Gram(
-        _slices([(name, x.shape[2]) for name, x in columns.items()]),
+        slices([(name, x.shape[2]) for name, x in columns.items()]),
         blocks,
         3.0 * np.diff(np.asarray(edges, float)),
         np.array(spans, float),
@@ -165,6 +166,7 @@ def solve(G: Array, right: Array) -> Array:
     return np.asarray(scale[:, None] * (basis @ inner))
 
 
-def _slices(widths: Sequence[tuple[str, int]]) -> dict[str, slice]:
+def slices(widths: Sequence[tuple[str, int]]) -> dict[str, slice]:
+    """Consecutive column slices of the given widths."""
     ends = np.cumsum([width for _, width in widths]).tolist()
     return {name: slice(end - width, end) for (name, width), end in zip(widths, ends, strict=True)}

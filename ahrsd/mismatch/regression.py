@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.evidence import log_bayes
-from ahrsd.mismatch.gram import Gram, block_edges, gram, solve
+from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.score import Score, score
 from ahrsd.mismatch.values import Columns, Context
@@ -24,6 +24,8 @@ from ahrsd.samples import Array
 CALIBRATION = "calibration"
 #: columns that pass the filter at once: as much as stays in the processor's cache
 BATCH_COLUMNS = 96
+#: effects whose parameters cannot be negative
+ONE_SIDED = ("mag_time_lag", "gyro_time_lag", "mag_low_pass", "mag_sample_hold")
 ONSET_STEPS = 12
 ONSET_PASSES = 2
 
@@ -53,19 +55,28 @@ class Base:
     """What every candidate is measured against: innovations with calibration and terms taken out.
 
     known (N, 3, q): whitened columns of the calibration and of the named terms, in `groups` order;
-    innovation (N, 3): whitened, 0 in unused rows.
+    innovation (N, 3): whitened, 0 in unused rows;  colour: its power at low frequency over white.
     """
 
     context: Context
     filtered: Filtered
     groups: Mapping[str, slice]
     known: Array
+    innovation: Array
     colour: float
 
-    @property
-    def innovation(self) -> Array:
-        """(N, 3) whitened."""
-        return self.filtered.whitened
+    def without(self, name: str, value: Array) -> Base:
+        """The same with one named term left out, what it explains put back; value (p,)."""
+        where = self.groups[name]
+        kept = [k for k in self.groups if k != name]
+        return Base(
+            self.context,
+            self.filtered,
+            slices([(k, self.groups[k].stop - self.groups[k].start) for k in kept]),
+            np.concatenate([self.known[:, :, self.groups[k]] for k in kept], axis=2),
+            self.innovation + self.known[:, :, where] @ value,
+            self.colour,
+        )
 
 
 def base(
@@ -77,12 +88,13 @@ def base(
     """Whiten the columns of calibration and named terms (group name, columns)."""
     parts = [(CALIBRATION, sensitivities(filtered, nuisance_columns(filtered)))]
     parts += [(name, sensitivities(filtered, columns)) for name, columns in terms]
-    ends = np.cumsum([part.shape[2] for _, part in parts]).tolist()
-    groups = {
-        name: slice(end - part.shape[2], end) for (name, part), end in zip(parts, ends, strict=True)
-    }
     return Base(
-        context, filtered, groups, np.concatenate([part for _, part in parts], axis=2), colour
+        context,
+        filtered,
+        slices([(name, part.shape[2]) for name, part in parts]),
+        np.concatenate([part for _, part in parts], axis=2),
+        filtered.whitened,
+        colour,
     )
 
 
@@ -170,7 +182,7 @@ def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candi
         s = X.T @ basis.innovation.ravel() - M.T @ known_e
         what = _total_score(G, s, np.einsum("ij,ij->j", X, X), scale)
         cost = np.log(len(options)) + np.log(float(option.get("searched", 1)))
-        evidence = log_bayes(what, basis.colour) - cost
+        evidence = log_bayes(what, basis.colour) - cost if _possible(effect, what) else -np.inf
         out.append(Candidate(effect, option, len(options), evidence))
     return out
 
@@ -192,6 +204,13 @@ def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
             best = Candidate(best.effect, finer.setting, len(options) * 4, paid)
         reach *= 2.0 / ONSET_STEPS
     return best
+
+
+def _possible(effect: Effect, what: Score) -> bool:
+    """False for a delay or a time constant that is negative beyond doubt."""
+    if effect.identifier not in ONE_SIDED or what.rank == 0:
+        return True
+    return bool(np.all(what.value > -2.0 * np.sqrt(np.diag(what.covariance))))
 
 
 def _total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:

@@ -1,8 +1,9 @@
 """A track at a lower rate with next to all of its information.
 
-Every m samples (m odd) become one: readings averaged around the middle sample, the gyro's turns
-from middle to middle multiplied.  Noise stays white; an average of the field over m dt loses
-(m dt)^2 / 24 of its curvature, so m is kept small against the motion.
+Every m samples (m odd) become one: readings carried to the middle sample by the gyro and averaged
+there, the gyro's turns from middle to middle multiplied.  Noise stays white.  Carried needs a
+calibration, h = C (m - b), turned, m = A h + b; one near the truth will do, since a group turns by
+a few degrees only.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
 
@@ -22,7 +24,7 @@ def thin_factor(track: Track, wanted_hz: float) -> int:
     return ratio if ratio % 2 else ratio - 1
 
 
-def thinned(track: Track, m: int) -> Track:
+def thinned(track: Track, m: int, model: NullModel) -> Track:
     """The track with every m samples made one; runs shorter than 2 m samples are left out.
 
     ValueError where m is not odd and positive.
@@ -31,7 +33,8 @@ def thinned(track: Track, m: int) -> Track:
         raise ValueError(f"thinning by {m}: an odd number is needed")
     if m == 1:
         return track
-    parts = [_thinned_run(track, run, m) for run in track.runs if run.stop - run.start >= 2 * m]
+    runs = [run for run in track.runs if run.stop - run.start >= 2 * m]
+    parts = [_thinned_run(track, run, m, model) for run in runs]
     lengths = [len(part["time_s"]) for part in parts]
     ends = np.cumsum(lengths).tolist()
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -48,7 +51,7 @@ def thinned(track: Track, m: int) -> Track:
     )
 
 
-def _thinned_run(track: Track, run: slice, m: int) -> dict[str, Array]:
+def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str, Array]:
     groups = (run.stop - run.start) // m
     rows = slice(run.start, run.start + groups * m)
 
@@ -58,6 +61,7 @@ def _thinned_run(track: Track, run: slice, m: int) -> dict[str, Array]:
     half = m // 2
     step = track.dt_s[rows]
     increments = so3.exp(track.gyro_b_rad_s[rows] * np.nan_to_num(step)[:, None])
+    carried = _carried(track, rows, m, model)
     shifted = np.arange(groups - 1)[:, None] * m + half + 1 + np.arange(m)
     product = increments[shifted[:, 0]]
     for k in range(1, m):
@@ -69,9 +73,25 @@ def _thinned_run(track: Track, run: slice, m: int) -> dict[str, Array]:
     out = {
         "time_s": track.time_s[rows][half::m],
         "dt_s": np.concatenate([[np.nan], dt]),
-        "mag": mean(track.mag_b_gauss),
+        "mag": mean(carried),
         "gyro": gyro,
     }
     if track.accel_b_m_s2 is not None:
         out["accel"] = mean(track.accel_b_m_s2)
     return out | {name: mean(values) for name, values in track.covariates.items()}
+
+
+def _carried(track: Track, rows: slice, m: int, model: NullModel) -> Array:
+    """Readings (n m, 3) turned to the middle of their group."""
+    rate = track.gyro_b_rad_s[rows] - model.gyro_bias_rad_s
+    back = so3.exp(-rate * np.nan_to_num(track.dt_s[rows])[:, None]).reshape(-1, m, 3, 3)
+    field = (track.mag_b_gauss[rows] - model.hard_iron_gauss) @ np.linalg.inv(model.soft_iron)
+    h = field.reshape(-1, m, 3).copy()
+    half = m // 2
+    ahead = behind = np.broadcast_to(np.eye(3), (len(h), 3, 3))
+    for k in range(1, half + 1):
+        behind = behind @ np.swapaxes(back[:, half + k], 1, 2)
+        h[:, half + k] = np.einsum("nij,nj->ni", behind, h[:, half + k])
+        ahead = ahead @ back[:, half - k + 1]
+        h[:, half - k] = np.einsum("nij,nj->ni", ahead, h[:, half - k])
+    return np.asarray(h.reshape(-1, 3) @ model.soft_iron + model.hard_iron_gauss)

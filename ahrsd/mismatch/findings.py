@@ -1,0 +1,149 @@
+"""A named term as a finding: set, address, parameters, held-out gain, cost, what would separate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ahrsd.mismatch.confound import separating_manoeuvre
+from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
+from ahrsd.mismatch.effects.base import Effect
+from ahrsd.mismatch.evidence import posterior
+from ahrsd.mismatch.gram import solve
+from ahrsd.mismatch.innovation import TRACELESS
+from ahrsd.mismatch.intervals import spans
+from ahrsd.mismatch.locate import segments
+from ahrsd.mismatch.name import Judged
+from ahrsd.mismatch.regression import CALIBRATION, Base
+from ahrsd.mismatch.search import State, Survey, term_group
+from ahrsd.mismatch.unknown import AXES, innovation_rms
+from ahrsd.mismatch.validate import heading_error_deg
+from ahrsd.mismatch.values import NullModel
+from ahrsd.samples import Array
+
+#: shares below this are not worth a line
+SMALLEST_SHARE = 0.005
+FRAMES: Mapping[str, str] = {"sensor": "sensor", "world": "world", "gyro": "gyro", "link": "link"}
+
+
+def finding(
+    library: Mapping[str, Effect], state: State, basis: Base, number: int, seen: Survey
+) -> Finding:
+    """The finding of term `number`; basis: of the whole model; seen: the survey without it."""
+    judged, term = state.named[number], state.fit.terms[number]
+    effect = judged.candidate.effect
+    shares = _shares(judged, seen)
+    alternatives = tuple(
+        Share(name, share) for name, share in shares.items() if name != effect.identifier
+    )[:4]
+    deviation = term.deviation if term.deviation is not None else np.zeros(len(term.value))
+    inflation = float(np.sqrt(basis.colour))
+    parameters = tuple(
+        Value(p.name, float(v), float(d) * inflation, p.unit)
+        for p, v, d in zip(effect.parameters, term.value, deviation, strict=True)
+    )
+    close = [share.effect for share in alternatives if share.confidence > 0.05]
+    return Finding(
+        effect=effect.identifier,
+        confidence=shares[effect.identifier],
+        alternatives=tuple(a for a in alternatives if a.confidence > SMALLEST_SHARE),
+        where=where(judged, term.value, basis),
+        parameters=parameters,
+        heldout=_heldout(judged, basis),
+        cost_if_left_out=cost(basis, number, term.value),
+        separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
+        words=effect.words,
+        equation=effect.equation,
+        setting={k: v for k, v in term.setting.items() if k != "searched"},
+        evidence_nats=judged.evidence,
+    )
+
+
+def contribution(judged: Judged, value: Array, basis: Base) -> Array:
+    """(N, 3) what the term adds to the readings: gauss, or rad/s where it acts on the gyro."""
+    columns = judged.candidate.effect.columns(basis.context, judged.candidate.setting)
+    matrix = columns.mag if columns.mag is not None else columns.gyro
+    if matrix is None:
+        return np.zeros((len(basis.innovation), 3))
+    return np.asarray(matrix @ value)
+
+
+def where(judged: Judged, value: Array, basis: Base) -> Where:
+    """When and on which axes the term acts."""
+    track = basis.context.track
+    added = contribution(judged, value, basis)
+    spread = np.sqrt(np.mean(added**2, axis=0))
+    axes = tuple(AXES[k] for k in range(3) if spread[k] > 0.2 * spread.max())
+    cut = segments(track.time_s, 100)
+    size = np.array(
+        [
+            np.sqrt(np.mean(added[cut.index == k] ** 2)) if (cut.index == k).any() else 0.0
+            for k in range(len(cut))
+        ]
+    )
+    setting = judged.candidate.setting
+    if "onset_s" in setting:
+        found = [(float(setting["onset_s"]), float(setting.get("end_s", track.time_s[-1])))]
+    else:
+        found = spans(cut.edges_s, size > 0.15 * size.max())
+        if sum(b - a for a, b in found) > 0.6 * track.duration_s:
+            found = [(float(track.time_s[0]), float(track.time_s[-1]))]
+    frequency = setting.get("frequency_hz")
+    width = 1.0 / max(track.duration_s, 1e-9)
+    return Where(
+        tuple(found),
+        axes,
+        FRAMES[judged.candidate.effect.family],
+        _regime(judged, basis, added),
+        None if frequency is None else (float(frequency) - width, float(frequency) + width),
+    )
+
+
+def cost(basis: Base, number: int, value: Array) -> Cost:
+    """How far the calibration moves when it has to take over what the term explains."""
+    flat = basis.known.reshape(-1, basis.known.shape[2])
+    Z, X = flat[:, basis.groups[CALIBRATION]], flat[:, basis.groups[term_group(number)]]
+    shift = solve(Z.T @ Z, (Z.T @ (X @ value))[:, None])[:, 0]
+    model = basis.context.model
+    moved = NullModel(
+        model.soft_iron + np.einsum("a,aij->ij", shift[:5], TRACELESS),
+        model.hard_iron_gauss + shift[5:8],
+        model.gyro_bias_rad_s + shift[8:11],
+        model.sigma_mag_gauss,
+        model.sigma_gyro_rad_s,
+    )
+    return Cost(
+        float(np.linalg.norm(shift[5:8])), heading_error_deg(moved, model, basis.context.field_b)
+    )
+
+
+def _shares(judged: Judged, seen: Survey) -> dict[str, float]:
+    evidence = {c.name: c.evidence for c in seen.candidates}
+    evidence[judged.candidate.name] = max(
+        evidence.get(judged.candidate.name, -np.inf), judged.evidence
+    )
+    found = posterior(evidence, {})
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _heldout(judged: Judged, basis: Base) -> Heldout:
+    rms = innovation_rms(basis)
+    ratio = judged.gain.before / max(judged.gain.after, 1e-12)
+    return Heldout(
+        rms * float(np.sqrt(max(ratio, 0.0))), rms, judged.gain.nats_per_sample, judged.placebo_gain
+    )
+
+
+def _regime(judged: Judged, basis: Base, added: Array) -> str | None:
+    """`motor_current_a > 6`: the covariate's upper range, where the term acts most."""
+    name = judged.candidate.setting.get("covariate")
+    values = basis.context.track.covariates.get(str(name))
+    if values is None or not np.isfinite(values).any():
+        return None
+    size = np.linalg.norm(added, axis=1)
+    strong = values[size > np.median(size)]
+    low, high = float(np.min(strong)), float(np.max(strong))
+    if low > float(np.median(values)) * 0.9:
+        return f"{name} > {low:.3g}"
+    return f"{name} < {high:.3g}" if high < float(np.median(values)) else f"follows {name}"

@@ -1,0 +1,69 @@
+"""Thinning keeps rotations and the field to second order of a badly known calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.mismatch.thin import thin_factor, thinned
+from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.values import NullModel
+
+
+def turning(count: int = 450, dt: float = 0.02) -> tuple[Track, np.ndarray]:
+    """A noise-free track in brisk motion and its R_nb."""
+    t = np.arange(count) * dt
+    rate = np.column_stack([2 * np.sin(3 * t), 1.5 * np.cos(2 * t), 0.8 + 0 * t])
+    R_nb = np.empty((count, 3, 3))
+    R_nb[0] = np.eye(3)
+    turn = so3.exp(rate * dt)
+    for k in range(1, count):
+        R_nb[k] = R_nb[k - 1] @ turn[k]
+    A = np.diag([1.1, 0.9, 1.0])
+    mag = np.einsum("nji,j->ni", R_nb, [0.2, 0.1, 0.4]) @ A + [0.05, -0.02, 0.1]
+    step = np.full(count, dt)
+    step[0] = np.nan
+    track = Track(t, step, mag, rate, None, {"a": t.copy()}, (slice(0, count),))
+    return track, R_nb
+
+
+def model(hard_iron: list[float]) -> NullModel:
+    return NullModel(np.diag([1.1, 0.9, 1.0]), np.array(hard_iron), np.zeros(3), 1e-3, 1e-3)
+
+
+@pytest.mark.parametrize("m", [3, 5, 7])
+def test_turns_and_readings_are_those_of_the_middle_samples(m):
+    track, R_nb = turning()
+    thin = thinned(track, m, model([0.05, -0.02, 0.1]))
+    middle = np.arange(len(thin)) * m + m // 2
+    np.testing.assert_allclose(thin.time_s, track.time_s[middle], atol=1e-12)
+    np.testing.assert_allclose(thin.covariates["a"], track.time_s[middle], atol=1e-12)
+    np.testing.assert_allclose(thin.mag_b_gauss, track.mag_b_gauss[middle], atol=1e-12)
+    turn = so3.exp(thin.gyro_b_rad_s[1:] * thin.dt_s[1:, None])
+    expected = np.swapaxes(R_nb[middle[:-1]], 1, 2) @ R_nb[middle[1:]]
+    np.testing.assert_allclose(turn, expected, atol=1e-12)
+
+
+def test_a_wrong_hard_iron_matters_little():
+    track, _ = turning()
+    right, wrong = (thinned(track, 3, model(b)) for b in ([0.05, -0.02, 0.1], [0.06, -0.02, 0.1]))
+    error = np.abs(wrong.mag_b_gauss - right.mag_b_gauss).max()
+    assert 0 < error < 0.01 * 0.01  # a hundredth of the hard iron's error
+
+
+def test_rate_is_kept_above_what_is_wanted():
+    track, _ = turning()
+    assert [thin_factor(track, hz) for hz in (60.0, 30.0, 16.0, 12.0, 10.0, 7.0)] == [
+        1,
+        1,
+        3,
+        3,
+        5,
+        7,
+    ]
+
+
+def test_even_factors_are_refused():
+    with pytest.raises(ValueError, match="odd"):
+        thinned(turning()[0], 4, model([0.0, 0.0, 0.0]))
