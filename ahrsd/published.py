@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ahrsd.batch import BatchResult
+from ahrsd.estimator.online import Estimator
 from ahrsd.events import SamplesSeen
 from ahrsd.methods import METHODS, MethodResult, calibrate_with
+from ahrsd.methods.comparison import Row, halves, spread_of
 from ahrsd.result import calibration_json
-from ahrsd.samples import Array
+from ahrsd.samples import Array, SampleBlock
 
 OURS = "magyc"
+Answer = tuple[Array | None, Array]  # A and b
+_YPR = (("vn_yaw_deg", "vn_pitch_deg", "vn_roll_deg"), ("yaw_rad", "pitch_rad", "roll_rad"))
 
 
 def run_published(result: BatchResult, method: str) -> MethodResult:
     """One method on the samples of a batch calibration; its failure is in the answer."""
-    blocks = [event.block for event in result.events if isinstance(event, SamplesSeen)]
-    world = result.core.settings.calibrator.world_field
-    return calibrate_with(
-        method,
-        blocks,
-        field_norm_gauss=None if world is None else world.total_gauss,
-        field_n_gauss=None if world is None else world.field_n_gauss,
-        clock=time.process_time,
-    )
+    return _run(result, method, _blocks(result))
 
 
-def published_json(result: BatchResult, found: MethodResult) -> dict[str, object]:
+def published_json(
+    result: BatchResult, found: MethodResult, row: Row | None = None
+) -> dict[str, object]:
     """The contract's calibration.json of a published method: what it does not estimate is null.
 
     `registers` stays empty: these methods say nothing about their own uncertainty, and nothing is
-    written to a device without it.
+    written to a device without it. With the row of the table, its spreads are in it.
     """
     said = [*result.said(), *([found.reason] if found.reason else [])]
     body = calibration_json(
@@ -47,7 +47,12 @@ def published_json(result: BatchResult, found: MethodResult) -> dict[str, object
         body["hard_iron_gauss"] = found.hard_iron_gauss.tolist()
     if found.gyro_bias_rad_s is not None:
         body["gyro_bias_rad_s"] = found.gyro_bias_rad_s.tolist()
-    return body
+    return body if row is None else with_spread(body, row)
+
+
+def with_spread(body: dict[str, object], row: Row) -> dict[str, object]:
+    """calibration.json with the spreads of the corrected field beside what the contract asks."""
+    return body | {"field_spread": {"everything": row.spread, "held_out": row.held_out}}
 
 
 def all_methods(result: BatchResult) -> list[MethodResult]:
@@ -55,27 +60,59 @@ def all_methods(result: BatchResult) -> list[MethodResult]:
     return [run_published(result, method) for method in METHODS]
 
 
-def table(result: BatchResult, found: list[MethodResult]) -> list[str]:
-    """One line a method: hard iron, gyro bias, spread of the corrected field, or why it failed."""
+def row_of(result: BatchResult, found: MethodResult, *, held_out: bool = True) -> Row:
+    """A published method's row of the table."""
+    if found.hard_iron_gauss is None:
+        return Row(found.method, None, None, None, False, found.reason)
+    answers: list[Answer] = [(found.soft_iron, found.hard_iron_gauss)]
+    spread = spread_of([_blocks(result)], answers)
+    unseen = _unseen(result, found.method) if held_out else None
+    reason = found.reason
+    if held_out and unseen is None:
+        reason = "; ".join(text for text in (reason, "no answer on half of the data") if text)
+    return Row(
+        found.method,
+        found.soft_iron,
+        found.hard_iron_gauss,
+        found.gyro_bias_rad_s,
+        found.converged,
+        reason,
+        spread,
+        unseen,
+    )
+
+
+def our_row(result: BatchResult) -> Row:
+    """Ours."""
     estimate = result.estimate
-    lines = [f"{'method':20}{'hard iron [mG]':>28}{'gyro bias [mrad/s]':>26}  field spread"]
-    if estimate is not None:
-        remark = "" if result.converged else "not converged: " + "; ".join(result.reasons())
-        spread = _spread(result, estimate.soft_iron, estimate.hard_iron_gauss)
-        bias = _triple(estimate.gyro_bias_rad_s, 3)
-        lines.append(
-            f"{OURS:20}{_triple(estimate.hard_iron_gauss, 1):>28}{bias:>26}{spread:>10}  {remark}"
-        )
-    for row in found:
+    reasons = "; ".join(result.reasons())
+    if estimate is None:
+        return Row(OURS, None, None, None, False, reasons)
+    answers: list[Answer] = [(estimate.soft_iron, estimate.hard_iron_gauss)]
+    return Row(
+        OURS,
+        estimate.soft_iron,
+        estimate.hard_iron_gauss,
+        estimate.gyro_bias_rad_s,
+        result.converged,
+        "" if result.converged else f"not converged: {reasons}",
+        spread_of([_blocks(result)], answers),
+        _unseen(result, OURS),
+    )
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """One line a method: hard iron, gyro bias, spreads of the corrected field, or why it failed."""
+    head = f"{'method':20}{'hard iron [mG]':>28}{'gyro bias [mrad/s]':>26}"
+    lines = [f"{head}{'spread':>9}{'held out':>10}"]
+    for row in rows:
         if row.hard_iron_gauss is None:
             lines.append(f"{row.method:20}  no answer: {row.reason}")
             continue
         bias = "-" if row.gyro_bias_rad_s is None else _triple(row.gyro_bias_rad_s, 3)
-        soft = np.eye(3) if row.soft_iron is None else row.soft_iron
-        spread = _spread(result, soft, row.hard_iron_gauss)
         lines.append(
-            f"{row.method:20}{_triple(row.hard_iron_gauss, 1):>28}{bias:>26}{spread:>10}"
-            f"  {row.reason}".rstrip()
+            f"{row.method:20}{_triple(row.hard_iron_gauss, 1):>28}{bias:>26}"
+            f"{_percent(row.spread):>9}{_percent(row.held_out):>10}  {row.reason}".rstrip()
         )
     return lines
 
@@ -84,8 +121,66 @@ def _triple(values: Array, digits: int) -> str:
     return ", ".join(f"{v * 1e3:+.{digits}f}" for v in values)
 
 
-def _spread(result: BatchResult, soft_iron: Array, hard_iron_gauss: Array) -> str:
-    """std / mean of the corrected field over the whole recording, in percent."""
-    raw = np.vstack([e.block.raw_b_gauss for e in result.events if isinstance(e, SamplesSeen)])
-    size = np.linalg.norm((raw - hard_iron_gauss) @ np.linalg.inv(soft_iron).T, axis=1)
-    return f"{100 * float(size.std() / size.mean()):.2f} %"
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.2f} %"
+
+
+def _blocks(result: BatchResult) -> list[SampleBlock]:
+    return [event.block for event in result.events if isinstance(event, SamplesSeen)]
+
+
+def _run(result: BatchResult, method: str, blocks: list[SampleBlock]) -> MethodResult:
+    world = result.core.settings.calibrator.world_field
+    field_n = None
+    if world is not None:  # the device's yaw is magnetic: its north has no declination
+        level = float(np.hypot(*world.field_n_gauss[:2]))
+        field_n = np.array([level, 0.0, world.field_n_gauss[2]])
+    return calibrate_with(
+        method,
+        blocks,
+        R_nb=_attitude(blocks),
+        field_norm_gauss=None if world is None else world.total_gauss,
+        field_n_gauss=field_n,
+        clock=time.process_time,
+    )
+
+
+def _attitude(blocks: list[SampleBlock]) -> Array | None:
+    """R_nb (N, 3, 3) as the device says it, which only magfactor3 uses; None without."""
+    for names in _YPR:
+        if all(name in block.covariates for block in blocks for name in names):
+            angles = [np.column_stack([b.covariates[name] for name in names]) for b in blocks]
+            ypr = np.vstack(angles) if angles else np.empty((0, 3))
+            if not len(ypr) or not np.isfinite(ypr).all():
+                return None
+            return Rotation.from_euler("ZYX", ypr, degrees=names[0].endswith("_deg")).as_matrix()
+    return None
+
+
+def _unseen(result: BatchResult, method: str) -> float | None:
+    """Held-out spread of a method; None where half of the data gives no answer."""
+    parts = halves(_blocks(result))
+    answers: list[Answer] = []
+    for part in parts:
+        answer = _ours_on(result, part) if method == OURS else _theirs_on(result, method, part)
+        if answer is None:
+            return None
+        answers.append(answer)
+    return spread_of([parts[1], parts[0]], answers)
+
+
+def _theirs_on(result: BatchResult, method: str, blocks: list[SampleBlock]) -> Answer | None:
+    found = _run(result, method, blocks)
+    hard_iron = found.hard_iron_gauss
+    return None if hard_iron is None else (found.soft_iron, hard_iron)
+
+
+def _ours_on(result: BatchResult, blocks: list[SampleBlock]) -> Answer | None:
+    calibrator = result.core.calibrator
+    estimator = Estimator(
+        calibrator.settings.estimator, calibrator.present, calibrator.present_gyro_bias_rad_s
+    )
+    for block in blocks:
+        estimator.add(block)
+    estimate = estimator.finish()
+    return None if estimate is None else (estimate.soft_iron, estimate.hard_iron_gauss)

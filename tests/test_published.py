@@ -28,7 +28,10 @@ def simulated(tmp_path_factory):
 def test_all_methods_in_one_table(simulated, run, capsys):
     path, truth = simulated
     target = path.with_name("all.json")
-    assert run("calibrate", path, "--method", "all", "--json", target) == 0
+    picture = path.with_name("all.png")
+    arguments = ("--method", "all", "--json", target, "--figure", picture)
+    assert run("calibrate", path, *arguments) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines if line.strip()][1:] == ["magyc", *METHODS]
     body = json.loads(target.read_text())["calibrations"]
@@ -39,6 +42,8 @@ def test_all_methods_in_one_table(simulated, run, capsys):
             assert entry["converged"], entry["warnings"]
             error = np.linalg.norm(np.array(entry["hard_iron_gauss"]) - true)
             assert error < (5e-4 if entry["method"] == "magyc" else 0.02)
+            assert entry["field_spread"]["everything"] < 0.02
+            assert entry["field_spread"]["held_out"] < 0.05
         if entry["method"] == "twostep":  # no position was given, so no field magnitude
             assert entry["hard_iron_gauss"] is None
             assert "magnitude" in entry["warnings"][-1]
@@ -48,3 +53,9 @@ def test_one_method_says_no_with_exit_code_one(simulated, run, capsys):
     path, _ = simulated
     assert run("calibrate", path, "--method", "twostep") == 1
     assert "no answer" in capsys.readouterr().out
+
+
+def test_a_figure_of_one_method_is_refused(simulated, run, capsys):
+    path, _ = simulated
+    assert run("calibrate", path, "--figure", path.with_name("one.png")) == 2
+    assert "--figure compares the methods: give --method all" in capsys.readouterr().err

@@ -10,13 +10,15 @@ import click
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.config import Config, load_config
-from ahrsd.errors import EXIT_DONE, EXIT_NO
+from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 
 if TYPE_CHECKING:
     from ahrsd.batch import BatchResult
+    from ahrsd.methods.comparison import Row
 
+_ALL = "all"
 _METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow to import
-    "magyc", "all", "magyc-ifg", "magyc-bfg", "magical-ifg", "magical-bfg", "magical-ls",
+    "magyc", _ALL, "magyc-ifg", "magyc-bfg", "magical-ifg", "magical-bfg", "magical-ls",
     "magical-nls", "twostep", "ellipsoid", "magfactor3", "tls", "np", "fnp", "np-uncertain-field",
 )  # fmt: skip
 
@@ -28,6 +30,8 @@ _METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
 @click.option("--json", "json_path", help="calibration.json into this file, - for stdout.")
 @click.option("--report", "report_path", type=click.Path(path_type=Path), help="Write a page.")
+@click.option("--figure", "figure_path", type=click.Path(path_type=Path),
+              help="With --method all: the table as a picture, PNG.")  # fmt: skip
 def command(
     recording: Path,
     method: str,
@@ -35,6 +39,7 @@ def command(
     rate_hz: float | None,
     json_path: str | None,
     report_path: Path | None,
+    figure_path: Path | None,
 ) -> None:
     """Calibrate from all of RECORDING at once: a capture, a byte stream or a table.
 
@@ -45,13 +50,16 @@ def command(
 
     refuse_unwritable(json_path)
     refuse_unwritable(report_path)
+    refuse_unwritable(figure_path)
+    if figure_path is not None and method != _ALL:
+        raise AhrsdError("--figure compares the methods: give --method all with it")
     config = load_config(path) if path else Config()
     with byte_progress(recording) as progress:
         result = calibrate(recording, config, rate_hz=rate_hz, progress=progress)
     if report_path is not None:
         result.write_report(report_path)
     if method != _METHODS[0]:
-        raise SystemExit(_published(result, method, json_path))
+        raise SystemExit(_published(result, method, json_path, figure_path))
     if json_path is not None:
         write_json(json_path, result.json(method))
     if json_path != "-":
@@ -63,22 +71,39 @@ def command(
     raise SystemExit(EXIT_DONE if result.converged else EXIT_NO)
 
 
-def _published(result: BatchResult, method: str, json_path: str | None) -> int:
+def _published(
+    result: BatchResult, method: str, json_path: str | None, figure_path: Path | None
+) -> int:
     """One published method, or all of them beside ours in one table; the exit code."""
-    from ahrsd.published import all_methods, published_json, run_published, table
+    from ahrsd import published
 
-    if method == "all":
-        rows = all_methods(result)
-        body = [result.json(_METHODS[0]), *(published_json(result, row) for row in rows)]
-        if json_path is not None:
-            write_json(json_path, {"schema": "ahrsd.calibrations/1", "calibrations": body})
-        lines, good = table(result, rows), result.converged
+    if method == _ALL:
+        found = published.all_methods(result)
+        rows = [published.our_row(result), *(published.row_of(result, one) for one in found)]
+        ours = published.with_spread(result.json(published.OURS), rows[0])
+        others = [published.published_json(result, *pair) for pair in zip(found, rows[1:])]
+        body: dict[str, object] = {
+            "schema": "ahrsd.calibrations/1",
+            "calibrations": [ours, *others],
+        }
     else:
-        row = run_published(result, method)
-        if json_path is not None:
-            write_json(json_path, published_json(result, row))
-        lines, good = table(result, [row]), row.converged
+        one = published.run_published(result, method)
+        rows = [published.row_of(result, one, held_out=False)]
+        body = published.published_json(result, one)
+    if json_path is not None:
+        write_json(json_path, body)
+    if figure_path is not None:
+        _draw(figure_path, result.name, rows)
     if json_path != "-":
-        for line in lines:
+        for line in published.table(rows):
             click.echo(line)
-    return EXIT_DONE if good else EXIT_NO
+    return EXIT_DONE if rows[0].converged else EXIT_NO
+
+
+def _draw(path: Path, name: str, rows: list[Row]) -> None:
+    from ahrsd.report.methods_figure import write_methods_figure
+
+    try:
+        write_methods_figure(path, f"All methods on {name}", rows)
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
