@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.accuracy import Answer, figures, geodesic, heading_rms_deg, nees, unit_volume
+from ahrsd.accuracy import (
+    Answer,
+    expected_heading_deg,
+    figures,
+    geodesic,
+    heading_rms_deg,
+    nees,
+    unit_volume,
+)
 from ahrsd.simulation import Iron, Settings, simulate
 from ahrsd.simulation.experiment import measured
 from ahrsd.simulation.motion import rotation_nb
@@ -67,6 +75,33 @@ def test_a_hard_iron_across_the_field_turns_a_level_heading_by_its_angle():
     made = measured("turn", iron, R, np.ones((n, 3)), np.arange(n) / 25, (0.0, 0.0), (rng, rng))
     error = heading_rms_deg(made, np.eye(3), np.zeros(3))
     assert error == pytest.approx(np.degrees(0.05) / np.sqrt(2), rel=2e-3)
+
+
+@pytest.mark.parametrize("noise_gauss", [0.0, 2e-3])
+def test_the_expected_heading_error_is_that_of_draws_from_the_covariance(noise_gauss):
+    rng = np.random.default_rng(3)
+    root = 1e-4 * rng.standard_normal((12, 12))
+    errors = []
+    for _ in range(300):
+        draw = root @ rng.standard_normal(12)
+        A = np.zeros((3, 3))
+        A[np.triu_indices(3)] = draw[:6]
+        A = TRUTH.soft_iron + A + np.triu(A, 1).T
+        b = TRUTH.hard_iron_gauss + draw[6:9]
+        errors.append(heading_rms_deg(EXPERIMENT, A, b, noise_gauss))
+    drawn = np.sqrt(np.mean(np.square(errors)))
+    assert expected_heading_deg(EXPERIMENT, root @ root.T, noise_gauss) == pytest.approx(
+        drawn, rel=0.06
+    )
+
+
+def test_each_experiment_has_its_own_noise_on_headings():
+    def floor(seed):
+        made = simulate(Settings("mam", seed=seed, samples=500))
+        return heading_rms_deg(made, TRUTH.soft_iron, TRUTH.hard_iron_gauss, 0.01)
+
+    assert floor(1) == floor(1)
+    assert floor(1) != floor(2)
 
 
 def test_nees_of_draws_from_the_covariance_is_one():

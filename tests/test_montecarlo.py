@@ -7,11 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from ahrsd.accuracy import FIGURES
+from ahrsd.accuracy import FIGURES, HEADINGS
 from ahrsd.errors import AhrsdError
 from ahrsd.montecarlo import Plan, run_many, run_one
 from ahrsd.montecarlo_methods import is_known, known_methods
-from ahrsd.montecarlo_summary import PARAMETERS, accuracy_lines, summarise
+from ahrsd.montecarlo_summary import (
+    BOUNDED,
+    PARAMETERS,
+    accuracy_lines,
+    bound_lines,
+    parameter_lines,
+    summarise,
+)
 
 SHORT = Plan("mam", "rov", at_s=(40.0, 80.0))
 
@@ -94,7 +101,7 @@ def test_the_summary_is_arithmetic():
             "errors": errors | {"hard_iron_gauss": error, "nees": nees},
             "soft_iron": None, "hard_iron_gauss": [error, 0.0, 0.0], "gyro_bias_rad_s": None,
         }  # fmt: skip
-        bounds = {"at_s": 9.0, "soft_iron": None, "gyro_bias_rad_s": None}
+        bounds = {"at_s": 9.0, "sigma": None} | dict.fromkeys((*BOUNDED, *HEADINGS))
         return {"seed": 0, "bounds": [bounds | {"hard_iron_gauss": bound}], "results": [result]}
 
     (row,) = summarise([record(3e-3, 1e-3, 0.5), record(4e-3, 2e-3, 1.5), record(0.0, 2e-3, 1.0)])
@@ -141,7 +148,7 @@ def test_the_command_writes_tables_json_and_figure(run, tmp_path, capsys):
     assert run("montecarlo", "wam", *arguments, *files, *methods) == 0
     out = capsys.readouterr().out
     assert "WAM rov, 2 runs" in out
-    assert out.count("\nbound ") == 2
+    assert out.count("\nbound ") == 3  # at both times, and of the parameters
     written = json.loads((tmp_path / "m.json").read_text())
     assert written["schema"] == "ahrsd.montecarlo/1"
     assert written["seeds"] == [0, 1]
@@ -153,6 +160,26 @@ def test_the_command_writes_tables_json_and_figure(run, tmp_path, capsys):
     assert hard["over_bound"] == pytest.approx(hard["rmse"] / hard["bound"])
     assert rows[2]["nees"] is None
     assert (tmp_path / "m.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_the_tables_have_the_bound_of_every_parameter_and_of_the_heading():
+    plan = Plan("mam", "rov", methods=("magyc", "ellipsoid"), at_s=(80.0,))
+    records = run_many(plan, range(3))
+    rows = summarise(records)
+    sigma = dict(zip(PARAMETERS, rows[0].bound_sigma, strict=True))
+    hard = np.linalg.norm([sigma["b1"], sigma["b2"], sigma["b3"]])
+    assert hard == pytest.approx(1e3 * rows[0].against_bound["hard_iron_gauss"].bound)
+    assert sigma["A21"] == sigma["A12"]
+    soft = np.linalg.norm([sigma[f"A{i}{j}"] for i in "123" for j in "123"])
+    assert soft == pytest.approx(rows[0].against_bound["soft_iron"].bound)
+    heading, noisy = (rows[0].against_bound[name] for name in HEADINGS)
+    assert 0.3 < heading.over_bound < 3.0
+    assert noisy.over_bound == pytest.approx(1.0, abs=0.05)  # the readings' noise is the most of it
+    table = parameter_lines(rows, np.arange(15.0))
+    assert [line.split()[0] for line in table[1:]] == ["truth", "bound", "magyc", "ellipsoid"]
+    assert f"+-{sigma['b3']:.4f}" in table[2]
+    (bound,) = bound_lines(rows)
+    assert f"{heading.bound:#.4g}" in bound
 
 
 def test_sweeps_over_noise_and_hard_iron(run, tmp_path):

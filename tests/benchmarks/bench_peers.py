@@ -113,6 +113,8 @@ def ask_peers(
     if not missing:
         return found
     kept.parent.mkdir(parents=True, exist_ok=True)
+    whole = "".join(f"{json.dumps(said)}\n" for said in found.values())
+    kept.write_text(whole, encoding="utf-8")  # without a line that a kill cut short
     data = kept.with_suffix(".npz")
     readings(experiment, data)
     command = [python, PROCESS, tool, data, kept, *missing]
@@ -284,22 +286,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only-peers", action="store_true", help="fill the cache, write nothing")
     parser.add_argument("--output", type=Path, default=Path("peers-out"))
     chosen = parser.parse_args(arguments)
-    try:
-        python, tool = environment(chosen.cache), tool_module()
-    except NoPeersError as error:
-        raise SystemExit(str(error)) from None
     plans = [
         Plan(kind, motion, methods=(OURS, STREAM), at_s=(AT_S,))
         for motion in chosen.motions.split(",")
         for kind in chosen.sets.split(",")
     ]
-    run = Comparison(chosen.cache, python, tool, chosen.runs)
-    for seed in range(chosen.runs[0]):  # every set gets its first seed before any gets its second
-        for plan in plans:
-            run.peers(plan, seed)
-    if not chosen.only_peers:
-        timed = times(chosen.cache, python, tool, (10_000, 80_000)) if chosen.time else []
-        write(chosen.output, [(plan, *run.compared(plan)) for plan in plans], timed)
+    try:
+        python, tool = environment(chosen.cache), tool_module()
+        run = Comparison(chosen.cache, python, tool, chosen.runs)
+        for seed in range(chosen.runs[0]):  # every set gets its first seed before any its second
+            for plan in plans:
+                run.peers(plan, seed)
+        if not chosen.only_peers:
+            timed = times(chosen.cache, python, tool, (10_000, 80_000)) if chosen.time else []
+            write(chosen.output, [(plan, *run.compared(plan)) for plan in plans], timed)
+    except NoPeersError as error:
+        raise SystemExit(str(error)) from None
 
 
 class Comparison:
