@@ -181,15 +181,17 @@ class _Averager:
             return None
         rows = np.vstack(self._rows)
         angle = np.diff(rows[:, 4:7], axis=0, prepend=rows[:1, 4:7])
+        turned_rad = float(np.sum(np.linalg.norm(_smooth(angle), axis=1)))
+        rows[:, 4:7] = angle  # one table per segment: this is most of what is remembered
         return Segment(
             number=number,
             heldout=heldout,
             time_s=rows[:, 0],
             raw_b_gauss=rows[:, 1:4],
-            angle_b_rad=angle,
+            angle_b_rad=rows[:, 4:7],
             accel_b_m_s2=rows[:, 7:10],
             temperature_c=float(np.mean(self._temperatures)) if self._temperatures else np.nan,
-            turned_rad=float(np.sum(np.linalg.norm(_smooth(angle), axis=1))),
+            turned_rad=turned_rad,
             averaged=self.factor,
         )
 
