@@ -13,6 +13,7 @@ from ahrsd.estimator.factors import (
     Factor,
     Node,
     Point,
+    Stack,
     bias_prior,
     chain_step,
     epoch_factor,
@@ -44,11 +45,11 @@ def dense(graph):
     """H and g of all factors and the anchor over [c, y_first ... y_last]."""
     first, size = graph.first, 9 + NODE * len(graph.nodes)
     H, g = np.zeros((size, size)), np.zeros(size)
-    for factor in (graph.prior, *graph.factors):
+    own = zip(*Stack([graph.prior, *graph.factors], graph.c, graph.nodes).here(), strict=True)
+    for factor, (own_H, own_g) in zip((graph.prior, *graph.factors), own, strict=True):
         rows = np.r_[0:9, 9 + NODE * (factor.a - first) : 14 + NODE * (factor.a - first)]
         if factor.b != factor.a:
             rows = np.r_[rows, 9 + NODE * (factor.b - first) : 14 + NODE * (factor.b - first)]
-        own_H, own_g = factor.at(graph.c, graph.nodes[factor.a], graph.nodes[factor.b])
         H[np.ix_(rows, rows)] += own_H[: len(rows), : len(rows)]
         g[rows] += own_g[: len(rows)]
     belief = graph.temper * np.diag(1 / SIGMA**2)
@@ -106,18 +107,20 @@ def test_moving_to_the_solution_leaves_no_step():
 
 
 def test_chart_change_of_a_node():
-    """offset() and its matrix are the old coordinates of the present direction and tangents."""
+    """z and its derivative are the old coordinates of the present direction and tangents."""
     u = np.array([0.6, 0.0, 0.8])
     old = Node.at(np.zeros(3), u)
     new = old.moved(np.array([0.1, 0.2, 0.3, 1e-3, -2e-3]))
-    factor = gap_factor(0, np.zeros(9), old, old, 4.0)
-    z, J = factor.offset(np.ones(9), new, old)
+    weights = np.random.default_rng(0).normal(size=SIZE)
+    factor = Factor(0, 1, np.zeros((SIZE, SIZE)), weights, Point(np.zeros(9), old, old))
+    stack = Stack([factor], np.ones(9), {0: new, 1: old})
+    z, g = stack.z[0], stack.here()[1][0]
     np.testing.assert_allclose(z[:9], 1.0)
     np.testing.assert_allclose(z[9:14], [0.1, 0.2, 0.3, 1e-3, -2e-3], atol=1e-8)
     h = np.array([3e-7, -5e-7])
     further = new.moved(np.r_[np.zeros(3), h])
-    z2, _ = factor.offset(np.ones(9), further, old)
-    np.testing.assert_allclose(z2[12:14] - z[12:14], J[12:14, 12:14] @ h, atol=1e-11)
+    z2 = Stack([factor], np.ones(9), {0: further, 1: old}).z[0]
+    assert weights @ (z2 - z) == pytest.approx(g[12:14] @ h, abs=1e-11)
     np.testing.assert_allclose(z[14:], 0.0)
 
 
@@ -125,12 +128,15 @@ def test_rise_integrates_the_gradient():
     graph = random_graph()
     factor = graph.factors[0]
     a, b = graph.nodes[0], graph.nodes[1]
-    assert factor.rise(graph.c, a, b) == pytest.approx(0.5e6 * np.sum((b.bias - a.bias) ** 2))
-    _, g = factor.at(graph.c, a, b)
+
+    def rise(c, a, b):
+        return Stack([factor], c, {0: a, 1: b}).rises()[0]
+
+    assert rise(graph.c, a, b) == pytest.approx(0.5e6 * np.sum((b.bias - a.bias) ** 2))
+    g = Stack([factor], graph.c, graph.nodes).here()[1][0]
     h = np.random.default_rng(1).normal(size=SIZE) * 1e-6
     sides = [
-        factor.rise(graph.c + s * h[:9], a.moved(s * h[9:14]), b.moved(s * h[14:]))
-        for s in (1.0, -1.0)
+        rise(graph.c + s * h[:9], a.moved(s * h[9:14]), b.moved(s * h[14:])) for s in (1.0, -1.0)
     ]
     assert sides[0] - sides[1] == pytest.approx(2 * g @ h, rel=1e-5)
 
@@ -166,7 +172,8 @@ def test_chain_step_picks_the_numbers_of_an_epoch():
 def test_a_gap_links_nothing_but_the_bias():
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
     other = Node.at(np.array([1e-3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
-    H, g = gap_factor(0, np.zeros(9), node, other, 4.0).at(np.zeros(9), node, other)
+    gap = gap_factor(0, np.zeros(9), node, other, 4.0)
+    (H,), (g,) = Stack([gap], np.zeros(9), {0: node, 1: other}).here()
     expected = np.zeros((SIZE, SIZE))
     for k in range(3):
         expected[np.ix_([9 + k, 14 + k], [9 + k, 14 + k])] = [[4.0, -4.0], [-4.0, 4.0]]

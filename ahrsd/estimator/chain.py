@@ -7,7 +7,8 @@ Model of an epoch (frame b, sensor; u_k unit vectors, M = A |h|):
 
 The field's magnitude never changes along the chain, because u_k stays on the sphere: the norm
 information of TWOSTEP and the rotation information of MAGYC are one likelihood, and nothing is
-differentiated. Gyro noise about u_k itself moves nothing and needs no state.
+differentiated. Gyro noise about u_k itself moves nothing and needs no state. A row may stand for
+several steps (`Averaging`): then m_k = M P_k u_k + b, with less noise.
 
 Each u_k moves in its tangent plane, u_k + T_k d_k. Gauss-Newton then gives a block tridiagonal
 system in the d_k, bordered by what is shared: x = [M (6), b (3)], the epoch's gyro bias (3) and the
@@ -73,6 +74,20 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Averaging:
+    """Rows whose field is a mean over several steps (`grouping.py`).
+
+    count (n,) steps in a row, turn (n, 3, 3) mean rotation P from the row's direction u to those of
+    its steps: the row measured M P u + b with the noise of one step / sqrt(count); spread_s (n,)
+    root of the sum of squared steps of time on the way from the row before: the gyro's noise.
+    """
+
+    count: Array
+    turn: Array
+    spread_s: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Data:
     """What an epoch measured. Row 0 is the border shared with the previous epoch (or a fresh start,
     then `measures_first`); angle and dt of row 0 are not used.
@@ -88,9 +103,32 @@ class Data:
     time_s: Array
     measures_first: bool
     linked: Array | None = None
+    averaging: Averaging | None = None
 
     def __len__(self) -> int:
         return len(self.dt_s)
+
+    @property
+    def count(self) -> Array | float:
+        """Steps that a row's field is the mean of."""
+        return 1.0 if self.averaging is None else self.averaging.count
+
+    @property
+    def steps(self) -> int:
+        """How many steps it holds."""
+        return len(self) if self.averaging is None else int(self.averaging.count.sum())
+
+    def seen(self, directions: Array) -> Array:
+        """What the field of each row is the image of: directions (n, 3) or tangents (n, 3, 2)."""
+        if self.averaging is None:
+            return directions
+        if directions.ndim == 3:
+            return np.asarray(self.averaging.turn @ directions)
+        return _times(self.averaging.turn, directions)
+
+    def field_error(self, u: Array, x: Array) -> Array:
+        """Field less its prediction at directions u (n, 3) and x = [M6, b]; gauss."""
+        return np.asarray(self.field_b_gauss - self.seen(u) @ symmetric(x[:6]) - x[6:9])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +156,7 @@ def start_directions(M: Array, b: Array, field: Array) -> Array:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-12))
 
 
-def robust_weights(residual: Array, limit_gauss: float) -> Array:
+def robust_weights(residual: Array, limit_gauss: Array | float) -> Array:
     """1 for residuals (n, 3) within the limit, (limit / size)^2 beyond: outliers lose weight."""
     size = np.linalg.norm(residual, axis=1)
     return np.asarray(np.minimum(1.0, (limit_gauss / np.maximum(size, 1e-12)) ** 2))
@@ -132,7 +170,7 @@ def linearise(
     w = np.ones(len(u)) if weights is None else weights.copy()
     if not data.measures_first:
         w[0] = 0.0
-    field = _field(data, u, T, x, np.sqrt(w) / noise.mag_gauss)
+    field = _field(data, u, T, x, np.sqrt(w * data.count) / noise.mag_gauss)
     motion = _motion(data, u, T, bias, noise)
     H, g, response = _eliminate(*_interior(field, motion), *_shared_part(field, motion))
     d = np.zeros((len(u), 2))
@@ -149,7 +187,7 @@ def linearise(
         sum_mag=sum_mag,
         sum_gyro=sum_gyro,
         count_mag=3.0 * float(np.count_nonzero(w)),
-        count_gyro=2.0 * (len(u) - 1),
+        count_gyro=2.0 * float(np.count_nonzero(motion.scale)),
     )
 
 
@@ -173,20 +211,21 @@ class _Motion:
 
 
 def _field(data: Data, u: Array, T: Array, x: Array, root: Array) -> _Field:
-    M, b = symmetric(x[:6]), x[6:9]
+    M = symmetric(x[:6])
     J_x = np.zeros((len(u), 3, SHARED))
-    J_x[:, :, :6] = symmetric_columns(u)
+    J_x[:, :, :6] = symmetric_columns(data.seen(u))
     J_x[:, [0, 1, 2], [6, 7, 8]] = 1.0
     J_x *= -root[:, None, None]
-    r = (data.field_b_gauss - u @ M - b) * root[:, None]
-    return _Field(r, -(M @ T) * root[:, None, None], J_x)
+    r = data.field_error(u, x) * root[:, None]
+    return _Field(r, -(M @ data.seen(T)) * root[:, None, None], J_x)
 
 
 def _motion(data: Data, u: Array, T: Array, bias: Array, noise: Noise) -> _Motion:
     dt = data.dt_s[1:]
     R, Jl = so3.exp_and_left_jacobian(-(data.angle_b_rad[1:] - bias * dt[:, None]))
     turned = _times(R, u[:-1])
-    scale = 1.0 / (noise.gyro_rad_s * dt)
+    spread = dt if data.averaging is None else data.averaging.spread_s[1:]
+    scale = 1.0 / (noise.gyro_rad_s * spread)
     if data.linked is not None:
         scale *= data.linked[1:]
     Tt = np.swapaxes(T[1:], 1, 2) * scale[:, None, None]

@@ -1,13 +1,15 @@
 """Quadratic factors between the calibration and the nodes between epochs, and their re-basing.
 
 Variables: c = [M (6), b (3)] and, per node between epochs, y = [gyro bias (3), border direction
-(2, in the node's tangent plane)]. A factor remembers where it was linearised; `at` expresses it
-around the present values: the calibration and the bias move additively, a direction moved from u0
-to u is T0^T (u - u0) away in the old tangent plane, and T0^T T turns the new tangents into old.
+(2, in the node's tangent plane)]. A factor remembers where it was linearised; `Stack` expresses
+factors around the present values: the calibration and the bias move additively, a direction moved
+from u0 to u is T0^T (u - u0) away in the old tangent plane, and T0^T T turns the new tangents into
+the old ones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,38 +77,53 @@ class Factor:
     point: Point
     walk: float = 0.0
 
-    def offset(self, c: Array, a: Node, b: Node) -> tuple[Array, Array]:
-        """How far the present values are from `point` (19,), and the 19x19 chart change."""
-        z = np.zeros(SIZE)
-        J = np.eye(SIZE)
-        z[C] = c - self.point.c
-        for where, node, old in ((9, a, self.point.a), (14, b, self.point.b)):
-            z[where : where + 3] = node.bias - old.bias
-            z[where + 3 : where + 5] = old.tangent.T @ (node.direction - old.direction)
-            J[where + 3 : where + 5, where + 3 : where + 5] = old.tangent.T @ node.tangent
-        return z, J
 
-    def rise(self, c: Array, a: Node, b: Node) -> float:
-        """Cost at the present values above that at `point`, the walk of the bias included."""
-        z, _ = self.offset(c, a, b)
-        d = b.bias - a.bias
-        return float(self.g @ z + 0.5 * z @ self.H @ z + 0.5 * self.walk * d @ d)
+class Stack:
+    """Factors around the present values, all at once: z (F, 19), how far each is from its `point`.
 
-    def at(self, c: Array, a: Node, b: Node) -> tuple[Array, Array]:
-        """H (19, 19) and gradient (19,) around the present values."""
-        z, J = self.offset(c, a, b)
-        H = J.T @ self.H @ J
-        g = J.T @ (self.g + self.H @ z)
-        if self.walk:
-            d = b.bias - a.bias
-            for k in range(3):
-                i, j = 9 + k, 14 + k
-                H[i, i] += self.walk
-                H[j, j] += self.walk
-                H[i, j] -= self.walk
-                H[j, i] -= self.walk
-                g[i] -= self.walk * d[k]
-                g[j] += self.walk * d[k]
+    `nodes` are the present ones by index.
+    """
+
+    def __init__(self, factors: Sequence[Factor], c: Array, nodes: Mapping[int, Node]) -> None:
+        self._H = np.array([f.H for f in factors])
+        self._g = np.array([f.g for f in factors])
+        self._walk = np.array([f.walk for f in factors])
+        self._tilt = np.empty((2, len(factors), 2, 2))
+        self.z = np.empty((len(factors), SIZE))
+        self.z[:, C] = c - np.array([f.point.c for f in factors])
+        sides = (
+            (9, [nodes[f.a] for f in factors], [f.point.a for f in factors]),
+            (14, [nodes[f.b] for f in factors], [f.point.b for f in factors]),
+        )
+        for k, (at, now, old) in enumerate(sides):
+            moved = np.array([n.direction for n in now]) - np.array([n.direction for n in old])
+            back = np.swapaxes(np.array([n.tangent for n in old]), 1, 2)
+            self.z[:, at : at + 3] = np.array([n.bias for n in now]) - [n.bias for n in old]
+            self.z[:, at + 3 : at + 5] = (back @ moved[:, :, None])[:, :, 0]
+            self._tilt[k] = back @ np.array([n.tangent for n in now])
+        self._walked = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
+
+    def rises(self) -> Array:
+        """Costs (F,) above those at each factor's `point`, the walk of the bias included."""
+        pulled = (self._H @ self.z[:, :, None])[:, :, 0]
+        walks = 0.5 * self._walk * np.sum(self._walked**2, axis=1)
+        return np.asarray(np.sum((self._g + 0.5 * pulled) * self.z, axis=1) + walks)
+
+    def here(self, *, walk: bool = True) -> tuple[Array, Array]:
+        """H (F, 19, 19) and gradients (F, 19) around the present values."""
+        J = np.tile(np.eye(SIZE), (len(self.z), 1, 1))
+        J[:, 12:14, 12:14], J[:, 17:19, 17:19] = self._tilt
+        Jt = np.swapaxes(J, 1, 2)
+        H = Jt @ self._H @ J
+        g = (Jt @ (self._g[:, :, None] + self._H @ self.z[:, :, None]))[:, :, 0]
+        if walk:
+            i, j = np.arange(9, 12), np.arange(14, 17)
+            H[:, i, i] += self._walk[:, None]
+            H[:, j, j] += self._walk[:, None]
+            H[:, i, j] -= self._walk[:, None]
+            H[:, j, i] -= self._walk[:, None]
+            g[:, i] -= self._walk[:, None] * self._walked
+            g[:, j] += self._walk[:, None] * self._walked
         return H, g
 
 

@@ -1,8 +1,8 @@
 """The factor graph of epochs on GTSAM: solve, marginals, and folding of what is old.
 
 Keys: `c` for the calibration, `y j` for node j. Every factor is a HessianFactor around the present
-values, in a LinearContainerFactor, so one Gauss-Newton step of the graph is one linear solve, and
-its cost depends on the number of factors only. The oldest node is folded away by GTSAM's own
+values, so one Gauss-Newton step of the graph is one linear solve, and its cost depends on the
+number of factors only. The oldest node is folded away by GTSAM's own
 elimination, which leaves one factor on (c, y 1) that holds all that the past said.
 
 Traps of the wrapper that shaped this file: HessianFactor's linear term is minus the gradient; views
@@ -14,10 +14,13 @@ pivots are alike, and what is left on c and the newest node (14 numbers) is solv
 
 from __future__ import annotations
 
+from operator import is_not
+
 import gtsam
 import numpy as np
 
-from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point
+from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point, Stack
+from ahrsd.estimator.retraction import Moments, moved
 from ahrsd.samples import Array
 
 
@@ -35,11 +38,7 @@ def _y(j: int) -> int:
     return int(gtsam.symbol("y", j))
 
 
-def _hessian(factor: Factor, H: Array, g: Array) -> gtsam.HessianFactor:
-    if not (np.isfinite(H).all() and np.isfinite(g).all()):
-        raise SingularError("a factor is not finite")
-    G = H * np.outer(_UNITS, _UNITS)
-    linear = -g * _UNITS
+def _hessian(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
     c, a, b = C, Y_A, Y_B
     if factor.a == factor.b:
         return gtsam.HessianFactor(
@@ -83,9 +82,11 @@ class Graph:
         self.anchor = (c.copy(), sigma_c.copy())
         self.temper = 1.0
         self.hold: Array = np.zeros((9, 9))
+        self.moments = Moments()
         self.nodes: dict[int, Node] = {prior.a: first}
         self.prior = prior
         self.factors: list[Factor] = []
+        self._kept: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
 
     @property
     def first(self) -> int:
@@ -96,28 +97,6 @@ class Graph:
     def last(self) -> int:
         """Index of the newest node."""
         return max(self.nodes)
-
-    def _linear(self, factors: list[Factor]) -> gtsam.NonlinearFactorGraph:
-        values = self._values(factors)
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in factors:
-            H, g = factor.at(self.c, self.nodes[factor.a], self.nodes[factor.b])
-            graph.add(gtsam.LinearContainerFactor(_hessian(factor, H, g), values))
-        return graph
-
-    def _anchored(
-        self, factors: list[Factor], extra: Array, damping: float = 0.0
-    ) -> gtsam.NonlinearFactorGraph:
-        """All factors and the anchor; `extra` (9, 9) is information that pulls to the anchor."""
-        graph = self._linear(factors)
-        information = self._belief() + extra
-        linear = information @ (self.anchor[0] - self.c)
-        if not np.isfinite(linear).all():
-            raise SingularError("the calibration is not finite")
-        information += np.diag(damping / self.anchor[1] ** 2)
-        hessian = gtsam.HessianFactor(_C, information, linear, 0.0)
-        graph.add(gtsam.LinearContainerFactor(hessian, self._values(factors)))
-        return graph
 
     def _belief(self) -> Array:
         return np.asarray(np.diag(self.temper / self.anchor[1] ** 2))
@@ -139,14 +118,6 @@ class Graph:
         blind = vectors[:, values > limit**2] / sigma[:, None]
         self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
 
-    @staticmethod
-    def _values(factors: list[Factor]) -> gtsam.Values:
-        values = gtsam.Values()
-        values.insert(_C, np.zeros(9))
-        for j in sorted({k for f in factors for k in (f.a, f.b)}):
-            values.insert(_y(j), np.zeros(NODE))
-        return values
-
     def _all(self) -> list[Factor]:
         return [self.prior, *self.factors]
 
@@ -157,11 +128,14 @@ class Graph:
 
         Raises SingularError where the graph does not determine all of it.
         """
-        factors = self._all()
-        linear = self._anchored(factors, self.hold, damping).linearize(self._values(factors))
-        net, rest = _eliminated(linear, self._older())
-        H, g = _information(rest)
-        solved = -_inverse(H[:14, :14]) @ g[:14]
+        net, H, g = self._reduced()
+        H, g = H[:14, :14].copy(), g[:14].copy()
+        pull = self._belief() + self.hold
+        H[C, C] += pull + np.diag(damping / self.anchor[1] ** 2)
+        g[C] += pull @ (self.c - self.anchor[0])
+        if not np.isfinite(g).all():
+            raise SingularError("the calibration is not finite")
+        solved = -_inverse(H) @ g
         given = gtsam.VectorValues()
         given.insert(_C, solved[C])
         given.insert(_y(self.last), solved[Y_A] / _UNITS[Y_A])
@@ -170,8 +144,8 @@ class Graph:
         return np.asarray(solved[C], dtype=np.float64), dy
 
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
-        """Move all values by a step."""
-        self.c = self.c + dc
+        """Move all values by a step, the calibration along its valley (`retraction.py`)."""
+        self.c = moved(self.c, dc, self.moments)
         self.nodes = {j: node.moved(dy[j]) for j, node in self.nodes.items()}
 
     def covariance(self) -> Array:
@@ -179,10 +153,32 @@ class Graph:
 
         As if nothing were held: what is not determined has the sigma of the prior.
         """
+        H = self._reduced()[1][:14, :14].copy()
+        H[C, C] += self._belief()
+        return _inverse(H)[:12, :12]
+
+    def _reduced(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
+        """All nodes but the newest eliminated, without anchor and hold, which are on c alone.
+
+        Kept until a factor or a value is replaced: anchor, hold and damping change more often.
+        """
         factors = self._all()
-        linear = self._anchored(factors, np.zeros((9, 9))).linearize(self._values(factors))
-        H, _ = _information(_eliminated(linear, self._older())[1])
-        return _inverse(H[:14, :14])[:12, :12]
+        used: list[object] = [self.c, *factors, *self.nodes.values()]
+        kept = self._kept
+        if kept is None or len(kept[0]) != len(used) or any(map(is_not, kept[0], used)):
+            net, rest = _eliminated(self._linear(factors), self._older())
+            kept = self._kept = (used, (net, *_information(rest)))
+        return kept[1]
+
+    def _linear(self, factors: list[Factor]) -> gtsam.GaussianFactorGraph:
+        graph = gtsam.GaussianFactorGraph()
+        H, g = Stack(factors, self.c, self.nodes).here()
+        if not (np.isfinite(H).all() and np.isfinite(g).all()):
+            raise SingularError("a factor is not finite")
+        H, linear = H * np.outer(_UNITS, _UNITS), -g * _UNITS
+        for k, factor in enumerate(factors):
+            graph.add(_hessian(factor, H[k], linear[k]))
+        return graph
 
     def _older(self) -> gtsam.Ordering:
         """All nodes but the newest, from old to new."""
@@ -197,10 +193,9 @@ class Graph:
         touching = [f for f in self.factors if old in (f.a, f.b)]
         new = next(k for f in touching for k in (f.a, f.b) if k != old)
         factors = [self.prior, *touching]
-        linear = self._linear(factors).linearize(self._values(factors))
         ordering = gtsam.Ordering()
         ordering.push_back(_y(old))
-        H, g = _information(_eliminated(linear, ordering)[1])
+        H, g = _information(_eliminated(self._linear(factors), ordering)[1])
         node = self.nodes[new]
         self.prior = Factor(new, new, H, g, Point(self.c.copy(), node.copy(), node.copy()))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]

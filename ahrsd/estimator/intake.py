@@ -1,7 +1,8 @@
 """From blocks of samples to the data of epochs; any split into blocks gives the same epochs.
 
 The rate is measured on the first _RATE_ROWS samples after a start or a gap, whatever blocks they
-came in; from it follows how many samples make a step.
+came in; from it follows how many samples make a step. Pieces between short gaps share an epoch:
+nothing links the steps on the two sides of a gap, but the gyro's bias is the same.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from ahrsd.estimator.steps import StepAverager, Steps, join, samples_per_step, s
 from ahrsd.samples import Array, SampleBlock
 
 _RATE_ROWS = 33
+_LONGEST_GAP_S = 60.0  # after a longer one the gyro's bias may have moved
 _SMOOTHED = 33  # steps over which the specific force is averaged to tell where down is
 
 
@@ -72,23 +74,48 @@ class Intake:
         rows = np.column_stack(
             [block.time_s, block.dt_s, block.raw_b_gauss, block.gyro_b_rad_s, block.accel_b_m_s2]
         )
+        closed: list[chain.Data] = []
         if self._averager is None:
             self._rows.append(rows)
             rows = np.vstack(self._rows)
             if len(rows) < _RATE_ROWS:
                 return []
             self._rows.clear()
-            self._averager = self._measured(rows[1:_RATE_ROWS, 1])
-        steps = self._averager.add(rows)
+            closed = self._measure(rows[1:_RATE_ROWS, 1])
+        self._take(rows)
+        return closed + self._complete()
+
+    def _measure(self, dt_s: Array) -> list[chain.Data]:
+        """Measure the rate; steps of another length do not share an epoch."""
+        rate_hz = 1.0 / float(np.median(dt_s))
+        averaged = samples_per_step(rate_hz, self._parameters.step_rate_hz)
+        data = self._closed() if averaged != self.averaged else None
+        self.averaged = averaged
+        self._averager = StepAverager(averaged)
+        return [] if data is None else [data]
+
+    def _take(self, rows: Array) -> None:
+        averager = self._averager or StepAverager(self.averaged)
+        steps = averager.add(rows)
         if len(steps):
             self._pending.append(steps)
             self._pending_count += len(steps)
-        return self._complete()
 
-    def _measured(self, dt_s: Array) -> StepAverager:
-        rate_hz = 1.0 / float(np.median(dt_s))
-        self.averaged = samples_per_step(rate_hz, self._parameters.step_rate_hz)
-        return StepAverager(self.averaged)
+    def gap(self, next_s: float) -> list[chain.Data]:
+        """The next sample, at `next_s`, does not follow the last one; epochs that end here."""
+        if self._averager is None and self._pending_count and len(self._rows):
+            self._take(np.vstack(self._rows))  # too short to tell its rate: as the one before
+        closed = self._complete()
+        if self._pending_count and 0.0 <= next_s - self._to_s <= _LONGEST_GAP_S:
+            self._cut()
+        elif (data := self.interrupt()) is not None:
+            closed.append(data)
+        return closed
+
+    def _cut(self) -> None:
+        self._rows.clear()
+        self._averager = None
+        self._earlier_s, self._from_s = self.duration_s, None
 
     def _complete(self) -> list[chain.Data]:
         closed = []
@@ -97,15 +124,17 @@ class Intake:
         return closed
 
     def interrupt(self) -> chain.Data | None:
-        """A gap: what is pending as a short epoch, if it is worth one; the next one starts anew."""
+        """What is pending as a short epoch, if it is worth one; the next one starts anew."""
+        data = self._closed()
+        self._cut()
+        return data
+
+    def _closed(self) -> chain.Data | None:
         enough = self._pending_count >= MIN_EPOCH_STEPS
         data = self._close(self._pending_count) if enough else None
         self._pending.clear()
         self._pending_count = 0
-        self._rows.clear()
-        self._averager = None
         self._fresh = True
-        self._earlier_s, self._from_s = self.duration_s, None
         return data
 
     def _close(self, count: int) -> chain.Data:
@@ -113,13 +142,15 @@ class Intake:
         self._pending = [rest] if len(rest) else []
         self._pending_count = len(rest)
         fresh, self._fresh = self._fresh, False
+        cut = steps.linked == 0
         return chain.Data(
             steps.field_b_gauss,
-            steps.angle_b_rad,
-            steps.dt_s,
+            np.where(cut[:, None], 0.0, steps.angle_b_rad),
+            np.where(cut, np.median(steps.dt_s[~cut]), steps.dt_s),
             _down(steps.accel_b_m_s2),
             steps.time_s,
             measures_first=fresh,
+            linked=steps.linked if cut[1:].any() else None,
         )
 
 
@@ -141,4 +172,5 @@ def with_border(data: chain.Data, before: chain.Data) -> chain.Data:
         np.vstack([before.down_b[-1:], data.down_b]),
         np.r_[before.time_s[-1], data.time_s],
         measures_first=False,
+        linked=None if data.linked is None else np.r_[1.0, data.linked],
     )

@@ -8,11 +8,10 @@ a wandering field or a lag make it larger, and the covariance of the estimate is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.estimator.factors import Factor
+from ahrsd.estimator.factors import Factor, Stack
 from ahrsd.estimator.graph import Graph, Step
 from ahrsd.samples import Array
 
@@ -30,7 +29,8 @@ class Misfit:
 
     def remember(self, factor: Factor, graph: Graph) -> None:
         """An epoch leaves the window: keep its score."""
-        s, n = _score(*_alone(factor, graph))
+        H, g = Stack([factor], graph.c, graph.nodes).here(walk=False)
+        s, n = _scores(H, g)
         self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
 
     def value(self, factors: Sequence[Factor], graph: Graph, step: Step) -> float:
@@ -39,27 +39,22 @@ class Misfit:
         At the joint optimum, not at the present values: what all epochs ask for together is not
         disagreement.
         """
-        total, count = self._sum, self._count
         dc, dy = step
-        for factor in factors:
-            H, g = _alone(factor, graph)
-            s, n = _score(H, g + H @ np.concatenate([dc, dy[factor.a], dy[factor.b]]))
-            total, count = total + s, count + n
+        H, g = Stack(factors, graph.c, graph.nodes).here(walk=False)
+        ahead = np.array([np.concatenate([dc, dy[f.a], dy[f.b]]) for f in factors])
+        s, n = _scores(H, g + (H @ ahead[:, :, None])[:, :, 0])
+        total, count = self._sum + s, self._count + n
         return total / max(count - _USED, 0.2 * count, 1.0)
 
 
-def _alone(factor: Factor, graph: Graph) -> tuple[Array, Array]:
-    """An epoch's quadratic at the present values, without the walk of the bias."""
-    return replace(factor, walk=0.0).at(graph.c, graph.nodes[factor.a], graph.nodes[factor.b])
-
-
-def _score(H: Array, g: Array) -> tuple[float, float]:
-    cross = H[np.ix_(_KEEP, _BORDERS)]
-    inverse = np.linalg.pinv(H[np.ix_(_BORDERS, _BORDERS)], rcond=1e-12)
-    S = H[np.ix_(_KEEP, _KEEP)] - cross @ inverse @ cross.T
-    r = g[_KEEP] - cross @ inverse @ g[_BORDERS]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-30))
-    values, vectors = np.linalg.eigh(S * np.outer(scale, scale))
+def _scores(H: Array, g: Array) -> tuple[float, float]:
+    """Sum of squares and degrees of freedom of several epochs, borders eliminated."""
+    cross = H[:, _KEEP[:, None], _BORDERS]
+    gain = cross @ np.linalg.pinv(H[:, _BORDERS[:, None], _BORDERS], rcond=1e-12, hermitian=True)
+    S = H[:, _KEEP[:, None], _KEEP] - gain @ np.swapaxes(cross, 1, 2)
+    r = g[:, _KEEP] - (gain @ g[:, _BORDERS, None])[:, :, 0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), 1e-30))
+    values, vectors = np.linalg.eigh(S * scale[:, :, None] * scale[:, None, :])
     good = values > 1e-4
-    projected = (vectors.T @ (scale * r))[good]
-    return float(np.sum(projected**2 / values[good])), float(np.count_nonzero(good))
+    projected = (np.swapaxes(vectors, 1, 2) @ (scale * r)[:, :, None])[:, :, 0]
+    return float(np.sum(projected[good] ** 2 / values[good])), float(np.count_nonzero(good))

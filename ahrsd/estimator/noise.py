@@ -53,11 +53,14 @@ def first_guess(data: chain.Data, parameters: EstimatorParameters) -> chain.Nois
 
 def residuals(q: chain.Quadratic, data: chain.Data, used: chain.Noise, M: Array) -> Residuals:
     """What an epoch linearised with the noise levels `used` says about them."""
-    dt = float(np.median(data.dt_s[1:]))
-    a = np.sum(np.square(np.einsum("ij,njk->nik", M, q.tangents)), axis=1) / used.mag_gauss**2
-    b = 1.0 / (used.gyro_rad_s * dt) ** 2
+    spread = data.dt_s if data.averaging is None else data.averaging.spread_s
+    seen = np.sum(np.square(M @ data.seen(q.tangents)), axis=1)
+    a = float(np.median(np.asarray(data.count))) * seen / used.mag_gauss**2
+    b = 1.0 / (used.gyro_rad_s * float(np.median(spread[1:]))) ** 2
     hat = float(np.sum(1.0 / np.sqrt(1.0 + 4.0 * b / np.maximum(a, 1e-12))))
     hat -= float(data.measures_first)
+    if data.linked is not None:
+        hat -= float(np.count_nonzero(data.linked[1:] == 0))
     return Residuals(
         q.sum_mag * used.mag_gauss**2,
         max(q.count_mag - hat, 1.0),

@@ -62,14 +62,15 @@ class Estimator:
         a field, rate or step is not a finite number; nothing of the block is then taken.
         """
         intake.check(block)
-        closed = self.interrupt() if block.gap_before else False
-        for data in self._intake.add(block):
+        gap = block.gap_before and len(block) > 0
+        closed = self._intake.gap(float(block.time_s[0])) if gap else []
+        closed += self._intake.add(block)
+        for data in closed:
             self._append(data)
-            closed = True
-        return closed
+        return bool(closed)
 
     def interrupt(self) -> bool:
-        """A gap follows: finish what is pending; nothing is bridged but the gyro bias's walk."""
+        """Close the epoch with what is pending; what follows does not share one with it."""
         data = self._intake.interrupt()
         if data is not None:
             self._append(data)

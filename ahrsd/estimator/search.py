@@ -1,10 +1,10 @@
 """Other starting points: do they lead to a better answer, and do they agree?
 
 The likelihood has more than one valley when motion is poor. So now and then several starts descend
-on a thinned copy of the window (every k-th field, rotations between them composed exactly; the
-epochs whose field varied most, all in one chain with cuts in it): the device's present calibration,
-a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be called sure only if
-two starts that know nothing of each other arrive there.
+on a part of the window (the epochs whose field varied most, all in one chain with cuts in it; of
+an epoch of single steps every k-th field, rotations between them composed exactly): the device's
+present calibration, a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be
+called sure only if two starts that know nothing of each other arrive there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ahrsd.estimator.window import Window, sigmas
 from ahrsd.samples import Array
 
 _EPOCHS = 6
-_STEPS = 128  # per epoch
+_STEPS = 128  # rows per epoch, at most twice that
 _DESCENT = 8  # Levenberg-Marquardt steps per start
 _SAME = 1.0  # sigmas within which two answers are one
 
@@ -69,7 +69,9 @@ def search(
     )
     first = Node.at(present_bias, np.array([1.0, 0.0, 0.0]))
     thin = Window(parameters, present, sigma, first, window.usual)
-    thin.append(joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen]))
+    thin.learn_from(window)
+    thin.graph.temper = graph.temper
+    thin.attach(joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen]))
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
     own = _descend(thin, graph.c, graph.nodes[graph.last].bias)
@@ -102,20 +104,40 @@ def _distance(r: _Reached, best: _Reached, temper: float) -> float:
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:
-    """Every k-th step of an epoch, by itself: its first field is measured."""
+    """Every k-th step of an epoch, by itself; all of one whose steps are grouped."""
+    if k == 1 or data.averaging is not None:
+        return data
     count = (len(data) - 1) // k
     rows = np.arange(count + 1) * k
+    linked = None
+    if data.linked is not None:
+        linked = np.r_[1.0, data.linked[1 : count * k + 1].reshape(count, k).min(axis=1)]
     angle = np.zeros((count + 1, 3))
     angle[1:] = compose(data.angle_b_rad[1 : count * k + 1].reshape(count, k, 3))
     dt = np.r_[data.dt_s[1], data.dt_s[1 : count * k + 1].reshape(count, k).sum(axis=1)]
     return chain.Data(
-        data.field_b_gauss[rows], angle, dt, data.down_b[rows], data.time_s[rows], True
+        data.field_b_gauss[rows], angle, dt, data.down_b[rows], data.time_s[rows], True, linked
     )
 
 
 def joined(parts: Sequence[chain.Data]) -> chain.Data:
-    """Epochs that measure their first field as one chain that is cut between them."""
-    linked = np.concatenate([np.r_[0.0, np.ones(len(p) - 1)] for p in parts])
+    """Epochs as one chain that is cut between them; each measures its first field."""
+    ones = [np.ones(len(p)) for p in parts]
+    linked = [
+        np.r_[0.0, (o if p.linked is None else p.linked)[1:]]
+        for p, o in zip(parts, ones, strict=True)
+    ]
+    averaging = None
+    if any(p.averaging is not None for p in parts):
+        all_ = [
+            p.averaging or chain.Averaging(o, np.tile(np.eye(3), (len(p), 1, 1)), p.dt_s)
+            for p, o in zip(parts, ones, strict=True)
+        ]
+        averaging = chain.Averaging(
+            np.concatenate([a.count for a in all_]),
+            np.concatenate([a.turn for a in all_]),
+            np.concatenate([a.spread_s for a in all_]),
+        )
     return chain.Data(
         np.vstack([p.field_b_gauss for p in parts]),
         np.vstack([p.angle_b_rad for p in parts]),
@@ -123,5 +145,6 @@ def joined(parts: Sequence[chain.Data]) -> chain.Data:
         np.vstack([p.down_b for p in parts]),
         np.concatenate([p.time_s for p in parts]),
         measures_first=True,
-        linked=linked,
+        linked=np.concatenate(linked),
+        averaging=averaging,
     )

@@ -1,6 +1,6 @@
 """The first linearisation point, from a linear problem: no starting value, no iteration.
 
-Over a lag of L steps with the gyro's rotation R the corrected field must turn with the sensor:
+Over a lag of L rows with the gyro's rotation R the corrected field must turn with the sensor:
 
     C m_(k+L) - R C m_k - (I - R) d = 0,    d = C b
 
@@ -22,7 +22,7 @@ from ahrsd import so3
 from ahrsd.estimator import chain
 from ahrsd.samples import Array
 
-_LAGS = (20, 60, 150)  # steps: from quick turns to slow ones
+_LAGS_S = (0.6, 1.8, 4.5)  # from quick turns to slow ones
 _NOISE_GRAM = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 
 
@@ -33,14 +33,15 @@ def linear_start(epochs: Sequence[chain.Data]) -> Array | None:
     for data in epochs:
         turned = _orientation(data)
         columns = chain.symmetric_columns(data.field_b_gauss)
-        for lag in _LAGS:
-            if len(data) <= lag:
-                continue
+        piece = np.zeros(len(data)) if data.linked is None else np.cumsum(data.linked == 0)
+        for lag_s in _LAGS_S:
+            lag = max(1, round(lag_s / float(np.median(data.dt_s[1:]))))
+            same = piece[lag:] == piece[:-lag]
             R = np.swapaxes(turned[lag:], 1, 2) @ turned[:-lag]
             phi = np.concatenate([columns[lag:] - R @ columns[:-lag], R - np.eye(3)], axis=2)
-            flat = phi.reshape(-1, 9)
+            flat = phi[same].reshape(-1, 9)
             gram += flat.T @ flat
-            rows += len(phi)
+            rows += int(np.count_nonzero(same))
     if rows == 0:
         return None
     return _solve(gram, rows, np.vstack([d.field_b_gauss for d in epochs]))

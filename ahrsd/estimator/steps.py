@@ -22,8 +22,8 @@ class Steps:
     """N consecutive steps; the rotation of row k leads from step k-1 to step k.
 
     time_s (N,), field_b_gauss (N, 3), angle_b_rad (N, 3) rotation vector of the step,
-    dt_s (N,), accel_b_m_s2 (N, 3), averaged: samples per step.
-    `linked` is true where the first row's rotation leads from the last step handed out before.
+    dt_s (N,), accel_b_m_s2 (N, 3), linked (N,): 0 for a step that nothing leads to, the first of a
+    piece, whose rotation and time are nan, else 1.
     """
 
     time_s: Array
@@ -31,8 +31,7 @@ class Steps:
     angle_b_rad: Array
     dt_s: Array
     accel_b_m_s2: Array
-    averaged: int
-    linked: bool
+    linked: Array
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -66,7 +65,7 @@ class StepAverager:
         used = lead + count * n
         if count == 0:
             self._rows = [rows]
-            return _empty(n)
+            return _empty()
         steps = _average(rows[:used], lead, n, count, self._linked)
         self._rows = [rows[used - half :]]
         self._linked = True
@@ -93,8 +92,7 @@ def _average(rows: Array, lead: int, n: int, count: int, linked: bool) -> Steps:
         angle_b_rad=angle,
         dt_s=length,
         accel_b_m_s2=body[:, :, 8:11].mean(axis=1),
-        averaged=n,
-        linked=linked,
+        linked=np.isfinite(length).astype(np.float64),
     )
 
 
@@ -118,8 +116,7 @@ def join(parts: Sequence[Steps]) -> Steps:
         np.concatenate([p.angle_b_rad for p in parts]),
         np.concatenate([p.dt_s for p in parts]),
         np.concatenate([p.accel_b_m_s2 for p in parts]),
-        parts[0].averaged,
-        parts[0].linked,
+        np.concatenate([p.linked for p in parts]),
     )
 
 
@@ -135,11 +132,10 @@ def _part(s: Steps, rows: slice) -> Steps:
         s.angle_b_rad[rows],
         s.dt_s[rows],
         s.accel_b_m_s2[rows],
-        s.averaged,
-        s.linked,
+        s.linked[rows],
     )
 
 
-def _empty(n: int) -> Steps:
+def _empty() -> Steps:
     z3 = np.zeros((0, 3))
-    return Steps(np.zeros(0), z3, z3, np.zeros(0), z3, n, False)
+    return Steps(np.zeros(0), z3, z3, np.zeros(0), z3, np.zeros(0))

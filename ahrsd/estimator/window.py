@@ -23,12 +23,14 @@ from ahrsd.estimator.factors import (
     Factor,
     Node,
     Point,
+    Stack,
     bias_prior,
     chain_step,
     epoch_factor,
     gap_factor,
 )
 from ahrsd.estimator.graph import Graph, SingularError
+from ahrsd.estimator.grouping import group_size, grouped
 from ahrsd.estimator.misfit import Misfit
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import Array
@@ -43,7 +45,7 @@ BLIND = 0.5  # posterior over prior sigma above which a direction counts as not 
 _FINISH_WORK = 6  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
-_DAMPING = 1e-3
+_DAMPING, _DAMPING_FAR = 1e-3, 1e2
 _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
@@ -63,8 +65,16 @@ class Epoch:
     b: int
     quadratic: chain.Quadratic
     factor: Factor
-    residuals: noise.Residuals
     turned: bool
+    _residuals: noise.Residuals | None = None
+
+    @property
+    def residuals(self) -> noise.Residuals:
+        """What it says about the noise, at its linearisation point."""
+        if self._residuals is None:
+            M = chain.symmetric(self.factor.point.c[:6])
+            self._residuals = noise.residuals(self.quadratic, self.data, self.used, M)
+        return self._residuals
 
     @property
     def cost(self) -> float:
@@ -107,9 +117,23 @@ class Window:
     # -- growing and forgetting ------------------------------------------------------------------
 
     def append(self, data: chain.Data) -> None:
-        """A new epoch at the end, linked to the last one unless `data.measures_first`."""
+        """A new epoch of single steps, linked to the last one unless `data.measures_first`."""
+        guess = noise.first_guess(data, self.parameters)
+        self._guesses.append(guess)
+        moving = turned(data)
+        if moving:
+            self.graph.moments.take(data.field_b_gauss)
+        size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
+        self.attach(grouped(data, group_size(data, guess, size)), moving=moving)
+
+    def learn_from(self, other: Window) -> None:
+        """First guesses of the noise and moments of the field, for a part of the other's data."""
+        self._guesses = other._guesses.copy()
+        self.graph.moments = other.graph.moments
+
+    def attach(self, data: chain.Data, *, moving: bool = True) -> None:
+        """An epoch whose steps are grouped already."""
         self._work = min(self._work + _WORK, _MOST_WORK)
-        self._guesses.append(noise.first_guess(data, self.parameters))
         graph = self.graph
         a = graph.last
         walk = self.parameters.bias_walk_rad_s_sqrt_s
@@ -127,16 +151,14 @@ class Window:
         u[0] = graph.nodes[a].direction
         graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
         info = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-        self.epochs.append(
-            self._linearised(data, u, self.usual, None, a, info, turned=turned(data))
-        )
+        self.epochs.append(self._linearised(data, u, self.usual, None, a, info, turned=moving))
         graph.factors.append(self.epochs[-1].factor)
 
     def fold(self) -> None:
         """Fold the oldest epochs until the window has its size."""
         while (
             len(self.epochs) > 1
-            and sum(len(e.data) for e in self.epochs) > self.parameters.window_steps
+            and sum(e.data.steps for e in self.epochs) > self.parameters.window_steps
         ):
             old = self.epochs.pop(0)
             self.folded |= old.turned
@@ -164,8 +186,7 @@ class Window:
         q = chain.linearise(data, u, graph.c, first.bias, used, weights=weights)
         point = Point(graph.c.copy(), first.copy(), last.copy())
         factor = epoch_factor(q, a, point, walk, calibrates=turned)
-        found = noise.residuals(q, data, used, chain.symmetric(graph.c[:6]))
-        return Epoch(data, u, used, weights, a, a + 1, q, factor, found, turned)
+        return Epoch(data, u, used, weights, a, a + 1, q, factor, turned)
 
     def _replace(self, k: int, u: Array, used: chain.Noise, weights: Array | None) -> None:
         old = self.epochs[k]
@@ -175,20 +196,25 @@ class Window:
         self.graph.factors[self.graph.factors.index(old.factor)] = new.factor
         self.epochs[k] = new
 
-    def _moved_directions(self, epoch: Epoch) -> Array:
-        graph = self.graph
-        z, _ = epoch.factor.offset(graph.c, graph.nodes[epoch.a], graph.nodes[epoch.b])
-        return chain.move(epoch.u, epoch.quadratic, chain_step(z, calibrates=epoch.turned))
+    def _moved_directions(self, which: list[int]) -> list[Array]:
+        """Directions of these epochs where the present values put them."""
+        graph, epochs = self.graph, [self.epochs[k] for k in which]
+        if not epochs:
+            return []
+        z = Stack([e.factor for e in epochs], graph.c, graph.nodes).z
+        return [
+            chain.move(e.u, e.quadratic, chain_step(own, calibrates=e.turned))
+            for e, own in zip(epochs, z, strict=True)
+        ]
 
     def refresh(self, which: list[int]) -> None:
         """Linearise epochs again at the present values, with fresh noise and outlier weights."""
-        for k in which:
+        for k, u in zip(which, self._moved_directions(which), strict=True):
             epoch = self.epochs[k]
-            u = self._moved_directions(epoch)
             used = noise.shrunk(epoch.residuals, self.usual, self.parameters)
             weights = chain.robust_weights(
-                epoch.data.field_b_gauss - u @ chain.symmetric(self.graph.c[:6]) - self.graph.c[6:],
-                used.mag_gauss * self.parameters.outlier_sigma,
+                epoch.data.field_error(u, self.graph.c),
+                used.mag_gauss * self.parameters.outlier_sigma / np.sqrt(epoch.data.count),
             )
             self._replace(k, u, used, weights)
         found = [e.residuals for e in self.epochs]
@@ -206,6 +232,7 @@ class Window:
         """
         graph = self.graph
         self.usual = self._start_noise()
+        self._damping = _DAMPING_FAR
         graph.c = c.copy()
         for k, epoch in enumerate(self.epochs):
             u = chain.start_directions(chain.symmetric(c[:6]), c[6:], epoch.data.field_b_gauss)
@@ -232,11 +259,8 @@ class Window:
     def cost(self) -> float:
         """Negative log likelihood of the window plus the prior, up to a constant."""
         graph = self.graph
-        rises = sum(
-            f.rise(graph.c, graph.nodes[f.a], graph.nodes[f.b])
-            for f in (graph.prior, *graph.factors)
-        )
-        return sum(e.cost for e in self.epochs) + rises + graph.anchor_cost()
+        rises = Stack([graph.prior, *graph.factors], graph.c, graph.nodes).rises()
+        return sum(e.cost for e in self.epochs) + float(rises.sum()) + graph.anchor_cost()
 
     def optimise(self, steps: int = _MAX_STEPS) -> float:
         """Levenberg-Marquardt over the whole window at fixed noise and weights; returns the cost.
@@ -262,7 +286,7 @@ class Window:
                     break
             else:
                 self.restore(kept)
-                self._damping *= 100
+                self._damping *= 30
                 if self._damping > _DAMPING_LIMITS[1]:
                     self._damping = _DAMPING
                     break
@@ -272,9 +296,9 @@ class Window:
         """Cost after a step, everything linearised there; infinite where M is not positive."""
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
             return float(np.inf)
-        for k, epoch in enumerate(self.epochs):
-            if epoch.turned:  # the others do not depend on c
-                self._replace(k, self._moved_directions(epoch), epoch.used, epoch.weights)
+        which = [k for k, e in enumerate(self.epochs) if e.turned]  # others do not depend on c
+        for k, u in zip(which, self._moved_directions(which), strict=True):
+            self._replace(k, u, self.epochs[k].used, self.epochs[k].weights)
         return self.cost()
 
     def track(self, *, everything: bool = False) -> None:
