@@ -82,7 +82,7 @@ def row_of(result: BatchResult, found: MethodResult, *, held_out: bool = True) -
     )
 
 
-def our_row(result: BatchResult) -> Row:
+def our_row(result: BatchResult, *, held_out: bool = True) -> Row:
     """Ours."""
     estimate = result.estimate
     reasons = "; ".join(result.reasons())
@@ -97,7 +97,7 @@ def our_row(result: BatchResult) -> Row:
         result.converged,
         "" if result.converged else f"not converged: {reasons}",
         spread_of([_blocks(result)], answers),
-        _unseen(result, OURS),
+        _unseen(result, OURS) if held_out else None,
     )
 
 

@@ -1,0 +1,252 @@
+"""Real recordings: what every method is worth where something can be known.
+
+    python tests/benchmarks/bench_real.py [--json FILE] [--short] [--only drive optical punch rest]
+
+drive:   circles_2022_rahul calibrates, drive_2022_rahul judges: heading against GPS course above
+         4 m/s, one constant removed, and dead reckoning by the receiver's speed
+optical: broad/01, 02 and 21, each calibrated by itself and by each other, against optical attitude
+punch:   one sensor on two people's fists: the hard iron must repeat
+rest:    nothing is observable: no answer is the right one
+
+It reads the recordings beside the project and prints tables; the right answer is in no file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+from ahrsd.batch import BatchResult, calibrate
+from ahrsd.calibration import Affine
+from ahrsd.commands.evaluate_sources import gps_beside, read_fixes, read_track
+from ahrsd.config import Config
+from ahrsd.config_sections import Location
+from ahrsd.evaluation import Evaluation, StoredCalibration, Track, judge
+from ahrsd.evaluation.references import course, optical
+from ahrsd.methods import METHODS
+from ahrsd.methods.comparison import Row
+from ahrsd.published import our_row, row_of, run_published
+
+RECORDINGS = Path(__file__).parents[3] / "shared" / "recordings"
+# Boston, where the car drove. The day is not known: a year moves |H| there by 1 mG.
+BOSTON = Config(
+    location=Location(latitude_deg=42.34, longitude_deg=-71.09, date=date(2022, 10, 15))
+)
+QUICK = ("magical-ls", "magyc-bfg", "ellipsoid", "fnp")
+LEAST_SPEED_M_S = 4.0
+BROAD = ("01_undisturbed_slow_rotation_A", "02_undisturbed_slow_rotation_B",
+         "21_undisturbed_fast_combined")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A method judged on a recording. Without an answer the figures are None."""
+
+    method: str
+    made_from: str
+    judged_on: str
+    converged: bool
+    reason: str
+    before_deg: float | None = None
+    after_deg: float | None = None
+    worst_deg: float | None = None
+    fold_spread_deg: float | None = None
+    reckoning_before_percent: float | None = None
+    reckoning_after_percent: float | None = None
+    spread_before: float | None = None
+    spread_after: float | None = None
+
+
+def rows_of(path: Path, methods: tuple[str, ...], config: Config) -> tuple[list[Row], BatchResult]:
+    """Ours and these methods on a recording."""
+    result = calibrate(path, config)
+    theirs = [row_of(result, run_published(result, name), held_out=False) for name in methods]
+    return [our_row(result, held_out=False), *theirs], result
+
+
+def stored(row: Row, recording: str) -> StoredCalibration | None:
+    """A row as a calibration; None where it has no answer."""
+    if row.hard_iron_gauss is None:
+        return None
+    C = np.eye(3) if row.soft_iron is None else np.linalg.inv(row.soft_iron)
+    correction = Affine(C, row.hard_iron_gauss)
+    return StoredCalibration("", row.method, recording, row.converged, correction)
+
+
+def judged(row: Row, made_from: str, judged_on: str, found: Evaluation | None) -> Judged:
+    """The figures of an evaluation in one line."""
+    base = (row.method, made_from, judged_on, row.converged, row.reason)
+    if found is None or not found.headings:
+        return Judged(*base)
+    pair = found.headings[0].figures
+    reckoned = found.reckoned
+    return Judged(
+        *base,
+        pair.before.rms_deg,
+        pair.after.rms_deg,
+        pair.after.worst_deg,
+        pair.after.fold_spread_deg,
+        None if reckoned is None else reckoned.figures.before.rms_percent,
+        None if reckoned is None else reckoned.figures.after.rms_percent,
+        found.field.before.spread,
+        found.field.after.spread,
+    )
+
+
+def drive(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Judged]:
+    """Calibrated on the circles, judged on the drive."""
+    circles = folder / "vn100" / "circles_2022_rahul.csv.gz"
+    path = folder / "vn100" / "drive_2022_rahul.csv.gz"
+    rows, _ = rows_of(circles, methods, BOSTON)
+    track, _ = read_track(path, Config())
+    gps = gps_beside(path)
+    assert gps is not None
+    fixes, _ = read_fixes(gps)
+    references = [course(fixes, LEAST_SPEED_M_S)]
+    lines = []
+    for row in rows:
+        calibration = stored(row, circles.name)
+        found = calibration and judge(path.name, track, calibration, references, fixes=fixes)
+        lines.append(judged(row, circles.name, path.name, found))
+    return lines
+
+
+def against_optics(
+    folder: Path,
+    methods: tuple[str, ...] = ("ellipsoid", "magyc-bfg"),
+    names: tuple[str, ...] = BROAD,
+) -> list[Judged]:
+    """Each trial calibrates, all of them judge."""
+    paths = [folder / "broad" / f"{name}.csv.gz" for name in names]
+    tracks: list[Track] = [read_track(path, Config())[0] for path in paths]
+    lines = []
+    for path in paths:
+        rows, _ = rows_of(path, methods, Config())
+        for row in rows:
+            calibration = stored(row, path.name)
+            for other, track in zip(paths, tracks, strict=True):
+                reference = optical(track)
+                assert reference is not None
+                found = calibration and judge(other.name, track, calibration, [reference])
+                lines.append(judged(row, path.name[:2], other.name[:2], found))
+    return lines
+
+
+def punch(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[dict[str, object]]:
+    """Hard iron (mG) of two people with the same sensor, and how far apart they are."""
+    names = ("punch_2024_shaked", "punch_2024_satish")
+    both = [rows_of(folder / "vn100" / f"{n}.csv.gz", methods, BOSTON)[0] for n in names]
+    lines = []
+    for one, other in zip(*both, strict=True):
+        known = one.hard_iron_gauss is not None and other.hard_iron_gauss is not None
+        lines.append(
+            {
+                "method": one.method,
+                "shaked_mG": None
+                if one.hard_iron_gauss is None
+                else list(1e3 * one.hard_iron_gauss),
+                "satish_mG": None
+                if other.hard_iron_gauss is None
+                else list(1e3 * other.hard_iron_gauss),
+                "apart_mG": 1e3 * float(np.linalg.norm(one.hard_iron_gauss - other.hard_iron_gauss))
+                if known
+                else None,
+                "converged": [one.converged, other.converged],
+                "reasons": [one.reason, other.reason],
+            }
+        )
+    return lines
+
+
+def at_rest(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Row]:
+    """What every method says about a sensor at rest."""
+    return rows_of(folder / "vn100" / "static_2025_kiran_5min.csv.gz", methods, BOSTON)[0]
+
+
+def print_judged(title: str, lines: list[Judged]) -> None:
+    """The table of one experiment."""
+    print(f"\n{title}")
+    print(f"{'method':20}{'from':>5}{'on':>5}{'before':>9}{'after':>8}{'worst':>8}{'folds':>8}"
+          f"{'XY before':>11}{'after':>8}{'spread':>9}{'after':>8}")  # fmt: skip
+    for line in lines:
+        head = f"{line.method:20}{line.made_from[:2]:>5}{line.judged_on[:2]:>5}"
+        if line.after_deg is None:
+            print(f"{head}  no answer: {line.reason}")
+            continue
+        figures = (
+            (line.before_deg, 9, 1, 1), (line.after_deg, 8, 2, 1), (line.worst_deg, 8, 1, 1),
+            (line.fold_spread_deg, 8, 2, 1), (line.reckoning_before_percent, 11, 1, 1),
+            (line.reckoning_after_percent, 8, 2, 1), (line.spread_before, 9, 2, 100),
+            (line.spread_after, 8, 2, 100),
+        )  # fmt: skip
+        text = "".join(
+            f"{'-':>{width}}" if value is None else f"{value * scale:{width}.{digits}f}"
+            for value, width, digits, scale in figures
+        )
+        print(f"{head}{text}  {'' if line.converged else 'not converged'}")
+    print("deg; XY: RMS in % of the distance; spread: std |h| / mean |h| in %")
+
+
+def print_punch(lines: list[dict[str, object]]) -> None:
+    """Two hard irons and their difference."""
+    print("\npunch: hard iron of one sensor on two fists, mG")
+    for line in lines:
+        apart = line["apart_mG"]
+        one, other = (
+            "no answer" if v is None else ", ".join(f"{x:+.1f}" for x in v)  # type: ignore[attr-defined]
+            for v in (line["shaked_mG"], line["satish_mG"])
+        )
+        words = "" if all(line["converged"]) else f"  converged: {line['converged']}"  # type: ignore[arg-type]
+        told = "     -" if apart is None else f"{apart:6.1f}"
+        print(f"{line['method']:20}{one:>26}{other:>26}  apart {told}{words}")
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--short", action="store_true", help="fewer methods")
+    parser.add_argument("--only", nargs="*", default=["drive", "optical", "punch", "rest"])
+    arguments = parser.parse_args()
+    methods = QUICK if arguments.short else tuple(METHODS)
+    body: dict[str, object] = {"schema": "ahrsd.bench_real/1"}
+    began = time.process_time()
+    if "drive" in arguments.only:
+        lines = drive(RECORDINGS, methods)
+        print_judged(
+            "drive: calibrated on circles (ci), judged on a drive (dr), against GPS", lines
+        )
+        body["drive"] = [_as_json(line) for line in lines]
+    if "optical" in arguments.only:
+        lines = against_optics(RECORDINGS)
+        print_judged("broad: against optical attitude", lines)
+        body["optical"] = [_as_json(line) for line in lines]
+    if "punch" in arguments.only:
+        pairs = punch(RECORDINGS, methods)
+        print_punch(pairs)
+        body["punch"] = pairs
+    if "rest" in arguments.only:
+        rows = at_rest(RECORDINGS, methods)
+        print("\nat rest")
+        for row in rows:
+            print(f"{row.method:20}{'ANSWERED' if row.converged else 'refused'}: {row.reason}")
+        body["rest"] = [{"method": r.method, "refused": not r.converged} for r in rows]
+    print(f"\n{time.process_time() - began:.0f} s of processor time")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(body, indent=1))
+
+
+def _as_json(line: Judged) -> dict[str, object]:
+    return {name: getattr(line, name) for name in line.__slots__}
+
+
+if __name__ == "__main__":
+    main()
