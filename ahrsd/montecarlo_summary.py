@@ -236,5 +236,30 @@ def parameter_lines(rows: Sequence[Row], truth: Sequence[float]) -> list[str]:
     return table
 
 
+def heading_lines(sets: Sequence[tuple[str, Sequence[Row]]]) -> list[str]:
+    """[R] Table 5.2: heading RMSE in degrees by method and set (name, rows) at the last time.
+
+    Of readings with 10 mG of noise, behind it of readings without; the bound's line is what a
+    method at the bound may expect.
+    """
+    table = [f"{'method':<19} " + " ".join(f"{name:>22}" for name, _ in sets)]
+    for method in dict.fromkeys(row.method for _, rows in sets for row in rows):
+        cells = []
+        for _, rows in sets:
+            found = [row.rms for row in rows if row.method == method]
+            cells.append(_headings(found[-1] if found else {}))
+        table.append(f"{method:<19} " + " ".join(f"{cell:>22}" for cell in cells))
+    bounds = [
+        _headings({name: rows[-1].against_bound[name].bound for name in HEADINGS} if rows else {})
+        for _, rows in sets
+    ]
+    return [*table, f"{'bound':<19} " + " ".join(f"{cell:>22}" for cell in bounds)]
+
+
+def _headings(figures: Mapping[str, float | None]) -> str:
+    quiet, noisy = (figures.get(name) for name in HEADINGS)
+    return f"{_text(noisy)} ({_text(quiet)})"
+
+
 def _cell(mean: float | None, spread: float | None) -> str:
     return "-" if mean is None or spread is None else f"{mean:.4f}+-{spread:.4f}"

@@ -16,6 +16,7 @@ from ahrsd.montecarlo_summary import (
     PARAMETERS,
     accuracy_lines,
     bound_lines,
+    heading_lines,
     parameter_lines,
     summarise,
 )
@@ -148,7 +149,7 @@ def test_the_command_writes_tables_json_and_figure(run, tmp_path, capsys):
     assert run("montecarlo", "wam", *arguments, *files, *methods) == 0
     out = capsys.readouterr().out
     assert "WAM rov, 2 runs" in out
-    assert out.count("\nbound ") == 3  # at both times, and of the parameters
+    assert out.count("\nbound ") == 4  # at both times, of the parameters, of the headings
     written = json.loads((tmp_path / "m.json").read_text())
     assert written["schema"] == "ahrsd.montecarlo/1"
     assert written["seeds"] == [0, 1]
@@ -178,6 +179,12 @@ def test_the_tables_have_the_bound_of_every_parameter_and_of_the_heading():
     table = parameter_lines(rows, np.arange(15.0))
     assert [line.split()[0] for line in table[1:]] == ["truth", "bound", "magyc", "ellipsoid"]
     assert f"+-{sigma['b3']:.4f}" in table[2]
+    text = [line.split() for line in heading_lines([("a", rows), ("b", rows[:1])])]
+    assert [line[0] for line in text] == ["method", "magyc", "ellipsoid", "bound"]
+    assert text[2][3:] == ["-", "(-)"]  # no ellipsoid in b
+    noisy_rms = f"{rows[1].rms['heading_10mg_deg']:#.4g}"
+    assert text[2][1:3] == [noisy_rms, f"({rows[1].rms['heading_deg']:#.4g})"]
+    assert text[3][1] == f"{noisy.bound:#.4g}"
     (bound,) = bound_lines(rows)
     assert f"{heading.bound:#.4g}" in bound
 

@@ -114,6 +114,8 @@ def command(
         sets.append((plan, rows))
         if json_path != "-":
             _say(plan, rows)
+    if json_path != "-":
+        _say_headings(sets)
     if json_path is not None:
         write_json(json_path, _json(sets, seed, runs))
     if figure_path is not None:
@@ -146,6 +148,14 @@ def _say(plan: Plan, rows: list[Row]) -> None:
         f"\nMean and spread at {plan.at_s[-1]:g} s; A with det A = 1, b in mG, w_b in mrad/s"
     )
     for line in parameter_lines(rows, listed):
+        click.echo(line)
+
+
+def _say_headings(sets: list[tuple[Plan, list[Row]]]) -> None:
+    from ahrsd.montecarlo_summary import heading_lines
+
+    click.echo("\nHeading RMSE in deg, of readings with 10 mG of noise (without noise)")
+    for line in heading_lines([(plan.name, rows) for plan, rows in sets]):
         click.echo(line)
 
 

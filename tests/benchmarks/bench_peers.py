@@ -21,6 +21,7 @@ import sys
 import time
 import venv
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,7 @@ TIERS = (
     ("MAGYC-BFG", "MAGYC-BFG +sg", "MAGYC-BFG jacfix"),
 )
 PEERS = tuple(name for tier in TIERS for name in tier)
-AT_S = 400.0
+AT_S, EARLIER_S = 400.0, (50.0, 100.0, 200.0)
 _SECONDS = 7200.0  # after which a peer's process is given up
 
 
@@ -322,16 +323,28 @@ class Comparison:
     def compared(self, plan: Plan) -> tuple[list[Record], list[Row]]:
         """Records and rows of ours and of all peers; dear ones over fewer seeds."""
         say(f"ours: {plan.name}")
-        kept = self.cache / f"ours-{estimator_source()}"
-        ours = run_many(plan, range(self.runs[0]), resume=kept)
-        records = [
-            record | {"results": [*record["results"], *self.peers(plan, record["seed"])]}
-            for record in ours
-        ]
+        records = []
+        for seed, ours in enumerate(self.ours(plan)):
+            results = [*ours["results"], *self.peers(plan, seed)]
+            records.append(ours | {"results": results})
         rows = []
         for runs, names in ((self.runs[0], (OURS, STREAM)), *self.tiers()):
             rows += summarise([only(record, names) for record in records[:runs]])
         return records, rows
+
+    def ours(self, plan: Plan) -> list[Record]:
+        """Batch and stream at the end, kept by the plans of docs/montecarlo.md's full form."""
+        kept = self.cache / f"ours-{estimator_source()}"
+        times_s = (*(t for t in EARLIER_S if t < AT_S), AT_S)
+        batch, stream = (
+            run_many(replace(plan, methods=(m,), at_s=t), range(self.runs[0]), resume=kept)
+            for m, t in ((OURS, (AT_S,)), (STREAM, times_s))
+        )
+        return [
+            whole
+            | {"results": [*whole["results"], *(r for r in late["results"] if r["at_s"] == AT_S)]}
+            for whole, late in zip(batch, stream, strict=True)
+        ]
 
     def tiers(self) -> list[tuple[int, tuple[str, ...]]]:
         """How many runs of which peers; the last number holds for all dearer ones."""
