@@ -21,6 +21,8 @@ COMMANDS: dict[str, str] = {
     "evaluate": "What a calibration is worth: heading, field and dead reckoning, before and after.",
     "simulate": "A recording of a scenario, with the truth beside it.",
     "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
+    "diagnose": "Where a simulation and a recording differ, and which physics was left out.",
+    "challenge": "Sealed blind trials of `diagnose`: make cases, run tools, score.",
     "operator": "A person's word to the running daemon: approve, lock, unlock, rollback.",
     "status": "How the running daemon stands.",
     "watch": "The running daemon, live on a terminal.",

@@ -1,0 +1,105 @@
+"""Answers and key together: every case judged, every score, files for people and programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ahrsd.challenge.answers import Answer, read_answer
+from ahrsd.challenge.judge import ORDER, Verdict, judge
+from ahrsd.challenge.report import html, markdown
+from ahrsd.challenge.running import OURS
+from ahrsd.challenge.scores import Score, error_rate, scores
+from ahrsd.challenge.sealing import Json, Round, open_key, read_object, write_object
+from ahrsd.errors import AhrsdError
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A tool's verdicts, misses first, and its scores."""
+
+    tool: str
+    verdicts: list[Verdict]
+    scores: list[Score]
+    mistakes: Score
+
+
+def score(trial: Round, key_path: Path, output: Path) -> list[Result]:
+    """Open the key, judge all tools, write score.json, report.md and report.html into `output`.
+
+    AhrsdError where seals are broken or nobody has answered.
+    """
+    tools = sorted(trial.tools(), key=lambda tool: (tool != OURS, tool))
+    if not tools:
+        raise AhrsdError(f"{trial.folder}: no finished answers; `ahrsd challenge run` first")
+    key = open_key(trial, key_path, tools)
+    results = [_result(tool, key["cases"], _answers(trial, tool)) for tool in tools]
+    output.mkdir(parents=True, exist_ok=True)
+    opened = trial.opened or {}
+    head: Json = {
+        "schema": "ahrsd.challenge.score/1",
+        "ring": key["ring"],
+        "cases": len(key["cases"]),
+        "sha256_of_salt_and_key": trial.sha256,
+        "opened_utc": opened.get("opened_utc"),
+        "answers_sha256": opened.get("answers"),
+    }
+    write_object(output / "score.json", head | {"tools": [_json(result) for result in results]})
+    for name, text in (
+        ("report.md", markdown(head, results)),
+        ("report.html", html(head, results)),
+    ):
+        try:
+            (output / name).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise AhrsdError(f"{output / name}: cannot be written: {error.strerror}") from error
+    return results
+
+
+def _answers(trial: Round, tool: str) -> dict[str, Answer]:
+    folder = trial.answers(tool)
+    return {case: read_answer(read_object(folder / f"{case}.json")) for case in trial.cases}
+
+
+def _result(tool: str, truths: list[Json], answers: dict[str, Answer]) -> Result:
+    controls = {
+        str(truth["motion"]): answers[str(truth["id"])]
+        for truth in truths
+        if truth["kind"] == "control"
+    }
+    verdicts = [
+        judge(truth, answers[str(truth["id"])], controls.get(str(truth["motion"])))
+        for truth in truths
+    ]
+    verdicts.sort(key=lambda v: (not v.error, ORDER.index(v.word), v.kind, -(v.multiple or 0)))
+    return Result(tool, verdicts, scores(verdicts), error_rate(verdicts))
+
+
+def _json(result: Result) -> dict[str, Any]:
+    return {
+        "tool": result.tool,
+        "mistakes": result.mistakes.json(),
+        "scores": [row.json() for row in result.scores],
+        "cases": [
+            {
+                "id": v.case,
+                "kind": v.kind,
+                "verdict": v.word,
+                "mistake": v.error,
+                "planted": [effect["source"] for effect in v.truth["effects"]],
+                "multiple": v.multiple,
+                "named": list(v.answer.names),
+                "unexplained": v.answer.unexplained,
+                "confidence": v.confidence,
+                "frame_right": v.frame_right,
+                "overlap": v.overlap,
+                "onset_error_s": v.onset_error_s,
+                "pulls": list(v.pulls),
+                "gain_share": v.gain,
+                "seconds": v.answer.seconds,
+                "failure": v.answer.failure,
+            }
+            for v in result.verdicts
+        ],
+    }
