@@ -97,10 +97,13 @@ def _table_inputs(table: Table) -> Iterator[Input]:
     yield Stop(host_ns, _END)
 
 
-def open_recording(path: Path, rate_hz: float | None = None) -> Recording:
+def open_recording(
+    path: Path, rate_hz: float | None = None, *, check_units: bool = True
+) -> Recording:
     """Open a capture, a byte stream or a table.
 
-    rate_hz is for byte streams without a device clock and is not used otherwise.
+    rate_hz is for byte streams without a device clock and is not used otherwise; check_units as
+    in `read_table`.
     Raises RecordingError, one line, where the file is none of the three.
     """
     if rate_hz is not None and not rate_hz > 0.0:
@@ -117,7 +120,7 @@ def open_recording(path: Path, rate_hz: float | None = None) -> Recording:
     if kind is Kind.CAPTURE:
         header = CaptureReader(path).header
         return Recording(path, kind, header=header, notes=unused)
-    table = read_table(path)
+    table = read_table(path, check_units=check_units)
     return Recording(path, kind, notes=[*unused, *table.notes], table=table)
 
 

@@ -88,8 +88,11 @@ class Table:
         )
 
 
-def read_table(path: Path) -> Table:
-    """Read and check a table.  Raises RecordingError naming the row, the column and a remedy."""
+def read_table(path: Path, *, check_units: bool = True) -> Table:
+    """Read and check a table.  Raises RecordingError naming the row, the column and a remedy.
+
+    check_units: refuse magnitudes that look like another unit
+    """
     parquet = path.suffix == ".parquet"
     table = _read_parquet(path) if parquet else _read_csv(path)
     if table.num_rows < MINIMUM_ROWS:
@@ -106,7 +109,7 @@ def read_table(path: Path) -> Table:
     time_s = columns["time_s"]
     _check_time(path, time_s, first_row)
     mag, gyro = (np.column_stack([columns[name] for name in names]) for names in (_MAG, _GYRO))
-    for vectors, limits in zip((mag, gyro), _RANGES, strict=True):
+    for vectors, limits in zip((mag, gyro), _RANGES if check_units else (), strict=check_units):
         _check_units(path, vectors, limits)
     dt_s, starts = _steps(time_s)
     rows = SampleBlock(

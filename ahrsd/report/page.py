@@ -87,11 +87,13 @@ def before_after_figure(
     figures.save_png(lambda: figures.heading(heading, HEADING_TITLE), path_png, width_px, height_px)
 
 
-def _section(title: str, *parts: str) -> str:
+def section(title: str, *parts: str) -> str:
+    """A heading and what is below it, HTML."""
     return f"<section><h2>{escape(title)}</h2>\n" + "\n".join(parts) + "</section>"
 
 
-def _picture(draw: Callable[[], Figure], alt: str, caption: str = "") -> str:
+def picture(draw: Callable[[], Figure], alt: str, caption: str = "") -> str:
+    """A picture inside the page, HTML."""
     from ahrsd.report import figures
 
     text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
@@ -99,7 +101,7 @@ def _picture(draw: Callable[[], Figure], alt: str, caption: str = "") -> str:
     return f'<figure><img alt="{escape(alt)}" src="{source}">{text}</figure>'
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = ()) -> str:
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = ()) -> str:
     """Build a table; the cells are HTML already, `numeric` columns are aligned to the right."""
 
     def row(cells: Sequence[str], tag: str) -> str:
@@ -108,7 +110,8 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence
         return "<tr>" + "".join(inner) + "</tr>"
 
     body = "".join(row(cells, "td") for cells in rows)
-    return f'<div class="scroll"><table>{row(head, "th")}{body}</table></div>'
+    top = row(head, "th") if any(head) else ""
+    return f'<div class="scroll"><table>{top}{body}</table></div>'
 
 
 def number(value: float | None, unit: str = "") -> str:
@@ -139,7 +142,7 @@ def _summary(data: ReportData) -> str:
         ]
         for f in figures
     ]
-    return verdict + _table(["", "before", "after", "limit"], rows, numeric=(1, 2, 3))
+    return verdict + table(["", "before", "after", "limit"], rows, numeric=(1, 2, 3))
 
 
 def _judged_number(figure: KeyFigure) -> str:
@@ -160,17 +163,17 @@ def _heading(data: ReportData) -> str:
         f"Heading error over all headings: worst {number(worst.before)} deg before and "
         f"{number(worst.after)} deg after, rms {number(rms.before)} and {number(rms.after)} deg"
     )
-    picture = _picture(
+    shot = picture(
         lambda: figures.heading(heading, "Before and after on one scale"), alt, heading.source
     )
-    return _section(HEADING_TITLE, picture)
+    return section(HEADING_TITLE, shot)
 
 
 def _warnings(data: ReportData) -> str:
     if not data.warnings:
         return ""
     items = "".join(f"<li>{escape(text)}</li>" for text in data.warnings)
-    return _section("Warnings", f"<ul>{items}</ul>")
+    return section("Warnings", f"<ul>{items}</ul>")
 
 
 def _norm(data: ReportData) -> str:
@@ -187,7 +190,7 @@ def _norm(data: ReportData) -> str:
         "The earth's field is equally strong whichever way the vehicle points. What varies here "
         "is iron, or a field of the surroundings."
     )
-    return _section("Field strength", _picture(lambda: figures.norm(norm), alt, caption))
+    return section("Field strength", picture(lambda: figures.norm(norm), alt, caption))
 
 
 def _spread(values: np.ndarray) -> str:
@@ -209,14 +212,14 @@ def _clouds(data: ReportData) -> str:
         "Hard iron moves the centre (+), soft iron bends the sphere into an ellipsoid. Points that "
         "cover only a part of it determine only a part of the calibration."
     )
-    picture = _picture(lambda: figures.clouds(clouds), alt, caption)
-    return _section("Raw and corrected field", picture)
+    shot = picture(lambda: figures.clouds(clouds), alt, caption)
+    return section("Raw and corrected field", shot)
 
 
 def _history(data: ReportData) -> str:
     if not data.history:
         return ""
-    return _section("How the estimate settled", *[_one_history(item) for item in data.history])
+    return section("How the estimate settled", *[_one_history(item) for item in data.history])
 
 
 def _one_history(item: EstimateHistory) -> str:
@@ -229,7 +232,7 @@ def _one_history(item: EstimateHistory) -> str:
     text = f"{item.name}: {last} {item.unit}".rstrip()
     if item.truth is not None:
         text += f"; truth {', '.join(number(float(value)) for value in item.truth)}"
-    return _picture(lambda: figures.history(item), text, f"{text}. Bands are one sigma.")
+    return picture(lambda: figures.history(item), text, f"{text}. Bands are one sigma.")
 
 
 def _gates(data: ReportData) -> str:
@@ -240,13 +243,13 @@ def _gates(data: ReportData) -> str:
     parts = []
     if failing:
         rows = [[*_gate_cells(gate), escape(gate.advice)] for gate in failing]
-        parts.append(_table(["", "gate", "value", "limit", "what to do"], rows, numeric=(2, 3)))
+        parts.append(table(["", "gate", "value", "limit", "what to do"], rows, numeric=(2, 3)))
     if passing:
-        table = _table(["", "gate", "value", "limit"], map(_gate_cells, passing), numeric=(2, 3))
+        passed = table(["", "gate", "value", "limit"], map(_gate_cells, passing), numeric=(2, 3))
         count = f"{len(passing)} of {len(data.gates)} checks are ok"
         opened = "" if failing else " open"
-        parts.append(f"<details{opened}><summary>{count}</summary>{table}</details>")
-    return _section("Gates: may it be written?", *parts)
+        parts.append(f"<details{opened}><summary>{count}</summary>{passed}</details>")
+    return section("Gates: may it be written?", *parts)
 
 
 def _gate_cells(gate: GateResult) -> list[str]:
@@ -265,13 +268,13 @@ def _states(data: ReportData) -> str:
         [f"{s.at_s:.1f} s", f"{escape(s.old)} → <b>{escape(s.new)}</b>", escape(s.reason)]
         for s in data.states
     ]
-    return _section("What happened", _table(["device time", "state", "why"], rows, numeric=(0,)))
+    return section("What happened", table(["device time", "state", "why"], rows, numeric=(0,)))
 
 
 def _registers(data: ReportData) -> str:
     if not data.registers:
         return ""
-    return _section("Registers", *[_one_register(change) for change in data.registers])
+    return section("Registers", *[_one_register(change) for change in data.registers])
 
 
 def _one_register(change: RegisterChange) -> str:
@@ -286,7 +289,7 @@ def _one_register(change: RegisterChange) -> str:
     )
     return (
         f"<p><b>Register {change.register}</b>: {escape(change.outcome)}</p>"
-        + _table(["", "x", "y", "z"], rows, numeric=(1, 2, 3))
+        + table(["", "x", "y", "z"], rows, numeric=(1, 2, 3))
         + f"<pre># writes 'after'\n{escape(write)}\n# writes 'before'\n{escape(restore)}</pre>"
     )
 
@@ -301,4 +304,4 @@ def _made(data: ReportData) -> str:
         lines.append(f"<pre>{escape(data.command)}</pre>")
     if data.seed is not None:
         lines.append(f'<p class="soft">Seed {data.seed}: the same seed gives the same run.</p>')
-    return _section("How this report was made", *lines) if lines else ""
+    return section("How this report was made", *lines) if lines else ""

@@ -1,0 +1,140 @@
+"""The pictures of a diagnosis. Orange is before, blue is after, as everywhere in the project."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ahrsd.mismatch.diagnosis import Diagnosis, Drawn
+from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN
+from ahrsd.samples import Array
+
+_BINS = 300  # of time
+_AXES = "xyz"
+
+
+def _figure(height_in: float, rows: int = 1) -> Figure:
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    figure.subplots(rows, 1, sharex=rows > 1)
+    return figure
+
+
+def _binned(time_s: Array, values: Array) -> tuple[Array, Array]:
+    """Means of `values` in at most _BINS spans of time; empty ones are left out."""
+    edges = np.linspace(time_s[0], time_s[-1], min(_BINS, max(len(time_s) // 8, 2)) + 1)
+    index = np.clip(np.searchsorted(edges, time_s, "right") - 1, 0, len(edges) - 2)
+    count = np.bincount(index, minlength=len(edges) - 1)
+    total = np.bincount(index, weights=values, minlength=len(edges) - 1)
+    kept = count > 0
+    return 0.5 * (edges[1:] + edges[:-1])[kept], total[kept] / count[kept]
+
+
+def _both(drawn: Drawn) -> tuple[tuple[Array, str, str], ...]:
+    return (drawn.before, BEFORE, "before"), (drawn.after, AFTER, "after")
+
+
+def residual(found: Diagnosis, drawn: Drawn) -> Figure:
+    """Whitened innovations over time, each axis, before and after, located spans shaded."""
+    figure = _figure(4.6, 3)
+    spans = [span for finding in found.findings for span in finding.where.intervals_s]
+    if found.unexplained.where is not None:
+        spans += found.unexplained.where.intervals_s
+    whole = drawn.time_s[-1] - drawn.time_s[0]
+    for k, axes in enumerate(figure.axes):
+        for begin, end in spans:
+            if end - begin < 0.95 * whole:
+                axes.axvspan(begin, end, color=GREY, alpha=0.15, lw=0)
+        for values, color, name in (
+            (drawn.before, BEFORE, "before"),
+            (drawn.after, AFTER, "after"),
+        ):
+            axes.plot(*_binned(drawn.time_s, values[:, k]), color=color, lw=1.0, label=name)
+        axes.set_ylabel(f"{_AXES[k]}, sigma")
+    figure.axes[0].legend(ncols=2, loc="upper right")
+    figure.axes[-1].set_xlabel("time, s")
+    return figure
+
+
+def evidence(found: Diagnosis, drawn: Drawn) -> Figure:
+    """Nats of every candidate in the first round, the strongest on top; named ones in blue."""
+    named = {finding.effect for finding in found.findings}
+    ranked = sorted(drawn.evidence.items(), key=lambda item: -item[1])[:14]
+    figure = _figure(0.5 + 0.24 * max(len(ranked), 2))
+    axes = figure.axes[0]
+    values = [max(nats, 0.1) for _, nats in ranked]
+    colors = [AFTER if name in named else GREY for name, _ in ranked]
+    axes.barh(range(len(ranked)), values, color=colors)
+    axes.set_yticks(range(len(ranked)), [name for name, _ in ranked], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.axvline(3.0, color=BEFORE, lw=1.0)
+    axes.set_xlabel("evidence over none, nats (line: what a name needs)")
+    return figure
+
+
+def contribution(name: str, drawn: Drawn) -> Figure:
+    """What a named effect adds to the readings over time."""
+    figure = _figure(2.0)
+    axes = figure.axes[0]
+    added = drawn.contributions[name]
+    for k in range(3):
+        series = _binned(drawn.time_s, added[:, k] * 1e3)
+        axes.plot(*series, color=SERIES[k], lw=1.0, label=_AXES[k])
+    axes.set_xlabel("time, s")
+    axes.set_ylabel("mG (mrad/s in the gyro)")
+    axes.legend(ncols=3, loc="upper right")
+    return figure
+
+
+def courses(drawn: Drawn) -> Figure:
+    """What is left after the named effects, in the three frames, by segments of time."""
+    shown = [one for one in drawn.courses if len(one.course)]
+    figure = _figure(0.4 + 1.5 * max(len(shown), 1), max(len(shown), 1))
+    for axes, one in zip(figure.axes, shown, strict=False):
+        middle = 0.5 * (np.asarray(one.cut.edges_s[1:]) + np.asarray(one.cut.edges_s[:-1]))
+        for k in range(3):
+            axes.plot(middle, one.course[:, k] * 1e3, color=SERIES[k], lw=1.2, label=_AXES[k])
+        axes.fill_between(
+            middle, -2e3 * one.deviation, 2e3 * one.deviation, color=GREY, alpha=0.15, lw=0
+        )
+        unit = "mrad/s" if one.frame == "gyro" else "mG"
+        axes.set_title(f"{one.frame} frame, evidence {max(one.evidence, 0.0):.0f} nats")
+        axes.set_ylabel(unit)
+    figure.axes[-1].set_xlabel("time, s")
+    figure.axes[0].legend(ncols=3, loc="upper right")
+    return figure
+
+
+def spectrum(drawn: Drawn) -> Figure:
+    """Power of the whitened innovations by frequency, all axes: 1 where nothing is left."""
+    figure = _figure(2.4)
+    axes = figure.axes[0]
+    for values, color, name in _both(drawn):
+        frequency, power = _power(drawn.time_s, values)
+        axes.plot(frequency, power, color=color, lw=1.0, label=name)
+    axes.axhline(1.0, color=GREY, lw=0.8)
+    _log_log(axes)
+    axes.set_xlabel("frequency, Hz")
+    axes.set_ylabel("power, 1 = as expected")
+    axes.legend(ncols=2, loc="upper right")
+    return figure
+
+
+def _power(time_s: Array, values: Array) -> tuple[Array, Array]:
+    """Averaged periodogram on a logarithmic grid of frequencies; 1 for white innovations."""
+    step_s = float(np.median(np.diff(time_s)))
+    clean = np.nan_to_num(values - np.nanmean(values, axis=0))
+    power = np.mean(np.abs(np.fft.rfft(clean, axis=0)) ** 2, axis=1) / len(clean)
+    frequency = np.fft.rfftfreq(len(clean), step_s)
+    edges = np.geomspace(frequency[1], frequency[-1] * 1.001, 50)
+    index = np.searchsorted(edges, frequency[1:], "right") - 1
+    count = np.bincount(index, minlength=len(edges))[: len(edges) - 1]
+    total = np.bincount(index, weights=power[1:], minlength=len(edges))[: len(edges) - 1]
+    kept = count > 0
+    return np.sqrt(edges[1:] * edges[:-1])[kept], total[kept] / count[kept]
+
+
+def _log_log(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")

@@ -1,0 +1,201 @@
+"""The report of a diagnosis: one HTML file, pictures inside, nothing loaded from elsewhere."""
+
+from __future__ import annotations
+
+from functools import partial
+from html import escape
+from pathlib import Path
+
+from ahrsd.mismatch.diagnosis import Diagnosis, Finding
+from ahrsd.mismatch.spoken import headline, place, sensitivity, value_text, verdict
+from ahrsd.report.page import CSS, number, picture, section, table
+
+_MG = 1e3
+
+
+def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
+    """Write the page.  OSError where it cannot be written."""
+    title = f"Diagnosis of {found.recording}"
+    parts = [
+        f'<p class="verdict {"no" if found.mismatch else "yes"}">{escape(verdict(found))}</p>',
+        *(_finding(found, number_, one) for number_, one in enumerate(found.findings, start=1)),
+        _unexplained(found),
+        _sensitivity(found),
+        _pictures(found),
+        _checks(found),
+        _baseline(found),
+        _notes(found),
+        f'<p class="soft">Made by <code>{escape(command)}</code>.</p>',
+    ]
+    path.write_text(
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{CSS}</style></head>\n<body>\n"
+        f"<h1>{escape(title)}</h1>\n"
+        + "\n".join(part for part in parts if part)
+        + "\n</body></html>\n",
+        encoding="utf-8",
+    )
+
+
+def _finding(found: Diagnosis, number_: int, one: Finding) -> str:
+    held, cost = one.heldout, one.cost_if_left_out
+    rows = [
+        ("where", escape(place(one.where))),
+        ("size", "<br>".join(escape(value_text(value)) for value in one.parameters)),
+        ("left out", f"<code>{escape(one.equation)}</code>"),
+        (
+            "without it",
+            f"hard iron off by {number(cost.hard_iron_shift_gauss * _MG, 'mG')}, heading by "
+            f"{number(cost.heading_error_deg, 'deg')}",
+        ),
+        (
+            "on data not fitted",
+            f"{held.nll_gain_per_sample:+.4f} nats per sample; the same effect moved in time gains "
+            f"at most {held.placebo_gain:+.4f}",
+        ),
+    ]
+    if one.alternatives:
+        rest = ", ".join(f"{a.effect} ({a.confidence:.1%})" for a in one.alternatives)
+        rows.append(("or else", escape(rest)))
+    if one.separate_from:
+        rows.append(("to be sure", escape(one.separate_from)))
+    parts = [table(("", ""), [[escape(name), text] for name, text in rows])]
+    if found.drawn is not None:
+        from ahrsd.report import diagnosis_figures as figures
+
+        drawn = found.drawn
+        names = [name for name in drawn.contributions if name.split(" ")[0] == one.effect]
+        parts += [
+            picture(partial(figures.contribution, name, drawn), f"{one.effect} over time")
+            for name in names
+        ]
+    return section(f"{number_}. {headline(one)}", *parts)
+
+
+def _unexplained(found: Diagnosis) -> str:
+    left = found.unexplained
+    if not left.detected or left.where is None:
+        return ""
+    rows = [("where", escape(place(left.where)))]
+    if left.size is not None:
+        rows.append(("size", escape(number(left.size, left.unit))))
+    if left.single_source_share is not None:
+        rows.append(("one source", f"{left.single_source_share:.0%} of it has one direction"))
+    rows += [
+        (
+            "moves with",
+            escape(f"{s.channel}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}"),
+        )
+        for s in left.follows
+    ]
+    words = (
+        "<p>Nothing in the library explains this. It is real: it has a place and a size. "
+        "A name would be a guess.</p>"
+    )
+    return section(
+        "Unknown, here", words, table(("", ""), [[escape(name), text] for name, text in rows])
+    )
+
+
+def _sensitivity(found: Diagnosis) -> str:
+    if not found.sensitivity:
+        return ""
+    rows = [
+        [
+            escape(limit.effect),
+            escape(limit.parameter),
+            escape(number(limit.smallest, limit.unit))
+            if limit.smallest is not None
+            else "cannot be seen on this motion",
+        ]
+        for limit in found.sensitivity
+    ]
+    text = f"<p>This recording would have shown {escape(sensitivity(found.sensitivity))}.</p>"
+    return section("What would have been seen", text, table(("effect", "parameter", "from"), rows))
+
+
+def _pictures(found: Diagnosis) -> str:
+    drawn = found.drawn
+    if drawn is None:
+        return ""
+    from ahrsd.report import diagnosis_figures as figures
+
+    shots = [
+        picture(
+            partial(figures.residual, found, drawn),
+            "innovations over time, before and after",
+            "What the model did not expect, before (orange) and after (blue) the effects above; "
+            "the places that were found are shaded.",
+        ),
+        picture(
+            partial(figures.spectrum, drawn),
+            "spectrum of the innovations",
+            "The same by frequency: 1 everywhere where nothing is left.",
+        ),
+    ]
+    if drawn.evidence:
+        shots.append(
+            picture(
+                partial(figures.evidence, found, drawn),
+                "evidence of every effect",
+                "How much every effect alone would explain; named ones in blue.",
+            )
+        )
+    if drawn.courses:
+        shots.append(
+            picture(
+                partial(figures.courses, drawn),
+                "what is left, by frame",
+                "What is left after the named effects, drawn freely in three frames; grey: two "
+                "standard deviations.",
+            )
+        )
+    return section("Before and after", *shots)
+
+
+def _checks(found: Diagnosis) -> str:
+    if not found.posterior_predictive:
+        return ""
+
+    def mark(inside: bool) -> str:
+        return '<span class="good">inside</span>' if inside else '<span class="bad">outside</span>'
+
+    rows = [
+        [
+            escape(name),
+            number(check.value),
+            f"{number(check.band[0])} ... {number(check.band[1])}",
+            mark(check.inside_before),
+            mark(check.inside_after),
+        ]
+        for name, check in found.posterior_predictive.items()
+    ]
+    text = (
+        "<p>The recording's own statistics against simulations along its motion: by the "
+        "calibration alone (before), and with the effects above (after).</p>"
+    )
+    head = ("statistic", "recording", "simulated, repaired", "before", "after")
+    return section("Does the repaired simulation look like the recording?", text, table(head, rows))
+
+
+def _baseline(found: Diagnosis) -> str:
+    base = found.baseline
+    if base is None:
+        return ""
+    rows = [
+        ["rms of the innovations", number(base.heldout_rms_gauss * _MG, "mG")],
+        ["normalised innovation (1: as expected)", number(base.normalised_innovation)],
+    ]
+    if found.model is not None:
+        iron = ", ".join(f"{value * _MG:+.2f}" for value in found.model.hard_iron_gauss)
+        rows.append(["hard iron with the effects in the model", f"{iron} mG"])
+    return section("The calibration alone", table(("", ""), rows))
+
+
+def _notes(found: Diagnosis) -> str:
+    if not found.notes:
+        return ""
+    return section(
+        "Notes", "<ul>" + "".join(f"<li>{escape(n)}</li>" for n in found.notes) + "</ul>"
+    )
