@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gzip
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -12,6 +14,7 @@ from ahrsd.commands.json_output import write_json
 from ahrsd.errors import EXIT_DONE, AhrsdError
 
 if TYPE_CHECKING:
+    from ahrsd.samples import Array
     from ahrsd.simulation import Experiment
     from ahrsd.simulation.disturbance import Disturbances
 
@@ -22,7 +25,7 @@ _MOST_SAMPLES = 1e7
 
 
 @click.command()
-@click.argument("scenario", type=click.Choice(["wam", "mam", "lam", _RECORDED]))
+@click.argument("scenario", required=False, type=click.Choice(["wam", "mam", "lam", _RECORDED]))
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The file.")
 @click.option("--motion", type=click.Choice(["slow", "rov"]), default="slow", show_default=True)
 @click.option("--seed", default=0, show_default=True, help="Chooses motion and noise.")
@@ -38,65 +41,112 @@ _MOST_SAMPLES = 1e7
 @click.option("--magnet", "magnet_at_s", type=float, help="A magnet passes at this second.")
 @click.option("--step", "step_at_s", type=float, help="The hard iron steps by 30 mG here.")
 @click.option("--gap", "gap_at_s", type=float, help="Two seconds without samples from here.")
-def command(
-    scenario: str,
-    output: Path,
-    motion: str,
-    seed: int,
-    seconds: float,
-    rate_hz: float,
-    mag_mg: float,
-    gyro_mrad: float,
-    hard_iron_as_read: bool,
-    gyro_path: Path | None,
-    outliers: float,
-    magnet_at_s: float | None,
-    step_at_s: float | None,
-    gap_at_s: float | None,
-) -> None:
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    help="ID, ID=STRENGTH (times its typical size) or ID=name=value,...; see docs/effects.md.",
+)
+@click.option("--model", type=click.Path(path_type=Path), help="A repaired model, with --along.")
+@click.option("--along", "along_path", type=click.Path(path_type=Path), help="Its motion's source.")
+def command(**options: object) -> None:
     """Simulate SCENARIO: wam, mam or lam (wide, medium, low angular movement) of the MAGYC thesis,
     or recorded: a field on the motion of a recorded gyro stream (--gyro), without soft iron.
+    With --model and --along instead: what a repaired model reads along a measured motion.
 
     FILE is a table (.csv, .csv.gz, .parquet) with the true attitude in ref_q{w,x,y,z}, or a byte
-    stream of VNYMR sentences (.vnraw, .vnraw.gz). The truth goes into FILE.truth.json.
+    stream of VNYMR sentences (.vnraw, .vnraw.gz). The truth goes into FILE.truth.json; columns
+    that an effect needs (a motor's current, a temperature, ...) are made up and written as well.
     """
+    wanted = _Options(**cast("dict[str, Any]", options))
+    if (wanted.model is None) != (wanted.along_path is None):
+        raise AhrsdError("--model and --along need each other")
+    if wanted.model is not None and wanted.along_path is not None:
+        if wanted.scenario is not None or wanted.effects:
+            raise AhrsdError("--model and --along take neither a scenario nor --effect")
+        _simulate_along(wanted.output, wanted.model, wanted.along_path, wanted.seed)
+    else:
+        _simulate_scenario(wanted)
+    raise SystemExit(EXIT_DONE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Options:
+    """What the command line says, by the options' names."""
+
+    scenario: str | None
+    output: Path
+    motion: str
+    seed: int
+    seconds: float
+    rate_hz: float
+    mag_mg: float
+    gyro_mrad: float
+    hard_iron_as_read: bool
+    gyro_path: Path | None
+    outliers: float
+    magnet_at_s: float | None
+    step_at_s: float | None
+    gap_at_s: float | None
+    effects: tuple[str, ...]
+    model: Path | None
+    along_path: Path | None
+
+
+def _simulate_scenario(wanted: _Options) -> None:
+    """Write a scenario's experiment, its effects in it, and its truth beside it."""
+    from ahrsd.simulation.tabular import truth_json
+
+    experiment, made_from = _experiment(wanted)
+    truth: dict[str, object] = {}
+    if wanted.effects:
+        from ahrsd.commands.simulate_effects import with_effects
+
+        experiment, truth["effects"] = with_effects(experiment, wanted.effects, wanted.seed)
+    _write_experiment(wanted.output, experiment)
+    write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
+    count, name = len(experiment), experiment.name
+    click.echo(f"{wanted.output}: {count} samples of {name}; truth beside it")
+
+
+def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
+    """The scenario's experiment, and what makes the same one again."""
     from ahrsd.simulation import Iron, Settings, simulate
     from ahrsd.simulation.disturbance import Disturbances
-    from ahrsd.simulation.tabular import settings_json, truth_json
+    from ahrsd.simulation.tabular import settings_json
 
-    if (scenario == _RECORDED) != (gyro_path is not None):
+    if wanted.scenario is None:
+        raise AhrsdError("name a scenario (wam, mam, lam, recorded), or give --model and --along")
+    if (wanted.scenario == _RECORDED) != (wanted.gyro_path is not None):
         raise AhrsdError("the scenario recorded and the option --gyro need each other")
-    if not (0 < seconds * rate_hz < _MOST_SAMPLES):
+    if not (0 < wanted.seconds * wanted.rate_hz < _MOST_SAMPLES):
         raise AhrsdError(f"--seconds times --rate must be positive and below {_MOST_SAMPLES:g}")
     try:
-        wanted = Disturbances(
-            outlier_fraction=outliers,
-            magnet_at_s=magnet_at_s,
-            step_at_s=step_at_s,
-            gap_at_s=gap_at_s,
+        disturbances = Disturbances(
+            outlier_fraction=wanted.outliers,
+            magnet_at_s=wanted.magnet_at_s,
+            step_at_s=wanted.step_at_s,
+            gap_at_s=wanted.gap_at_s,
         )
-        if gyro_path is not None:
-            experiment = _recorded(gyro_path, seconds, seed, mag_mg, wanted)
-            made_from: dict[str, object] = {"gyro": gyro_path.name, "seed": seed}
-        else:
-            settings = Settings(
-                scenario=scenario,
-                motion=motion,
-                seed=seed,
-                samples=round(seconds * rate_hz),
-                rate_hz=rate_hz,
-                noise_mag_gauss=mag_mg * _MG,
-                noise_gyro_rad_s=gyro_mrad * _MRAD,
-                iron=Iron(offset_behind_iron=hard_iron_as_read),
-                disturbances=wanted,
+        if wanted.gyro_path is not None:
+            made = _recorded(
+                wanted.gyro_path, wanted.seconds, wanted.seed, wanted.mag_mg, disturbances
             )
-            experiment, made_from = simulate(settings), settings_json(settings)
+            return made, {"gyro": wanted.gyro_path.name, "seed": wanted.seed}
+        settings = Settings(
+            scenario=wanted.scenario,
+            motion=wanted.motion,
+            seed=wanted.seed,
+            samples=round(wanted.seconds * wanted.rate_hz),
+            rate_hz=wanted.rate_hz,
+            noise_mag_gauss=wanted.mag_mg * _MG,
+            noise_gyro_rad_s=wanted.gyro_mrad * _MRAD,
+            iron=Iron(offset_behind_iron=wanted.hard_iron_as_read),
+            disturbances=disturbances,
+        )
+        return simulate(settings), settings_json(settings)
     except ValueError as error:
         raise AhrsdError(str(error)) from None
-    _write(output, experiment)
-    write_json(f"{output}.truth.json", truth_json(experiment, made_from))
-    click.echo(f"{output}: {len(experiment)} samples of {experiment.name}; truth beside it")
-    raise SystemExit(EXIT_DONE)
 
 
 def _recorded(
@@ -120,18 +170,58 @@ def _recorded(
     return disturbed(made, wanted, generator(seed, 3))
 
 
-def _write(path: Path, experiment: Experiment) -> None:
-    from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table, write_table
+def _simulate_along(output: Path, model_path: Path, recording: Path, seed: int) -> None:
+    """Write a table of what a repaired model reads along a recording, and its truth beside it."""
+    from ahrsd.commands.simulate_effects import along, read_model
+    from ahrsd.mismatch.injection import terms_json
+    from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table
+
+    if not is_table(output):
+        raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
+    model = read_model(model_path)
+    columns, notes = along(model, recording, seed)
+    for note in notes:
+        click.echo(f"{recording}: {note}", err=True)
+    _write_columns(output, columns)
+    truth = {
+        "schema": "ahrsd.truth/1",
+        "name": f"{model_path.name} along {recording.name}, seed {seed}",
+        "soft_iron": model.calibration.soft_iron.tolist(),
+        "hard_iron_gauss": model.calibration.hard_iron_gauss.tolist(),
+        "gyro_bias_rad_s": model.calibration.gyro_bias_rad_s.tolist(),
+        "effects": terms_json(model.terms),
+        "made_from": {"model": model_path.name, "along": recording.name, "seed": seed},
+    }
+    write_json(f"{output}.truth.json", truth)
+    click.echo(f"{output}: {len(columns['time_s'])} samples of {truth['name']}; truth beside it")
+
+
+def _write_experiment(path: Path, experiment: Experiment) -> None:
+    from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table
     from ahrsd.simulation.tabular import columns, sentences
 
+    further = experiment.samples.covariates
+    if is_table(path):
+        _write_columns(path, {**columns(experiment), **further})
+        return
+    if not path.name.endswith(_STREAM_SUFFIXES):
+        known = ", ".join((*TABLE_SUFFIXES, *_STREAM_SUFFIXES))
+        raise AhrsdError(f"{path}: unknown kind of file; the name must end in one of {known}")
+    if further:
+        raise AhrsdError(
+            f"{path}: a byte stream has no place for {', '.join(further)}; write a table"
+        )
+    content = b"".join(sentences(experiment))
     try:
-        if is_table(path):
-            write_table(path, columns(experiment))
-            return
-        if not path.name.endswith(_STREAM_SUFFIXES):
-            known = ", ".join((*TABLE_SUFFIXES, *_STREAM_SUFFIXES))
-            raise AhrsdError(f"{path}: unknown kind of file; the name must end in one of {known}")
-        content = b"".join(sentences(experiment))
         path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _write_columns(path: Path, columns: Mapping[str, Array]) -> None:
+    from ahrsd.recording.table_writer import write_table
+
+    try:
+        write_table(path, columns)
     except OSError as error:
         raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error

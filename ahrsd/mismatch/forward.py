@@ -4,7 +4,7 @@
     simulated(truth, ...)     readings of it: calibration, named terms, noise, gaps as recorded
 
 The motion is the smoothed rate's integral, which the smoothed field holds in place over DRIFT_S:
-the headings are those of the recording, and each step turns the field exactly as the true rate says.
+the headings are the recording's, and each step turns the field exactly as the true rate says.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ahrsd import so3
+from ahrsd.mismatch.context import build_context
 from ahrsd.mismatch.effects import series
-from ahrsd.mismatch.effects.base import Effect, Readings, readings_of
+from ahrsd.mismatch.effects.base import Effect, Readings, contribution, readings_of
 from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, NullModel, Term
 from ahrsd.samples import Array
@@ -64,6 +66,37 @@ def noise_of(model: NullModel, whitened: Array | None = None, step_s: float = 0.
         if amplitude > 4 * deviation and explained > best:
             best, red_time_s, part = explained, time_s, amplitude
     return replace(white, red_part=min(part, 0.9), red_time_s=red_time_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """A fit that was made earlier, as `build_context` wants it."""
+
+    filtered: Filtered
+    terms_gyro: Array | None
+
+
+def context_along(
+    track: Track,
+    model: NullModel,
+    terms: Sequence[Term] = (),
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Context:
+    """The track as a model sees it that was fitted before, its terms taken out; nothing is fitted.
+
+    Twice: the terms' contributions need a context, which is better without the terms.
+    Raises ValueError where a term needs a covariate that the track has not.
+    """
+    for term in terms:
+        missing = term.setting.get("covariate")
+        if missing not in (None, "accel", *track.covariates):
+            raise ValueError(f"{term.identifier} needs the column {missing}")
+    context = build_context(track, Given(run_filter(track, model, sensitive=False), None))
+    if not terms:
+        return context
+    parts = [contribution(library[t.identifier], context, t.value, t.setting) for t in terms]
+    mag, gyro = (np.sum([part[side] for part in parts], axis=0) for side in (0, 1))
+    return build_context(track, Given(run_filter(track, model, mag, gyro, sensitive=False), gyro))
 
 
 def truth_along(context: Context) -> Readings:

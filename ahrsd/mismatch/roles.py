@@ -45,7 +45,12 @@ ROLES: Mapping[str, Role] = {
     "pressure": Role("pressure, kPa", r"pressure", "mean", (0.1, 2e5), "another unit"),
     "latitude": Role("latitude, deg", r"^lat(itude)?(_|$)", "zero", (-90, 90), "no latitude", True),
     "position": Role(
-        "position, m", r"^position_(north|east|down)_m$", "mean", (-1e6, 1e6), "latitude"
+        "position, m",
+        r"^position_(north|east|down)_m$",
+        "mean",
+        (-1e6, 1e6),
+        "another unit",
+        constant=True,  # a straight leg along one axis
     ),
     "altitude": Role(
         "altitude, height or depth, m",

@@ -196,9 +196,9 @@ class AltitudeField(Linear):
         """Straight in each height; as of something close below where the height is over ground."""
         found = list(shapes.per_covariate(readings, "altitude", shape="line"))
         if "position_down_m" in roles.named(readings.covariates, "position"):
-            mean = roles.reference("position", readings.covariates["position_down_m"])
-            line = {"covariate": "position_down_m", "reference": mean, "shape": "line"}
-            found.append(line)
+            depth = readings.covariates["position_down_m"]
+            line = {"covariate": "position_down_m", "reference": float(depth.mean())}
+            found += [{**line, "shape": "line"}] if float(np.ptp(depth)) > 0 else []
         for name in roles.named(readings.covariates, "altitude"):
             lowest = float(np.min(readings.covariates[name]))
             if lowest > 0.1:
@@ -244,12 +244,16 @@ class FieldStep(Linear):
 
 
 def position_m(readings: Readings) -> Array | None:
-    """North, east, down (N, 3) in metres, down 0 where it was not logged; None without position."""
+    """North, east, down (N, 3) in metres, down 0 where it was not logged.
+
+    None without north and east, or where the vehicle does not move.
+    """
     usable = roles.named(readings.covariates, "position")
     if not {"position_north_m", "position_east_m"} <= set(usable):
         return None
     zero = np.zeros(len(readings.time_s))
-    return np.column_stack([readings.covariates[n] if n in usable else zero for n in _NED])
+    place = np.column_stack([readings.covariates[n] if n in usable else zero for n in _NED])
+    return place if float(np.ptp(place, axis=0).max()) > 0 else None
 
 
 def turned_down(vectors: Array, turn_deg: float) -> Array:
