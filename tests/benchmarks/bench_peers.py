@@ -20,19 +20,19 @@ import subprocess
 import sys
 import time
 import venv
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from peers_table import set_lines, time_lines
+from peers_table import best_peers, set_lines, time_lines, verdict_lines
 
 from ahrsd.accuracy import Answer
 from ahrsd.estimator.online import Estimator
 from ahrsd.methods import MethodError
 from ahrsd.montecarlo import Plan, Record, run_many, scored
 from ahrsd.montecarlo_methods import OURS, STREAM
-from ahrsd.montecarlo_summary import BOUNDED, Row, summarise
+from ahrsd.montecarlo_summary import Row, summarise
 from ahrsd.report.peers_figure import write_peers_figure
 from ahrsd.simulation import Experiment, Settings, simulate
 
@@ -180,45 +180,6 @@ def estimator_source() -> str:
     return digest.hexdigest()[:12]
 
 
-def paired(records: Sequence[Record], ours: str, peer: str, name: str) -> float | None:
-    """RMSE of a peer over ours, on the seeds that both answer."""
-    pairs = []
-    for record in records:
-        errors = {r["method"]: r["errors"][name] for r in record["results"] if not r["failure"]}
-        if errors.get(ours) is not None and errors.get(peer) is not None:
-            pairs.append((errors[peer], errors[ours]))
-    if not pairs:
-        return None
-    theirs, own = np.sqrt(np.mean(np.square(pairs), axis=0))
-    return float(theirs / own)
-
-
-def best_peers(
-    records: Sequence[Record], rows: Sequence[Row], peers: Iterable[str], ours: str
-) -> dict[str, Record]:
-    """By figure: the peer that is nearest to the bound, how far ours is ahead, and the room."""
-    by_name = {row.method: row for row in rows}
-    out: dict[str, Record] = {}
-    for name in BOUNDED:
-        ratios = {
-            peer: ratio
-            for peer in peers
-            if (ratio := by_name[peer].against_bound[name].over_bound) is not None
-        }
-        if not ratios:
-            continue
-        best = min(ratios, key=lambda peer: ratios[peer])
-        out[name] = {
-            "peer": best,
-            "answered": by_name[best].answered,
-            "peer_over_bound": ratios[best],
-            "ours_over_bound": by_name[ours].against_bound[name].over_bound,
-            "standard_error": by_name[ours].against_bound[name].standard_error,
-            "peer_over_ours": paired(records, ours, best, name),
-        }
-    return out
-
-
 # -- time --------------------------------------------------------------------------------------
 
 
@@ -362,10 +323,11 @@ def write(
 ) -> None:
     """peers.json, table.md and peers.png."""
     folder.mkdir(parents=True, exist_ok=True)
-    lines, body = [], []
+    lines, body, verdicts = [], [], []
     for plan, records, rows in compared:
         best = {ours: best_peers(records, rows, PEERS, ours) for ours in (OURS, STREAM)}
-        lines += set_lines(plan.name, rows, best[OURS])
+        verdicts.append((plan.name, best[OURS]))
+        lines += set_lines(plan.name, rows)
         body.append({"set": plan.name, "rows": [row.json() for row in rows], "best_peers": best})
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],
@@ -381,7 +343,7 @@ def write(
         "time": timed,
     }
     (folder / "peers.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    lines += time_lines(timed)
+    lines = [*verdict_lines(verdicts), *time_lines(timed), *lines]
     (folder / "table.md").write_text("\n".join(lines).lstrip() + "\n", encoding="utf-8")
     sets = [(plan.name, rows) for plan, _, rows in compared]
     write_peers_figure(folder / "peers.png", sets, (OURS, STREAM))
