@@ -18,6 +18,7 @@ from ahrsd.samples import Array
 
 _LEG_M, _APART_M, _SPEED_M_S = 40.0, 8.0, 0.6
 _PING_S = 1.7
+_FAR = 12.0  # roundings after which a change of level is over to the last digit but three
 
 Columns = dict[str, Array]
 
@@ -46,8 +47,14 @@ def _levels(
     length = float(time_s[-1]) + 1.0
     starts = np.cumsum(rng.uniform(10.0, 40.0, int(length / 10.0) + 2))
     values = rng.uniform(*span, len(starts) + 1)
-    steps = 0.5 + 0.5 * np.tanh((time_s[:, None] - starts) / rounding_s)
-    return np.asarray(values[0] + steps @ np.diff(values))
+    out = values[np.searchsorted(starts, time_s, side="right")]
+    for start, step in zip(starts, np.diff(values), strict=True):
+        near = slice(
+            *np.searchsorted(time_s, (start - _FAR * rounding_s, start + _FAR * rounding_s))
+        )
+        apart = (time_s[near] - start) / rounding_s
+        out[near] += step * (0.5 + 0.5 * np.tanh(apart) - (apart >= 0))
+    return np.asarray(out)
 
 
 def _current(time_s: Array, rng: np.random.Generator) -> Columns:

@@ -108,8 +108,12 @@ class FieldAnomaly(Linear):
         """Where the calibrated field's size departs most: bumps then, dipoles below that place."""
         readings = readings_of(context)
         rows, searched = departures(context)
+        first = float(readings.time_s[0])
         bumps = [
-            {"onset_s": round(float(readings.time_s[row]) - part * length, 3), "length_s": length}
+            {
+                "onset_s": round(max(float(readings.time_s[row]) - part * length, first), 3),
+                "length_s": length,
+            }
             for row, length, part in product(rows, _BUMP_LENGTHS_S, (0.35, 0.5, 0.65))
         ]
         place = position_m(readings) if context.world_levelled else None
