@@ -149,7 +149,7 @@ def _carried(U: Array, vectors: Array, runs: Sequence[slice], width: float) -> A
         ahead = signal.lfilter([1.0], [1.0, -keep], rows, axis=0)
         back = signal.lfilter([1.0], [1.0, -keep], rows[::-1], axis=0)[::-1]
         out[run] = ahead + back - rows
-    return out
+    return np.asarray(out)
 
 
 def _held_by_field(field: Array, runs: Sequence[slice]) -> Array:

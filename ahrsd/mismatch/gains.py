@@ -85,34 +85,31 @@ class _Sweep:
         self._blind = layout.padded((model.blind | model.opens).astype(float), 1.0) > 0
         self._any_blind = np.any(self._blind, axis=1)
 
-    def _update(self, j: int, P: Array) -> tuple[Array, Array, Array]:
-        """P- H^T as (B, 3, s), S, and the transposed gain of step j, from P behind step j - 1."""
+    def _prior(self, j: int, P: Array) -> tuple[Array, Array, Array]:
+        """P-, A P-[:3] as (B, 3, s), and S of step j, from P behind step j - 1."""
         step = self._steps[j]
         prior = step @ P @ np.swapaxes(step, 1, 2) + self._process[j]
         cross = self._A @ prior[:, :3]
-        S = cross[:, :, :3] @ self._A + self._R
-        gain_t = np.linalg.solve(S, cross)
-        if self._any_blind[j]:
-            gain_t[self._blind[j]] = 0.0
-        P = prior - np.swapaxes(cross, 1, 2) @ gain_t
-        return (P + np.swapaxes(P, 1, 2)) / 2, S, gain_t
+        return prior, cross, cross[:, :, :3] @ self._A + self._R
 
     def element(self) -> tuple[Array, Array, Array]:
         """(T, C, J) of every block."""
         count, blocks, size = self._steps.shape[:3]
         C = np.zeros((blocks, size, size))
         J = np.zeros_like(C)
-        T = np.broadcast_to(np.eye(size), C.shape)
+        T: Array = np.broadcast_to(np.eye(size), C.shape)
         for j in range(count):
-            C, S, gain_t = self._update(j, C)
+            prior, cross, S = self._prior(j, C)
             moved = self._steps[j] @ T
             seen = self._A @ moved[:, :3]
-            told = np.swapaxes(seen, 1, 2) @ np.linalg.solve(S, seen)
+            both = np.linalg.solve(S, np.concatenate([cross, seen], axis=2))
             if self._any_blind[j]:
-                told[self._blind[j]] = 0.0
-            J = J + told
-            T = moved - np.swapaxes(gain_t, 1, 2) @ seen
-        return np.asarray(T), C, J
+                both[self._blind[j]] = 0.0
+            back = np.swapaxes(cross, 1, 2)
+            C = _symmetric(prior - back @ both[:, :, :size])
+            J = J + np.swapaxes(seen, 1, 2) @ both[:, :, size:]
+            T = moved - back @ both[:, :, size:]
+        return T, C, J
 
     def filter(self, P: Array) -> tuple[Array, Array]:
         """Gains (N, s, 3) and innovation covariances (N, 3, 3) from the true starts."""
@@ -120,6 +117,14 @@ class _Sweep:
         gain = np.empty((count, blocks, size, 3))
         S = np.empty((count, blocks, 3, 3))
         for j in range(count):
-            P, S[j], gain_t = self._update(j, P)
+            prior, cross, S[j] = self._prior(j, P)
+            gain_t = np.linalg.solve(S[j], cross)
+            if self._any_blind[j]:
+                gain_t[self._blind[j]] = 0.0
             gain[j] = np.swapaxes(gain_t, 1, 2)
+            P = _symmetric(prior - gain[j] @ cross)
         return self._layout.unpadded(gain), self._layout.unpadded(S)
+
+
+def _symmetric(P: Array) -> Array:
+    return np.asarray((P + np.swapaxes(P, 1, 2)) / 2)

@@ -64,7 +64,7 @@ class Filtered:
     used: NDArray[np.bool]
     log_likelihood: Array
     gains: Gains
-    recursion: Recursion
+    recursion: Recursion | None
 
     @property
     def normalised_innovation(self) -> float:
@@ -79,10 +79,12 @@ def run_filter(
     terms_gyro: Array | None = None,
     *,
     held: Filtered | None = None,
+    sensitive: bool = True,
 ) -> Filtered:
     """Filter a track.  terms_*: (N, 3) contributions of the named terms, subtracted first.
 
-    held: take gains and nominal field of this earlier run (same track) and not the model's own.
+    held:      take gains and nominal field of this earlier run (same track), not the model's own
+    sensitive: false where only innovations are wanted, not what `sensitivities` needs
     Rows whose reading is not finite are passed over.  ValueError where a run has no rows.
     """
     field = _readings(track, model, terms_mag)
@@ -121,15 +123,19 @@ def run_filter(
         used=used,
         log_likelihood=np.where(used, likelihood, 0.0),
         gains=found,
-        recursion=_sensitivity(layout, state, found, model.soft_iron, root, motion, predicted),
+        recursion=_sensitivity(layout, state, found, model.soft_iron, root, motion, predicted)
+        if sensitive
+        else None,
     )
 
 
 def sensitivities(filtered: Filtered, columns: Columns) -> Array:
     """Whitened regressors (N, 3, p): e~(theta) = e~ - X dtheta to first order, gain held.
 
-    ValueError where the columns are empty on both sides.
+    ValueError where the columns are empty on both sides, or the run was not `sensitive`.
     """
+    if filtered.recursion is None:
+        raise ValueError("this run of the filter was made without sensitivities")
     return filtered.recursion.run(columns.gyro, columns.mag)
 
 

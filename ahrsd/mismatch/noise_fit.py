@@ -17,9 +17,12 @@ from ahrsd.samples import Array
 CAP = 1.5
 #: random walk of the bias beyond which it is no longer noise: 50 deg/h after 400 s
 WALK_CAP_RAD_S_SQRT_S = 1.2e-5
+#: how far (log) the gyro's noise is believed to be from its differenced one before the data speak
+_TRUST = 0.25
+_WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
 _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
 _FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
-_PIECES, _PIECE_ROWS = 8, 500
+_PIECES, _PIECE_ROWS = 6, 400
 _SAME = 0.05  # relative change of a noise level that changes nothing
 
 
@@ -49,15 +52,30 @@ def alike(a: NullModel, b: NullModel) -> bool:
 def estimated(
     filtered: Filtered,
     spec: Spec,
-    terms_mag: Array | None,
-    terms_gyro: Array | None,
+    terms_mag: Array | None = None,
+    terms_gyro: Array | None = None,
     *,
     walk: bool = True,
 ) -> NullModel:
     """The model of a filter run with its noise estimated anew; what the spec says stays."""
     clean = cleaned(filtered.track, terms_mag, terms_gyro)
-    model = _white(pieces(clean), filtered.model, spec, CAP * noise_of(filtered.track)[1])
+    model = _white(pieces(clean), filtered.model, spec, max(noise_of(filtered.track)[1], 1e-9))
     return _walking(clean, model) if walk else replace(model, gyro_walk_rad_s_sqrt_s=0.0)
+
+
+def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
+    """The noise scaled so that the whole track's normalised innovation becomes 1, not its pieces'.
+
+    Both levels together; sigma_mag alone where the gyro's is given or at its cap.
+    """
+    model, factor = filtered.model, float(np.sqrt(filtered.normalised_innovation))
+    if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
+        return model
+    mag = max(model.sigma_mag_gauss * factor, _FLOOR_MAG_GAUSS)
+    gyro = model.sigma_gyro_rad_s
+    if not spec.sigma_gyro_rad_s:
+        gyro = float(np.clip(gyro * factor, _FLOOR_GYRO_RAD_S, _cap(noise_of(filtered.track)[1])))
+    return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
 
 
 def cleaned(track: Track, terms_mag: Array | None, terms_gyro: Array | None) -> Track:
@@ -68,7 +86,7 @@ def cleaned(track: Track, terms_mag: Array | None, terms_gyro: Array | None) -> 
 
 
 def pieces(track: Track) -> Track:
-    """Up to 4,000 rows of a track: pieces spread over it evenly, each a run of its own."""
+    """Up to 2,400 rows of a track: pieces spread over it evenly, each a run of its own."""
     if len(track) <= _PIECES * _PIECE_ROWS:
         return track
     starts = np.linspace(0, len(track) - _PIECE_ROWS, _PIECES).round().astype(int)
@@ -97,48 +115,45 @@ def pieces(track: Track) -> Track:
     )
 
 
-def _white(track: Track, model: NullModel, spec: Spec, cap: float) -> NullModel:
-    """Both levels: free by their ratio, then within the cap."""
-    cap = max(cap, _FLOOR_GYRO_RAD_S)
+def _cap(differenced: float) -> float:
+    return max(CAP * differenced, _FLOOR_GYRO_RAD_S)
+
+
+def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> NullModel:
+    """Both levels, sigma_gyro drawn to the gyro's differenced noise and within its cap."""
     base = replace(model, gyro_walk_rad_s_sqrt_s=0.0)
-    if spec.sigma_mag_gauss and spec.sigma_gyro_rad_s:
-        return replace(
-            base,
-            sigma_mag_gauss=spec.sigma_mag_gauss,
-            sigma_gyro_rad_s=spec.sigma_gyro_rad_s,
-        )
-    if spec.sigma_gyro_rad_s:
-        return _mag_alone(track, replace(base, sigma_gyro_rad_s=spec.sigma_gyro_rad_s))
-    if spec.sigma_mag_gauss:
-        fixed = replace(base, sigma_mag_gauss=spec.sigma_mag_gauss)
-
-        def of_gyro(level: float) -> float:
-            return _likelihood(track, replace(fixed, sigma_gyro_rad_s=np.exp(level)))
-
-        best = _highest(of_gyro, np.log(min(model.sigma_gyro_rad_s, cap)))
-        found = float(np.clip(np.exp(best), _FLOOR_GYRO_RAD_S, cap))
-        return replace(fixed, sigma_gyro_rad_s=found)
-    free = _by_ratio(track, base)
-    if free.sigma_gyro_rad_s <= cap:
+    given_mag, given_gyro = spec.sigma_mag_gauss, spec.sigma_gyro_rad_s
+    if given_mag and given_gyro:
+        return replace(base, sigma_mag_gauss=given_mag, sigma_gyro_rad_s=given_gyro)
+    if given_gyro:
+        return _mag_alone(track, replace(base, sigma_gyro_rad_s=given_gyro))
+    if given_mag:
+        return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced)
+    free = _by_ratio(track, base, differenced)
+    if free.sigma_gyro_rad_s <= _cap(differenced):
         return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
-    return _mag_alone(track, replace(free, sigma_gyro_rad_s=cap))
+    return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
 
 
-def _by_ratio(track: Track, model: NullModel) -> NullModel:
+def _prior(sigma_gyro: float, differenced: float) -> float:
+    return -0.5 * float(np.square(np.log(sigma_gyro / differenced) / _TRUST))
+
+
+def _by_ratio(track: Track, model: NullModel, differenced: float) -> NullModel:
     def scaled(level: float) -> tuple[NullModel, float]:
         tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * np.exp(level))
-        done = run_filter(track, tried)
+        done = run_filter(track, tried, sensitive=False)
         scale = max(done.normalised_innovation, 1e-12)
         count = 3 * int(np.count_nonzero(done.used))
-        # with the scale at its best the squares sum to their number
-        value = float(np.sum(done.log_likelihood)) + 0.5 * count * (scale - 1 - np.log(scale))
         root = float(np.sqrt(scale))
         fitted = replace(
             tried,
             sigma_mag_gauss=tried.sigma_mag_gauss * root,
             sigma_gyro_rad_s=tried.sigma_gyro_rad_s * root,
         )
-        return fitted, value
+        # with the scale at its best the squares sum to their number
+        value = float(np.sum(done.log_likelihood)) + 0.5 * count * (scale - 1 - np.log(scale))
+        return fitted, value + _prior(fitted.sigma_gyro_rad_s, differenced)
 
     start = np.log(model.sigma_gyro_rad_s / model.sigma_mag_gauss)
     return scaled(_highest(lambda level: scaled(level)[1], start))[0]
@@ -152,6 +167,17 @@ def _mag_alone(track: Track, model: NullModel) -> NullModel:
     return replace(model, sigma_mag_gauss=max(float(np.exp(best)), _FLOOR_MAG_GAUSS))
 
 
+def _gyro_alone(track: Track, model: NullModel, differenced: float) -> NullModel:
+    def of_gyro(level: float) -> float:
+        tried = replace(model, sigma_gyro_rad_s=np.exp(level))
+        return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced)
+
+    best = float(np.exp(_highest(of_gyro, np.log(differenced))))
+    return replace(
+        model, sigma_gyro_rad_s=float(np.clip(best, _FLOOR_GYRO_RAD_S, _cap(differenced)))
+    )
+
+
 def _walking(track: Track, model: NullModel) -> NullModel:
     """With a random walk of the gyro's bias if that is far more likely than none."""
     size = group_size(track)
@@ -163,15 +189,18 @@ def _walking(track: Track, model: NullModel) -> NullModel:
     def of_walk(level: float) -> float:
         return _likelihood(coarse, replace(rate, gyro_walk_rad_s_sqrt_s=np.exp(level)))
 
-    tried = [(of_walk(level), level) for level in (top - 3.0, top - 1.5, top)]
-    value, best = max(tried)
-    if value < still + _WALK_GAIN:
+    tried = [of_walk(top + level) for level in _WALKS]
+    at = int(np.argmax(tried))
+    if tried[at] < still + _WALK_GAIN:
         return model
-    return replace(model, gyro_walk_rad_s_sqrt_s=float(np.exp(min(_highest(of_walk, best), top))))
+    level = _WALKS[at]
+    if 0 < at < len(_WALKS) - 1:
+        level += _parabola(tried[at - 1], tried[at], tried[at + 1]) * (_WALKS[1] - _WALKS[0])
+    return replace(model, gyro_walk_rad_s_sqrt_s=float(np.exp(top + level)))
 
 
 def _likelihood(track: Track, model: NullModel) -> float:
-    return float(np.sum(run_filter(track, model).log_likelihood))
+    return float(np.sum(run_filter(track, model, sensitive=False).log_likelihood))
 
 
 def _highest(function: Callable[[float], float], start: float) -> float:
@@ -188,7 +217,10 @@ def _highest(function: Callable[[float], float], start: float) -> float:
             right = function(middle + step)
         else:
             break
-    bend = left - 2 * value + right
-    if bend >= 0:
-        return middle
-    return middle + float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * step
+    return middle + _parabola(left, value, right) * step
+
+
+def _parabola(left: float, middle: float, right: float) -> float:
+    """Where the parabola through values at -1, 0, 1 is highest, at most 1 away."""
+    bend = left - 2 * middle + right
+    return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0))

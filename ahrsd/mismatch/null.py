@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.estimator import chain
-from ahrsd.estimator.start import linear_start, sphere_start
+from ahrsd.estimator.start import linear_start
 from ahrsd.mismatch import noise_fit
-from ahrsd.mismatch.coarse import group_size, thinned
+from ahrsd.mismatch.coarse import group_size, noise_of, thinned
 from ahrsd.mismatch.context import build_context
 from ahrsd.mismatch.innovation import (
     TRACELESS,
@@ -43,7 +43,16 @@ PRIOR = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _DONE = 0.05  # largest step in standard deviations
 _STEPS = 6
-_HALVINGS = 6
+_HALVINGS = 3
+_BLOCKS = 40
+_REPEATED = 3.0  # repetition from which the prior is made to count
+_REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
+_GOOD = 1.5  # normalised innovation of a start that needs no rival
+_WORTH = 10.0  # by which a further start's cost must be lower
+_SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
+_TURNED = 0.1  # scatter of the field over its size that shows the iron
+_FARTHEST_GAUSS = 3.0  # hard iron of a start: beyond, the start is nonsense
+_AT_REST_RAD_S = 1e-3  # what the mean of a resting gyro may differ from its bias
 _SMALLEST_EIGENVALUE = 0.05  # of the soft iron: beyond, no calibration
 
 
@@ -111,54 +120,163 @@ def fit_null(
     walk:  let the gyro's bias wander where the data say so
     """
     known = spec or Spec()
-    model = cold_start(track, known) if start is None else start
-    fit = _descended(_Problem(track, tuple(terms)), model)
-    for _ in range(2 if noise else 0):
-        before = fit.model
-        model = noise_fit.estimated(fit.filtered, known, fit.terms_mag, fit.terms_gyro, walk=walk)
-        fit = _descended(_Problem(track, fit.terms), model)
-        if noise_fit.alike(before, model):
-            break
-    return fit
+    prior = prior_of(track)
+    problem = _Problem(track, tuple(terms), prior)
+    if start is None:
+        start = noise_fit.estimated(
+            run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
+        )
+    fit = _descended(problem, start, _STEPS)
+    prior = prior.sharper(repetition_of(fit))
+    if prior is not problem.prior:
+        problem = _Problem(track, fit.terms, prior)
+        fit = _descended(problem, start, _STEPS)
+    if not noise:
+        return fit
+    again = noise_fit.rescaled(fit.filtered, known)
+    if abs(np.log(fit.filtered.normalised_innovation)) > _REESTIMATE:
+        again = noise_fit.estimated(fit.filtered, known, fit.terms_mag, fit.terms_gyro, walk=walk)
+    if noise_fit.alike(again, fit.model):
+        return fit
+    fit = _descended(_Problem(track, fit.terms, prior), again, _STEPS)
+    return _descended(_Problem(track, fit.terms, prior), noise_fit.rescaled(fit.filtered, known), 1)
 
 
 def cold_start(track: Track, spec: Spec) -> NullModel:
     """A model to begin from, without knowing anything but the track."""
-    coarse = thinned(track, group_size(track))
-    first, size = noise_fit.first_guess(track, spec), group_size(track)
+    size = group_size(track)
+    coarse = thinned(track, size)
+    first = noise_fit.first_guess(track, spec)
     # a row's rate is the mean of its samples': their noise averages
-    base = replace(first, sigma_gyro_rad_s=first.sigma_gyro_rad_s / np.sqrt(size))
-    found: list[NullFit] = []
-    for model in _starts(coarse, base):
-        fit = None
-        for inflation in _INFLATIONS:
-            loose = replace(model, sigma_gyro_rad_s=base.sigma_gyro_rad_s * inflation)
-            fit = _descended(_Problem(coarse, ()), loose)
-            model = fit.model
-        if fit is not None:
-            found.append(fit)
-    best = min(found, key=lambda fit: fit.cost).model
+    quiet = first.sigma_gyro_rad_s / np.sqrt(size)
+    problem = _Problem(coarse, (), prior_of(track))
+    best: NullFit | None = None
+    for model in _starts(coarse, replace(first, gyro_bias_rad_s=problem.prior.mean[8:])):
+        fit = _loosely(problem, model, quiet)
+        if best is None or fit.cost < best.cost - _WORTH:
+            best = fit
+        if fit.filtered.normalised_innovation < _GOOD:
+            break
+    found = first if best is None else best.model
     return replace(
-        best,
+        found,
         sigma_mag_gauss=first.sigma_mag_gauss,
         sigma_gyro_rad_s=first.sigma_gyro_rad_s,
     )
 
 
+def _loosely(problem: _Problem, model: NullModel, quiet: float) -> NullFit:
+    """Descend with less and less inflation of the gyro's noise."""
+    for inflation in _INFLATIONS[:-1]:
+        loose = replace(model, sigma_gyro_rad_s=quiet * inflation)
+        model = _descended(problem, loose, 2).model
+    return _descended(problem, replace(model, sigma_gyro_rad_s=quiet), _STEPS)
+
+
 def _starts(track: Track, base: NullModel) -> list[NullModel]:
-    """Calibrations to descend from."""
+    """Calibrations to descend from, the most likely first."""
     seen = np.isfinite(track.mag_b_gauss).all(axis=1)
     mag = track.mag_b_gauss[seen]
-    centred = replace(base, hard_iron_gauss=mag.mean(axis=0) * 0.0)
-    out = [centred]
-    sphere = sphere_start(mag)
-    if sphere is not None and np.linalg.norm(sphere[6:]) < 3.0:
-        out.append(replace(base, hard_iron_gauss=sphere[6:]))
-    linear = linear_start(_epochs(track)) if seen.all() else None
-    if linear is not None and np.linalg.norm(linear[6:]) < 3.0:
+    out = []
+    out.append(replace(base, hard_iron_gauss=_sphere(mag)))
+    out.append(base)
+    well = _turned(mag) > _TURNED and seen.all()
+    linear = linear_start(_epochs(track)) if well else None
+    if linear is not None and np.linalg.norm(linear[6:]) < _FARTHEST_GAUSS:
         A = chain.symmetric(linear[:6])
-        out.append(replace(base, soft_iron=A * 3 / np.trace(A), hard_iron_gauss=linear[6:]))
-    return out[-2:]
+        A = A * 3 / np.trace(A)
+        if np.linalg.norm(A - np.eye(3)) < 1.0:
+            out.append(replace(base, soft_iron=A, hard_iron_gauss=linear[6:]))
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What is believed before the data: mean and deviation (11,), in the order of the fit.
+
+    repetition: of how many data one says something new: the deviations are for that many
+    """
+
+    mean: Array
+    deviation: Array
+    repetition: float = 1.0
+
+    def sharper(self, repetition: float) -> Prior:
+        """For data of which only one in `repetition` says anything new; itself where all do."""
+        if repetition < _REPEATED:
+            return self
+        sharp = self.deviation / np.sqrt(repetition / self.repetition)
+        return Prior(self.mean, sharp, repetition)
+
+
+def repetition_of(fit: NullFit) -> float:
+    """How many times larger the variance of the scores is than if the innovations were white.
+
+    A misfit that lasts makes the data look surer than they are: of the sum of a block's scores
+    white innovations have the block's information as variance.  1 on a null.
+    """
+    done = fit.filtered
+    X = sensitivities(done, nuisance_columns(done))
+    score = np.einsum("nia,ni->na", X, done.whitened)
+    edges = np.linspace(0, len(score), _BLOCKS + 1).astype(int)[:-1]
+    sums = np.add.reduceat(score, edges, axis=0)
+    flat = X.reshape(-1, 11)
+    ridge = np.diag(1.0 / PRIOR**2)
+    ratio = np.trace(np.linalg.solve(flat.T @ flat + ridge, sums.T @ sums))
+    return float(ratio / 11 / (1 - 11 / _BLOCKS))
+
+
+def prior_of(track: Track) -> Prior:
+    """The usual one; where the sensor rests for long, its gyro reads its bias.
+
+    Iron shows itself by turning only.  Without turning, slow noise of the magnetometer would be
+    laid at its door, so the less the field turned, the closer the iron is held.
+    """
+    mean, deviation = np.zeros(11), PRIOR.copy()
+    deviation[:8] *= np.clip(_turned(track.mag_b_gauss) / _TURNED, 0.02, 1.0)
+    rest = rate_at_rest(track)
+    if rest is not None:
+        mean[8:], deviation[8:] = rest, _AT_REST_RAD_S
+    return Prior(mean, deviation)
+
+
+def rate_at_rest(track: Track) -> Array | None:
+    """Mean gyro reading (3,) over the still seconds, None where fewer than a fifth are still.
+
+    Still: neither the readings' scatter within the second nor the magnetometer's mean against the
+    second before is more than their noise.
+    """
+    mag_noise, gyro_noise = noise_of(track)
+    rows = max(8, round(1.0 / max(float(np.nanmedian(track.dt_s)), 1e-6)))
+    whole = len(track) // rows * rows
+    if whole < 5 * rows:
+        return None
+    mag = track.mag_b_gauss[:whole].reshape(-1, rows, 3)
+    gyro = track.gyro_b_rad_s[:whole].reshape(-1, rows, 3)
+    moved = np.linalg.norm(np.diff(mag.mean(axis=1), axis=0, prepend=np.nan), axis=1)
+    still = (
+        (np.max(gyro.std(axis=1), axis=1) < 2 * gyro_noise)
+        & (np.max(mag.std(axis=1), axis=1) < 2 * mag_noise)
+        & (moved < 6 * mag_noise / np.sqrt(rows) + 1e-4)
+    )
+    if np.count_nonzero(still) < 0.2 * len(still):
+        return None
+    return np.asarray(np.median(gyro[still].mean(axis=1), axis=0))
+
+
+def _turned(mag: Array) -> float:
+    """Scatter of the field over its size."""
+    size = float(np.nanmedian(np.linalg.norm(mag, axis=1)))
+    return float(np.linalg.norm(np.nanstd(mag, axis=0))) / max(size, 1e-12)
+
+
+def _sphere(mag: Array) -> Array:
+    """Centre of the sphere |m - b| = r, |m|^2 = 2 m.b + c, drawn to 0 where the motion is poor."""
+    square = np.sum(mag**2, axis=1)
+    off = 2 * (mag - mag.mean(axis=0))
+    weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
+    gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
+    return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
 
 
 def _epochs(track: Track) -> list[chain.Data]:
@@ -181,6 +299,18 @@ def _epochs(track: Track) -> list[chain.Data]:
 class _Problem:
     track: Track
     terms: tuple[FittedTerm, ...]
+    prior: Prior
+
+    @property
+    def mean(self) -> Array:
+        """(11 + p,) of the prior."""
+        return np.concatenate([self.prior.mean, *(np.zeros(len(t.value)) for t in self.terms)])
+
+    @property
+    def weight(self) -> Array:
+        """(11 + p,) inverse variances of the prior."""
+        scales = [self.prior.deviation, *(term.scale for term in self.terms)]
+        return np.asarray(1.0 / np.concatenate(scales) ** 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +325,7 @@ class _Point:
     columns: tuple[Columns, ...]
 
 
-def _descended(problem: _Problem, model: NullModel) -> NullFit:
+def _descended(problem: _Problem, model: NullModel, steps: int) -> NullFit:
     values = np.concatenate([np.zeros(0), *(term.value for term in problem.terms)])
     point = _at(problem, model, values, None)
     cost = _cost(problem, point)
@@ -203,7 +333,7 @@ def _descended(problem: _Problem, model: NullModel) -> NullFit:
     count = 0
     covariance: Array = np.zeros((11 + len(values), 11 + len(values)))
     information = np.zeros(11)
-    while count < _STEPS and not converged:
+    while count < steps and not converged:
         count += 1
         gradient, data, prior = _normal(problem, point)
         information = np.diag(data)[:11]
@@ -213,15 +343,17 @@ def _descended(problem: _Problem, model: NullModel) -> NullFit:
         if new is None:
             converged = True  # nothing lower: the noise of the linearisation is reached
             break
-        point = new
-        cost = _cost(problem, point)
-        converged = bool(np.max(np.abs(step) / np.sqrt(np.diag(covariance))) < _DONE)
+        gained = cost - _cost(problem, new)
+        point, cost = new, cost - gained
+        largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
+        repetition = problem.prior.repetition
+        converged = largest < _DONE * np.sqrt(repetition) or gained < _DONE**2 * repetition
     return NullFit(
         model=point.model,
         filtered=point.filtered,
         converged=converged,
         covariance=covariance,
-        informed=(np.diag(covariance)[:11] < 0.25 * PRIOR**2) & (information > 0),
+        informed=(np.diag(covariance)[:11] < 0.25 * problem.prior.deviation**2) & (information > 0),
         terms=_named(problem, point, covariance),
         terms_mag=point.terms_mag,
         terms_gyro=point.terms_gyro,
@@ -274,29 +406,28 @@ def _normal(problem: _Problem, point: _Point) -> tuple[Array, Array, Array]:
     X = sensitivities(point.filtered, nuisance_columns(point.filtered))
     parts = [X, *(sensitivities(point.filtered, mine) for mine in point.columns)]
     flat = np.concatenate(parts, axis=2).reshape(-1, 11 + len(point.values))
-    scale = np.concatenate([PRIOR, *(term.scale for term in problem.terms)])
-    prior = 1.0 / scale**2
-    gradient = flat.T @ point.filtered.whitened.ravel() - prior * _from_prior(point)
+    prior = problem.weight
+    gradient = flat.T @ point.filtered.whitened.ravel() - prior * _from_prior(problem, point)
     return gradient, flat.T @ flat, prior
 
 
-def _from_prior(point: _Point) -> Array:
+def _from_prior(problem: _Problem, point: _Point) -> Array:
     m = point.model
     off = np.asarray(m.soft_iron) - np.eye(3)
     soft = [off[0, 0], off[1, 1], off[0, 1], off[0, 2], off[1, 2]]
-    return np.concatenate([soft, m.hard_iron_gauss, m.gyro_bias_rad_s, point.values])
+    here = np.concatenate([soft, m.hard_iron_gauss, m.gyro_bias_rad_s, point.values])
+    return np.asarray(here - problem.mean)
 
 
 def _cost(problem: _Problem, point: _Point) -> float:
-    scale = np.concatenate([PRIOR, *(term.scale for term in problem.terms)])
-    prior = float(np.sum(np.square(_from_prior(point) / scale)))
+    prior = float(np.sum(problem.weight * _from_prior(problem, point) ** 2))
     return 0.5 * (float(np.sum(point.filtered.whitened**2)) + prior)
 
 
 def _taken(problem: _Problem, point: _Point, step: Array, cost: float) -> _Point | None:
-    """The longest halving of the step that does not raise the cost; None where none does."""
+    """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does."""
     for halving in range(_HALVINGS):
-        part = step / 2**halving
+        part = step / 4**halving
         model = _moved(point.model, part)
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
             continue

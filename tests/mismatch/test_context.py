@@ -1,0 +1,93 @@
+"""The context: attitude, field and rates against the simulation's truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tracks import experiment, track_of, true_model
+
+from ahrsd import so3
+from ahrsd.mismatch.context import bandwidth_hz, build_context, smoothed_rate
+from ahrsd.mismatch.innovation import run_filter
+from ahrsd.mismatch.null import NullFit
+from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.values import Context
+from ahrsd.samples import Array
+from ahrsd.simulation import Experiment
+
+
+def _context(track: Track, made: Experiment) -> Context:
+    filtered = run_filter(track, true_model(made))
+    empty = np.zeros((11, 11))
+    return build_context(
+        track, NullFit(filtered.model, filtered, True, empty, np.ones(11, dtype=bool))
+    )
+
+
+def _apart_deg(R: Array, truth: Array) -> Array:
+    """Angles in degrees between attitudes that may differ by one constant rotation of the world."""
+    offset = R @ np.swapaxes(truth, 1, 2)
+    mean = Rotation.from_matrix(offset).mean().as_matrix()
+    return np.degrees(np.linalg.norm(so3.log(np.swapaxes(offset, 1, 2) @ mean), axis=1))
+
+
+def test_attitude_is_level_and_does_not_drift() -> None:
+    """The accelerometer levels it and the field keeps it, under 5 mrad/s of gyro noise."""
+    made = experiment("wam", samples=6000, sigma_gyro=5e-3)
+    context = _context(track_of(made), made)
+    assert context.world_levelled
+    down = np.einsum("nij,nj->ni", context.R_nb, made.R_nb[:, 2, :])
+    assert np.degrees(np.arccos(np.clip(down[:, 2], -1, 1))).max() < 1.0
+    assert _apart_deg(context.R_nb, made.R_nb).max() < 1.5
+    assert np.abs(np.linalg.det(context.R_nb) - 1).max() < 1e-9
+
+
+def test_without_an_accelerometer_the_field_holds_still() -> None:
+    made = experiment("wam", samples=6000, sigma_gyro=5e-3)
+    context = _context(replace(track_of(made), accel_b_m_s2=None), made)
+    assert not context.world_levelled
+    field = np.einsum("nij,nj->ni", context.R_nb, made.field_b)
+    assert np.degrees(np.linalg.norm(field - field[0], axis=1) / np.linalg.norm(field[0])).max() < 1
+    assert _apart_deg(context.R_nb, made.R_nb).max() < 12  # about the field it may drift
+
+
+def test_a_reference_attitude_is_used_with_down_along_z() -> None:
+    made = experiment("wam", samples=600)
+    up = np.diag([1.0, -1.0, -1.0]) @ made.R_nb  # a world with z up, as optical systems have
+    q = Rotation.from_matrix(up).as_quat(scalar_first=True)
+    names = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
+    track = replace(track_of(made), covariates=dict(zip(names, q.T, strict=True)))
+    context = _context(track, made)
+    assert np.abs(context.R_nb - made.R_nb).max() < 1e-9
+
+
+@pytest.mark.parametrize("motion", ["slow", "rov"])
+def test_rates_are_smoothed_but_not_delayed(motion: str) -> None:
+    made = experiment("mam", motion=motion, samples=4000, sigma_gyro=5e-3)
+    context = _context(track_of(made), made)
+    inner = slice(50, -50)
+    error = (context.rate_b_rad_s - made.rate_b_rad_s)[inner]
+    assert np.sqrt(np.mean(error**2)) < 0.35 * 5e-3
+    # a delay of d would leave d * dw/dt
+    slope = np.gradient(made.rate_b_rad_s, 0.04, axis=0)[inner]
+    delay_s = float(np.sum(error * slope) / np.sum(slope**2))
+    assert abs(delay_s) < 0.03 if motion == "slow" else abs(delay_s) < 0.004
+    truth = np.gradient(made.field_b, 0.04, axis=0)[inner] * np.trace(made.truth.soft_iron) / 3
+    off = context.field_dot_b[inner] - truth
+    assert np.sqrt(np.mean(off**2)) < 0.35 * 5e-3 * 0.5
+
+
+def test_quick_motion_keeps_its_bandwidth() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(4000) / 100.0
+    clean = np.column_stack([3 * np.sin(2 * np.pi * 5 * t), np.cos(2 * np.pi * 3 * t), 0 * t])
+    noisy = clean + 0.01 * rng.standard_normal(clean.shape)
+    runs = (slice(0, 4000),)
+    assert bandwidth_hz(noisy, runs, 0.01, 0.01) > 8
+    smooth = smoothed_rate(noisy, runs, 0.01, 0.01)
+    assert np.abs(smooth - clean)[100:-100].max() < 0.06
+    slow = clean * 0 + 0.01 * rng.standard_normal(clean.shape)
+    assert bandwidth_hz(slow, runs, 0.01, 0.01) == 0.5

@@ -1,0 +1,173 @@
+"""The null fit: truth within its deviations, noise found, nothing runs away, terms beside it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from tracks import experiment, recorded, track_of, true_model
+
+from ahrsd import so3
+from ahrsd.mismatch.coarse import noise_of, thinned
+from ahrsd.mismatch.noise_fit import WALK_CAP_RAD_S_SQRT_S
+from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null, rate_at_rest
+from ahrsd.mismatch.track import Spec, Track
+from ahrsd.mismatch.values import Columns, Context, NullModel
+from ahrsd.samples import Array
+
+
+def _difference(fit: NullFit, truth: NullModel) -> Array:
+    off = fit.model.soft_iron - truth.soft_iron
+    soft = [off[0, 0], off[1, 1], off[0, 1], off[0, 2], off[1, 2]]
+    return np.concatenate(
+        [
+            soft,
+            fit.model.hard_iron_gauss - truth.hard_iron_gauss,
+            fit.model.gyro_bias_rad_s - truth.gyro_bias_rad_s,
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("scenario", "motion", "sigma_gyro"), [("mam", "rov", 5e-4), ("wam", "slow", 5e-3)]
+)
+def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: float) -> None:
+    squares = []
+    for seed in range(2):
+        made = experiment(scenario, motion=motion, seed=seed, samples=6000, sigma_gyro=sigma_gyro)
+        fit = fit_null(track_of(made))
+        off = _difference(fit, true_model(made))
+        squares.append(float(off @ np.linalg.solve(fit.covariance, off)))
+        assert fit.converged
+        assert fit.informed.all()
+        assert abs(fit.model.sigma_mag_gauss / 1e-3 - 1) < 0.04
+        assert abs(fit.model.sigma_gyro_rad_s / sigma_gyro - 1) < 0.35
+        assert fit.model.gyro_walk_rad_s_sqrt_s < WALK_CAP_RAD_S_SQRT_S / 3
+        assert abs(fit.filtered.normalised_innovation - 1) < 0.04
+    assert 1e-3 < stats.chi2.sf(sum(squares), 22) < 1 - 1e-3
+
+
+def test_what_the_spec_says_stays() -> None:
+    track = track_of(experiment(samples=3000))
+    fit = fit_null(track, Spec(sigma_mag_gauss=2e-3, sigma_gyro_rad_s=7e-4))
+    assert fit.model.sigma_mag_gauss == 2e-3
+    assert fit.model.sigma_gyro_rad_s == 7e-4
+    half = fit_null(track, Spec(sigma_gyro_rad_s=7e-4))
+    assert half.model.sigma_gyro_rad_s == 7e-4
+    assert abs(half.model.sigma_mag_gauss / 1e-3 - 1) < 0.06
+
+
+def test_the_gyros_noise_does_not_swallow_a_drift_of_the_gyro() -> None:
+    """Free, sigma_gyro would grow until the drift is noise."""
+    made = experiment(samples=3000)
+    track = track_of(made)
+    ramp = np.linspace(-1, 1, 3000)[:, None] * np.array([3e-3, -2e-3, 4e-3])
+    fit = fit_null(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + ramp))
+    assert fit.model.sigma_gyro_rad_s <= 1.5 * noise_of(track)[1] * 1.01
+    assert fit.model.gyro_walk_rad_s_sqrt_s <= WALK_CAP_RAD_S_SQRT_S * 1.01
+
+
+def test_a_wandering_gyro_bias_is_in_the_null() -> None:
+    made = experiment(samples=8000, seed=4)
+    track = track_of(made)
+    rng = np.random.default_rng(2)
+    walk = np.cumsum(rng.standard_normal((8000, 3)) * 1e-5 * np.sqrt(0.04), axis=0)
+    fit = fit_null(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + walk))
+    assert 4e-6 < fit.model.gyro_walk_rad_s_sqrt_s < 1.3e-5
+    off = _difference(fit, true_model(made))[:8]
+    chi2 = float(off @ np.linalg.solve(fit.covariance[:8, :8], off))
+    assert stats.chi2.sf(chi2, 8) > 1e-3
+
+
+def _misalignment(context: Context) -> Columns:
+    """Gyro turned by a small rotation against the magnetometer: d gyro / d phi."""
+    return Columns(gyro=so3.skew(context.rate_b_rad_s))
+
+
+def _ramp(context: Context) -> Columns:
+    t = context.track.time_s
+    course = (t - t[0]) / (t[-1] - t[0]) - 0.5
+    return Columns(mag=course[:, None, None] * np.eye(3))
+
+
+def test_terms_are_fitted_jointly_and_linearised_again() -> None:
+    """3 degrees is far outside the linear range: the deviation says whether the refit got there."""
+    made = experiment("wam", samples=4000, seed=2)
+    track, truth = track_of(made), true_model(made)
+    phi = np.radians([1.5, -2.0, 1.2])
+    true_rate = track.gyro_b_rad_s - truth.gyro_bias_rad_s
+    turned = true_rate @ so3.exp(-phi).T + truth.gyro_bias_rad_s  # reading = Exp(phi x) ...
+    drift = np.array([2e-3, 0.0, -3e-3])
+    course = (track.time_s - track.time_s[0]) / track.duration_s - 0.5
+    bent = replace(
+        track, gyro_b_rad_s=turned, mag_b_gauss=track.mag_b_gauss + course[:, None] * drift
+    )
+    null = fit_null(bent)
+    terms = (
+        FittedTerm("mag_gyro_misalignment", _misalignment, np.zeros(3), np.full(3, 0.05)),
+        FittedTerm("hard_iron_drift", _ramp, np.zeros(3), np.full(3, 0.01)),
+    )
+    fit = fit_null(bent, start=null.model, terms=terms)
+    # what the null had to call noise is gone
+    assert abs(fit.model.sigma_mag_gauss / 1e-3 - 1) < 0.05 < null.model.sigma_mag_gauss / 1e-3 - 1
+    found, ramp = fit.terms
+    # w_read = w + [w]x phi + ..., to second order of the 2.8 degrees
+    assert np.abs(found.value - phi).max() < 2e-3
+    assert ramp.deviation is not None
+    assert np.max(np.abs(ramp.value - drift) / ramp.deviation) < 4
+    assert fit.terms_mag is not None
+    assert np.abs(fit.terms_mag[-1] - 0.5 * ramp.value).max() < 1e-9
+    off = np.abs(fit.model.hard_iron_gauss - truth.hard_iron_gauss).max()
+    assert off < 5e-4 < np.abs(null.model.hard_iron_gauss - truth.hard_iron_gauss).max()
+
+
+def test_thinning_composes_rotations_exactly() -> None:
+    track = track_of(experiment("wam", samples=400))
+    coarse = thinned(track, 5)
+    assert len(coarse) == 80
+    by_one = np.eye(3)
+    for k in range(5, 10):
+        by_one = by_one @ so3.exp(track.gyro_b_rad_s[k] * track.dt_s[k])
+    assert np.abs(so3.exp(coarse.gyro_b_rad_s[1] * coarse.dt_s[1]) - by_one).max() < 1e-12
+    assert np.array_equal(coarse.mag_b_gauss[1], track.mag_b_gauss[9])
+    assert np.isnan(coarse.dt_s[0])
+
+
+def test_noise_of_differences() -> None:
+    mag, gyro = noise_of(track_of(experiment("lam", samples=4000, sigma_gyro=2e-3)))
+    assert abs(mag / 1e-3 - 1) < 0.06
+    assert abs(gyro / 2e-3 - 1) < 0.06
+
+
+def test_at_rest_the_gyro_reads_its_bias_and_nothing_runs_away() -> None:
+    rng = np.random.default_rng(0)
+    bias = np.array([4e-3, -5e-3, 2e-3])
+    field = np.array([0.2, 0.05, 0.41])
+    dt = np.full(3000, 0.04)
+    dt[0] = np.nan
+    still = Track(
+        np.arange(3000) * 0.04,
+        dt,
+        field + 1e-3 * rng.standard_normal((3000, 3)),
+        bias + 1e-3 * rng.standard_normal((3000, 3)),
+        None,
+        {},
+        (slice(0, 3000),),
+    )
+    rest = rate_at_rest(still)
+    assert rest is not None
+    assert np.abs(rest - bias).max() < 1e-4
+    assert rate_at_rest(track_of(experiment("lam", motion="slow", samples=3000))) is None
+    fit = fit_null(still)
+    assert np.abs(fit.model.soft_iron - np.eye(3)).max() < 0.05
+    assert np.abs(fit.model.gyro_bias_rad_s - bias).max() < 5e-4
+    assert not fit.informed[:8].any()
+
+
+def test_a_stationary_recording_does_not_diverge() -> None:
+    fit = fit_null(recorded("vn100/F00379"))
+    assert np.linalg.norm(fit.model.soft_iron - np.eye(3)) < 0.3
+    assert np.linalg.norm(fit.model.hard_iron_gauss) < 0.5
+    assert np.abs(fit.model.gyro_bias_rad_s - [3.3e-3, 1.5e-3, 7.0e-3]).max() < 1.5e-3
