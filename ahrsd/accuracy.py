@@ -24,6 +24,7 @@ from ahrsd.simulation import Experiment, Truth
 _STEEPEST_SIN = float(np.sin(np.radians(80.0)))  # beyond this pitch nobody asks for a heading
 _TABLE_5_2_NOISE_GAUSS = 0.010
 _DIFFERENCE = 1e-6  # of A's entries and, in gauss, of b
+_EVERY_FOR_BOUND = 25
 _EVERY = 5  # samples: neighbours say nothing new about a heading
 
 
@@ -104,10 +105,14 @@ def heading_rms_deg(
 
 
 def _heading_errors(
-    experiment: Experiment, soft_iron: Array, hard_iron_gauss: Array, noise_gauss: float
+    experiment: Experiment,
+    soft_iron: Array,
+    hard_iron_gauss: Array,
+    noise_gauss: float,
+    every: int = _EVERY,
 ) -> Array:
     """In rad, of every fifth sample that is not too steep."""
-    rows = slice(None, None, _EVERY)
+    rows = slice(None, None, every)
     R_nb, field_b, truth = experiment.R_nb[rows], experiment.field_b[rows], experiment.truth
     usable = np.abs(R_nb[:, 2, 0]) < _STEEPEST_SIN
     up = -R_nb[usable, 2, :]
@@ -128,19 +133,26 @@ def expected_heading_deg(experiment: Experiment, covariance: Array, noise_gauss:
     """
     truth = experiment.truth
     floor = _heading_errors(experiment, truth.soft_iron, truth.hard_iron_gauss, noise_gauss)
-    J = np.empty((len(floor), 9))
-    for column, step in enumerate(np.eye(9) * _DIFFERENCE):
+    columns = []
+    for step in np.eye(9) * _DIFFERENCE:
         A = np.zeros((3, 3))
         A[np.triu_indices(3)] = step[:6]
         A += np.triu(A, 1).T
         b = step[6:]
         there, back = (
-            _heading_errors(experiment, truth.soft_iron + s * A, truth.hard_iron_gauss + s * b, 0.0)
+            _heading_errors(
+                experiment,
+                truth.soft_iron + s * A,
+                truth.hard_iron_gauss + s * b,
+                0.0,
+                _EVERY_FOR_BOUND,
+            )
             for s in (1.0, -1.0)
         )
-        J[:, column] = wrapped(there - back) / (2 * _DIFFERENCE)
+        columns.append(wrapped(there - back) / (2 * _DIFFERENCE))
+    J = np.column_stack(columns)
     variance = np.einsum("ni,ij,nj->n", J, covariance[:9, :9], J)
-    return float(np.degrees(np.sqrt(np.mean(np.square(floor) + variance))))
+    return float(np.degrees(np.sqrt(np.mean(np.square(floor)) + np.mean(variance))))
 
 
 def field_errors(
