@@ -20,8 +20,8 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
         f'<p class="verdict {"no" if found.mismatch else "yes"}">{escape(verdict(found))}</p>',
         *(_finding(found, number_, one) for number_, one in enumerate(found.findings, start=1)),
         _unexplained(found),
-        _sensitivity(found),
         _pictures(found),
+        _sensitivity(found),
         _checks(found),
         _baseline(found),
         _notes(found),
@@ -99,20 +99,32 @@ def _unexplained(found: Diagnosis) -> str:
 
 
 def _sensitivity(found: Diagnosis) -> str:
+    """One row an effect: the range of its parameters' limits; those that are invisible last."""
     if not found.sensitivity:
         return ""
-    rows = [
+    seen: dict[str, list[str]] = {}
+    hidden: dict[str, list[str]] = {}
+    for limit in found.sensitivity:
+        if limit.smallest is None:
+            hidden.setdefault(limit.effect, []).append(limit.parameter)
+        else:
+            shown = f"{limit.parameter} {number(limit.smallest, limit.unit)}"
+            seen.setdefault(limit.effect, []).append(shown)
+    rows = [[escape(effect), escape(", ".join(texts))] for effect, texts in seen.items()]
+    rows += [
         [
-            escape(limit.effect),
-            escape(limit.parameter),
-            escape(number(limit.smallest, limit.unit))
-            if limit.smallest is not None
-            else "cannot be seen on this motion",
+            escape(effect),
+            f'<span class="soft">cannot be seen here: {escape(", ".join(names))}</span>',
         ]
-        for limit in found.sensitivity
+        for effect, names in hidden.items()
     ]
     text = f"<p>This recording would have shown {escape(sensitivity(found.sensitivity))}.</p>"
-    return section("What would have been seen", text, table(("effect", "parameter", "from"), rows))
+    inner = table(("effect", "would have been seen from"), rows)
+    count = len(seen | hidden)
+    folded = (
+        f"<details><summary>all {count} effects that were looked for</summary>{inner}</details>"
+    )
+    return section("What would have been seen", text, folded)
 
 
 def _pictures(found: Diagnosis) -> str:

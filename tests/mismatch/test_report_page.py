@@ -1,0 +1,122 @@
+"""The report of a diagnosis in a real browser, and its words."""
+
+import numpy as np
+import pytest
+from browser import BROWSER, look_at
+
+from ahrsd.mismatch.diagnosis import (
+    Baseline,
+    Check,
+    Cost,
+    Diagnosis,
+    Drawn,
+    Finding,
+    Heldout,
+    Limit,
+    Share,
+    Suspect,
+    Unexplained,
+    Value,
+    Where,
+)
+from ahrsd.mismatch.spoken import lines
+from ahrsd.mismatch.values import NullModel
+from ahrsd.report.diagnosis_page import write_diagnosis_report
+from ahrsd.rerun_diagnosis import write_rrd
+
+
+def diagnosis(**changes):
+    """A diagnosis with one of everything; text that HTML must not take for its own."""
+    rng = np.random.default_rng(1)
+    time_s = np.arange(4000) / 12.0
+    finding = Finding(
+        effect="motor_current_field",
+        confidence=0.97,
+        alternatives=(Share("vibration_rectification", 0.02),),
+        where=Where(((120.0, 260.5),), ("y", "z"), "sensor", "motor_current_a > 6"),
+        parameters=(Value("field_per_ampere_y", 1.3e-3, 4e-5, "gauss/A"),),
+        heldout=Heldout(1.2e-3, 1.0e-3, 0.052, 0.0006),
+        cost_if_left_out=Cost(1.4e-3, 0.35),
+        separate_from="pulse the motor at rest on one heading",
+        words="the field of a motor current",
+        equation="m += k I(t)",
+    )
+    left = Unexplained(
+        detected=True,
+        where=Where(((300.0, 320.0),), ("x",), "world"),
+        heldout=Heldout(1e-3, 9e-4, 0.01, 0.0),
+        size=2.5,
+        unit="mG",
+        single_source_share=0.93,
+        follows=(Suspect("<b>throttle</b>", 0.95, 1e-6),),
+    )
+    drawn = Drawn(
+        time_s=time_s,
+        before=rng.standard_normal((4000, 3)),
+        after=rng.standard_normal((4000, 3)),
+        contributions={"motor_current_field 0": rng.standard_normal((4000, 3)) * 1e-3},
+        courses=(),
+        evidence={"motor_current_field": 2102.0, "hysteresis": 5.0, "mag_time_lag": -2.0},
+    )
+    fields = {
+        "recording": "dive <7>.csv",
+        "baseline": Baseline(1.2e-3, -9.0, 1.09),
+        "mismatch": True,
+        "p_value": 1e-9,
+        "findings": (finding,),
+        "unexplained": left,
+        "posterior_predictive": {"nis": Check(1.09, (0.97, 1.03), False, True)},
+        "notes": ("column a & b was left out",),
+        "model": NullModel(np.eye(3), np.array([0.1, 0.0, -0.2]), np.zeros(3), 1e-3, 5e-4),
+        "drawn": drawn,
+    }
+    return Diagnosis(**(fields | changes))
+
+
+def test_the_words_of_a_diagnosis():
+    assert lines(diagnosis())[:12] == [
+        "dive <7>.csv: MISMATCH: 1 effect left out and something that the library has no name for "
+        "(p = 1e-09)",
+        "",
+        "1. the field of a motor current (motor_current_field), 97.0% sure",
+        "   where      120.0-260.5 s; axes y z; turns with the vehicle; motor_current_a > 6",
+        "   size       field_per_ampere_y = 0.0013 +- 4e-05 gauss/A",
+        "   left out   m += k I(t)",
+        "   without it hard iron off by 1.40 mG, heading by 0.35 deg",
+        "   held out   +0.0520 nats/sample (moved in time: at most +0.0006)",
+        "   or else    vibration_rectification 2.0%",
+        "   to be sure pulse the motor at rest on one heading",
+        "",
+        "not in the library:",
+    ]
+
+
+def test_nothing_found_says_what_would_have_been_seen():
+    limits = (
+        Limit("mag_time_lag", "lag", 1.5e-3, "s"),
+        Limit("gyro_scale", "scale_x", None, "1"),
+    )
+    none = Unexplained(False)
+    said = lines(diagnosis(mismatch=False, findings=(), unexplained=none, sensitivity=limits))
+    assert said[0] == "dive <7>.csv: recording and model agree"
+    assert said[2] == "this recording would have shown: mag_time_lag above 0.0015 s"
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+@pytest.mark.parametrize("width_px", [360, 1000])
+def test_the_page_in_a_browser(tmp_path, width_px):
+    page = tmp_path / "report.html"
+    write_diagnosis_report(page, diagnosis(), "ahrsd diagnose dive")
+    seen = look_at(page, width_px, tmp_path)
+    assert seen["errors"] == []
+    assert len(seen["pictures"]) == 4
+    assert all(complete and width > 0 for _, width, complete in seen["pictures"])
+    assert seen["window"] == width_px
+    assert seen["width"] <= width_px
+    assert "Unknown, here" in seen["headings"]
+    assert "<b>throttle" not in page.read_text()
+
+
+def test_the_rerun_recording_is_written(tmp_path):
+    write_rrd(tmp_path / "d.rrd", diagnosis())
+    assert (tmp_path / "d.rrd").stat().st_size > 10_000
