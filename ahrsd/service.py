@@ -34,7 +34,7 @@ log = logging.getLogger("ahrsd")
 
 _VIEWER_S = 3.0
 _SEARCH_AGAIN_S = 0.5
-_KEEP = 64  # decisions and gaps in memory; the capture has them all
+DAEMON_KEEPS = 64  # decisions and gaps in memory; the capture has them all
 
 
 class _Stopped(Exception):
@@ -65,7 +65,7 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
 
     Raises CaptureError where there can be no capture.
     """
-    core = Core(replace(core_settings(config), keep=_KEEP))
+    core = Core(replace(core_settings(config), keep=DAEMON_KEEPS))
     writer = None if capture is None else _open_capture(config, capture)
     viewer = None
     if config.rerun.file is not None or config.rerun.serve:

@@ -32,11 +32,15 @@ from drivers.vn100.emulator_scenarios import Setup
 BAUD = 921600
 SETTLE_S = 3.0
 LOOK_S = 2.0
+FLAT_FROM_S = 120.0
 
 
 @dataclass(frozen=True)
 class Figures:
-    """expected: by the device's time; in_capture, taken: what the record and the daemon have."""
+    """expected: by the device's time; in_capture, taken: what the record and the daemon have.
+
+    rss_mb: at the start, after every minute, and at the end; rss_slope_kb_min: from minute 2 on
+    """
 
     rate_hz: int
     seconds: float
@@ -45,8 +49,7 @@ class Figures:
     taken: int
     cpu_s: float
     parse_s: float
-    rss_start_mb: float
-    rss_end_mb: float
+    rss_mb: tuple[float, ...]
     rss_slope_kb_min: float
     threads: int
     descriptors: int
@@ -73,8 +76,8 @@ class Figures:
             f"{self.rate_hz} Hz, {self.seconds:.0f} s: {self.expected} samples expected, "
             f"{self.in_capture} in the capture, {self.taken} taken, {self.lost} lost\n"
             f"  CPU {self.cpu_percent:.2f} % of one core, {self.parse_ratio:.1f} x parsing alone\n"
-            f"  RSS {self.rss_start_mb:.1f} MB at the start, {self.rss_end_mb:.1f} at the end, "
-            f"slope of the second half {self.rss_slope_kb_min:+.0f} kB/min\n"
+            f"  RSS by the minute {' '.join(f'{mb:.1f}' for mb in self.rss_mb)} MB, "
+            f"slope from minute {FLAT_FROM_S / 60:.0f} on {self.rss_slope_kb_min:+.0f} kB/min\n"
             f"  {self.threads} threads, {self.descriptors} descriptors; exit {self.exit_code} "
             f"{self.stop_s:.2f} s after SIGTERM"
         )
@@ -104,8 +107,8 @@ def measure(rate_hz: int, seconds: float, folder: Path, *, verbose: bool = False
     taken = int(count[1])
     expected, in_capture, parse_s_per_sample = count_in_capture(folder)
     rss, cpu_s, lasted_s, threads, descriptors = watched
-    half = rss[len(rss) // 2 :]
-    slope = np.polyfit([t for t, _ in half], [b for _, b in half], 1)[0] if len(half) > 2 else 0.0
+    late = [(t, size) for t, size in rss if t >= min(FLAT_FROM_S, lasted_s / 2)]
+    slope = np.polyfit([t for t, _ in late], [size for _, size in late], 1)[0]
     return Figures(
         rate_hz=rate_hz,
         seconds=lasted_s,
@@ -114,14 +117,20 @@ def measure(rate_hz: int, seconds: float, folder: Path, *, verbose: bool = False
         taken=taken,
         cpu_s=cpu_s,
         parse_s=parse_s_per_sample * rate_hz * lasted_s,
-        rss_start_mb=rss[0][1] / 1e6,
-        rss_end_mb=rss[-1][1] / 1e6,
+        rss_mb=_by_minute(rss),
         rss_slope_kb_min=float(slope) * 60 / 1e3,
         threads=threads,
         descriptors=descriptors,
         exit_code=daemon.returncode,
         stop_s=stop_s,
     )
+
+
+def _by_minute(rss: list[tuple[float, int]]) -> tuple[float, ...]:
+    """MB at the start, after every minute and at the end."""
+    times = [t for t, _ in rss]
+    wanted = [*np.arange(0.0, times[-1], 60.0), times[-1]]
+    return tuple(rss[int(np.argmin(np.abs(np.subtract(times, t))))][1] / 1e6 for t in wanted)
 
 
 def _wait_for(log: Path, text: bytes, seconds: float = 60.0) -> None:
