@@ -22,9 +22,10 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.findings import contribution, finding
+from ahrsd.mismatch.findings import contribution, finding, whole_term
 from ahrsd.mismatch.limits import LIMITS, Limits
-from ahrsd.mismatch.null import NullFit, cold_start, fit_null
+from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.null import NullFit, fit_null
 from ahrsd.mismatch.regression import Base, candidate_gram
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
@@ -33,17 +34,23 @@ from ahrsd.mismatch.search import (
     Survey,
     basis_of,
     forward,
-    noise_of_thinned,
+    problem_of,
     pruned,
+    refitted,
+    survey,
     swapped,
+    term_group,
 )
-from ahrsd.mismatch.thin import thin_factor, thinned
 from ahrsd.mismatch.track import Spec, Track
-from ahrsd.mismatch.values import NullModel, Term
+from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
-#: rows per second that the search works with; faster recordings are averaged down to it
-WORKING_HZ = 12.0
+#: names that are a course in time and nothing else, by the frame that they act in
+TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
+    "sensor": ("hard_iron_step", "hard_iron_drift", "switched_device", "soft_iron_step"),
+    "world": ("field_step", "geomagnetic_drift", "field_anomaly"),
+    "gyro": ("gyro_bias_step", "gyro_startup", "gyro_bias_drift"),
+}
 #: a detection limit is this many standard deviations: what the gate would pass 9 times in 10
 DETECTED_AT = 6.5
 
@@ -63,13 +70,15 @@ def diagnose(
     """
     spec = spec or Spec()
     track, notes = roles.prepared(track)
-    problem, start = _prepared(track, spec, library, limits)
-    state, first, _ = forward(problem, start)
-    state = pruned(problem, state)
-    state, surveys = swapped(problem, state)
-    basis = basis_of(problem, state)
-    left = unknown.remainder(basis)
-    found = tuple(finding(library, state, basis, k, seen) for k, seen in enumerate(surveys))
+    problem, cold = problem_of(track, spec, library, limits)
+    start = fit_null(problem.track, problem.spec, cold, walk=False)
+    state, first, last = forward(State(problem, start))
+    slim = pruned(state)
+    last = last if slim.names == state.names else survey(slim)
+    state, surveys, last = swapped(slim, last)
+    state, surveys, left = without_stand_ins(state, surveys)
+    basis = basis_of(state)
+    found = tuple(finding(state, basis, k, seen, last) for k, seen in enumerate(surveys))
     something = unknown.detected(left, limits)
     unexplained = (
         unknown.described(basis, left, problem.block_s, limits) if something else Unexplained(False)
@@ -85,26 +94,39 @@ def diagnose(
         sensitivity=() if found or something else sensitivity(problem, basis, first),
         notes=notes,
         model=state.fit.model,
-        terms=_terms(state),
+        terms=tuple(whole_term(state, basis, k, one.effect) for k, one in enumerate(found)),
         drawn=_drawn(start, state, basis, first, left),
     )
 
 
-def _prepared(
-    track: Track, spec: Spec, library: Mapping[str, Effect], limits: Limits
-) -> tuple[Problem, NullFit]:
-    """The recording at working rate, and the calibration alone fitted to it."""
-    cold = cold_start(track, spec)
-    m = thin_factor(track, WORKING_HZ)
-    work = thinned(track, m, cold)
-    known = noise_of_thinned(spec, m)
-    root = float(np.sqrt(m))
-    start = replace(
-        cold,
-        sigma_mag_gauss=cold.sigma_mag_gauss / root,
-        sigma_gyro_rad_s=cold.sigma_gyro_rad_s / root,
-    )
-    return Problem(work, known, library, limits), fit_null(work, known, start)
+def without_stand_ins(
+    state: State, surveys: list[Survey]
+) -> tuple[State, list[Survey], unknown.Remainder]:
+    """Names that only stand in for a course in time taken out again, and what is then left.
+
+    Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
+    all of what their frame's own coefficients explain, and where a few of them do.
+    """
+    limits = state.problem.limits
+    basis = basis_of(state)
+    left = unknown.remainder(basis)
+    for frame, names in TIME_SHAPED.items():
+        shaped = [k for k, name in enumerate(state.names) if name in names]
+        if not shaped:
+            continue
+        fires = unknown.detected(left, limits)
+        bare = basis
+        for k in shaped:
+            bare = bare.without(term_group(k), state.fit.terms[k].value)
+        before = unknown.remainder(bare, with_bins=False).located[frame].statistic
+        covered = 1.0 - left.located[frame].statistic / max(before, 1e-300)
+        if (fires and covered < limits.coverage) or len(shaped) > limits.most_shaped:
+            kept = [k for k in range(len(state.named)) if k not in shaped]
+            state = refitted(state, tuple(state.named[k] for k in kept))
+            surveys = [surveys[k] for k in kept]
+            basis = basis_of(state)
+            left = unknown.remainder(basis)
+    return state, surveys, left
 
 
 def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:
@@ -143,18 +165,6 @@ def _p_value(first: Survey, left: unknown.Remainder) -> float:
     frames = [min(1.0, 3.0 * one.p_value) for one in left.located.values()]
     bins = [min(1.0, len(left.bins) * p) for _, _, p in left.bins]
     return float(min([1.0, *named, *frames, *bins]))
-
-
-def _terms(state: State) -> tuple[Term, ...]:
-    return tuple(
-        Term(
-            term.identifier,
-            term.value,
-            np.zeros_like(term.value) if term.deviation is None else term.deviation,
-            term.setting,
-        )
-        for term in state.fit.terms
-    )
 
 
 def _drawn(

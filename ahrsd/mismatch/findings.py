@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ahrsd.mismatch.confound import separating_manoeuvre
+from ahrsd.mismatch.delays import DELAYS, weighed
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
-from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import posterior
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.innovation import TRACELESS
@@ -16,10 +16,10 @@ from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.regression import CALIBRATION, Base
-from ahrsd.mismatch.search import State, Survey, term_group
+from ahrsd.mismatch.search import State, Survey, in_its_place, term_group
 from ahrsd.mismatch.unknown import AXES, innovation_rms
 from ahrsd.mismatch.validate import heading_error_deg
-from ahrsd.mismatch.values import NullModel
+from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import Array
 
 #: shares below this are not worth a line
@@ -27,37 +27,78 @@ SMALLEST_SHARE = 0.005
 FRAMES: Mapping[str, str] = {"sensor": "sensor", "world": "world", "gyro": "gyro", "link": "link"}
 
 
-def finding(
-    library: Mapping[str, Effect], state: State, basis: Base, number: int, seen: Survey
-) -> Finding:
-    """The finding of term `number`; basis: of the whole model; seen: the survey without it."""
-    judged, term = state.named[number], state.fit.terms[number]
-    effect = judged.candidate.effect
-    shares = _shares(judged, seen)
+def finding(state: State, basis: Base, number: int, seen: Survey, last: Survey) -> Finding:
+    """The finding of term `number`.
+
+    basis: of the whole model;  seen: the survey without the term;  last: with all terms
+    """
+    judged, library = state.named[number], state.problem.library
+    shares = _delay_shares(state, basis, number) or _shares(judged, seen, last)
+    term = whole_term(state, basis, number, next(iter(shares)))
+    effect = library[term.identifier]
     alternatives = tuple(
         Share(name, share) for name, share in shares.items() if name != effect.identifier
     )[:4]
-    deviation = term.deviation if term.deviation is not None else np.zeros(len(term.value))
-    inflation = float(np.sqrt(basis.colour))
     parameters = tuple(
-        Value(p.name, float(v), float(d) * inflation, p.unit)
-        for p, v, d in zip(effect.parameters, term.value, deviation, strict=True)
+        Value(p.name, float(v), float(d), p.unit)
+        for p, v, d in zip(effect.parameters, term.value, term.deviation, strict=True)
     )
     close = [share.effect for share in alternatives if share.confidence > 0.05]
     return Finding(
         effect=effect.identifier,
         confidence=shares[effect.identifier],
         alternatives=tuple(a for a in alternatives if a.confidence > SMALLEST_SHARE),
-        where=where(judged, term.value, basis),
+        where=where(judged, added_value(state, number), basis),
         parameters=parameters,
         heldout=_heldout(judged, basis),
-        cost_if_left_out=cost(basis, number, term.value),
+        cost_if_left_out=cost(basis, number, added_value(state, number)),
         separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
         equation=effect.equation,
-        setting={k: v for k, v in term.setting.items() if k != "searched"},
+        setting=term.setting,
         evidence_nats=judged.evidence,
     )
+
+
+def added_value(state: State, number: int) -> Array:
+    """(p,) a term's whole value: a delay's includes what was taken out of the track."""
+    value = state.fit.terms[number].value
+    return np.array([state.lag_s(number)]) if _is_delay(state, number) else value
+
+
+def whole_term(state: State, basis: Base, number: int, name: str | None = None) -> Term:
+    """A fitted term as it is told: whole value, deviations for the noise as coloured as it is.
+
+    name: what a delay is called in the end
+    """
+    term = state.fit.terms[number]
+    value = added_value(state, number)
+    deviation = np.zeros(len(value)) if term.deviation is None else term.deviation
+    deviation = deviation * np.sqrt(basis.colour)
+    setting = {k: v for k, v in term.setting.items() if k != "searched"}
+    if not _is_delay(state, number):
+        return Term(term.identifier, value, deviation, setting)
+    name = name or term.identifier
+    if name == "gyro_integration":
+        half_s = float(np.nanmedian(state.problem.recorded.dt_s)) / 2
+        return Term(name, value / half_s, deviation / half_s, {})
+    if name == "mag_low_pass":
+        setting = {"time_constant_s": float(value[0])}
+    return Term(name, value, deviation, setting)
+
+
+def _is_delay(state: State, number: int) -> bool:
+    return state.named[number].candidate.name in DELAYS
+
+
+def _delay_shares(state: State, basis: Base, number: int) -> dict[str, float] | None:
+    if not _is_delay(state, number):
+        return None
+    term = state.fit.terms[number]
+    deviation = 1e-6 if term.deviation is None else float(term.deviation[0])
+    recorded = float(np.nanmedian(state.problem.recorded.dt_s))
+    lag_s = DELAYS[term.identifier] * state.lag_s(number)
+    return weighed(basis, state.problem.library, lag_s, deviation * basis.colour**0.5, recorded)
 
 
 def contribution(judged: Judged, value: Array, basis: Base) -> Array:
@@ -118,13 +159,14 @@ def cost(basis: Base, number: int, value: Array) -> Cost:
     )
 
 
-def _shares(judged: Judged, seen: Survey) -> dict[str, float]:
-    evidence = {c.name: c.evidence for c in seen.candidates}
-    evidence[judged.candidate.name] = max(
-        evidence.get(judged.candidate.name, -np.inf), judged.evidence
-    )
-    found = posterior(evidence, {})
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+def _shares(judged: Judged, seen: Survey, last: Survey) -> dict[str, float]:
+    """Every name's share of the probability of being what the term explains."""
+    mine = judged.candidate.name
+    evidence = {c.name: in_its_place(c, last) for c in seen.candidates if c.name != mine}
+    own = [c.evidence for c in seen.candidates if c.name == mine]
+    found = posterior({mine: max([judged.evidence, *own]), **evidence}, {})
+    rest = {k: v for k, v in sorted(found.items(), key=lambda item: -item[1]) if k != mine}
+    return {mine: found[mine], **rest}
 
 
 def _heldout(judged: Judged, basis: Base) -> Heldout:

@@ -20,10 +20,10 @@ class Limits:
     placebo_beaten: share of time-shifted copies of a candidate that it must beat
     coverage:       share of the agnostic statistic of its own frame that a time-shaped name must
                     explain, else it is a stand-in for an unlogged source
+    most_shaped:    steps, drifts and bumps of one frame beyond this are one source that changes
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
-    deflation:      beyond this colour of the innovations no term is named before the noise is told
     """
 
     family_p: float = 2e-3
@@ -33,6 +33,7 @@ class Limits:
     cv_gain: float = 0.0
     placebo_beaten: float = 0.99
     coverage: float = 0.9
+    most_shaped: int = 3
     unknown_nats: float = 8.0
     unknown_p: float = 1e-4
     most_terms: int = 5

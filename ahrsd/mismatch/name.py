@@ -72,7 +72,7 @@ def judge(
     evidence = log_bayes(what, basis.colour) - float(np.log(candidate.tried))
     tests = tried * candidate.tried
     family = min(1.0, tests * chi2_p(what, basis.colour))
-    robust = min(1.0, tests * robust_p(what))
+    robust = min(1.0, tests * robust_p(what, basis.colour))
     gain = heldout(gram, known, candidate.name, candidate.scale)
     found, shifted = shift_statistics(
         *without_known(basis, columns), round(MINIMUM_SHIFT_SHARE * len(columns))

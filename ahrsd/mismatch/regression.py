@@ -197,6 +197,8 @@ def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
     for _ in range(ONSET_PASSES):
         grid = best.setting["onset_s"] + reach * np.linspace(-1, 1, ONSET_STEPS + 1)
         inside = grid[(grid > time_s[0]) & (grid < time_s[-1])]
+        if not len(inside):
+            break
         closer = [{**best.setting, "onset_s": round(float(t), 4)} for t in inside]
         finer = max(_scan(basis, best.effect, closer), key=lambda candidate: candidate.evidence)
         paid = finer.evidence + np.log(len(closer)) - np.log(len(options) * 4)

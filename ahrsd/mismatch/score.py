@@ -24,6 +24,8 @@ from ahrsd.samples import Array
 
 #: 1 - leverage of a block is not taken smaller: a block that alone carries an effect proves little.
 MINIMUM_FREEDOM = 0.05
+#: effective blocks beyond the rank that T^2 needs
+FEW_BLOCKS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +43,7 @@ class Score:
     score: Array
     block_information: Array
     block_s: Array
+    block_power: Array
     share: float
 
     @property
@@ -75,12 +78,17 @@ def score(gram: Gram, name: str, scale: Array, minimum_information: float = 1.0)
     kept = values > max(minimum_information, RANK_SHARE * float(before.sum()))
     V = vectors[:, kept]
     block_s = scores @ V
+    block_information = V.T @ blocks @ V
+    z = block_s.sum(axis=0) / values[kept]
+    square = gram.blocks[:, -1, -1] - 2 * block_s @ z
+    square += np.einsum("i,bij,j->b", z, block_information, z)
     return Score(
         basis=scale[:, None] * V,
         information=values[kept],
         score=block_s.sum(axis=0),
-        block_information=V.T @ blocks @ V,
+        block_information=block_information,
         block_s=block_s,
+        block_power=square / np.maximum(gram.counts, 1.0),
         share=float(np.clip(np.trace(whole) / max(float(before.sum()), 1e-300), 0.0, 1.0)),
     )
 
@@ -90,26 +98,39 @@ def chi2_p(what: Score, colour: float = 1.0) -> float:
     return float(stats.chi2.sf(what.statistic / colour, what.rank)) if what.rank else 1.0
 
 
-def robust_p(what: Score) -> float:
-    """Probability of a larger T^2; 1 where there are too few effective blocks for the rank."""
-    B, r = len(what.block_s), what.rank
+def robust_p(what: Score, colour: float = 1.0) -> float:
+    """Probability of a larger T^2.
+
+    Where fewer blocks than FEW_BLOCKS more than the rank carry the information (a lag that only one
+    brisk turn shows), blocks cannot vouch for each other; then every block's share of the variance
+    is its information times the power of its own residuals and the colour of the noise.
+    """
+    r = what.rank
     if r == 0:
         return 1.0
     root = 1.0 / np.sqrt(what.information)
     H = what.block_information * root[:, None] * root
     s = what.block_s * root
+    leverage = np.einsum("bii->b", H) / r
+    blocks = min(float(len(s)), 1.0 / float(np.sum(leverage**2)))
+    whole = s.sum(axis=0)
+    if blocks <= r + FEW_BLOCKS:
+        power = np.maximum(what.block_power, 1.0)
+        usual = max(1.0, float(np.mean(power)))
+        V = np.einsum("b,bij->ij", power, H) * max(1.0, colour / usual)
+        return float(stats.chi2.sf(whole @ np.linalg.pinv(V, hermitian=True) @ whole, r))
+    u = _jackknifed(H, s)
+    T = float(whole @ np.linalg.pinv(u.T @ u, hermitian=True) @ whole)
+    return float(stats.f.sf(T * (blocks - r) / (r * blocks), r, blocks - r))
+
+
+def _jackknifed(H: Array, s: Array) -> Array:
+    """(B, r) block scores with the group fitted, each as if its own block had been left out."""
     residual = s - np.einsum("bij,j->bi", H, s.sum(axis=0))
     values, vectors = np.linalg.eigh(H)
     freedom = np.maximum(1.0 - values, MINIMUM_FREEDOM)
     turned = np.einsum("bji,bj->bi", vectors, residual) / freedom
-    u = np.einsum("bij,bj->bi", vectors, turned)
-    leverage = np.einsum("bii->b", H) / r
-    blocks = min(float(B), 1.0 / float(np.sum(leverage**2)))
-    if blocks <= r + 1:
-        return 1.0
-    V = u.T @ u
-    T = float(s.sum(axis=0) @ np.linalg.pinv(V, hermitian=True) @ s.sum(axis=0))
-    return float(stats.f.sf(T * (blocks - r) / (r * blocks), r, blocks - r))
+    return np.asarray(np.einsum("bij,bj->bi", vectors, turned))
 
 
 def bootstrap_p(what: Score, rng: np.random.Generator, flips: int = 1000) -> float:

@@ -13,11 +13,13 @@ from functools import partial
 
 import numpy as np
 
+from ahrsd.mismatch.delay import delayed_gyro
+from ahrsd.mismatch.delays import DELAYS, plain
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.name import Judged, judge
-from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
+from ahrsd.mismatch.null import FittedTerm, NullFit, cold_start, fit_null
 from ahrsd.mismatch.regression import (
     Base,
     Candidate,
@@ -25,6 +27,7 @@ from ahrsd.mismatch.regression import (
     best_settings,
     candidate_gram,
 )
+from ahrsd.mismatch.thin import thin_factor, thinned
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
@@ -35,16 +38,30 @@ BLOCK_S = (2.0, 10.0)
 LOOKED_AT = 8
 #: prior of a term in the joint fit, in its own prior deviations: next to none
 LOOSE = 30.0
+#: rows per second that the search works with; faster recordings are averaged down to it
+WORKING_HZ = 12.0
+SMALL_LAG_S = 2e-3
+LAG_STEPS = 3
+#: names of a gyro bias that changes with time alone
+WANDERING = ("gyro_bias_drift", "gyro_bias_step", "gyro_startup", "gyro_bias_temperature")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """What is asked: the track, what is known of the sensor, the library, the thresholds."""
+    """What is asked: the track, what is known of the sensor, the library, the thresholds.
+
+    recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
+    lag_s:    lag of the magnetometer that is already taken out of the track
+    """
 
     track: Track
     spec: Spec
     library: Mapping[str, Effect]
     limits: Limits
+    recorded: Track
+    thin: int
+    cold: NullModel
+    lag_s: float = 0.0
 
     @property
     def rate_hz(self) -> float:
@@ -56,13 +73,44 @@ class Problem:
         """Length of the Gram's blocks: about 80, longer than correlated noise where possible."""
         return float(np.clip(self.track.duration_s / BLOCKS, *BLOCK_S))
 
+    def lagging(self, lag_s: float) -> Problem:
+        """The same with a lag of the magnetometer taken out."""
+        track = thinned(delayed_gyro(self.recorded, lag_s), self.thin, self.cold)
+        return replace(self, track=track, lag_s=lag_s)
+
+
+def problem_of(
+    track: Track, spec: Spec, library: Mapping[str, Effect], limits: Limits
+) -> tuple[Problem, NullModel]:
+    """The recording at working rate, and a calibration to start from."""
+    cold = cold_start(track, spec)
+    m = thin_factor(track, WORKING_HZ)
+    root = float(np.sqrt(m))
+    start = replace(
+        cold,
+        sigma_mag_gauss=cold.sigma_mag_gauss / root,
+        sigma_gyro_rad_s=cold.sigma_gyro_rad_s / root,
+    )
+    work = thinned(track, m, cold)
+    return Problem(work, noise_of_thinned(spec, m), library, limits, track, m, cold), start
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """A fit with its named terms, in the order in which they were named."""
+    """A fit with its named terms, in the order in which they were named.
 
+    problem: with the lag that is taken out;  walk: whether the gyro's bias may wander
+    """
+
+    problem: Problem
     fit: NullFit
     named: tuple[Judged, ...] = ()
+    walk: bool = False
+
+    def lag_s(self, number: int) -> float:
+        """The whole delay that a delay's term stands for, in the term's own sign."""
+        term = self.fit.terms[number]
+        return DELAYS[term.identifier] * self.problem.lag_s + float(term.value[0])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -84,19 +132,23 @@ def term_group(number: int) -> str:
     return f"term {number}"
 
 
-def basis_of(problem: Problem, state: State) -> Base:
+def basis_of(state: State) -> Base:
     """Whitened columns of calibration and terms at the state's fit."""
     context = state.fit.context()
     terms = [(term_group(k), term.columns(context)) for k, term in enumerate(state.fit.terms)]
     whitened = state.fit.filtered.whitened
-    return base(context, state.fit.filtered, terms, colour(whitened, problem.rate_hz))
+    return base(context, state.fit.filtered, terms, colour(whitened, state.problem.rate_hz))
 
 
-def survey(problem: Problem, state: State, basis: Base | None = None) -> Survey:
+def survey(state: State, basis: Base | None = None) -> Survey:
     """Every effect in its best setting, and the strongest of them held against the gate."""
-    basis = basis or basis_of(problem, state)
+    problem = state.problem
+    basis = basis or basis_of(state)
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
-    candidates = best_settings(basis, problem.library, taken)
+    library = problem.library
+    if any(name in DELAYS for name in state.names):
+        library = {name: effect for name, effect in library.items() if name not in DELAYS}
+    candidates = best_settings(basis, library, taken)
     near = [c for c in candidates if c.evidence > problem.limits.evidence_nats][:LOOKED_AT]
     if not near:
         return Survey(basis, tuple(candidates), ())
@@ -105,37 +157,73 @@ def survey(problem: Problem, state: State, basis: Base | None = None) -> Survey:
     return Survey(basis, tuple(candidates), tuple(judged))
 
 
-def forward(problem: Problem, start: NullFit) -> tuple[State, Survey, Survey]:
-    """Name one effect after the other until nothing passes; the first and the last survey."""
-    state = State(start)
-    first = last = survey(problem, state)
-    while len(state.named) < problem.limits.most_terms:
+def forward(state: State) -> tuple[State, Survey, Survey]:
+    """Name one effect after the other until nothing passes; the first and the last survey.
+
+    Before a wandering gyro is given a name, the null may wander itself: noise is no physics.
+    """
+    first = last = survey(state)
+    while len(state.named) < state.problem.limits.most_terms:
         accepted = [judged for judged in last.judged if judged.accepted]
         if not accepted:
             break
-        state = added(problem, state, accepted[0])
-        last = survey(problem, state)
+        if accepted[0].candidate.name in WANDERING and not state.walk:
+            state = refitted(replace(state, walk=True), state.named)
+        else:
+            state = added(state, accepted[0])
+        last = survey(state)
     return state, first, last
 
 
-def added(problem: Problem, state: State, judged: Judged) -> State:
+def added(state: State, judged: Judged) -> State:
     """The state with one more term, everything fitted together."""
-    return refitted(problem, state.fit.model, (*state.named, judged), state.fit.terms)
+    name = judged.candidate.name
+    if name not in DELAYS:
+        return refitted(state, (*state.named, judged))
+    step_s = float(np.nanmedian(state.problem.track.dt_s)) / 2
+    lag_s = DELAYS[name] * float(judged.what.value[0])
+    lag_s *= step_s if name == "gyro_integration" else 1.0
+    effect = state.problem.library[plain(lag_s)]
+    lag = replace(judged, candidate=replace(judged.candidate, effect=effect, setting={}))
+    return _lag_taken_out(state, lag, lag_s)
 
 
-def refitted(
-    problem: Problem,
-    start: NullModel,
-    named: tuple[Judged, ...],
-    terms: tuple[FittedTerm, ...] = (),
-) -> State:
+def refitted(state: State, named: tuple[Judged, ...]) -> State:
     """Calibration, noise and the given terms fitted together, from where the last fit ended."""
-    known = {(term.identifier, str(term.setting)): term for term in terms}
+    known = {(term.identifier, str(term.setting)): term for term in state.fit.terms}
     fitted = []
     for judged in named:
-        term = fitted_term(judged.candidate, judged.what.value)
+        value = judged.what.value
+        if judged.candidate.name in DELAYS:  # the delay itself is out of the track
+            value = np.zeros(1)
+        term = fitted_term(judged.candidate, value)
         fitted.append(known.get((term.identifier, str(term.setting)), term))
-    return State(fit_null(problem.track, problem.spec, start, tuple(fitted)), named)
+    fit = fit_null(
+        state.problem.track,
+        state.problem.spec,
+        state.fit.model,
+        tuple(fitted),
+        walk=state.walk,
+    )
+    return replace(state, fit=fit, named=named)
+
+
+def _lag_taken_out(state: State, judged: Judged, lag_s: float) -> State:
+    """A delay taken out of the track until what is left is linear; its term stays in the fit.
+
+    State.lag_s is the whole of it.
+    """
+    sign = DELAYS[judged.candidate.name]
+    named = (*state.named, judged)
+    for _ in range(LAG_STEPS):
+        problem = state.problem.lagging(state.problem.lag_s + lag_s)
+        rest = fitted_term(judged.candidate, np.zeros(1))
+        fit = replace(state.fit, terms=(*state.fit.terms[: len(named) - 1], rest))
+        state = refitted(replace(state, problem=problem, fit=fit), named)
+        lag_s = sign * float(state.fit.terms[len(named) - 1].value[0])
+        if abs(lag_s) < SMALL_LAG_S:
+            break
+    return state
 
 
 def fitted_term(candidate: Candidate, value: Array) -> FittedTerm:
@@ -149,54 +237,70 @@ def fitted_term(candidate: Candidate, value: Array) -> FittedTerm:
     )
 
 
-def pruned(problem: Problem, state: State) -> State:
+def pruned(state: State) -> State:
     """Terms that the others have made superfluous taken out, one at a time."""
-    while state.named:
-        weakest, evidence = None, problem.limits.evidence_nats
-        basis = basis_of(problem, state)
+    while len(state.named) > 1:
+        basis = basis_of(state)
+        evidence = []
         for k, judged in enumerate(state.named):
-            left = basis.without(term_group(k), state.fit.terms[k].value)
-            gram, columns = candidate_gram(left, [judged.candidate], problem.block_s)
-            again = judge(
-                judged.candidate, gram, columns[judged.candidate.name], left, 1, problem.limits
-            )
-            if again.evidence < evidence:
-                weakest, evidence = k, again.evidence
-        if weakest is None:
+            left = without_term(state, k, basis)
+            gram, columns = candidate_gram(left, [judged.candidate], state.problem.block_s)
+            name = judged.candidate.name
+            again = judge(judged.candidate, gram, columns[name], left, 1, state.problem.limits)
+            evidence.append(again.evidence)
+        weakest = int(np.argmin(evidence))
+        if evidence[weakest] > state.problem.limits.evidence_nats:
             break
-        kept = tuple(j for k, j in enumerate(state.named) if k != weakest)
-        state = refitted(problem, state.fit.model, kept, state.fit.terms)
+        state = refitted(state, tuple(j for k, j in enumerate(state.named) if k != weakest))
     return state
 
 
-def swapped(problem: Problem, state: State) -> tuple[State, list[Survey]]:
+def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
     """Each term held against every other name for what it explains; surveys without each term.
 
     A term gives way to another that explains the same better by the lead that makes a name
-    certain; the new one is fitted in its place.
+    certain; the new one is fitted in its place.  last: the survey of the state, renewed if need be.
     """
     surveys: list[Survey] = []
     for k in range(len(state.named)):
-        basis = basis_of(problem, state)
-        left = basis.without(term_group(k), state.fit.terms[k].value)
-        others = tuple(j for i, j in enumerate(state.named) if i != k)
-        seen = survey(problem, State(state.fit, others), left)
-        mine = max(
-            (c.evidence for c in seen.candidates if c.name == state.named[k].candidate.name),
-            default=0.0,
-        )
+        name = state.named[k].candidate.name
+        seen, mine = _without(state, k)
+        least = mine + state.problem.limits.lead_nats
         better = [
             j
             for j in seen.judged
-            if j.accepted
-            and j.evidence > mine + problem.limits.lead_nats
-            and j.candidate.name != state.named[k].candidate.name
+            if j.accepted and j.candidate.name != name and in_its_place(j.candidate, last) > least
         ]
-        if better:
-            named = (*state.named[:k], better[0], *state.named[k + 1 :])
-            state = refitted(problem, state.fit.model, named, state.fit.terms)
+        if better and name not in DELAYS:
+            state = refitted(state, (*state.named[:k], better[0], *state.named[k + 1 :]))
+            last = survey(state)
+            seen, _ = _without(state, k)
         surveys.append(seen)
-    return state, surveys
+    return state, surveys, last
+
+
+def in_its_place(candidate: Candidate, last: Survey) -> float:
+    """Evidence that a candidate has without a term and no more has with it: what both explain."""
+    beside = {c.name: c.evidence for c in last.candidates}.get(candidate.name, 0.0)
+    return candidate.evidence - max(0.0, beside)
+
+
+def without_term(state: State, number: int, basis: Base | None = None) -> Base:
+    """The basis with one term left out and all that it explains put back."""
+    basis = basis or basis_of(state)
+    value = state.fit.terms[number].value
+    if state.named[number].candidate.name in DELAYS:
+        value = np.array([state.lag_s(number)])
+    return basis.without(term_group(number), value)
+
+
+def _without(state: State, number: int) -> tuple[Survey, float]:
+    """The survey without one term, and the term's own evidence in it."""
+    left = without_term(state, number)
+    others = tuple(j for i, j in enumerate(state.named) if i != number)
+    seen = survey(replace(state, named=others), left)
+    name = state.named[number].candidate.name
+    return seen, max((c.evidence for c in seen.candidates if c.name == name), default=0.0)
 
 
 def noise_of_thinned(spec: Spec, m: int) -> Spec:

@@ -1,0 +1,68 @@
+"""Which delay it is: magnetometer late, gyro late, a low-pass, or half a sample of convention.
+
+All four act as one number, tau, and only the motion's finer structure tells some of them apart.
+With the delay taken out of the track exactly, each is weighed against the plain lag:
+
+    low-pass     what A (LP_tau[h](t) - h(t - tau)) explains beyond the lag, at its full size tau
+    half sample  tau = dt / 2 exactly: a point against the lag's decade of possible sizes
+    sign         a late magnetometer and a late gyro have opposite signs; neither is early
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ahrsd.mismatch.effects.base import Effect
+from ahrsd.mismatch.evidence import posterior
+from ahrsd.mismatch.gram import solve
+from ahrsd.mismatch.regression import Base, whiten
+
+#: effects that are a delay of the magnetometer against the gyro, and their sign
+DELAYS: Mapping[str, float] = {
+    "mag_time_lag": 1.0,
+    "mag_low_pass": 1.0,
+    "gyro_integration": 1.0,
+    "gyro_time_lag": -1.0,
+}
+#: log prior against the plain lag: rarer, and told only where the data ask for it
+RARER = {"mag_low_pass": -1.0, "gyro_integration": -2.0}
+
+
+def plain(lag_s: float) -> str:
+    """The plain lag of that sign."""
+    return "mag_time_lag" if lag_s >= 0 else "gyro_time_lag"
+
+
+def weighed(
+    basis: Base,
+    library: Mapping[str, Effect],
+    lag_s: float,
+    deviation_s: float,
+    recorded_step_s: float,
+) -> dict[str, float]:
+    """Probabilities of the delays; basis: of the model with the lag taken out and its term in."""
+    name = plain(lag_s)
+    scale = library[name].parameters[0].scale
+    evidence = {name: 0.0}
+    if lag_s > 0:
+        evidence["mag_low_pass"] = _low_pass(basis, library["mag_low_pass"], lag_s)
+    miss = (lag_s - recorded_step_s / 2) / max(deviation_s, 1e-9)
+    if lag_s > 0:
+        evidence["gyro_integration"] = float(
+            0.5 * ((lag_s / scale) ** 2 - miss**2) + np.log(scale / max(deviation_s, 1e-9))
+        )
+    found = posterior(evidence, RARER)
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _low_pass(basis: Base, effect: Effect, lag_s: float) -> float:
+    """Log likelihood ratio of a low-pass of that delay against the plain lag."""
+    columns = effect.columns(basis.context, {"time_constant_s": lag_s})
+    X = whiten(basis.filtered, [columns])[0].reshape(-1)
+    Z = basis.known.reshape(-1, basis.known.shape[2])
+    M = solve(Z.T @ Z, (Z.T @ X)[:, None])[:, 0]
+    rest = X - Z @ M
+    s, G = float(rest @ basis.innovation.ravel()), float(rest @ X)
+    return (s * lag_s - 0.5 * G * lag_s**2) / basis.colour

@@ -1,0 +1,41 @@
+"""Moving the gyro in time gives the rotation between the moved instants."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.mismatch.delay import delayed_gyro
+from ahrsd.mismatch.track import Track
+
+
+def attitude(t: np.ndarray) -> np.ndarray:
+    """A smooth attitude: two rotations, one after the other."""
+    first = so3.exp(np.outer(np.sin(1.3 * t), [0.3, -0.8, 0.4]))
+    return first @ so3.exp(np.outer(np.cos(0.9 * t), [0.5, 0.2, 0.6]))
+
+
+def rates(t: np.ndarray) -> np.ndarray:
+    R = attitude(t)
+    mean = so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / np.diff(t)[:, None]
+    return np.vstack([mean[:1], mean])
+
+
+@pytest.mark.parametrize("tau", [0.013, 0.04, -0.027])
+def test_rates_are_those_of_the_earlier_instants(tau):
+    t = np.arange(0.0, 20.0, 0.02)
+    dt = np.concatenate([[np.nan], np.diff(t)])
+    track = Track(t, dt, np.zeros((len(t), 3)), rates(t), None, {}, (slice(0, len(t)),))
+    moved = delayed_gyro(track, tau).gyro_b_rad_s
+    expected = rates(t - tau)
+    inner = slice(5, -5)
+    before = np.abs(track.gyro_b_rad_s - expected)[inner].max()
+    after = np.abs(moved - expected)[inner].max()
+    assert after < 0.02 * before
+
+
+def test_no_delay_is_the_same_track():
+    t = np.arange(10.0)
+    track = Track(t, t, np.zeros((10, 3)), np.ones((10, 3)), None, {}, (slice(0, 10),))
+    assert delayed_gyro(track, 0.0) is track
