@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,11 +33,15 @@ def _list(_context: click.Context, _option: click.Parameter, wanted: bool) -> No
     raise SystemExit(0)
 
 
-def _device(setup: Setup) -> Emulator:
+def _device(setup: Setup, effects: Sequence[str]) -> Emulator:
     from drivers.vn100.emulator_scenarios import build
 
     try:
-        return build(setup)
+        if not effects:
+            return build(setup)
+        from ahrsd.commands.emulate_effects import EmulatedEffects
+
+        return build(setup, EmulatedEffects(setup, effects))
     except ValueError as error:
         raise AhrsdError(str(error)) from None
 
@@ -47,6 +52,12 @@ def _device(setup: Setup) -> Emulator:
 @click.option("--motion", default="", help="Another motion than the scenario's.")
 @click.option("--seed", default=0, show_default=True, help="Chooses truth, motion and noise.")
 @click.option("--fault", "faults", multiple=True, help="name[=parameter][@start[+duration]].")
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    help="ID[=STRENGTH] or ID=name=value,...; see docs/effects.md.",
+)
 @click.option("--firmware", default="", help="2, 3 or a version such as 3.0.0.0.")
 @click.option("--speed", default=1.0, show_default=True, help="Device seconds per second.")
 @click.option("--rate", "rate_hz", default=40, show_default=True, help="Output rate, Hz.")
@@ -70,6 +81,7 @@ def emulate(
     motion: str,
     seed: int,
     faults: tuple[str, ...],
+    effects: tuple[str, ...],
     firmware: str,
     speed: float,
     rate_hz: int,
@@ -89,7 +101,7 @@ def emulate(
     setup = Setup(scenario, seed, faults, firmware, output, rate_hz, baud, int(port), motion)
     try:
         server = PtyEmulator(
-            _device(setup),
+            _device(setup, effects),
             link=link,
             speed=speed,
             lossless=lossless,

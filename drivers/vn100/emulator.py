@@ -30,7 +30,7 @@ from drivers.vn100.emulator_events import Events
 from drivers.vn100.emulator_faults import FaultPlan
 from drivers.vn100.emulator_memory import Memory
 from drivers.vn100.emulator_motion import Motion
-from drivers.vn100.emulator_physics import TICK_HZ, Truth, World
+from drivers.vn100.emulator_physics import TICK_HZ, Further, Truth, World
 from drivers.vn100.emulator_sensor import Sensor
 from drivers.vn100.emulator_streams import Stream, streams
 from drivers.vn100.emulator_wire import Transmitter
@@ -53,7 +53,7 @@ class Emulator:
     truth, motion: what it senses;  firmware: as register 4 says it;  serial: register 3
     faults:  schedules as `emulator_faults.parse_fault` takes them
     port:    the serial port that the host is connected to, 1 or 2
-    presets: register values that were saved long ago
+    presets: register values that were saved long ago;  further: physics that the caller adds
     plugged: false while the host's port does not exist;  counters: what happened how often
     """
 
@@ -68,6 +68,7 @@ class Emulator:
         faults: Sequence[str] = (),
         port: int = 1,
         presets: Mapping[int, Sequence[float | int | str]] | None = None,
+        further: Further | None = None,
     ) -> None:
         self.truth = truth
         self.serial = serial
@@ -76,7 +77,7 @@ class Emulator:
         self._firmware, self._port = firmware, port
         self._presets = dict(presets or {})
         self._plan = FaultPlan(faults, seed)
-        self._world = World(truth, motion, seed, self._plan.disturbances())
+        self._world = World(truth, motion, seed, self._plan.disturbances(), further)
         self._delays = np.random.default_rng([seed, 5])
         self._make_unit(serial)
         self._wire = Transmitter(self._plan, self.memory.number(5, port), self._overflowed)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -155,6 +156,14 @@ class IronStep:
 Disturbance = Dipole | IronStep
 
 
+class Further(Protocol):
+    """Physics that the host's program adds: a function of time alone, the same however asked."""
+
+    def at(self, time_s: Array) -> tuple[Array, Array]:
+        """What adds to the field (gauss) and to the rate (rad/s), (N, 3) each, at (N,) instants."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
     """`BLOCK_TICKS` ticks of sensor values behind the factory calibration, sensor frame.
@@ -206,9 +215,15 @@ class World:
     """Makes the blocks, one after the other."""
 
     def __init__(
-        self, truth: Truth, motion: Motion, seed: int, disturbances: tuple[Disturbance, ...] = ()
+        self,
+        truth: Truth,
+        motion: Motion,
+        seed: int,
+        disturbances: tuple[Disturbance, ...] = (),
+        further: Further | None = None,
     ) -> None:
         self.truth = truth
+        self._further = further
         self._motion = motion
         self._disturbances = disturbances
         self._noise = np.random.default_rng([seed, 3])
@@ -236,7 +251,9 @@ class World:
             first_tick=self._next_tick,
             q_nb=self._q_nb,
             mag_gauss=self._mag,
-            gyro_extra_rad_s=bias + truth.noise_gyro_rad_s * noise[:, 3:6],
+            gyro_extra_rad_s=bias
+            + truth.noise_gyro_rad_s * noise[:, 3:6]
+            + (0.0 if self._further is None else self._further.at(time_s)[1]),
             bias_rad_s=bias,
             accel_m_s2=accel,
             temperature_c=truth.temperature_c + truth.warming_c * warmth + 3e-3 * noise[:, 9],
@@ -258,6 +275,8 @@ class World:
                 h_b = h_b + disturbance.field_b_gauss(time_s)
             else:
                 offset = offset + disturbance.offset_b_gauss(time_s)
+        if self._further is not None:
+            offset = offset + self._further.at(time_s)[0]
         read = h_b @ truth.soft_iron.T + offset + truth.noise_mag_gauss * noise
         return np.asarray(np.clip(read, -MAG_RANGE_GAUSS, MAG_RANGE_GAUSS))
 

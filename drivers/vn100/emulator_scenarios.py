@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.vn100.emulator import Emulator
-from drivers.vn100.emulator_motion import make_motion
-from drivers.vn100.emulator_physics import TICK_HZ, Truth, draw_truth
+from drivers.vn100.emulator_motion import Motion, make_motion
+from drivers.vn100.emulator_physics import TICK_HZ, Further, Truth, draw_truth
 from drivers.vn100.emulator_streams import fits
 
 Values = tuple[float | int | str, ...]
@@ -83,24 +83,34 @@ class Setup:
     motion: str | tuple[tuple[str, float], ...] = ""
 
 
-def build(setup: Setup) -> Emulator:
-    """The emulated device. Raises ValueError naming what is wrong and what there is."""
+def hidden(setup: Setup) -> tuple[Scenario, Truth, Motion]:
+    """The scenario, its hidden truth and its motion.  ValueError for a name that there is not."""
     scenario = SCENARIOS.get(setup.scenario)
     if scenario is None:
         raise ValueError(f"no scenario {setup.scenario!r}; there are {', '.join(SCENARIOS)}")
-    truth = draw_truth(setup.seed)
+    motion = make_motion(setup.motion or scenario.motion, setup.seed)
+    return scenario, draw_truth(setup.seed), motion
+
+
+def build(setup: Setup, further: Further | None = None) -> Emulator:
+    """The emulated device, with further physics where the caller has some.
+
+    Raises ValueError naming what is wrong and what there is.
+    """
+    scenario, truth, motion = hidden(setup)
     presets = dict(_outputs(setup))
     if scenario.calibrated:
         presets.update(calibration_registers(truth))
     firmware = FIRMWARES.get(setup.firmware, setup.firmware) or scenario.firmware
     device = Emulator(
         truth,
-        make_motion(setup.motion or scenario.motion, setup.seed),
+        motion,
         firmware,
         setup.seed,
         faults=(*scenario.faults, *setup.faults),
         port=setup.port,
         presets=presets,
+        further=further,
     )
     if not fits(device.memory, 5, setup.port, (setup.baud,)):
         raise ValueError(
