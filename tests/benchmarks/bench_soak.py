@@ -116,7 +116,7 @@ class Device:
         return self._answers[said]
 
     def round(self, begins_s: float) -> Iterator[tuple[float, bytes]]:
-        """Seconds since the round began, and bytes; the device's time at its start is `begins_s`."""
+        """Seconds since the round began, and bytes; device time at its start: `begins_s`."""
         edges = np.arange(0.0, self._times_s[-1], CHUNK_S)
         cuts = [*np.searchsorted(self._times_s, edges).tolist(), len(self._times_s)]
         for at_s, a, b in zip(edges.tolist(), cuts[:-1], cuts[1:], strict=True):
@@ -239,12 +239,12 @@ class Soak:
         began, cpu_s = time.monotonic(), time.process_time()
         count = 0
         with _estimator_time() as spent:
-            for _ in self._inputs(days * DAY_S):
+            for _ in self._inputs():
                 if self._now_s < count * row_s:
                     continue
                 rows[count] = self._row(time.process_time() - cpu_s, spent[0])
                 count += 1
-                if time.monotonic() - began > wall_s:
+                if self._now_s >= days * DAY_S or time.monotonic() - began > wall_s:
                     break
         self.shell.capture.close()
         return rows[:count]
@@ -266,11 +266,11 @@ class Soak:
             core.stream.all_gaps.count,
         )
 
-    def _inputs(self, until_s: float) -> Iterator[None]:
-        """Round after round; yields after every chunk."""
+    def _inputs(self) -> Iterator[None]:
+        """Round after round, for ever; yields after every chunk."""
         self._feed(inputs.WallClock(0, 1.7e9))
         number, device_s = 0, 10.0
-        while self._now_s < until_s:
+        while True:
             began_s = self._now_s
             self._feed(inputs.LinkOpened(self._ns, "soak", 921600, None))
             for at_s, data in self._device.round(device_s):
