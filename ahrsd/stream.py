@@ -84,7 +84,7 @@ class Stream:
         self._replaced = self._left_out = False
         self._attitude: list[int] | None = None
         self._turns = TurnWatch()
-        self._turns_said = ""
+        self._turns_said = self._rate_warned = ""
         self._given_s: float | None = None
         self._given_steps, self._given_step_s = 0, 0.0
 
@@ -238,10 +238,12 @@ class Stream:
 
     def _decide(self, rate_hz: float, source: str) -> float:
         self.facts.rate_hz, self.facts.rate_source = rate_hz, source
-        self.warnings[
+        self.warnings.pop(self._rate_warned, None)
+        self._rate_warned = (
             f"{self.facts.layout} carries no time: {rate_hz:.4g} Hz ({source}); "
             "a wrong rate makes the gyro bias and the weights wrong, --rate sets it"
-        ] = None
+        )
+        self.warnings[self._rate_warned] = None
         self._steps = StepClock(rate_hz)
         return rate_hz
 

@@ -338,3 +338,18 @@ def test_names_of_messages_are_bounded_and_every_message_is_counted():
     assert len(stream.refused) == 64
     feed(stream, BINARY, range(10, 20))
     assert stream.by_layout[BINARY.name] == 20
+
+
+def test_a_rate_that_is_found_again_is_warned_of_once():
+    stream = Stream(RegisterEpochs())
+    for begin, rate in ((0, 40.0), (5000, 50.0), (10000, 20.0)):
+        stream.register_rate_hz = rate
+        feed(stream, VNYMR, range(begin, begin + 50))
+        assert stream.facts.rate_hz == rate
+        stream.forget()
+        feed(stream, BINARY, range(begin + 100, begin + 150))
+        stream.forget()
+    assert [text for text in stream.warnings if "carries no time" in text] == [
+        "VNYMR carries no time: 20 Hz (register 7); a wrong rate makes the gyro bias and the "
+        "weights wrong, --rate sets it"
+    ]
