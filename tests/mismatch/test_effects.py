@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from effect_motion import moving
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ahrsd import so3
 from ahrsd.mismatch import roles
+from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.base import contribution
 from ahrsd.mismatch.effects.library import EFFECTS
 
@@ -112,3 +115,72 @@ def test_every_identifier_of_the_contract_is_there():
 def test_the_contract_names_the_same_effects():
     text = CONTRACT.read_text().split("Effect identifiers")[1]
     assert set(re.findall(r"`([a-z_]+)`", text)) == set(EFFECTS)
+
+
+#: effects that know the sensor's axes: their form is another one in a turned frame
+AXES = {
+    "ac_interference", "hysteresis", "mag_cross_axis", "mag_nonlinearity", "mag_scale_temperature",
+    "gyro_nonlinearity", "gyro_scale", "gyro_nonorthogonality",
+}  # fmt: skip
+
+
+def turned(readings, R):
+    """The same recording by a sensor whose axes are turned by R."""
+    return replace(
+        readings,
+        mag_b_gauss=readings.mag_b_gauss @ R.T,
+        gyro_b_rad_s=readings.gyro_b_rad_s @ R.T,
+        accel_b_m_s2=readings.accel_b_m_s2 @ R.T,
+        rate_b_rad_s=readings.rate_b_rad_s @ R.T,
+        field_b=readings.field_b @ R.T,
+        R_nb=readings.R_nb @ R.T,
+        soft_iron=R @ readings.soft_iron @ R.T,
+    )
+
+
+@pytest.mark.parametrize("name", [name for name in MEAN if name not in AXES])
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_what_an_effect_can_do_does_not_depend_on_the_sensor_s_axes(name, seed):
+    """The columns of the turned recording span the turned columns."""
+    _, readings = moving(seed, rows=120)
+    effect = EFFECTS[name]
+    R = so3.exp(np.random.default_rng(seed).uniform(-2, 2, 3))
+    other = turned(readings, R)
+    setting = effect.example(readings, 1.0)[1]
+    step = 1e-4
+    scale = np.array([parameter.scale for parameter in effect.parameters])
+    for side in (0, 1):
+        spans = [
+            np.stack(
+                [
+                    difference(effect, at, scale * unit, setting, step)[side].ravel()
+                    for unit in np.eye(len(scale))
+                ],
+                axis=1,
+            )
+            for at in (readings, other)
+        ]
+        wanted = (spans[0].reshape(120, 3, -1).transpose(0, 2, 1) @ R.T).transpose(0, 2, 1)
+        wanted = wanted.reshape(360, -1)
+        if not np.any(wanted):
+            assert not np.any(spans[1])
+            continue
+        found, *_ = np.linalg.lstsq(spans[1], wanted, rcond=1e-9)
+        assert np.abs(spans[1] @ found - wanted).max() < 1e-6 * np.abs(wanted).max()
+
+
+def test_an_effect_does_not_reach_over_a_gap():
+    """What stands behind a gap is the same whatever went before it."""
+    _, readings = moving(7, rows=200, gap_at=100)
+    rows = np.arange(200) >= 100
+    alone = series.kept(readings, rows)
+    for name in ("eddy_current", "viscous_magnetisation", "mag_time_lag", "mag_low_pass",
+                 "gyro_time_lag", "gyro_integration", "current_derivative_field",
+                 "mag_sample_hold"):  # fmt: skip
+        effect = EFFECTS[name]
+        value, setting = effect.example(readings, 1.0)
+        whole = effect.simulate(readings, value, setting)
+        part = effect.simulate(alone, value, setting)
+        assert whole.mag_b_gauss[rows] == pytest.approx(part.mag_b_gauss, abs=1e-12), name
+        assert whole.gyro_b_rad_s[rows] == pytest.approx(part.gyro_b_rad_s, abs=1e-12), name

@@ -269,8 +269,8 @@ class MagSampleHold(Effect):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Readings of the last update, noise included."""
         m = readings.mag_b_gauss
-        held = m[_last_update(readings.dt_s, setting)]
-        return replace(readings, mag_b_gauss=m + float(value[0]) * (held - m))
+        part, held = float(value[0]), m[_last_update(readings.dt_s, setting)]
+        return replace(readings, mag_b_gauss=(1 - part) * m + part * held)  # equal bit by bit at 1
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Updated every fourth sample; the stronger, the more seldom."""
