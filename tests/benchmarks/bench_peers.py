@@ -21,7 +21,7 @@ import sys
 import time
 import venv
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -41,16 +41,15 @@ TOOL = PROJECT.parent / "shared" / "tools" / "magyc_peers.py"
 PROCESS = Path(__file__).with_name("peer_process.py")
 PACKAGE = "magyc==1.0.0"
 IFG = "MAGYC-IFG"
-#: by what a run costs: two seconds, eight, and up to half a minute
+#: by what a run costs: half a second, ten, and up to a minute
 TIERS = (
     (
-        "MAGYC-NLS",
         "MAGYC-NLS +sg",
         "ellipsoid_fit_fang mended",
         "ellipsoid_fit_fang mended +sg",
         "MAGYC-BFG jacfix +sg",
     ),
-    (IFG, "MAGYC-IFG +sg", "MAGYC-IFG jacfix", "MAGYC-IFG jacfix +sg"),
+    ("MAGYC-NLS", IFG, "MAGYC-IFG +sg", "MAGYC-IFG jacfix", "MAGYC-IFG jacfix +sg"),
     ("MAGYC-BFG", "MAGYC-BFG +sg", "MAGYC-BFG jacfix"),
 )
 PEERS = tuple(name for tier in TIERS for name in tier)
@@ -105,32 +104,51 @@ def readings(experiment: Experiment, path: Path) -> None:
     )
 
 
-def ask_peers(
-    python: Path, tool: Path, experiment: Experiment, kept: Path, names: Sequence[str]
-) -> dict[str, Record]:
-    """Answers by name from the file `kept`, those that are missing computed first."""
-    found = answers(kept)
-    missing = [name for name in names if name not in found]
-    if not missing:
-        return found
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    whole = "".join(f"{json.dumps(said)}\n" for said in found.values())
-    kept.write_text(whole, encoding="utf-8")  # without a line that a kill cut short
-    data = kept.with_suffix(".npz")
-    readings(experiment, data)
-    command = [python, PROCESS, tool, data, kept, *missing]
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One experiment, the peers that are to answer it, and the file that keeps their answers."""
+
+    settings: Settings
+    kept: Path
+    names: tuple[str, ...]
+
+    @property
+    def missing(self) -> list[str]:
+        """Peers whose answers are not there."""
+        found = answers(self.kept)
+        return [name for name in self.names if name not in found]
+
+
+def ask_peers(python: Path, tool: Path, cases: Sequence[Case]) -> None:
+    """All answers that are missing, in one process of the peers' environment.
+
+    NoPeersError where the process ends before the last of them.
+    """
+    orders = [_order(case) for case in cases if case.missing]
+    if not orders:
+        return
+    command = [str(python), str(PROCESS), str(tool), *(json.dumps(order) for order in orders)]
     ran = subprocess.run(
-        [str(part) for part in command],
-        check=False, capture_output=True, text=True, timeout=_SECONDS,
+        command, check=False, capture_output=True, text=True, timeout=_SECONDS,
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
     )  # fmt: skip
-    data.unlink()
-    found = answers(kept)
-    lost = [name for name in missing if name not in found]
-    if lost:
-        words = ran.stderr.strip().splitlines() or [f"exit {ran.returncode}"]
-        raise NoPeersError(f"the peers' process ended before {lost[0]}: {words[-1]}")
-    return found
+    for order in orders:
+        Path(order[0]).unlink()
+    for case in cases:
+        if case.missing:
+            words = ran.stderr.strip().splitlines() or [f"exit {ran.returncode}"]
+            raise NoPeersError(f"the peers' process ended before {case.missing[0]}: {words[-1]}")
+
+
+def _order(case: Case) -> list[str]:
+    """Readings' file, answers' file, and the missing peers: what the process is told."""
+    missing, found = case.missing, answers(case.kept)
+    case.kept.parent.mkdir(parents=True, exist_ok=True)
+    whole = "".join(f"{json.dumps(said)}\n" for said in found.values())
+    case.kept.write_text(whole, encoding="utf-8")  # without a line that a kill cut short
+    data = case.kept.with_suffix(".npz")
+    readings(simulate(case.settings), data)
+    return [str(data), str(case.kept), *missing]
 
 
 def answers(kept: Path) -> dict[str, Record]:
@@ -158,16 +176,13 @@ def answered(said: Record) -> Answer:
 # -- one set -----------------------------------------------------------------------------------
 
 
-def peers_results(
-    plan: Plan, seed: int, kept: Path, python: Path, tool: Path, names: Sequence[str]
-) -> list[Record]:
-    """The peers' lines of a seed, scored against the truth."""
-    experiment = simulate(plan.settings(seed))
-    found = ask_peers(python, tool, experiment, kept, names)
+def peers_results(case: Case) -> list[Record]:
+    """The peers' kept answers, scored against the truth."""
+    experiment, found = simulate(case.settings), answers(case.kept)
     return [
         scored(name, AT_S, experiment, lambda name=name: answered(found[name]))  # type: ignore[misc]
         | {"cpu_s": found[name]["cpu_s"]}
-        for name in names
+        for name in case.names
     ]
 
 
@@ -191,10 +206,11 @@ def times(cache: Path, python: Path, tool: Path, counts: Sequence[int]) -> list[
     out = []
     for motion in ("slow", "rov"):
         for count in counts:
-            experiment = simulate(Settings("mam", motion, seed=0, samples=count))
+            settings = Settings("mam", motion, seed=0, samples=count)
             say(f"time: mam {motion}, {count} samples")
-            kept = cache / "time" / f"mam-{motion}-{count}.jsonl"
-            peer = ask_peers(python, tool, experiment, kept, [IFG])[IFG]
+            case = Case(settings, cache / "time" / f"mam-{motion}-{count}.jsonl", (IFG,))
+            ask_peers(python, tool, [case])
+            peer, experiment = answers(case.kept)[IFG], simulate(settings)
             own = {name: ours_s(experiment, rows) for name, rows in ((STREAM, 25), (OURS, 1000))}
             ratios = {f"ratio {name}": peer["cpu_s"] / seconds for name, seconds in own.items()}
             out.append({"motion": motion, "samples": count, IFG: peer["cpu_s"], **own, **ratios})
@@ -256,9 +272,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         python, tool = environment(chosen.cache), tool_module()
         run = Comparison(chosen.cache, python, tool, chosen.runs)
-        for seed in range(chosen.runs[0]):  # every set gets its first seed before any its second
-            for plan in plans:
-                run.peers(plan, seed)
+        run.fill(plans)
         if not chosen.only_peers:
             timed = times(chosen.cache, python, tool, (10_000, 80_000)) if chosen.time else []
             write(chosen.output, [(plan, *run.compared(plan)) for plan in plans], timed)
@@ -272,21 +286,26 @@ class Comparison:
     def __init__(self, cache: Path, python: Path, tool: Path, runs: Sequence[int]) -> None:
         self.cache, self.python, self.tool, self.runs = cache, python, tool, runs
 
-    def peers(self, plan: Plan, seed: int) -> list[Record]:
-        """The peers' results of a seed."""
+    def case(self, plan: Plan, seed: int) -> Case:
+        """What a seed asks of the peers."""
         kept = self.cache / "peers" / f"{plan.scenario}-{plan.motion}" / f"{seed}.jsonl"
-        names = [name for runs, tier in self.tiers() if seed < runs for name in tier]
-        known = answers(kept)
-        if any(name not in known for name in names):
-            say(f"peers: {plan.name}, seed {seed}")
-        return peers_results(plan, seed, kept, self.python, self.tool, names)
+        names = tuple(name for runs, tier in self.tiers() if seed < runs for name in tier)
+        return Case(plan.settings(seed), kept, names)
+
+    def fill(self, plans: Sequence[Plan]) -> None:
+        """Ask the peers: every set gets its first seed before any gets its second."""
+        for seed in range(self.runs[0]):
+            cases = [self.case(plan, seed) for plan in plans]
+            if any(case.missing for case in cases):
+                say(f"peers: seed {seed}")
+            ask_peers(self.python, self.tool, cases)
 
     def compared(self, plan: Plan) -> tuple[list[Record], list[Row]]:
         """Records and rows of ours and of all peers; dear ones over fewer seeds."""
         say(f"ours: {plan.name}")
         records = []
         for seed, ours in enumerate(self.ours(plan)):
-            results = [*ours["results"], *self.peers(plan, seed)]
+            results = [*ours["results"], *peers_results(self.case(plan, seed))]
             records.append(ours | {"results": results})
         rows = []
         for runs, names in ((self.runs[0], (OURS, STREAM)), *self.tiers()):

@@ -1,6 +1,6 @@
 """Runs in the peers' own environment: readings in, what each method says out.
 
-    python peer_process.py MAGYC_PEERS.PY READINGS.NPZ ANSWERS.JSONL METHOD...
+    python peer_process.py MAGYC_PEERS.PY '["READINGS.NPZ", "ANSWERS.JSONL", METHOD, ...]' ...
 
 READINGS: mag (N, 3) mG, gyro (N, 3) rad/s, t (N,) s, rph (N, 3) rad, m0 (3,) mG. Each answer is one
 line as soon as it is there: hard iron in mG, soft iron, gyro bias in rad/s, processor seconds, or
@@ -61,19 +61,21 @@ def answer(name: str, ask: Callable[[], Answer]) -> dict[str, object]:
     return said | dict(zip(("hard_iron_mg", "soft_iron", "gyro_bias_rad_s"), listed))
 
 
-def main(tool: str, readings: str, answers: str, *names: str) -> None:
-    """Answer with every method named, in that order."""
+def main(tool: str, *orders: str) -> None:
+    """Do the orders, one after the other, methods in the order in which they are named."""
     spec = importlib.util.spec_from_file_location("magyc_peers", tool)
     if spec is None or spec.loader is None:
         raise SystemExit(f"{tool}: not a Python file")
     peers = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(peers)
-    data = np.load(readings)
-    known = methods(peers, data["mag"], data["gyro"], (data["t"], data["rph"], data["m0"]))
-    with open(answers, "a", encoding="utf-8") as file:  # noqa: PTH123 - a plain script
-        for name in names:
-            file.write(json.dumps(answer(name, known[name])) + "\n")
-            file.flush()
+    for order in orders:
+        readings, answers, *names = json.loads(order)
+        data = np.load(readings)
+        known = methods(peers, data["mag"], data["gyro"], (data["t"], data["rph"], data["m0"]))
+        with open(answers, "a", encoding="utf-8") as file:  # noqa: PTH123 - a plain script
+            for name in names:
+                file.write(json.dumps(answer(name, known[name])) + "\n")
+                file.flush()
 
 
 if __name__ == "__main__":
