@@ -1,0 +1,108 @@
+"""Limits and steps of a sensor's numbers: flat tops, and a comb in the histogram."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.mismatch.coarse import noise_of
+from ahrsd.mismatch.diagnosis import Value, Where
+from ahrsd.mismatch.facts import Fact, spans_of
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+
+_AXES = ("x", "y", "z")
+_FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
+_PILED = 6.0  # times as many at the limit as in the same width just inside it
+_COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
+
+
+def clipping(track: Track) -> list[Fact]:
+    """Saturation of either sensor."""
+    mag_noise, gyro_noise = noise_of(track)
+    out = []
+    for effect, values, noise, unit, frame in (
+        ("mag_saturation", track.mag_b_gauss, mag_noise, "gauss", "sensor"),
+        ("gyro_saturation", track.gyro_b_rad_s, gyro_noise, "rad/s", "gyro"),
+    ):
+        found = [_flat_tops(values[:, axis], noise) for axis in range(3)]
+        if not any(rows.any() for rows, _ in found):
+            continue
+        limit = max(level for rows, level in found if rows.any())
+        rows = np.any([rows for rows, _ in found], axis=0)
+        intervals = tuple(
+            (float(track.time_s[a]), float(track.time_s[b - 1])) for a, b in spans_of(rows, 5)
+        )
+        axes = tuple(name for name, (mine, _) in zip(_AXES, found, strict=True) if mine.any())
+        sensor = "magnetometer" if unit == "gauss" else "gyro"
+        words = (
+            f"the {sensor} stands at its limit of {limit:.4g} {unit} in "
+            f"{int(np.count_nonzero(rows))} samples ({', '.join(axes)})"
+        )
+        out.append(
+            Fact(
+                effect,
+                words,
+                Where(intervals, axes, frame),
+                0.99,
+                (Value("limit", limit, max(noise, 1e-9), unit),),
+                {},
+                rows if unit == "gauss" else None,
+            )
+        )
+    return out
+
+
+def _flat_tops(values: Array, noise: float) -> tuple[NDArray[np.bool], float]:
+    """Rows at a limit of one axis, and that limit's size.
+
+    At a limit readings are equal bit by bit, several in a row, and pile up: just inside it,
+    within the noise, there are far fewer.
+    """
+    rows = np.zeros(len(values), dtype=bool)
+    size = 0.0
+    finite = values[np.isfinite(values)]
+    for sign in (1.0, -1.0):
+        top = float(np.max(sign * finite)) if len(finite) else 0.0
+        at = sign * values == top
+        if top <= 0 or np.count_nonzero(at) < max(_FEWEST, _SHARE * len(values)):
+            continue
+        longest = max(b - a for a, b in spans_of(at))
+        width = noise or 1e-12
+        inside = np.count_nonzero((sign * finite < top) & (sign * finite > top - width))
+        if longest >= 3 and np.count_nonzero(at) > _PILED * max(inside, 1):
+            # of a sensor that lies still at its largest reading everything piles up
+            if float(finite.max() - finite.min()) < 20 * width:
+                continue
+            rows |= at
+            size = max(size, top)
+    return rows, size
+
+
+def quantisation(track: Track) -> list[Fact]:
+    """A step of the magnetometer's numbers that is coarse against its noise."""
+    noise = noise_of(track)[0]
+    steps = np.array([step_of(track.mag_b_gauss[:, axis]) for axis in range(3)])
+    coarse = steps > _COARSE * noise
+    if noise == 0.0 or not coarse.any():
+        return []
+    step = float(steps.max())
+    axes = tuple(name for name, yes in zip(_AXES, coarse, strict=True) if yes)
+    words = f"the magnetometer's readings come in steps of {1e3 * step:.3g} mG, coarser than noise"
+    where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), axes, "sensor")
+    parameters = (Value("step", step, 1e-6, "gauss"),)
+    return [Fact("mag_quantisation", words, where, 0.99, parameters)]
+
+
+def step_of(values: Array) -> float:
+    """The step that all values are multiples of, but for one offset; 0 where there is none."""
+    unique = np.unique(values[np.isfinite(values)])
+    if len(unique) < 4 or len(unique) > 0.5 * len(values):
+        return 0.0
+    gaps = np.diff(unique)
+    gaps = gaps[gaps > 1e-9]
+    if len(gaps) < 3:
+        return 0.0
+    step = float(np.quantile(gaps, 0.1))
+    off = gaps / step - np.round(gaps / step)
+    return step if np.mean(np.abs(off) < 0.05) > 0.95 else 0.0

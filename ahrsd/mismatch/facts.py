@@ -1,0 +1,44 @@
+"""A fact about a recording that needs no physics: found by counting, told before any fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.mismatch.diagnosis import Value, Where
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fact:
+    """One finding of the hygiene.
+
+    effect:     identifier of the contract;  words: one line that says it with its numbers
+    confidence: of the name, 0..1
+    parameters: as the effect's table row
+    setting:    what else the effect needs (axes, signs, onset, ...), JSON-able
+    bad:        (N,) rows whose magnetometer reading is not one, None where all are
+    stops:      nothing that is fitted before it is put right means anything
+    """
+
+    effect: str
+    words: str
+    where: Where
+    confidence: float
+    parameters: tuple[Value, ...] = ()
+    setting: dict[str, Any] = field(default_factory=dict)
+    bad: NDArray[np.bool] | None = None
+    stops: bool = False
+
+
+def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:
+    """First row and row behind the last of each stretch of true rows; gaps up to `gap` closed."""
+    at = np.flatnonzero(rows)
+    if not len(at):
+        return []
+    cut = np.flatnonzero(np.diff(at) > 1 + gap)
+    firsts = at[np.r_[0, cut + 1]]
+    lasts = at[np.r_[cut, len(at) - 1]] + 1
+    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))

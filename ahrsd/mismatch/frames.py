@@ -1,0 +1,170 @@
+"""Do gyro and magnetometer mean the same axes, the same unit and the same time?
+
+A field that is fixed in the world turns against the sensor: with iron b, gyro bias -c, and the
+gyro's axes and unit P between it and the magnetometer,
+
+    dm/dt = (m - b) x (P w + c) = m x P w - (b x) P w + m x c - b x c
+
+linear in [P, (b x) P, c, b x c].  Integrated over windows it needs no derivative of a noisy
+reading, and the normal equations of all 24 unknowns, made once, hold those of each of the 48
+signed permutations P = s Pi: 10 unknowns [s, s b, c, b x c], for which the 24 are a linear map.
+Iron that deforms is left out here; it bends all 48 alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+from ahrsd.so3 import skew
+
+_WINDOW_S = 0.5
+_ROWS = 4000  # samples in the windows that turn most
+_LAGS_S = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One of the 48: gyro_true_i = signs_i * gyro_(axes_i) * scale.
+
+    cost: residual sum of squares over that of no motion at all, 0..1
+    """
+
+    axes: tuple[int, int, int]
+    signs: tuple[int, int, int]
+    scale: float
+    cost: float
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether nothing is swapped or negated."""
+        return self.axes == (0, 1, 2) and self.signs == (1, 1, 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lag:
+    """lag_s: how much later the magnetometer is than the gyro; cost as in `Frame`; at_edge: the
+    best of the grid is its end."""
+
+    lag_s: float
+    cost: float
+    cost_at_zero: float
+    at_edge: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Normal equations of windows: gram (24, 24), right (24,), total of the readings' changes."""
+
+    gram: Array
+    right: Array
+    total: float
+    count: int
+
+
+def windows(track: Track, shift: int = 0, margin: int = 0) -> Windows | None:
+    """Normal equations with the gyro `shift` samples later; None where there is too little.
+
+    margin: samples kept free at the ends of runs, so that every shift has the same windows
+    """
+    step = float(np.nanmedian(track.dt_s))
+    length = max(4, round(_WINDOW_S / step))
+    blocks = list(_blocks(track, length, max(margin, abs(shift))))
+    if len(blocks) < 12:
+        return None
+    turn = np.array([np.sum(np.abs(track.gyro_b_rad_s[rows]), axis=0).max() for rows in blocks])
+    chosen = np.argsort(-turn)[: max(12, _ROWS // length)]
+    rows = np.concatenate([np.arange(blocks[k].start, blocks[k].stop) for k in np.sort(chosen)])
+    m0, m1 = track.mag_b_gauss[rows - 1], track.mag_b_gauss[rows]
+    middle, dt = (m0 + m1) / 2, track.dt_s[rows][:, None]
+    rate = track.gyro_b_rad_s[rows + shift] * dt
+    starts = np.arange(0, len(rows), length)
+    cross = skew(middle)
+    parts = [
+        np.einsum("nab,nj->nabj", cross, rate).reshape(-1, 3, 9),
+        np.einsum("ab,nj->nabj", np.eye(3), rate).reshape(-1, 3, 9),
+        cross * dt[:, :, None],
+        np.eye(3) * dt[:, :, None],
+    ]
+    X = np.add.reduceat(np.concatenate(parts, axis=2), starts, axis=0).reshape(-1, 24)
+    y = np.add.reduceat(m1 - m0, starts, axis=0).ravel()
+    if not (np.isfinite(X).all() and np.isfinite(y).all()):
+        good = np.isfinite(X).all(axis=1) & np.isfinite(y)
+        X, y = X[good], y[good]
+    return Windows(X.T @ X, X.T @ y, float(y @ y), len(starts))
+
+
+def _blocks(track: Track, length: int, margin: int) -> Iterator[slice]:
+    for run in track.runs or (slice(0, len(track)),):
+        for first in range(run.start + 1 + margin, run.stop - length - margin + 1, length):
+            yield slice(first, first + length)
+
+
+def ranked(found: Windows) -> list[Frame]:
+    """The best first; of each frame and its negative, the one whose scale is positive."""
+    out = []
+    for axes in permutations(range(3)):
+        for signs in product((1, -1), repeat=3):
+            P = np.zeros((3, 3))
+            P[range(3), axes] = signs
+            scale, cost = _fitted(found, P)
+            if scale > 0:
+                i, j, k = axes
+                a, b, c = signs
+                out.append(Frame((i, j, k), (a, b, c), scale, cost))
+    return sorted(out, key=lambda frame: frame.cost)
+
+
+def _fitted(found: Windows, P: Array) -> tuple[float, float]:
+    """Scale and cost of P = s Pi, the hard iron and the bias free."""
+    T = np.zeros((24, 10))
+    T[:9, 0] = P.ravel()
+    for axis in range(3):
+        T[9:18, 1 + axis] = -(skew(np.eye(3)[axis]) @ P).ravel()
+    T[18:, 4:] = np.eye(6)
+    gram, right = T.T @ found.gram @ T, T.T @ found.right
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    normal = gram / scale[:, None] / scale + 1e-9 * np.eye(10)
+    solved = np.linalg.solve(normal, right / scale)
+    # twice the linear part less the quadratic one: right also where the ridge acts
+    gained = 2 * solved @ (right / scale) - solved @ (gram / scale[:, None] / scale) @ solved
+    return float(solved[0] / scale[0]), float(1.0 - gained / max(found.total, 1e-300))
+
+
+def lag_of(track: Track) -> Lag | None:
+    """The lag of a grid over +-200 ms at which gyro and magnetometer agree best, interpolated.
+
+    All 24 unknowns are free, so that neither frame nor iron can pose as a lag.
+    """
+    step = float(np.nanmedian(track.dt_s))
+    most = max(2, round(_LAGS_S / step))
+    shifts = np.unique(np.linspace(-most, most, min(2 * most + 1, 41)).round().astype(int))
+    costs = []
+    for shift in shifts:
+        found = windows(track, int(shift), most)
+        if found is None:
+            return None
+        costs.append(_free_cost(found))
+    best = int(np.argmin(costs))
+    at_edge = best in (0, len(costs) - 1)
+    offset = 0.0
+    if not at_edge:
+        left, middle, right = costs[best - 1 : best + 2]
+        bend = left - 2 * middle + right
+        offset = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    spacing = float(np.median(np.diff(shifts)))
+    zero = costs[int(np.argmin(np.abs(shifts)))]
+    # the gyro's earlier samples fit: what the magnetometer shows now happened before
+    return Lag(float(-(shifts[best] + offset * spacing) * step), costs[best], zero, at_edge)
+
+
+def _free_cost(found: Windows) -> float:
+    scale = np.sqrt(np.maximum(np.diag(found.gram), 1e-300))
+    normal = found.gram / scale[:, None] / scale + 1e-9 * np.eye(24)
+    right = found.right / scale
+    return float(1.0 - right @ np.linalg.solve(normal, right) / max(found.total, 1e-300))

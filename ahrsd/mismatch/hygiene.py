@@ -1,0 +1,176 @@
+"""Before any physics: what is wrong with the recording itself.
+
+Counting and comparing only, no calibration: repeated and doubled readings, limits, coarse steps,
+the clock, units, and whether gyro and magnetometer mean the same axes.  `put_right` gives the
+track as it would be without what was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.mismatch.clipping import clipping, quantisation
+from ahrsd.mismatch.coarse import noise_of
+from ahrsd.mismatch.diagnosis import Value, Where
+from ahrsd.mismatch.facts import Fact
+from ahrsd.mismatch.frames import Frame, ranked, windows
+from ahrsd.mismatch.repeats import repeats
+from ahrsd.mismatch.stamps import regular, stamps
+from ahrsd.mismatch.track import Track
+
+_EXPLAINED = 0.6  # cost of the best frame, of that of no motion, at most
+_BETTER = 1.5  # times the cost that the frame as recorded must be worse
+_NATS = 20.0  # log likelihood by which it must be worse
+_UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
+#: median readings in gauss of the Earth's field (0.2 to 0.7 G) taken in other units
+MAG_UNITS = (
+    ("uT", 1e-2, 20.0, 70.0),
+    ("mG", 1e-3, 200.0, 700.0),
+    ("nT", 1e-5, 2e4, 7e4),
+    ("T", 1e4, 2e-5, 7e-5),
+)
+GYRO_UNITS = (("deg/s", np.pi / 180), ("mrad/s", 1e-3), ("rpm", 2 * np.pi / 60))
+
+
+def hygiene(track: Track) -> tuple[Fact, ...]:
+    """Everything that is found, what stops first."""
+    unit = mag_unit(track)
+    frame = _gyro(track)
+    rest = repeats(track) + clipping(track) + quantisation(track) + stamps(track)
+    return tuple(sorted(unit + frame + rest, key=lambda fact: not fact.stops))
+
+
+def mag_unit(track: Track) -> list[Fact]:
+    """The magnetometer in another unit, told by the Earth's field only."""
+    size = float(np.nanmedian(np.linalg.norm(track.mag_b_gauss, axis=1)))
+    for name, factor, low, high in MAG_UNITS:
+        if low <= size <= high:
+            words = f"the magnetometer reads {size:.3g}: that is {name}, not gauss"
+            return [
+                _unit_error(track, words, 1 / factor, {"sensor": "mag", "unit": name}, "sensor")
+            ]
+    return []
+
+
+def _gyro(track: Track) -> list[Fact]:
+    """Axes, signs and unit of the gyro against the magnetometer."""
+    found = windows(track)
+    if found is None:
+        return []
+    order = ranked(found)
+    same = next((one for one in order if one.is_identity), None)
+    if not order or order[0].cost > _EXPLAINED:
+        return []
+    best = order[0]
+    if same is not None and not _worse(same.cost, best.cost, found.count):
+        best = same
+    facts = []
+    if not best.is_identity:
+        equal = [one for one in order if not _worse(one.cost, best.cost, found.count)]
+        facts.append(_frame_error(track, best, len(equal)))
+    if not 1 / _UNIT < best.scale < _UNIT:
+        facts += _gyro_unit(track, best)
+    return facts
+
+
+def _worse(cost: float, best: float, count: int) -> bool:
+    """Whether a frame explains so much less that it is out."""
+    ratio = max(cost, 1e-12) / max(best, 1e-12)
+    return ratio > _BETTER and 1.5 * count * np.log(ratio) > _NATS
+
+
+def _frame_error(track: Track, best: Frame, equal: int) -> Fact:
+    """equal: how many frames explain the recording as well, this one among them."""
+    P = np.zeros((3, 3))
+    P[range(3), best.axes] = best.signs
+    hand = " (left-handed)" if np.linalg.det(P) < 0 else ""
+    words = f"the gyro's x y z are the magnetometer's {' '.join(_inverse_words(best))}{hand}"
+    return Fact(
+        "frame_error",
+        words,
+        Where(_whole(track), ("x", "y", "z"), "gyro"),
+        1.0 / equal,
+        (Value("present", 1.0, 0.0, "1"),),
+        # the true rate is signs * reading[axes]
+        {"axes": list(best.axes), "signs": list(best.signs)},
+        stops=True,
+    )
+
+
+def _inverse_words(frame: Frame) -> list[str]:
+    """What the reading's axes are in the magnetometer's frame."""
+    out = [""] * 3
+    for true_axis, (axis, sign) in enumerate(zip(frame.axes, frame.signs, strict=True)):
+        out[axis] = f"{'-' if sign < 0 else ''}{'xyz'[true_axis]}"
+    return out
+
+
+def _gyro_unit(track: Track, best: Frame) -> list[Fact]:
+    """The unit whose factor is nearest, if one is near."""
+    tried = [(name, f) for name, factor in GYRO_UNITS for f in (factor, 1 / factor)]
+    name, factor = min(tried, key=lambda pair: abs(np.log(best.scale / pair[1])))
+    if abs(np.log(best.scale / factor)) > np.log(1.5):
+        return []
+    way = f"in {name}" if factor < 1 else f"divided by {factor:.4g} once too often"
+    words = f"the gyro's rates are {1 / best.scale:.3g} times too large: they are {way}"
+    if factor > 1:
+        words = f"the gyro's rates are {best.scale:.3g} times too small: they are {way}"
+    setting = {"sensor": "gyro", "unit": name}
+    return [_unit_error(track, words, 1 / factor, setting, "gyro")]
+
+
+def _unit_error(
+    track: Track, words: str, too_large: float, setting: dict[str, str], frame: str
+) -> Fact:
+    parameters = (Value("factor_less_one", too_large - 1, 0.0, "1"),)
+    where = Where(_whole(track), ("x", "y", "z"), frame)
+    return Fact("unit_error", words, where, 0.99, parameters, dict(setting), stops=True)
+
+
+def put_right(track: Track, facts: Sequence[Fact]) -> Track:
+    """The track without what the facts say: frames and units undone, false readings nan.
+
+    Jittering stamps are put on their regular clock.  Rows stay as they are in number and order.
+    """
+    mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
+    time_s, dt_s = track.time_s, track.dt_s
+    for fact in facts:
+        if fact.effect == "frame_error":
+            gyro = gyro[:, fact.setting["axes"]] * np.array(fact.setting["signs"])
+        elif fact.effect == "unit_error":
+            factor = 1.0 / (1.0 + fact.parameters[0].value)
+            if fact.setting["sensor"] == "gyro":
+                gyro = gyro * factor
+            else:
+                mag = mag * factor
+        elif fact.effect == "timestamp_jitter" and not fact.stops:
+            time_s = regular(track)
+            dt_s = np.where(np.isnan(dt_s), np.nan, np.diff(time_s, prepend=np.nan))
+        if fact.bad is not None:
+            mag[fact.bad] = np.nan
+    return replace(track, time_s=time_s, dt_s=dt_s, mag_b_gauss=mag, gyro_b_rad_s=gyro)
+
+
+def sensitivity(track: Track) -> tuple[str, ...]:
+    """What the checks would have shown here, one line each."""
+    mag, gyro = noise_of(track)
+    step = float(np.nanmedian(track.dt_s))
+    found = windows(track)
+    lines = [
+        f"a magnetometer stuck for 1 s while turning by {1e3 * 8 * mag:.2g} mG",
+        f"readings in steps above {1e3 * 2 * mag:.2g} mG (noise {1e3 * mag:.2g} mG, "
+        f"{1e3 * gyro:.2g} mrad/s)",
+        f"time stamps that jitter by {1e3 * 0.03 * step:.2g} ms; 1 sample in 1000 missing",
+    ]
+    if found is not None and ranked(found) and ranked(found)[0].cost < _EXPLAINED:
+        lines.append("swapped, negated or left-handed axes, and wrong units of the gyro")
+    else:
+        lines.append("no wrong axes or units of the gyro: the sensor hardly turned")
+    return tuple(lines)
+
+
+def _whole(track: Track) -> tuple[tuple[float, float], ...]:
+    return ((float(track.time_s[0]), float(track.time_s[-1])),)

@@ -1,0 +1,181 @@
+"""The noise law of the whitened innovations: colour, tails, and when it changed.
+
+Colour: autoregression over time, the same on the three axes; its order by the Bayesian criterion.
+What is regressed on coloured innovations should be whitened by it first (`whitened_again`): least
+squares is then efficient again and its chi-squared tests keep their level, which
+`tests/mismatch/test_noise.py` measures on red noise.
+
+Level: half the mean square of successive differences per block, which no slow misfit enters, so a
+field that the model does not know is not called noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+
+from ahrsd.mismatch.diagnosis import Value, Where
+from ahrsd.mismatch.facts import Fact
+from ahrsd.mismatch.innovation import Filtered
+from ahrsd.samples import Array
+
+_MOST = 12  # order of the autoregression
+_BLOCK_S = 2.0
+_NATS = 15.0  # by which a change of level must be more likely than none
+_RATIO = 1.3  # of the levels, at least
+_BURST_SHARE = 0.4  # of the recording that a burst may last
+_LEVEL = 1.15  # times the spec's noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Colour:
+    """e_k = sum_j coefficients_j e_(k-j) + white of `variance`; no coefficients: white.
+
+    long_run: variance of a sum of innovations over their number, over that of one: 1 where white
+    """
+
+    coefficients: Array
+    variance: float
+    long_run: float
+
+    @property
+    def order(self) -> int:
+        """How many samples back it reaches."""
+        return len(self.coefficients)
+
+
+@dataclass(frozen=True, slots=True)
+class Tails:
+    """excess_kurtosis: 0 for Gaussian; freedom: of the Student-t that has it, inf for none;
+    outliers: share beyond 4 deviations (6e-5 for Gaussian)."""
+
+    excess_kurtosis: float
+    freedom: float
+    outliers: float
+
+
+def colour_of(done: Filtered) -> Colour:
+    """Autoregression of the whitened innovations."""
+    rows = _centred(done)
+    count = max(float(np.count_nonzero(done.used)) * 3, 1.0)
+    r = np.array(
+        [float(np.sum(rows[lag:] * rows[: len(rows) - lag])) / count for lag in range(_MOST + 1)]
+    )
+    best, best_value, variance = np.zeros(0), count * np.log(max(r[0], 1e-300)), r[0]
+    for order in range(1, _MOST + 1):
+        a = solve_toeplitz(r[:order], r[1 : order + 1])
+        left = float(r[0] - a @ r[1 : order + 1])
+        value = count * np.log(max(left, 1e-300)) + order * np.log(count)
+        if value < best_value - 2.0:
+            best, best_value, variance = np.asarray(a), value, left
+    gain = 1.0 - float(best.sum())
+    return Colour(best, float(variance), float(variance / max(gain**2, 1e-6) / max(r[0], 1e-300)))
+
+
+def whitened_again(values: Array, done: Filtered, colour: Colour) -> Array:
+    """Innovations or regressors (N, 3, ...) with the colour taken out, of variance 1 again.
+
+    Each run starts anew; its first rows, which lack a past, are taken as they are.
+    """
+    if colour.order == 0:
+        return values
+    out = values.copy()
+    track = done.track
+    for run in track.runs or (slice(0, len(track)),):
+        mine = values[run]
+        for j, a in enumerate(colour.coefficients, start=1):
+            if j < len(mine):
+                out[run][j:] -= a * mine[:-j]
+    return np.asarray(out / np.sqrt(colour.variance))
+
+
+def tails_of(done: Filtered) -> Tails:
+    """Tails of the white part of the innovations, all axes together."""
+    e = done.whitened[done.used].ravel()
+    if len(e) < 30:
+        return Tails(0.0, float("inf"), 0.0)
+    z = (e - e.mean()) / max(float(e.std()), 1e-300)
+    kurtosis = float(np.mean(z**4) - 3.0)
+    deviation = float(np.sqrt(24.0 / len(z)))
+    freedom = 4.0 + 6.0 / kurtosis if kurtosis > 3 * deviation else float("inf")
+    middle = 1.4826 * float(np.median(np.abs(e - np.median(e))))
+    return Tails(kurtosis, freedom, float(np.mean(np.abs(e) > 4 * max(middle, 1e-300))))
+
+
+def levels(done: Filtered, block_s: float = _BLOCK_S) -> tuple[Array, Array, Array]:
+    """Middle (B,), white variance of the whitened innovations (B,), and their number (B,)."""
+    track = done.track
+    pairs = done.used[1:] & done.used[:-1]
+    half = np.where(pairs, np.sum(np.diff(done.whitened, axis=0) ** 2, axis=1) / 2, 0.0)
+    block = ((track.time_s[1:] - track.time_s[0]) / block_s).astype(int)
+    size = np.asarray(np.bincount(block, weights=3.0 * pairs), dtype=np.float64)
+    total = np.bincount(block, weights=half, minlength=len(size))
+    kept = size >= 15
+    middle = track.time_s[0] + (np.arange(len(size)) + 0.5) * block_s
+    return middle[kept], total[kept] / size[kept], size[kept]
+
+
+def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
+    """A burst, or a level that changed or is above the spec's."""
+    middle, variance, size = levels(done)
+    if len(middle) < 10:
+        return []
+    # neighbouring differences share a sample, and heavy tails scatter more than Gaussian ones
+    weight = size / 1.5 / (1.0 + max(tails_of(done).excess_kurtosis, 0.0) / 2.0)
+    first, last, gain = _loudest(variance, weight)
+    inside = np.zeros(len(middle), dtype=bool)
+    inside[first:last] = True
+    loud = float(np.average(variance[inside], weights=weight[inside])) if inside.any() else 1.0
+    quiet = float(np.average(variance[~inside], weights=weight[~inside])) if not inside.all() else 1
+    changed = gain > _NATS and loud > _RATIO * quiet
+    if changed and last < len(middle) and last - first <= _BURST_SHARE * len(middle):
+        return [_fact(done, "noise_burst", middle[first], middle[last - 1], loud, quiet)]
+    if changed:
+        return [_fact(done, "noise_level", middle[first], middle[last - 1], loud, quiet)]
+    overall = float(np.average(variance, weights=weight))
+    if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 / weight.sum()):
+        return [_fact(done, "noise_level", middle[0], middle[-1], overall, 1.0)]
+    return []
+
+
+def _loudest(variance: Array, weight: Array) -> tuple[int, int, float]:
+    """The stretch of blocks whose own level is most likely: first, behind the last, nats."""
+    squares = np.concatenate([[0.0], np.cumsum(variance * weight)])
+    weights = np.concatenate([[0.0], np.cumsum(weight)])
+    base = weights[-1] * np.log(squares[-1] / weights[-1])
+    a, b = np.triu_indices(len(squares), k=1)
+    mine, rest = weights[b] - weights[a], weights[-1] - weights[b] + weights[a]
+    loud, quiet = squares[b] - squares[a], squares[-1] - squares[b] + squares[a]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inner = mine * np.log(loud / mine)
+        outer = np.where(rest > 0.5, rest * np.log(quiet / rest), 0.0)
+        gain = 0.5 * (base - inner - outer)
+        gain[(rest > 0.5) & (loud * rest < quiet * mine)] = 0.0
+    best = int(np.nanargmax(gain))
+    return int(a[best]), int(b[best]), float(gain[best])
+
+
+def _fact(
+    done: Filtered, effect: str, first: float, last: float, loud: float, quiet: float
+) -> Fact:
+    begin, end = float(first - _BLOCK_S / 2), float(last + _BLOCK_S / 2)
+    end = min(end, float(done.track.time_s[-1]))
+    sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
+    ratio = float(np.sqrt(loud / quiet))
+    words = f"from {begin:.0f} to {end:.0f} s the noise is {ratio:.2g} times its usual level"
+    where = Where(((begin, end),), ("x", "y", "z"), "noise")
+    if effect == "noise_burst":
+        parameters = (Value("burst", sigma, sigma * 0.1, "gauss"),)
+        return Fact(
+            effect, words, where, 0.95, parameters, {"onset_s": begin, "length_s": end - begin}
+        )
+    parameters = (Value("mag", sigma, sigma * 0.1, "gauss"),)
+    return Fact(effect, words, where, 0.95, parameters, {"onset_s": begin})
+
+
+def _centred(done: Filtered) -> Array:
+    rows = np.where(done.used[:, None], done.whitened, 0.0)
+    mean = done.whitened[done.used].mean(axis=0) if done.used.any() else np.zeros(3)
+    return np.asarray(np.where(done.used[:, None], rows - mean, 0.0))

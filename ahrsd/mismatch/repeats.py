@@ -1,0 +1,145 @@
+"""Readings that repeat: a stuck magnetometer, one that is updated too slowly, doubled samples.
+
+Equal bit by bit on all three axes is the sign, and only where the gyro says that the sensor
+turned by more than the readings' resolution: a quiet sensor at rest repeats itself honestly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.mismatch.coarse import noise_of
+from ahrsd.mismatch.diagnosis import Value, Where
+from ahrsd.mismatch.facts import Fact, spans_of
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+
+_AXES = ("x", "y", "z")
+_STUCK_S = 1.0
+_MOVED = 8.0  # noise levels by which the field must have turned during the repetition
+_HELD_SHARE = 0.4  # of the moving samples that repeat the one before
+_DOUBLED_SHARE = 2e-3
+_TURNING = 5.0  # gyro noise levels
+
+
+def repeats(track: Track) -> list[Fact]:
+    """Stuck, held and doubled samples."""
+    again = _again(track, track.mag_b_gauss)
+    expected = _expected_change(track)
+    stuck, bad = _stuck(track, again, expected)
+    held = _held(track, again & ~bad, expected)
+    doubled = [] if held else _doubled(track, again & ~bad)
+    return stuck + held + doubled
+
+
+def _again(track: Track, values: Array) -> NDArray[np.bool]:
+    """(N,) rows equal to the row before, within a run."""
+    out = np.zeros(len(values), dtype=bool)
+    out[1:] = np.all(values[1:] == values[:-1], axis=1)
+    for run in track.runs:
+        out[run.start] = False
+    return out
+
+
+def _expected_change(track: Track) -> Array:
+    """(N,) gauss by which a step turns the field at most, the gyro's middle taken as its bias."""
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    size = float(np.nanmedian(np.linalg.norm(track.mag_b_gauss, axis=1)))
+    step = np.linalg.norm(rate, axis=1) * np.nan_to_num(track.dt_s, nan=0.0)
+    return np.asarray(step * size)
+
+
+def _resolution(track: Track) -> float:
+    return max(noise_of(track)[0], 1e-6)
+
+
+def _stuck(
+    track: Track, again: NDArray[np.bool], expected: Array
+) -> tuple[list[Fact], NDArray[np.bool]]:
+    bad = np.zeros(len(track), dtype=bool)
+    intervals: list[tuple[float, float]] = []
+    for first, last in spans_of(again):
+        begin = float(track.time_s[first - 1])
+        length = float(track.time_s[last - 1]) - begin
+        if length < _STUCK_S or expected[first:last].sum() < _MOVED * _resolution(track):
+            continue
+        bad[first:last] = True
+        intervals.append((begin, begin + length))
+    if not intervals:
+        return [], bad
+    total = sum(b - a for a, b in intervals)
+    step = float(np.nanmedian(track.dt_s))
+    words = f"the magnetometer repeats one reading while the sensor turns, {total:.1f} s in all"
+    return [
+        Fact(
+            "stuck_magnetometer",
+            words,
+            Where(tuple(intervals), _AXES, "sensor"),
+            1.0,
+            (Value("length", total, step, "s"),),
+            {"onset_s": intervals[0][0]},
+            bad,
+        )
+    ], bad
+
+
+def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
+    moving = expected > np.quantile(expected, 0.5)
+    count = int(np.count_nonzero(moving))
+    if count < 50 or np.count_nonzero(again & moving) < _HELD_SHARE * count:
+        return []
+    fresh = np.flatnonzero(~again)
+    lengths = np.diff(fresh)
+    if len(lengths) < 10:
+        return []
+    usual = int(np.median(lengths))
+    if usual < 2 or np.mean(np.abs(lengths - usual) <= 1) < 0.8:
+        return []
+    step = float(np.nanmedian(track.dt_s))
+    words = (
+        f"the magnetometer has a new reading only every {usual} samples "
+        f"({1 / (usual * step):.3g} Hz)"
+    )
+    return [
+        Fact(
+            "mag_sample_hold",
+            words,
+            Where(_whole(track), _AXES, "sensor"),
+            1.0,
+            (Value("held_part", 1.0, 0.0, "1"),),
+            {"hold": usual, "period_s": usual * step},
+            again.copy(),
+        )
+    ]
+
+
+def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
+    """Rows that repeat magnetometer and gyro: a sample that was sent or stored twice.
+
+    Only while the sensor turns: at rest coarse numbers repeat by chance.
+    """
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    turning = np.max(np.abs(rate), axis=1) > _TURNING * noise_of(track)[1]
+    both = again & _again(track, track.gyro_b_rad_s) & turning
+    count = int(np.count_nonzero(both))
+    if count < max(3, _DOUBLED_SHARE * len(track)):
+        return []
+    share = count / len(track)
+    step = float(np.nanmedian(track.dt_s))
+    times = tuple((float(t) - step, float(t)) for t in track.time_s[both][:50])
+    return [
+        Fact(
+            "dropped_samples",
+            f"{count} samples repeat the one before, gyro and magnetometer: they came twice",
+            Where(times, _AXES, "link"),
+            0.95,
+            (Value("part", share, float(np.sqrt(share / len(track))), "1"),),
+            {"doubled": True},
+            both,
+        )
+    ]
+
+
+def _whole(track: Track) -> tuple[tuple[float, float], ...]:
+    return ((float(track.time_s[0]), float(track.time_s[-1])),)
