@@ -22,7 +22,7 @@ from ahrsd.methods import (
     tls,
     twostep,
 )
-from ahrsd.methods.checks import moved, usable
+from ahrsd.methods.checks import agrees_with_gyro, moved, usable
 from ahrsd.methods.data import Data, Fit, MethodError, MethodResult, Settings
 from ahrsd.samples import Array, SampleBlock
 
@@ -86,6 +86,8 @@ def run(
         remark = moved(data, chosen, row.axes)
         fit = row.function(data, chosen)
         _finite(fit)
+        if "gyro" in row.needs:
+            agrees_with_gyro(data, fit)
     except (MethodError, np.linalg.LinAlgError) as error:
         seconds = clock() - began if clock else began
         return MethodResult(method, None, None, None, False, _reason(error), 0, seconds)

@@ -45,7 +45,8 @@ def test_a_gap_is_not_differentiated(method):
     apart = calibrate_with(method, blocks(data, (half, half), gaps=(1,)), settings=KNOWN)
     assert np.linalg.norm(apart.hard_iron_gauss - HARD_IRON) < 1e-3
     if method in ("magical-ls", "magical-nls"):  # the others' median hides one bad difference
-        assert np.linalg.norm(across.hard_iron_gauss - HARD_IRON) > 3e-3
+        assert not across.converged
+        assert "explains" in across.reason
 
 
 @pytest.mark.parametrize("derivative", ["median", "savgol"])

@@ -104,6 +104,47 @@ def test_units_wrong(method):
     assert "is the unit rad/s?" in refused(method, milliradians)
 
 
+GYRO = [m for m in EVERY if "gyro" in METHODS[m].needs]
+
+
+@pytest.mark.parametrize("method", GYRO)
+@pytest.mark.parametrize("kind", ["wam", "lam"])
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1e-3, "gauss for each radian of the gyroscope: is its unit rad/s?"),
+        (0.0, "gauss for each radian of the gyroscope: is its unit rad/s?"),
+        (np.pi / 180, "unit"),
+        (180 / np.pi, "unit"),
+        (-1.0, "% of how the field turns: are its unit, axes and the time right?"),
+    ],
+)
+def test_a_gyroscope_that_does_not_turn_with_the_field(method, kind, factor, words):
+    """Wrong by 1000, dead, in deg/s, divided twice, mirrored: sizes alone would pass."""
+    data = simulate(kind, n=3000, faster=4.0).data
+    assert run(method, data).converged
+    reason = refused(method, replace(data, gyro_b_rad_s=factor * data.gyro_b_rad_s))
+    assert words in reason or "determine" in reason or "positive definite" in reason or (
+        "no end" in reason or "distorted" in reason or "diverged" in reason
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("method", GYRO)
+def test_time_in_another_unit(method):
+    data = simulate("wam", n=3000, faster=4.0).data
+    for factor in (0.01, 10.0):
+        slower = replace(data, time_s=factor * data.time_s, dt_s=factor * data.dt_s)
+        assert refused(method, slower)
+
+
+def test_one_run_in_twenty_may_be_spoilt():
+    """A magnet passing by is no reason to call the gyroscope wrong."""
+    data = simulate("wam", n=5000, faster=4.0).data
+    raw = data.raw_b_gauss.copy()
+    raw[1000:1060] += [0.4, -0.3, 0.2]
+    assert run("magyc-bfg", replace(data, raw_b_gauss=raw)).converged
+
+
 @pytest.mark.parametrize("method", EVERY)
 def test_time_backwards(method):
     data = clean(n=2000).data
