@@ -224,14 +224,21 @@ def parameter_lines(rows: Sequence[Row], truth: Sequence[float]) -> list[str]:
     last = max((row.at_s for row in rows), default=0.0)
     shown = [k for k, name in enumerate(PARAMETERS) if name not in ("A21", "A31", "A32")]
     table = [f"{'':<19} " + " ".join(f"{PARAMETERS[k]:>16}" for k in shown)]
-    table.append(f"{'truth':<19} " + " ".join(f"{truth[k]:>16.4f}" for k in shown))
+    digits = [5 if PARAMETERS[k] in _ENTRIES else 4 for k in shown]
+    cells = [f"{truth[k]:.{d}f}" for k, d in zip(shown, digits, strict=True)]
+    table.append(f"{'truth':<19} " + " ".join(f"{cell:>16}" for cell in cells))
     if rows:
         sigma = [next(row for row in rows if row.at_s == last).bound_sigma[k] for k in shown]
-        cells = ["-" if value is None else f"+-{value:.4f}" for value in sigma]
+        cells = [
+            "-" if value is None else f"+-{value:.{d}f}"
+            for value, d in zip(sigma, digits, strict=True)
+        ]
         table.append(f"{'bound':<19} " + " ".join(f"{cell:>16}" for cell in cells))
     for row in rows:
         if row.at_s == last and row.answered:
-            cells = [_cell(row.mean[k], row.spread[k]) for k in shown]
+            cells = [
+                _cell(row.mean[k], row.spread[k], d) for k, d in zip(shown, digits, strict=True)
+            ]
             table.append(f"{row.method:<19} " + " ".join(f"{cell:>16}" for cell in cells))
     return table
 
@@ -261,5 +268,5 @@ def _headings(figures: Mapping[str, float | None]) -> str:
     return f"{_text(noisy)} ({_text(quiet)})"
 
 
-def _cell(mean: float | None, spread: float | None) -> str:
-    return "-" if mean is None or spread is None else f"{mean:.4f}+-{spread:.4f}"
+def _cell(mean: float | None, spread: float | None, digits: int) -> str:
+    return "-" if mean is None or spread is None else f"{mean:.{digits}f}+-{spread:.{digits}f}"
