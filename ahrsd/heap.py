@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 
+from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
 
 EVIDENCE_BYTES = 16 << 20  # an hour of segments, their tracks, one judgement's small temporaries
@@ -30,7 +31,7 @@ def needed_bytes(estimator: EstimatorParameters) -> int:
 def take_heap(size_bytes: int) -> bool:
     """Grow the heap by this much, for good; call it before threads are started.
 
-    False, and nothing is done, where the C library is not glibc. Raises MemoryError where there is
+    False, and nothing is done, where the C library is not glibc. Raises ConfigError where there is
     not so much.
     """
     libc = ctypes.CDLL(None)
@@ -44,7 +45,10 @@ def take_heap(size_bytes: int) -> bool:
     pieces = [libc.malloc(_PIECE_BYTES) for _ in range(size_bytes // _PIECE_BYTES)]
     try:
         if None in pieces:
-            raise MemoryError(f"{size_bytes >> 20} MB for the histories are not there")
+            megabytes = size_bytes >> 20
+            raise ConfigError(
+                [f"estimator.window_steps: its {megabytes} MB of memory are not there; less of it"]
+            )
         for piece in pieces:
             ctypes.memset(piece, 0, _PIECE_BYTES)
     finally:

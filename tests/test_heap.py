@@ -23,6 +23,7 @@ def run(text):
     head = (
         "import json, resource, threading\n"
         "import numpy as np\n"
+        "from ahrsd.errors import ConfigError\n"
         "from ahrsd.heap import take_heap\n"
         "def rss(): return int(open('/proc/self/statm').read().split()[1]) * 4096 / 2**20\n"
         "def fill(n=700): return [np.ones(4000) for _ in range(n)]  # 32 kB each, 21 MB\n"
@@ -65,9 +66,9 @@ def test_what_is_not_there_is_said_at_the_start():
         "_, most = resource.getrlimit(resource.RLIMIT_AS)\n"
         "resource.setrlimit(resource.RLIMIT_AS, (2**31, most))\n"
         "try: take_heap(2**31)\n"
-        "except MemoryError as error: print(json.dumps([str(error)]))"
+        "except ConfigError as error: print(json.dumps([str(error)]))"
     )
-    assert said == "2048 MB for the histories are not there"
+    assert said == "estimator.window_steps: its 2048 MB of memory are not there; less of it"
 
 
 def test_another_c_library_is_left_alone(monkeypatch):
