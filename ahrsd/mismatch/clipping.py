@@ -69,7 +69,7 @@ def _flat_tops(values: Array, noise: float) -> tuple[NDArray[np.bool], float]:
             continue
         longest = max(b - a for a, b in spans_of(at))
         width = noise or 1e-12
-        inside = np.count_nonzero((sign * finite < top) & (sign * finite > top - width))
+        inside = int(np.count_nonzero((sign * finite < top) & (sign * finite > top - width)))
         if longest >= 3 and np.count_nonzero(at) > _PILED * max(inside, 1):
             # of a sensor that lies still at its largest reading everything piles up
             if float(finite.max() - finite.min()) < 20 * width:

@@ -39,7 +39,9 @@ def hygiene(track: Track) -> tuple[Fact, ...]:
     """Everything that is found, what stops first."""
     unit = mag_unit(track)
     frame = _gyro(track)
-    rest = repeats(track) + clipping(track) + quantisation(track) + stamps(track)
+    limits = clipping(track)
+    clipped = next((fact.bad for fact in limits if fact.bad is not None), None)
+    rest = repeats(track, clipped) + limits + quantisation(track) + stamps(track)
     return tuple(sorted(unit + frame + rest, key=lambda fact: not fact.stops))
 
 

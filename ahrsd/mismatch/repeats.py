@@ -23,9 +23,11 @@ _DOUBLED_SHARE = 2e-3
 _TURNING = 5.0  # gyro noise levels
 
 
-def repeats(track: Track) -> list[Fact]:
-    """Stuck, held and doubled samples."""
+def repeats(track: Track, clipped: NDArray[np.bool] | None = None) -> list[Fact]:
+    """Stuck, held and doubled samples.  clipped: (N,) readings at a limit, which repeat of course."""
     again = _again(track, track.mag_b_gauss)
+    if clipped is not None:
+        again &= ~clipped
     expected = _expected_change(track)
     stuck, bad = _stuck(track, again, expected)
     held = _held(track, again & ~bad, expected)

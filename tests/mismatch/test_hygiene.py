@@ -1,0 +1,258 @@
+"""Hygiene: each fault is found with its numbers, and nothing on clean recordings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, recorded, track_of, true_model
+
+from ahrsd.mismatch.facts import Fact, spans_of
+from ahrsd.mismatch.frames import lag_of, ranked, windows
+from ahrsd.mismatch.hygiene import hygiene, put_right, sensitivity
+from ahrsd.mismatch.innovation import run_filter
+from ahrsd.mismatch.missing import missing_turns
+from ahrsd.mismatch.stamps import regular
+from ahrsd.mismatch.track import Track
+
+CLEAN = (
+    "broad/01_undisturbed_slow_rotation_A",
+    "broad/02_undisturbed_slow_rotation_B",
+    "broad/21_undisturbed_fast_combined",
+    "vn100/hand_2023_thumatti",
+    "repoimu/TStick_Test11_Trial1",
+    "vn100/drive_2022_rahul",
+    "vn100/static_2025_kiran_5min",
+)
+
+
+def _only(facts: tuple[Fact, ...]) -> Fact:
+    assert len(facts) == 1, [fact.words for fact in facts]
+    return facts[0]
+
+
+def _value(fact: Fact) -> float:
+    return fact.parameters[0].value
+
+
+@pytest.fixture(scope="module")
+def track() -> Track:
+    return track_of(experiment("mam", samples=6000, seed=3))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "motion", "sigma"),
+    [("wam", "rov", 5e-4), ("mam", "slow", 5e-3), ("lam", "slow", 5e-3), ("lam", "rov", 5e-4)],
+)
+def test_nothing_on_simulated_nulls(scenario: str, motion: str, sigma: float) -> None:
+    for seed in range(6):
+        made = experiment(scenario, motion=motion, seed=seed, samples=5000, sigma_gyro=sigma)
+        assert hygiene(track_of(made)) == ()
+
+
+@pytest.mark.parametrize("name", CLEAN)
+def test_nothing_on_clean_recordings(name: str) -> None:
+    assert [fact.words for fact in hygiene(recorded(name))] == []
+
+
+@pytest.mark.parametrize(
+    ("axes", "signs"),
+    [
+        ([0, 2, 1], [-1, 1, 1]),
+        ([1, 0, 2], [1, 1, -1]),
+        ([0, 1, 2], [1, 1, -1]),
+        ([2, 0, 1], [1, 1, 1]),
+    ],
+)
+def test_a_wrong_frame_is_named_and_undone(track: Track, axes: list[int], signs: list[int]) -> None:
+    wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s[:, axes] * np.array(signs))
+    fact = _only(hygiene(wrong))
+    assert fact.effect == "frame_error"
+    assert fact.stops
+    assert fact.confidence > 0.9
+    assert np.array_equal(put_right(wrong, (fact,)).gyro_b_rad_s, track.gyro_b_rad_s)
+
+
+def test_left_handed_axes_are_called_so(track: Track) -> None:
+    wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * np.array([1.0, 1.0, -1.0]))
+    assert "left-handed" in _only(hygiene(wrong)).words
+
+
+def test_degrees_and_swapped_axes_together(track: Track) -> None:
+    wrong = replace(track, gyro_b_rad_s=np.degrees(track.gyro_b_rad_s[:, [1, 0, 2]]))
+    facts = hygiene(wrong)
+    assert {fact.effect for fact in facts} == {"frame_error", "unit_error"}
+    unit = next(fact for fact in facts if fact.effect == "unit_error")
+    assert abs(_value(unit) / (180 / np.pi - 1) - 1) < 1e-9
+    assert "deg/s" in unit.words
+    assert np.abs(put_right(wrong, facts).gyro_b_rad_s - track.gyro_b_rad_s).max() < 1e-12
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("uT", 100.0), ("mG", 1e3), ("nT", 1e5), ("T", 1e-4)])
+def test_the_magnetometers_unit_by_the_earths_field(track: Track, unit: str, factor: float) -> None:
+    wrong = replace(track, mag_b_gauss=track.mag_b_gauss * factor)
+    facts = [fact for fact in hygiene(wrong) if fact.effect == "unit_error"]
+    fact = _only(tuple(facts))
+    assert fact.setting == {"sensor": "mag", "unit": unit}
+    right = put_right(wrong, facts).mag_b_gauss
+    assert np.abs(right / track.mag_b_gauss - 1).max() < 1e-12
+
+
+def test_a_quiet_motion_does_not_tell_the_frame() -> None:
+    """At rest every frame fits: nothing is said, and the sensitivity says why."""
+    made = experiment("lam", samples=2000)
+    rng = np.random.default_rng(1)
+    at_rest = replace(
+        track_of(made),
+        mag_b_gauss=np.array([0.2, 0.1, 0.4]) + 1e-3 * rng.standard_normal((2000, 3)),
+        gyro_b_rad_s=1e-3 * rng.standard_normal((2000, 3)),
+    )
+    assert hygiene(at_rest) == ()
+    assert "hardly turned" in sensitivity(at_rest)[-1]
+    assert "left-handed" in sensitivity(track_of(made))[-1]
+
+
+def test_a_stuck_magnetometer(track: Track) -> None:
+    mag = track.mag_b_gauss.copy()
+    mag[2000:2125] = mag[2000]
+    stuck = replace(track, mag_b_gauss=mag)
+    fact = _only(hygiene(stuck))
+    assert fact.effect == "stuck_magnetometer"
+    assert abs(_value(fact) - 124 * 0.04) < 0.05
+    begin, end = fact.where.intervals_s[0]
+    assert abs(begin - track.time_s[2000]) < 0.05
+    assert abs(end - track.time_s[2124]) < 0.05
+    right = put_right(stuck, (fact,))
+    assert np.isnan(right.mag_b_gauss[2001:2125]).all()
+    assert np.isfinite(right.mag_b_gauss[2000]).all()
+
+
+def test_a_held_magnetometer(track: Track) -> None:
+    at = np.arange(len(track)) // 4 * 4
+    fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    assert fact.effect == "mag_sample_hold"
+    assert fact.setting["hold"] == 4
+    assert fact.bad is not None
+    assert abs(np.mean(fact.bad) - 0.75) < 0.01
+
+
+def test_doubled_samples(track: Track) -> None:
+    order = np.sort(np.r_[np.arange(5900), np.arange(40, 5840, 58)])
+    doubled = replace(
+        track, mag_b_gauss=track.mag_b_gauss[order], gyro_b_rad_s=track.gyro_b_rad_s[order]
+    )
+    fact = _only(hygiene(doubled))
+    assert fact.effect == "dropped_samples"
+    assert fact.setting == {"doubled": True}
+    assert abs(_value(fact) - 100 / 6000) < 2e-3
+
+
+def test_saturation_of_both_sensors(track: Track) -> None:
+    mag = np.clip(track.mag_b_gauss, -np.inf, 0.3)
+    fact = _only(hygiene(replace(track, mag_b_gauss=mag)))
+    assert fact.effect == "mag_saturation"
+    assert _value(fact) == 0.3
+    assert fact.bad is not None
+    assert np.array_equal(fact.bad, (mag == 0.3).any(axis=1))
+    top = 0.7 * float(np.abs(track.gyro_b_rad_s).max())
+    fact = _only(hygiene(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
+    assert fact.effect == "gyro_saturation"
+    assert _value(fact) == top
+
+
+def test_coarse_steps(track: Track) -> None:
+    coarse = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 0.01) * 0.01)
+    facts = [fact for fact in hygiene(coarse) if fact.effect == "mag_quantisation"]
+    assert abs(_value(_only(tuple(facts))) / 0.01 - 1) < 1e-6
+    fine = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 1e-4) * 1e-4)
+    assert hygiene(fine) == ()
+
+
+def _without(track: Track, keep: np.ndarray, *, restamp: bool) -> Track:
+    """The track without rows; restamped: the time stamps do not show it."""
+    time_s = track.time_s[: len(keep)] if restamp else track.time_s[keep]
+    assert track.accel_b_m_s2 is not None
+    return Track(
+        time_s,
+        np.diff(time_s, prepend=np.nan),
+        track.mag_b_gauss[keep],
+        track.gyro_b_rad_s[keep],
+        track.accel_b_m_s2[keep],
+        {},
+        (slice(0, len(keep)),),
+    )
+
+
+def test_missing_samples_by_their_stamps(track: Track) -> None:
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.02)
+    fact = _only(hygiene(_without(track, keep, restamp=False)))
+    assert fact.effect == "dropped_samples"
+    assert abs(_value(fact) - (1 - len(keep) / len(track))) < 1e-3
+
+
+def test_missing_samples_without_a_gap_in_the_stamps() -> None:
+    made = experiment("mam", samples=6000, seed=3, sigma_mag=5e-4)
+    track = track_of(made)
+    model = replace(true_model(made), sigma_mag_gauss=5e-4)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
+    cut = _without(track, keep, restamp=True)
+    facts = missing_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    fact = _only(tuple(facts))
+    assert fact.effect == "dropped_samples"
+    assert 0.004 < _value(fact) < 0.02
+    rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
+    assert missing_turns(run_filter(track, model), rate) == []
+
+
+def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
+    rng = np.random.default_rng(2)
+    stamped = track.time_s + 3e-3 * rng.standard_normal(len(track))
+    jittered = replace(track, time_s=stamped, dt_s=np.diff(stamped, prepend=np.nan))
+    fact = _only(hygiene(jittered))
+    assert fact.effect == "timestamp_jitter"
+    assert abs(_value(fact) / 3e-3 - 1) < 0.1
+    assert np.abs(regular(jittered) - track.time_s).max() < 3e-4
+    assert np.abs(np.diff(put_right(jittered, (fact,)).time_s) - 0.04).max() < 1e-4
+
+
+def test_time_that_goes_back_stops_everything(track: Track) -> None:
+    stamped = track.time_s.copy()
+    stamped[700] -= 1.0
+    facts = hygiene(replace(track, time_s=stamped))
+    assert facts[0].stops
+    assert "row 700" in facts[0].words
+
+
+def test_two_clocks(track: Track) -> None:
+    other = 5.0 + track.time_s * 1.002
+    fact = _only(hygiene(replace(track, covariates={"host_time_s": other})))
+    assert fact.effect == "clock_rate"
+    assert abs(_value(fact) - 2e-3) < 1e-6
+    same = replace(track, covariates={"host_time_s": track.time_s + 3.0})
+    assert hygiene(same) == ()
+
+
+def test_the_lag_of_every_broad_trial() -> None:
+    """11.5 ms; trial 21 turns fast enough for the coarse grid to see it well."""
+    lag = lag_of(recorded("broad/21_undisturbed_fast_combined"))
+    assert lag is not None
+    assert abs(lag.lag_s - 11.5e-3) < 2e-3
+    assert lag.cost < lag.cost_at_zero / 2
+
+
+def test_frames_are_ranked_with_their_scale(track: Track) -> None:
+    found = windows(track)
+    assert found is not None
+    order = ranked(found)
+    assert len(order) == 24  # of each frame and its negative one has a positive scale
+    assert order[0].is_identity
+    assert 0.7 < order[0].scale < 1.3
+    assert order[0].cost < order[1].cost / 3
+
+
+def test_spans() -> None:
+    rows = np.array([0, 1, 1, 0, 1, 0, 0, 1], dtype=bool)
+    assert spans_of(rows) == [(1, 3), (4, 5), (7, 8)]
+    assert spans_of(rows, 1) == [(1, 5), (7, 8)]
+    assert spans_of(rows[:1]) == []
