@@ -24,7 +24,7 @@ _TURNING = 5.0  # gyro noise levels
 
 
 def repeats(track: Track, clipped: NDArray[np.bool] | None = None) -> list[Fact]:
-    """Stuck, held and doubled samples.  clipped: (N,) readings at a limit, which repeat of course."""
+    """Stuck, held and doubled samples.  clipped: (N,) readings at a limit: they repeat."""
     again = _again(track, track.mag_b_gauss)
     if clipped is not None:
         again &= ~clipped
