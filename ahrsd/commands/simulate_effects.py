@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ahrsd.commands.evaluate_sources import read_track
-from ahrsd.config import Config
-from ahrsd.errors import AhrsdError, RecordingError
+from ahrsd.diagnosing import load_track
+from ahrsd.errors import AhrsdError
 from ahrsd.mismatch import forward, roles
 from ahrsd.mismatch.effects import profiles, request
-from ahrsd.mismatch.effects.series import runs
 from ahrsd.mismatch.injection import injected, readings_of, terms_json
 from ahrsd.mismatch.model_file import RepairedModel, from_text
-from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
 
@@ -44,38 +41,13 @@ def read_model(path: Path) -> RepairedModel:
         raise AhrsdError(f"{path}: {error}") from None
 
 
-def read_mismatch_track(path: Path, rate_hz: float | None = None) -> tuple[Track, list[str]]:
-    """A recording as a track with usable covariates, and what a person should know.
-
-    RecordingError where the recording cannot be opened or is too short.
-    """
-    read, notes = read_track(path, Config(), rate_hz)
-    time_s = read.time_s
-    if len(time_s) < 2:
-        raise RecordingError(path, "has a single sample", "record longer")
-    dt_s = time_s.copy()
-    dt_s[1:] = time_s[1:] - time_s[:-1]
-    dt_s[list(read.starts)] = float("nan")
-    accel = read.accel_b_m_s2 if read.has_accel else None
-    whole = Track(
-        time_s,
-        dt_s,
-        read.raw_b_gauss,
-        read.gyro_b_rad_s,
-        accel,
-        dict(read.covariates),
-        tuple(runs(dt_s)),
-    )
-    track, refused = roles.prepared(whole)
-    return track, [*notes, *refused]
-
-
 def along(model: RepairedModel, recording: Path, seed: int) -> tuple[dict[str, Array], list[str]]:
     """A table's columns: what the repaired model reads along the motion of a recording.
 
-    AhrsdError where a term of the model needs a column that the recording has not.
+    RecordingError as `diagnose`; AhrsdError where a term needs a column that there is not.
     """
-    track, notes = read_mismatch_track(recording)
+    read, notes = load_track(recording)
+    track, refused = roles.prepared(read)
     try:
         context = forward.context_along(track, model.calibration, model.terms)
         truth = forward.truth_along(context)
@@ -89,4 +61,4 @@ def along(model: RepairedModel, recording: Path, seed: int) -> tuple[dict[str, A
         sensors.append(("accel", "m_s2", done.accel_b_m_s2))
     for name, unit, values in sensors:
         columns |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
-    return columns | done.covariates, notes
+    return columns | done.covariates, [*notes, *refused]

@@ -21,12 +21,13 @@ from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.base import Effect, Readings, contribution, readings_of
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.innovation import Filtered, run_filter
+from ahrsd.mismatch.noise import colour_of
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, NullModel, Term
 from ahrsd.samples import Array
 
 DRIFT_S = 20.0
-_RED_TIMES_S = (0.3, 1.0, 3.0)
+_RESPONSE = 4000  # rows after which a colour has died away
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,38 +35,33 @@ class Noise:
     """Scatter of the sensors, standard deviations per sample.
 
     gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias
-    red_part:   share of the magnetometer's variance that is not white but has the time constant
+    colour:  autoregression of the magnetometer's noise, e_k = sum_j colour_j e_(k-j) + white;
+             empty: white.  mag_gauss is the deviation of e whatever its colour
     """
 
     mag_gauss: float
     gyro_rad_s: float
     gyro_walk_rad_s_sqrt_s: float = 0.0
-    red_part: float = 0.0
-    red_time_s: float = 1.0
+    colour: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where a deviation is negative or the colour grows without end."""
+        if min(self.mag_gauss, self.gyro_rad_s, self.gyro_walk_rad_s_sqrt_s) < 0:
+            raise ValueError("noise: a deviation is negative")
+        if len(self.colour) and np.abs(np.roots([1.0, *(-c for c in self.colour)])).max() >= 1:
+            raise ValueError("noise: the colour's autoregression is not stable")
 
 
-def noise_of(model: NullModel, whitened: Array | None = None, step_s: float = 0.0) -> Noise:
-    """The model's noise; with whitened innovations (N, 3) the colour that they still have.
+def noise_of(model: NullModel, filtered: Filtered | None = None) -> Noise:
+    """The model's noise; with a filter run, the colour that its innovations still have.
 
-    The colour is that time constant, of a few, whose exponential the autocorrelation of the
-    innovations is most like; what the filter's memory takes out of slow noise is left out of
-    account, so slow noise comes out a little small.
+    Where the filter remembers more than a sample or two its innovations are nearly the
+    magnetometer's noise, so their colour is given to that.
     """
-    white = Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, model.gyro_walk_rad_s_sqrt_s)
-    if whitened is None or len(whitened) < 100:
-        return white
-    lags = np.arange(1, min(max(round(3 * _RED_TIMES_S[-1] / step_s), 3), len(whitened) // 4))
-    power = float(np.mean(whitened**2))
-    seen = np.array([np.mean(whitened[k:] * whitened[:-k]) for k in lags]) / power
-    best, red_time_s, part = 0.0, 1.0, 0.0
-    for time_s in _RED_TIMES_S:
-        shape = np.exp(-lags * step_s / time_s)
-        amplitude = float(shape @ seen / (shape @ shape))
-        explained = amplitude * float(shape @ seen)
-        deviation = 1.0 / np.sqrt(3 * len(whitened) * float(shape @ shape))
-        if amplitude > 4 * deviation and explained > best:
-            best, red_time_s, part = explained, time_s, amplitude
-    return replace(white, red_part=min(part, 0.9), red_time_s=red_time_s)
+    colour = () if filtered is None else tuple(colour_of(filtered).coefficients.tolist())
+    return Noise(
+        model.sigma_mag_gauss, model.sigma_gyro_rad_s, model.gyro_walk_rad_s_sqrt_s, colour
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,21 +211,27 @@ def _smallest_turn(vectors: Array, onto: Array) -> Array:
 
 
 def _noisy(readings: Readings, noise: Noise, seed: int) -> Readings:
-    """White noise on both sensors, red noise on the magnetometer, a walk of the gyro's bias."""
+    """Noise of that colour on the magnetometer, white noise and a walking bias on the gyro."""
     shape = readings.mag_b_gauss.shape
-    white, gyro, walk, red = (
-        np.random.default_rng([seed, stream]).standard_normal(shape) for stream in range(4)
+    mag, gyro, walk = (
+        np.random.default_rng([seed, stream]).standard_normal(shape) for stream in range(3)
     )
-    step_s = series.median_step(readings.dt_s)
-    mag = np.sqrt(1 - noise.red_part) * white
-    if noise.red_part > 0:
-        keep = np.exp(-step_s / noise.red_time_s)
-        slow = lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], red, axis=0, zi=keep * red[:1])[0]
-        mag = mag + np.sqrt(noise.red_part) * slow
     passed = np.sqrt(np.concatenate([[0.0], np.diff(readings.time_s)]))[:, None]
     bias = noise.gyro_walk_rad_s_sqrt_s * np.cumsum(passed * walk, axis=0)
     return replace(
         readings,
-        mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * mag,
+        mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * _coloured(mag, noise.colour),
         gyro_b_rad_s=readings.gyro_b_rad_s + noise.gyro_rad_s * gyro + bias,
     )
+
+
+def _coloured(white: Array, colour: tuple[float, ...]) -> Array:
+    """White noise (N, 3) of variance 1 with a colour, its variance 1 again."""
+    if not colour:
+        return white
+    taps = [1.0, *(-c for c in colour)]
+    response = np.asarray(lfilter([1.0], taps, np.eye(1, _RESPONSE)[0]))
+    # a stretch before the first row, so that the noise is settled there
+    ahead = np.vstack([white[:_RESPONSE][::-1], white])
+    coloured = np.asarray(lfilter([1.0], taps, ahead, axis=0))[-len(white) :]
+    return coloured / float(np.sqrt(response @ response))

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.mismatch.diagnosis import Diagnosis
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.forward import Noise
+from ahrsd.mismatch.forward import Noise, noise_of
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import Array
 
@@ -60,9 +61,7 @@ def from_text(text: str, library: Mapping[str, Effect] = EFFECTS) -> RepairedMod
         raise ValueError(f"is no JSON: {error}") from None
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         raise ValueError(f"is no model: its schema must be {SCHEMA!r}")
-    noise = Noise(**{key: _number(body, "noise", key) for key in Noise.__dataclass_fields__})
-    if min(asdict(noise).values()) < 0 or noise.red_part >= 1 or noise.red_time_s <= 0:
-        raise ValueError("noise: a deviation is negative, or red_part is not below 1")
+    noise = _noise(body)
     calibration = NullModel(
         soft_iron=_numbers(body, "calibration", "soft_iron", (3, 3)),
         hard_iron_gauss=_numbers(body, "calibration", "hard_iron_gauss", (3,)),
@@ -80,6 +79,23 @@ def from_text(text: str, library: Mapping[str, Effect] = EFFECTS) -> RepairedMod
         tuple(_term(entry, number, library) for number, entry in enumerate(terms)),
         str(body.get("recording", "")),
     )
+
+
+def of_diagnosis(found: Diagnosis) -> RepairedModel:
+    """The repaired model of a diagnosis.  ValueError where it has none."""
+    if found.model is None:
+        raise ValueError("the diagnosis has no model: the recording could not be fitted")
+    return RepairedModel(found.model, noise_of(found.model), found.terms, found.recording)
+
+
+def _noise(body: dict[str, Any]) -> Noise:
+    names = ("mag_gauss", "gyro_rad_s", "gyro_walk_rad_s_sqrt_s")
+    mag, gyro, walk = (_number(body, "noise", name) for name in names)
+    colour = body["noise"].get("colour")
+    if not isinstance(colour, list):
+        raise ValueError("noise.colour must be a list of numbers")
+    by_row = {str(k): value for k, value in enumerate(colour)}
+    return Noise(mag, gyro, walk, tuple(_finite(by_row, key, "noise.colour") for key in by_row))
 
 
 def _term_json(term: Term, effect: Effect) -> dict[str, object]:

@@ -65,23 +65,32 @@ def test_simulated_noise_is_what_the_filter_expects():
     track = forward.track_of(made, context.track)
     filtered = run_filter(track, context.model)
     assert filtered.normalised_innovation == pytest.approx(1.0, abs=0.04)
-    assert forward.noise_of(context.model, filtered.whitened, 0.05) == noise
+    assert forward.noise_of(context.model, filtered) == noise
     again = forward.simulated(truth, noise=noise, seed=7)
     assert np.array_equal(again.mag_b_gauss, made.mag_b_gauss)
     other = forward.simulated(truth, noise=noise, seed=8)
     assert not np.array_equal(other.mag_b_gauss, made.mag_b_gauss)
 
 
-def test_red_noise_is_made_and_found_again():
+def test_coloured_noise_is_made_and_found_again():
     context, _ = moving(4, rows=6000)
     model = context.model
-    noise = forward.Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, 0.0, 0.3, 1.0)
+    noise = forward.Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, 0.0, (0.5, 0.2))
     made = forward.simulated(forward.truth_along(context), noise=noise, seed=1)
     left = made.mag_b_gauss - context.field_b @ SOFT_IRON.T - HARD_IRON
-    assert left.std() == pytest.approx(noise.mag_gauss, rel=0.1)
-    found = forward.noise_of(model, run_filter(forward.track_of(made), model).whitened, 0.05)
-    assert found.red_time_s == 1.0
-    assert found.red_part == pytest.approx(0.3, abs=0.12)
+    assert left.std() == pytest.approx(noise.mag_gauss, rel=0.05)
+    found = forward.noise_of(model, run_filter(forward.track_of(made), model)).colour
+    assert len(found) >= 2
+    assert np.sum(found) == pytest.approx(0.7, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [((-1e-3, 1e-3), "negative"), ((1e-3, 1e-3, 0.0, (1.0,)), "not stable")],
+)
+def test_noise_that_cannot_be(values, said):
+    with pytest.raises(ValueError, match=said):
+        forward.Noise(*values)
 
 
 def test_terms_come_before_the_noise_and_clipping_behind_it():
@@ -102,7 +111,8 @@ def test_terms_come_before_the_noise_and_clipping_behind_it():
 def test_a_model_file_reads_back_as_it_was_written():
     context, readings = moving(6)
     named = terms(readings, *(name for name, e in EFFECTS.items() if e.kind == "mean"))
-    model = RepairedModel(context.model, forward.Noise(1e-3, 5e-4), named, "x.csv")
+    noise = forward.Noise(1e-3, 5e-4, 1e-6, (0.3, -0.1))
+    model = RepairedModel(context.model, noise, named, "x.csv")
     back = from_text(to_text(model))
     assert back.recording == "x.csv"
     assert back.noise == model.noise
@@ -123,7 +133,10 @@ def test_a_model_file_reads_back_as_it_was_written():
         (lambda body: body.update(schema="ahrsd.calibration/1"), "schema must be 'ahrsd.model/1'"),
         (lambda body: body.pop("noise"), "noise is missing"),
         (lambda body: body["noise"].update(mag_gauss="loud"), "noise.mag_gauss: 'loud' is no"),
-        (lambda body: body["noise"].update(red_part=-1), "noise: a deviation is negative"),
+        (lambda body: body["noise"].update(mag_gauss=-1), "noise: a deviation is negative"),
+        (lambda body: body["noise"].update(colour=[2.0]), "autoregression is not stable"),
+        (lambda body: body["noise"].update(colour=["red"]), "noise.colour.0: 'red' is no finite"),
+        (lambda body: body["noise"].pop("colour"), "noise.colour must be a list"),
         (lambda body: body["calibration"].update(soft_iron=[[1, 2], [3]]), "calibration.soft_iron"),
         (lambda body: body["terms"][0].update(effect="magic"), "terms[0]: no effect 'magic'"),
         (lambda body: body["terms"][0].update(parameters=[]), "terms[0]: the parameters of"),
