@@ -2,7 +2,8 @@
 
 field in the world -> body -> (mount) -> iron and body sources -> sensor electronics -> delay
 -> the value at the sample's instant
-body rate -> gyro errors -> delay -> mean over the step that ends at the sample
+body rate -> gyro errors -> delay -> mean over the step that ends at the sample:
+    delta angles with coning, so that an ideal gyro turns the attitude exactly
 """
 
 from __future__ import annotations
@@ -129,6 +130,23 @@ def _at(signal, times, instants):
     return CubicSpline(times, signal, axis=0)(instants)
 
 
+def _integral(x):
+    """Of a signal (N, 3) on the grid, from its first instant on."""
+    return np.vstack([np.zeros(3), np.cumsum(0.5 * (x[1:] + x[:-1]), axis=0) * STEP_S])
+
+
+def _turn(w, t, ends):
+    """Rotation vectors (K, 3) between K + 1 instants, as a gyro's delta angles: coning included.
+
+    The integral of the rate and, to second order, of (angle since the step began) x rate / 2.
+    """
+    angle = _integral(w)
+    area = _integral(np.cross(angle, w))
+    angles, areas = _at(angle, t, ends), _at(area, t, ends)
+    turned_by = np.diff(angles, axis=0)
+    return turned_by + 0.5 * (np.diff(areas, axis=0) - np.cross(angles[:-1], turned_by))
+
+
 def readings(world, stages, rate_hz):
     """Noise-free (instants (K,), magnetometer (K, 3), gyro (K, 3)) of the sensors."""
     t = world.time_s
@@ -137,7 +155,5 @@ def readings(world, stages, rate_hz):
     w = gyroscope(world, stages)
     if stages.gyro_at_instant:
         return at, mag, _at(w, t, at - stages.gyro_delay_s)
-    turned_by = np.vstack([np.zeros(3), np.cumsum(0.5 * (w[1:] + w[:-1]), axis=0) * STEP_S])
     step = at[1] - at[0]
-    ends = _at(turned_by, t, np.concatenate([at[:1] - step, at]) - stages.gyro_delay_s)
-    return at, mag, np.diff(ends, axis=0) / step
+    return at, mag, _turn(w, t, np.concatenate([at[:1] - step, at]) - stages.gyro_delay_s) / step
