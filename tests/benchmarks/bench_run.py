@@ -40,6 +40,7 @@ class Figures:
     """expected: by the device's time; in_capture, taken: what the record and the daemon have.
 
     rss_mb: at the start, after every minute, and at the end; rss_slope_kb_min: from minute 2 on
+    said:   what the daemon says of messages and gaps
     """
 
     rate_hz: int
@@ -55,6 +56,7 @@ class Figures:
     descriptors: int
     exit_code: int
     stop_s: float
+    said: str
 
     @property
     def cpu_percent(self) -> float:
@@ -79,7 +81,7 @@ class Figures:
             f"  RSS by the minute {' '.join(f'{mb:.1f}' for mb in self.rss_mb)} MB, "
             f"slope from minute {FLAT_FROM_S / 60:.0f} on {self.rss_slope_kb_min:+.0f} kB/min\n"
             f"  {self.threads} threads, {self.descriptors} descriptors; exit {self.exit_code} "
-            f"{self.stop_s:.2f} s after SIGTERM"
+            f"{self.stop_s:.2f} s after SIGTERM; {self.said}"
         )
 
 
@@ -123,6 +125,7 @@ def measure(rate_hz: int, seconds: float, folder: Path, *, verbose: bool = False
         descriptors=descriptors,
         exit_code=daemon.returncode,
         stop_s=stop_s,
+        said="; ".join(re.findall(r"^  (messages: .*|\d+ gaps?, .*)$", said, re.MULTILINE)),
     )
 
 

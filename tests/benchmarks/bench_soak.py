@@ -54,6 +54,7 @@ ROW_S = 600.0
 HOUR_S, DAY_S = 3600.0, 86400.0
 SETTLED_S = 4500.0  # the histories, of an hour at most, are full
 TIME = slice(6, 14)  # TimeStartup in a packet of the calibration set, ns
+_LINES = ",\n"
 COLUMNS = (
     "device_s",
     "rss_mb",
@@ -330,7 +331,8 @@ def plot(found: Figures, path: Path) -> None:
     hours = found.column("device_s") / HOUR_S
     memory.plot(hours, found.column("rss_mb"), label="resident")
     memory.plot(hours, found.column("heap_mb"), label="live in the C heap")
-    memory.set(ylabel="MB", ylim=(0, None), title=str(found).split("\n", maxsplit=1)[0])
+    title = f"{found.days:.2f} device-days at {found.rate_hz} Hz in {found.wall_s / 60:.0f} minutes"
+    memory.set(ylabel="MB", ylim=(0, None), title=title)
     updates = np.maximum(np.diff(found.column("updates")), 1)
     for name, label in (("cpu_s", "everything"), ("estimator_s", "estimator alone")):
         speed.plot(hours[1:], 1e3 * np.diff(found.column(name)) / updates, label=label)
@@ -349,13 +351,15 @@ def save(found: Figures, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     facts = asdict(found) | {
         "columns": COLUMNS,
-        "rows": [[round(value, 3) for value in row] for row in found.rows.tolist()],
+        "rows": [],
         "rss_mb_per_day": found.slope_per_day("rss_mb"),
         "heap_mb_per_day": found.slope_per_day("heap_mb"),
         "estimator_last_to_first_hour": found.last_to_first("estimator_s"),
         "everything_last_to_first_hour": found.last_to_first("cpu_s"),
     }
-    (folder / "soak.json").write_text(json.dumps(facts, indent=1) + "\n")
+    rows = [json.dumps([round(value, 3) for value in row]) for row in found.rows.tolist()]
+    text = json.dumps(facts, indent=1).replace('"rows": []', f'"rows": [\n{_LINES.join(rows)}\n]')
+    (folder / "soak.json").write_text(text + "\n")
     plot(found, folder / "soak.png")
 
 
