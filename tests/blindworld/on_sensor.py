@@ -105,7 +105,7 @@ def moving_iron(world, stages, strength, rng):
     cosine, sine = strength * first, strength * np.cross(axis, first)
     psi = world.joint[:, None]
     stages.body.append(np.cos(psi) * cosine + np.sin(psi) * sine)
-    return Planted("sensor", xyz("cos", cosine, "gauss") + xyz("sin", sine, "gauss"))
+    return Planted("sensor", xyz("cosine", cosine, "gauss") + xyz("sine", sine, "gauss"))
 
 
 def _line_hz(world, rng):
