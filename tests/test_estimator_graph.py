@@ -31,7 +31,7 @@ def random_graph(nodes=6, seed=0, *, rank=12):
     directions = rng.normal(size=(nodes, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     places = [Node.at(rng.normal(size=3) * 0.01, d) for d in directions]
-    graph = Graph(c, SIGMA, places[0], bias_prior(0, c, places[0], 0.05))
+    graph = Graph(c, np.diag(SIGMA**2), places[0], bias_prior(0, c, places[0], 0.05))
     for j in range(nodes - 1):
         graph.nodes[j + 1] = places[j + 1]
         J = rng.normal(size=(rank, SIZE)) * 10.0
@@ -142,7 +142,7 @@ def test_rise_integrates_the_gradient():
 
 
 def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
-    """The marginal over its borders at the present c, and a token on the borders themselves."""
+    """Its marginal over the borders at the present c, across the field; a token on the borders."""
     rng = np.random.default_rng(0)
     J = rng.normal(size=(40, 16)) * 100
 
@@ -151,14 +151,16 @@ def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
         g = J.T @ rng.normal(size=40)
 
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
-    factor = epoch_factor(Quadratic, 0, Point(np.zeros(9), node, node), 0.0, calibrates=False)
+    factor = epoch_factor(Quadratic, 0, Point(np.zeros(9), node, node), 0.0, rest=node.direction)
     own = Quadratic.H[9:, 9:]
     expected = np.zeros((SIZE, SIZE))
-    expected[9:12, 9:12] = np.linalg.inv(np.linalg.inv(own)[:3, :3])
+    across = np.eye(3) - np.outer([0.0, 0.6, 0.8], [0.0, 0.6, 0.8])
+    marginal = np.linalg.inv(np.linalg.inv(own)[:3, :3])
+    expected[9:12, 9:12] = across @ marginal @ across
     expected[[12, 13, 17, 18], [12, 13, 17, 18]] = 1.0
     np.testing.assert_allclose(factor.H, expected, atol=1e-6)
-    solution = np.linalg.solve(expected[9:12, 9:12], factor.g[9:12])
-    np.testing.assert_allclose(solution, np.linalg.solve(own, Quadratic.g[9:])[:3], rtol=1e-6)
+    gradient = across @ marginal @ np.linalg.solve(own, Quadratic.g[9:])[:3]
+    np.testing.assert_allclose(factor.g[9:12], gradient, rtol=1e-6)
     assert not np.delete(factor.g, [9, 10, 11]).any()
 
 

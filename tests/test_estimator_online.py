@@ -166,12 +166,19 @@ def test_rest_leaves_everything_where_the_device_has_it():
     bench.feed(estimator, rest)
     estimate = estimator.finish()
     assert not estimate.converged
-    assert len(estimate.observability.unobservable) == 9
+    assert len(estimate.observability.unobservable) == 10  # the tenth: gyro bias along the field
     np.testing.assert_allclose(estimate.hard_iron_gauss, present.offset, atol=1e-6)
     expected = np.linalg.inv(C) * np.cbrt(np.linalg.det(C))
     np.testing.assert_allclose(estimate.soft_iron, expected, atol=1e-6)
     np.testing.assert_allclose(estimate.sigma[6:9], 0.5, rtol=0.01)
-    assert np.all(np.abs(estimate.gyro_bias_rad_s) < 0.05)
+    # the gyro's bias is known across the field, and along it not at all
+    along = present.apply(np.array([0.1, 0.25, -0.33]))
+    along /= np.linalg.norm(along)
+    error = estimate.gyro_bias_rad_s - [1e-3, 2e-3, -1e-3]
+    assert np.linalg.norm(error - along * (along @ error)) < 5e-4
+    sigma = np.sqrt(along @ estimate.covariance[9:, 9:] @ along)
+    assert abs(along @ estimate.gyro_bias_rad_s) < 0.005
+    assert sigma > 0.04
 
 
 def test_moving_after_a_long_rest_is_as_good_as_moving_at_once():
@@ -332,14 +339,18 @@ def replayed(recordings):
 
 
 def test_the_two_punch_recordings_give_the_same_hard_iron(replayed):
-    """The same sensor on two fists. z and y are well determined, x (the fist's axis) poorly."""
+    """The same sensor on two fists, which turned about x: x is held near the device's value and
+    says so; what remains repeats.
+    """
     (first, _), (second, _) = replayed("punch_2024_shaked"), replayed("punch_2024_satish")
-    spread = np.sqrt(first.sigma[6:9] ** 2 + second.sigma[6:9] ** 2)
     difference = np.abs(first.hard_iron_gauss - second.hard_iron_gauss)
-    assert np.all(difference < 2.5 * spread)
-    assert np.all(spread < [0.08, 0.015, 0.015])
-    np.testing.assert_allclose(first.hard_iron_gauss[1:], [0.03, -0.45], atol=0.025)
-    assert first.sigma[6] > 3 * first.sigma[7]
+    assert np.all(difference < 0.015)
+    spread = np.sqrt(first.sigma[6:9] ** 2 + second.sigma[6:9] ** 2)
+    assert np.all(spread < [0.15, 0.06, 0.06])
+    np.testing.assert_allclose(first.hard_iron_gauss, [0.24, 0.03, -0.45], atol=0.07)
+    for estimate in (first, second):
+        assert "soft iron xx" in " ".join(estimate.observability.unobservable)
+        assert abs(estimate.hard_iron_gauss[0] - 0.24) < 2.5 * estimate.sigma[6]
 
 
 def test_a_real_sensor_at_rest_is_told_apart(replayed):
@@ -354,9 +365,19 @@ def test_a_real_sensor_at_rest_is_told_apart(replayed):
 
 
 @pytest.mark.parametrize("name", ["circles_2022_rahul", "drive_2022_rahul", "circles_2024_liu"])
-def test_a_car_never_converges(replayed, name):
+def test_what_a_car_cannot_know_stays_where_the_device_has_it(replayed, name):
     estimate, cost = replayed(name)
-    assert not estimate.converged
     assert "soft iron zz" in " ".join(estimate.observability.unobservable)
-    assert estimate.sigma[8] > 0.03
+    assert abs(estimate.hard_iron_gauss[2]) < 0.1
+    assert estimate.sigma[8] > 0.1
     assert cost < 0.025
+
+
+def test_circles_calibrate_the_drive_that_follows(replayed):
+    """The hard iron in the plane of the turn, of the same car minutes apart."""
+    (circles, _), (drive, _) = replayed("circles_2022_rahul"), replayed("drive_2022_rahul")
+    spread = np.sqrt(circles.sigma[6:8] ** 2 + drive.sigma[6:8] ** 2)
+    difference = np.abs(circles.hard_iron_gauss - drive.hard_iron_gauss)[:2]
+    assert np.all(difference < 2.5 * spread)
+    assert np.all(difference < 0.07)
+    assert np.all(spread < 0.15)

@@ -128,22 +128,25 @@ class Stack:
 
 
 def epoch_factor(
-    q: chain.Quadratic, a: int, point: Point, walk: float, *, calibrates: bool = True
+    q: chain.Quadratic, a: int, point: Point, walk: float, *, rest: Array | None = None
 ) -> Factor:
     """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
 
-    One that does not calibrate speaks of the gyro's bias only. At rest that holds whatever c is:
-    the rate that was read is the bias. Its borders keep a token of information, to stay determined.
+    One at rest does not calibrate, it speaks of the gyro's bias only, and that whatever c is: the
+    rate that was read is the bias, across the field's direction `rest` (3,), a mean over the epoch.
+    What seems to be said along it comes from the noise of the directions. Its borders keep a token
+    of information, to stay determined.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     H[np.ix_(_FROM_CHAIN, _FROM_CHAIN)] = q.H
     g[_FROM_CHAIN] = q.g
-    if not calibrates:
+    if rest is not None:
         gain = np.linalg.solve(H[_BORDERS][:, _BORDERS], np.c_[H[_BORDERS][:, _BIAS], g[_BORDERS]])
         cross = H[_BIAS][:, _BORDERS]
         H_bias, g_bias = H[_BIAS, _BIAS] - cross @ gain[:, :3], g[_BIAS] - cross @ gain[:, 3]
+        across = np.eye(3) - np.outer(rest, rest)
         H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-        H[_BIAS, _BIAS], g[_BIAS] = H_bias, g_bias
+        H[_BIAS, _BIAS], g[_BIAS] = across @ H_bias @ across, across @ g_bias
         H[_BORDERS, _BORDERS] = _TOKEN
     return Factor(a, a + 1, H, g, point, walk)
 

@@ -14,6 +14,7 @@ pivots are alike, and what is left on c and the newest node (14 numbers) is solv
 
 from __future__ import annotations
 
+from copy import copy
 from operator import is_not
 
 import gtsam
@@ -72,14 +73,18 @@ Step = tuple[Array, dict[int, Array]]
 class Graph:
     """Calibration c (9,), nodes and factors; all values are the present linearisation point.
 
-    `anchor` is what is believed of c without data, (mean, sigma); it is never folded, because its
-    weight against the data changes: `temper` multiplies its information (see `misfit`), and `hold`
-    (9, 9) is added to it, which keeps the directions of c that nothing determines at the mean.
+    `anchor` is what is believed of c without data, its mean (9,) and information (9, 9); it is
+    never folded, because its weight against the data changes: `temper` multiplies its information
+    (see `misfit`), and `hold` (9, 9) is added to it, which keeps the directions of c that nothing
+    determines at the mean.
     """
 
-    def __init__(self, c: Array, sigma_c: Array, first: Node, prior: Factor) -> None:
+    def __init__(self, c: Array, belief: Array, first: Node, prior: Factor) -> None:
+        """`belief` is the covariance (9, 9) of the anchor, whose mean is c."""
         self.c = c.copy()
-        self.anchor = (c.copy(), sigma_c.copy())
+        self.anchor = (c.copy(), np.asarray(np.linalg.inv(belief), dtype=np.float64))
+        self._whitening = whitening(belief)
+        self._blind: Array = np.zeros((9, 0))
         self.temper = 1.0
         self.hold: Array = np.zeros((9, 9))
         self.moments = Moments()
@@ -87,6 +92,13 @@ class Graph:
         self.prior = prior
         self.factors: list[Factor] = []
         self._kept: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
+
+    def twin(self) -> Graph:
+        """A copy that goes its own way; nodes and factors are shared, they never change."""
+        other = copy(self)
+        other.nodes, other.factors = dict(self.nodes), list(self.factors)
+        other.moments = copy(self.moments)
+        return other
 
     @property
     def first(self) -> int:
@@ -99,7 +111,7 @@ class Graph:
         return max(self.nodes)
 
     def _belief(self) -> Array:
-        return np.asarray(np.diag(self.temper / self.anchor[1] ** 2))
+        return np.asarray(self.temper * self.anchor[1])
 
     def anchor_cost(self) -> float:
         """What departing from the anchor costs, as a negative log likelihood."""
@@ -112,10 +124,11 @@ class Graph:
         covariance (9+, 9+) of c first, tempered. In the eigenbasis of the posterior, whitened by
         the prior, both are diagonal: holding one direction moves no other.
         """
-        sigma = self.anchor[1]
-        scaled = covariance[:9, :9] / np.outer(sigma, sigma)
+        W = self._whitening
+        scaled = W @ covariance[:9, :9] @ W.T
         values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-        blind = vectors[:, values > limit**2] / sigma[:, None]
+        self._blind = vectors[:, values > limit**2]
+        blind = W.T @ self._blind
         self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
 
     def _all(self) -> list[Factor]:
@@ -131,7 +144,7 @@ class Graph:
         net, H, g = self._reduced()
         H, g = H[:14, :14].copy(), g[:14].copy()
         pull = self._belief() + self.hold
-        H[C, C] += pull + np.diag(damping / self.anchor[1] ** 2)
+        H[C, C] += pull + damping * self.anchor[1]
         g[C] += pull @ (self.c - self.anchor[0])
         if not np.isfinite(g).all():
             raise SingularError("the calibration is not finite")
@@ -156,6 +169,12 @@ class Graph:
         H = self._reduced()[1][:14, :14].copy()
         H[C, C] += self._belief()
         return _inverse(H)[:12, :12]
+
+    def with_held(self, c: Array) -> Array:
+        """c with the directions that are held put where they are held."""
+        W = self._whitening
+        beside = self._blind @ self._blind.T @ W @ (c - self.anchor[0])
+        return np.asarray(c - np.linalg.solve(W, beside))
 
     def _reduced(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
         """All nodes but the newest eliminated, without anchor and hold, which are on c alone.
@@ -223,6 +242,13 @@ def _information(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
     H[np.ix_(rows, rows)] = augmented[:-1, :-1]
     g[rows] = -augmented[:-1, -1]
     return H / np.outer(_UNITS, _UNITS), g / _UNITS
+
+
+def whitening(covariance: Array) -> Array:
+    """W with W P W^T = I that mixes the numbers as little as it can: R^(-1/2) D^-1 of P = D R D."""
+    sigma = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    return np.asarray((vectors / np.sqrt(values)) @ vectors.T / sigma)
 
 
 def _inverse(H: Array) -> Array:

@@ -7,6 +7,8 @@ nothing links the steps on the two sides of a gap, but the gyro's bias is the sa
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from ahrsd.estimator import chain
@@ -122,6 +124,17 @@ class Intake:
         while self._pending_count >= self._parameters.epoch_steps + int(self._fresh):
             closed.append(self._close(self._parameters.epoch_steps + int(self._fresh)))
         return closed
+
+    @property
+    def pending(self) -> int:
+        """Steps of the epoch that is not complete yet."""
+        return self._pending_count
+
+    def twin(self) -> Intake:
+        """A copy that goes its own way, for closing the epoch early."""
+        other = copy(self)
+        other._pending, other._rows = list(self._pending), list(self._rows)
+        return other
 
     def interrupt(self) -> chain.Data | None:
         """What is pending as a short epoch, if it is worth one; the next one starts anew."""

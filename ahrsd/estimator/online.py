@@ -8,20 +8,22 @@ falls out of it is folded into the prior.
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, intake, noise, summary
 from ahrsd.estimator.factors import Node
-from ahrsd.estimator.graph import SingularError
+from ahrsd.estimator.graph import SingularError, whitening
 from ahrsd.estimator.intake import Intake
-from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.estimator.search import search
 from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
+_FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
 _FRESH = 1.25  # at the end, a search that saw all but a quarter need not be repeated
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
 _AWAY, _AWAY_UNSETTLED = 3.0, 0.5
@@ -29,6 +31,7 @@ _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data 
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
 _MOST_SIGMAS = 100.0  # of movement or disagreement that are counted
+_SCALE = 0.5  # 1-sigma of the field's magnitude over its size in the present calibration
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
@@ -49,7 +52,7 @@ class Estimator:
         )
         self._intake = Intake(self.parameters)
         self._window: Window | None = None
-        self._prior_sigma = np.ones(12)
+        self._whitening = np.eye(12)
         self._down: deque[Array] = deque(maxlen=64)
         self._searching, self._agreed, self._apart = True, False, 0.0
         self._moving_epochs, self._last_search = 0, 0
@@ -83,7 +86,7 @@ class Estimator:
             if self._searching and self._moving_epochs > _FRESH * self._last_search:
                 self._search(self._window)
             self._window.track(everything=True)
-        return self.estimate()
+        return self._answer()
 
     def _append(self, data: chain.Data) -> None:
         window = self._window
@@ -93,7 +96,7 @@ class Estimator:
             data = intake.with_border(data, window.epochs[-1].data)
         self._down.append(data.down_b[len(data) // 2])
         window.append(data)
-        window.track()
+        window.track(everything=len(window.epochs) <= _FEW)
         if self._searching and window.epochs[-1].turned:
             self._moving_epochs += 1
             if self._moving_epochs >= self._next_search:
@@ -108,15 +111,19 @@ class Estimator:
         c = np.r_[chain.upper_triangle(A0 * max(size, 1e-3)), self._present.offset]
         p = self.parameters
         scale = float(np.cbrt(np.linalg.det(chain.symmetric(c[:6]))))
-        sigma_c = np.r_[np.full(6, p.prior_soft_iron * scale), np.full(3, p.prior_hard_iron_gauss)]
-        self._prior_sigma = np.r_[sigma_c, np.full(3, p.prior_gyro_bias_rad_s)]
+        sigma = np.r_[np.full(6, p.prior_soft_iron * scale), np.full(3, p.prior_hard_iron_gauss)]
+        belief = np.diag(sigma**2)
+        belief[:6, :6] += _SCALE**2 * np.outer(c[:6], c[:6])
+        self._whitening = np.diag(np.r_[np.zeros(9), np.full(3, 1 / p.prior_gyro_bias_rad_s)])
+        self._whitening[:9, :9] = whitening(belief)
         direction = chain.start_directions(chain.symmetric(c[:6]), c[6:], data.field_b_gauss[:1])[0]
         first = Node.at(self._present_bias, direction)
-        return Window(p, c, sigma_c, first, noise.first_guess(data, p))
+        return Window(p, c, belief, first, noise.first_guess(data, p))
 
     def _search(self, window: Window) -> None:
         """Other starts compete with the present answer, until they agree on good data."""
         found = search(self.parameters, window, self._present_bias, [e.data for e in window.epochs])
+        window.loud = found.loud
         unsettled = window.step_sigmas > _SETTLED
         better = found.gain > _GAIN_FOLDED * window.graph.temper
         if (
@@ -140,7 +147,21 @@ class Estimator:
         return bool(np.all(sigma < _SURE * size))
 
     def estimate(self) -> Estimate | None:
-        """The present answer, None before the first epoch or where nothing at all is determined."""
+        """The present answer, None before the first epoch or where nothing at all is determined.
+
+        An epoch that is under way counts as far as it is, if it is long enough to be one.
+        """
+        if self._window is not None and self._intake.pending >= MIN_EPOCH_STEPS:
+            return self._twin().finish()
+        return self._answer()
+
+    def _twin(self) -> Estimator:
+        other = copy(self)
+        other._intake, other._down = self._intake.twin(), self._down.copy()
+        other._window = None if self._window is None else self._window.twin()
+        return other
+
+    def _answer(self) -> Estimate | None:
         window = self._window
         if window is None or not window.epochs:
             return None
@@ -150,7 +171,7 @@ class Estimator:
         except SingularError:
             return None
         covariance = covariance * graph.temper
-        observed = summary.observability(covariance, self._prior_sigma)
+        observed = summary.observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         covariance = covariance * (1.0 + doubt**2)
@@ -175,9 +196,6 @@ class Estimator:
             samples=self._intake.samples,
             duration_s=self._intake.duration_s,
             converged=bool(
-                self._agreed
-                and window.step_sigmas < _SETTLED
-                and not observed.unobservable
-                and heading < _HOPELESS_DEG
+                self._agreed and window.step_sigmas < _SETTLED and heading < _HOPELESS_DEG
             ),
         )

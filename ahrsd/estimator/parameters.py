@@ -20,7 +20,8 @@ class EstimatorParameters:
                        Gaussian factor. Larger is nearer to the batch answer [16384]
     bias_walk_rad_s_sqrt_s: random walk of the gyro bias; larger follows temperature faster and
                        averages less [2e-6 rad/s/sqrt(s)]
-    prior_soft_iron:   1-sigma of the soft iron's entries around the device's present value [0.3]
+    prior_soft_iron:   1-sigma of the soft iron's entries around the device's present value, its
+                       scale left free; what iron and scale factors do to a magnetometer [0.1]
     prior_hard_iron_gauss: the same for the hard iron [0.5 G]
     prior_gyro_bias_rad_s: the same for the gyro bias [0.05 rad/s]
     outlier_sigma:     field residuals beyond this many sigmas lose weight quadratically [4.6, which
@@ -32,7 +33,7 @@ class EstimatorParameters:
     epoch_steps: int = 512
     window_steps: int = 16384
     bias_walk_rad_s_sqrt_s: float = 2e-6
-    prior_soft_iron: float = 0.3
+    prior_soft_iron: float = 0.1
     prior_hard_iron_gauss: float = 0.5
     prior_gyro_bias_rad_s: float = 0.05
     outlier_sigma: float = 4.6

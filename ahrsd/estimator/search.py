@@ -27,6 +27,7 @@ _EPOCHS = 6
 _STEPS = 128  # rows per epoch, at most twice that
 _DESCENT = 8  # Levenberg-Marquardt steps per start
 _SAME = 1.0  # sigmas within which two answers are one
+_LOUD = 2.0  # residual variance over that of the fields' differences that the model left over
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +37,8 @@ class Found:
     away:   sigmas between it and the answer as it stands
     gain:   in log likelihood over where a descent from the answer as it stands leads
     apart:  sigmas from it within which two starts that know nothing of each other ended
+    loud:   residual variance that even the best leaves over that of the fields' differences, at
+            which the starts descend; 1 where the model explains the data
     """
 
     c: Array
@@ -43,6 +46,7 @@ class Found:
     away: float
     gain: float
     apart: float
+    loud: float
 
     @property
     def agreed(self) -> bool:
@@ -56,6 +60,7 @@ class _Reached:
     c: Array
     bias: Array
     information: Array | None
+    loud: float
 
 
 def search(
@@ -63,27 +68,36 @@ def search(
 ) -> Found:
     """Descend from every start on a thinned copy of `data`; `window` itself is not touched."""
     graph = window.graph
-    present, sigma = graph.anchor
+    present, information = graph.anchor
+    belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
     chosen = sorted(
         sorted(range(len(data)), key=lambda k: -spread(data[k].field_b_gauss))[:_EPOCHS]
     )
     first = Node.at(present_bias, np.array([1.0, 0.0, 0.0]))
-    thin = Window(parameters, present, sigma, first, window.usual)
+    thin = Window(parameters, present, belief, first, window.usual)
     thin.learn_from(window)
     thin.graph.temper = graph.temper
+    if window.loud > 1.0:
+        thin.graph.hold = graph.hold
     thin.attach(joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen]))
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
     own = _descend(thin, graph.c, graph.nodes[graph.last].bias)
-    independent = [
-        _descend(thin, c, present_bias)
-        for c in (present, start.linear_start(whole), start.sphere_start(fields))
-        if c is not None
-    ]
+    starts = [present, start.linear_start(whole), start.sphere_start(fields)]
+    known = [c for c in starts if c is not None]
+    if window.loud > 1.0:
+        known = [graph.with_held(c) for c in known]
+    independent = [_descend(thin, c, present_bias) for c in known if _positive(c)]
     best = min([own, *independent], key=lambda r: r.cost)
-    apart = sorted(_distance(r, best, graph.temper) for r in independent)
-    away = np.inf if best.information is None else sigmas(graph.c - best.c, best.information)
-    return Found(best.c, best.bias, float(away), own.cost - best.cost, (*apart, np.inf)[1])
+    loud = best.loud if best.loud > _LOUD else 1.0
+    away = _distance(graph.c, best, graph.temper * loud if loud > 1.0 else 1.0)
+    apart = sorted(_distance(r.c, best, graph.temper * loud) for r in independent)
+    gain = (own.cost - best.cost) / loud
+    return Found(best.c, best.bias, away, gain, (*apart, np.inf)[1], loud)
+
+
+def _positive(c: Array) -> bool:
+    return bool(np.linalg.eigvalsh(chain.symmetric(c[:6]))[0] > 0.0)
 
 
 def _descend(thin: Window, c: Array, bias: Array) -> _Reached:
@@ -94,13 +108,16 @@ def _descend(thin: Window, c: Array, bias: Array) -> _Reached:
         information = np.asarray(np.linalg.inv(graph.covariance()[:9, :9]), dtype=np.float64)
     except (SingularError, np.linalg.LinAlgError):
         information = None
-    return _Reached(cost, graph.c.copy(), graph.nodes[graph.last].bias.copy(), information)
+    found = thin.epochs[0].residuals
+    loud = found.mag_gauss2 / found.mag_freedom / thin.usual.mag_gauss**2
+    bias_reached = graph.nodes[graph.last].bias.copy()
+    return _Reached(cost, graph.c.copy(), bias_reached, information, loud)
 
 
-def _distance(r: _Reached, best: _Reached, temper: float) -> float:
+def _distance(c: Array, best: _Reached, temper: float) -> float:
     if best.information is None:
         return float(np.inf)
-    return sigmas(r.c - best.c, best.information / temper)
+    return sigmas(c - best.c, best.information / temper)
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:

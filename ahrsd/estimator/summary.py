@@ -82,9 +82,12 @@ def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> t
     return down, float(np.clip(dip, -_STEEPEST_RAD, _STEEPEST_RAD))
 
 
-def observability(covariance: Array, prior_sigma: Array) -> Observability:
-    """Compare the posterior of [M (6), b (3), w_b (3)] with the prior, direction by direction."""
-    scaled = covariance / np.outer(prior_sigma, prior_sigma)
+def observability(covariance: Array, W: Array) -> Observability:
+    """Compare the posterior of [M (6), b (3), w_b (3)] with the prior, direction by direction.
+
+    W (12, 12) whitens the prior.
+    """
+    scaled = W @ covariance @ W.T
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     ratio = np.sqrt(np.clip(values, 0.0, None))
     blind = []

@@ -13,11 +13,13 @@ noise and model errors cannot make them wander (`Graph.hold_blind`).
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from ahrsd.estimator import chain, noise
+from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
     Factor,
@@ -33,6 +35,7 @@ from ahrsd.estimator.graph import Graph, SingularError
 from ahrsd.estimator.grouping import group_size, grouped
 from ahrsd.estimator.misfit import Misfit
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.systematic import Cells, excess
 from ahrsd.samples import Array
 
 _STALE = 0.3  # sigmas of movement after which an epoch is linearised again
@@ -50,36 +53,8 @@ _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
+_ANOTHER_REST = 0.02  # rad between two directions at rest
 _SHORTEST_GAP_S = 0.1
-
-
-@dataclass(slots=True, eq=False)
-class Epoch:
-    """One epoch in the window: its data, directions, noise, and its factor's nodes a -> b."""
-
-    data: chain.Data
-    u: Array
-    used: chain.Noise
-    weights: Array | None
-    a: int
-    b: int
-    quadratic: chain.Quadratic
-    factor: Factor
-    turned: bool
-    _residuals: noise.Residuals | None = None
-
-    @property
-    def residuals(self) -> noise.Residuals:
-        """What it says about the noise, at its linearisation point."""
-        if self._residuals is None:
-            M = chain.symmetric(self.factor.point.c[:6])
-            self._residuals = noise.residuals(self.quadratic, self.data, self.used, M)
-        return self._residuals
-
-    @property
-    def cost(self) -> float:
-        """Half the sum of squares with the interior directions at their best."""
-        return self.quadratic.cost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +72,7 @@ class Window:
         self,
         parameters: EstimatorParameters,
         c: Array,
-        sigma_c: Array,
+        belief: Array,
         first: Node,
         usual: chain.Noise,
     ) -> None:
@@ -108,11 +83,21 @@ class Window:
         self.found_misfit = 1.0
         self.step_sigmas = float(np.inf)
         self.folded = False
+        self.loud = 1.0  # what searching found the model to leave over (`search.Found`)
+        self._folded_cells = Cells()
         self._damping = _DAMPING
+        self._rest: Array | None = None
         self._work = 0
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
-        self.graph = Graph(c, sigma_c, first, prior)
+        self.graph = Graph(c, belief, first, prior)
+
+    def twin(self) -> Window:
+        """A copy that goes its own way."""
+        other = copy(self)
+        other.graph, other.epochs = self.graph.twin(), list(self.epochs)
+        other._guesses, other.misfit = self._guesses.copy(), copy(self.misfit)
+        return other
 
     # -- growing and forgetting ------------------------------------------------------------------
 
@@ -162,6 +147,8 @@ class Window:
         ):
             old = self.epochs.pop(0)
             self.folded |= old.turned
+            if old.turned:
+                self._folded_cells = self._folded_cells.with_(old.u, old.data.count)
             self.misfit.remember(old.factor, self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
@@ -185,8 +172,19 @@ class Window:
         u[0], u[-1] = first.direction, last.direction
         q = chain.linearise(data, u, graph.c, first.bias, used, weights=weights)
         point = Point(graph.c.copy(), first.copy(), last.copy())
-        factor = epoch_factor(q, a, point, walk, calibrates=turned)
+        factor = epoch_factor(q, a, point, walk, rest=None if turned else self._resting(u))
         return Epoch(data, u, used, weights, a, a + 1, q, factor, turned)
+
+    def _resting(self, u: Array) -> Array:
+        """Direction at rest: that of the last rest unless it is clearly another.
+
+        Differences that are only noise would seem to say something of the bias along the field.
+        """
+        mean = u.mean(axis=0)
+        mean /= np.linalg.norm(mean)
+        if self._rest is None or float(np.linalg.norm(mean - self._rest)) > _ANOTHER_REST:
+            self._rest = mean
+        return self._rest
 
     def _replace(self, k: int, u: Array, used: chain.Noise, weights: Array | None) -> None:
         old = self.epochs[k]
@@ -357,10 +355,19 @@ class Window:
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
         factors = [e.factor for e in self.epochs]
         self.found_misfit = self.misfit.value(factors, graph, graph.step())
-        graph.temper = max(1.0, self.found_misfit)
+        graph.temper = max(1.0, self.found_misfit, self._repeating())
         covariance = graph.covariance()[:9, :9] * graph.temper
         graph.hold_blind(BLIND, covariance)
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+
+    def _repeating(self) -> float:
+        """By how much errors that repeat with the attitude shrink the information."""
+        cells = self._folded_cells
+        for epoch in self.epochs:
+            if epoch.turned:
+                cells = cells.with_(epoch.u, epoch.data.count)
+        white = noise.median(self._guesses).mag_gauss
+        return excess(cells, self.usual.mag_gauss, white)
 
 
 def sigmas(step: Array, information: Array) -> float:
