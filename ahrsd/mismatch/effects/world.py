@@ -12,6 +12,7 @@ import numpy as np
 from ahrsd.mismatch import roles
 from ahrsd.mismatch.effects import series, shapes
 from ahrsd.mismatch.effects.base import Linear, Parameter, Readings, Setting, readings_of
+from ahrsd.mismatch.effects.dipole import found_place, unit_fields
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -23,6 +24,7 @@ _DECLINATIONS_DEG = (-16.0, 0.0, 16.0)
 _BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
 _BUMPS = 2
 _DISTANCES_M = (0.7, 2.0)
+_CLEAR = 4.0  # usual departures of the size from which an object is sought
 #: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
 _GRADIENT = ("nn", "ee", "ne", "nd", "ed")
 
@@ -105,9 +107,10 @@ class FieldAnomaly(Linear):
     source = "BROAD trials 28 to 31 (dossier W2)"
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Where the calibrated field's size departs most: bumps then, dipoles below that place."""
+        """Where the calibrated field's size departs most: bumps then, a dipole near that place."""
         readings = readings_of(context)
-        rows, searched = departures(context)
+        size = size_departure(context)
+        rows, searched = departures(size, readings)
         first = float(readings.time_s[0])
         bumps = [
             {
@@ -116,12 +119,7 @@ class FieldAnomaly(Linear):
             }
             for row, length, part in product(rows, _BUMP_LENGTHS_S, (0.35, 0.5, 0.65))
         ]
-        place = position_m(readings) if context.world_levelled else None
-        dipoles = [
-            _dipole(place[row], distance)
-            for row, distance in product(rows, _DISTANCES_M)
-            if place is not None
-        ]
+        dipoles = _dipoles(context, readings, size, rows)
         return tuple({**setting, "searched": searched} for setting in (*bumps, *dipoles))
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
@@ -140,10 +138,8 @@ class FieldAnomaly(Linear):
         place = position_m(readings)
         if place is None:
             raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
-        away = place - setting["place_m"]
-        distance = np.linalg.norm(away, axis=1)[:, None, None]
-        r = away[:, :, None] / distance
-        field = (3 * r @ np.swapaxes(r, 1, 2) - np.eye(3)) * (setting["distance_m"] / distance) ** 3
+        away = turned_down(place - setting["place_m"], setting.get("turn_deg", 0.0))
+        field = unit_fields(away, setting["distance_m"])
         return Columns(mag=_seen(readings, field))
 
 
@@ -266,25 +262,51 @@ def turned_down(vectors: Array, turn_deg: float) -> Array:
     return np.asarray(vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
 
 
-def departures(context: Context) -> tuple[list[int], int]:
-    """Rows where the size of the calibrated field departs most from its usual value, and how many
-    places there were to look at.
+def size_departure(context: Context) -> Array:
+    """Size of the calibrated field minus its usual value (N,), gauss.
 
     The size does not turn with the sensor, so nothing but the calibration goes into it.
     """
     track, model = context.track, context.model
     field = np.linalg.solve(model.soft_iron, (track.mag_b_gauss - model.hard_iron_gauss).T)
     size = np.linalg.norm(field, axis=0)
-    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / series.median_step(track.dt_s)), 1)
-    away = np.abs(series.moving_mean(size - np.median(size), track.dt_s, rows))
+    return np.asarray(np.where(np.isfinite(size), size - np.nanmedian(size), 0.0))
+
+
+def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
+    """Rows where the size departs most, and how many places there were to look at."""
+    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / series.median_step(readings.dt_s)), 1)
+    away = np.abs(series.moving_mean(size, readings.dt_s, rows))
     found: list[int] = []
     for _ in range(_BUMPS):
         found.append(int(np.argmax(away)))
-        near = np.abs(track.time_s - track.time_s[found[-1]]) < _BUMP_LENGTHS_S[-1] / 2
+        near = np.abs(readings.time_s - readings.time_s[found[-1]]) < _BUMP_LENGTHS_S[-1] / 2
         away = np.where(near, -1.0, away)
         if away.max() <= 0:
             break
     return found, max(len(size) // rows, 1)
+
+
+def _dipoles(
+    context: Context, readings: Readings, size: Array, rows: list[int]
+) -> tuple[Setting, ...]:
+    """Objects near the way, sought where the size clearly departs, guessed below it elsewhere."""
+    place = position_m(readings) if context.world_levelled else None
+    if place is None:
+        return ()
+    field_n = np.einsum("nij,nj->ni", readings.R_nb, readings.field_b).mean(axis=0)
+    usual = 1.4826 * float(np.median(np.abs(size)))
+    found: list[Setting] = []
+    for row in rows:
+        window = slice(max(row - 2, 0), row + 3)
+        if abs(float(np.mean(size[window]))) > _CLEAR * usual:
+            best = found_place(size, place, field_n, row)
+            if best is not None:
+                nearest = float(np.linalg.norm(place - best[0], axis=1).min())
+                found.append(_object(best[0], max(nearest, 0.2), float(np.degrees(best[1]))))
+                continue
+        found += [_dipole(place[row], distance) for distance in _DISTANCES_M]
+    return tuple(found)
 
 
 def _seen(readings: Readings, field_n: Array) -> Array:
@@ -293,5 +315,13 @@ def _seen(readings: Readings, field_n: Array) -> Array:
 
 
 def _dipole(at: Array, distance: float) -> Setting:
-    place = [round(float(x), 3) for x in at + np.array([0.0, 0.0, distance])]
-    return {"place_m": place, "distance_m": distance}
+    """An object that far below a point of the way."""
+    return _object(at + np.array([0.0, 0.0, distance]), distance)
+
+
+def _object(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
+    return {
+        "place_m": [round(float(x), 3) for x in place],
+        "distance_m": round(distance, 3),
+        "turn_deg": round(turn_deg, 2),
+    }
