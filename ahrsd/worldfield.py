@@ -27,7 +27,8 @@ from ahrsd.samples import Array
 GAUSS_PER_NANOTESLA = 1e-5
 _LIFE_YEARS = 5.0
 _MODELS = {2015.0: WMM_2015v2, 2020.0: WMM_2020, 2025.0: WMM_2025}
-_IGRF_YEARS = (1900.0, 2030.0)  # IGRF-14; from 2025 on by its predicted secular variation
+OLDEST_WMM_YEAR = min(_MODELS)
+OLDEST_YEAR, _IGRF_END = 1900.0, 2030.0  # IGRF-14; from 2025 on by its predicted secular variation
 # WMM2025's error figures: north, east, down and total in nT, inclination in deg
 _SIGMA_N_NT, _SIGMA_TOTAL_NT, _SIGMA_INCLINATION_DEG = (137.0, 89.0, 141.0), 138.0, 0.20
 _BLACKOUT_NT = 2000.0  # of horizontal field, below which the WMM calls a compass unusable
@@ -96,15 +97,19 @@ def _wmm(latitude_deg: float, longitude_deg: float, height_km: float, year: floa
 
 
 def _igrf(latitude_deg: float, longitude_deg: float, height_km: float, year: float) -> WorldField:
-    first, last = _IGRF_YEARS
-    if not first <= year < last:
+    if not OLDEST_YEAR <= year < _IGRF_END:
         raise WorldFieldError(
-            f"no IGRF for the year {year:.2f} (IGRF-14 holds from {first:.0f} to {last:.0f}): set "
-            "the date, or install a newer generation"
+            f"no IGRF for the year {year:.2f} (IGRF-14 holds from {OLDEST_YEAR:.0f} to "
+            f"{_IGRF_END:.0f}): set the date, or install a newer generation"
         )
     *_, north, east, down, _ = igrf_value(latitude_deg, longitude_deg, height_km, year)
     return _field(
-        (north, east, down), _SIGMA_N_NT, _SIGMA_TOTAL_NT, _SIGMA_INCLINATION_DEG, "IGRF-14", last
+        (north, east, down),
+        _SIGMA_N_NT,
+        _SIGMA_TOTAL_NT,
+        _SIGMA_INCLINATION_DEG,
+        "IGRF-14",
+        _IGRF_END,
     )
 
 

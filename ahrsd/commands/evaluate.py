@@ -28,7 +28,8 @@ _MODELS = ("wmm", "igrf")
 @click.option("--heading-column", help="A column of RECORDING or of --reference to compare with.")
 @click.option("--position", help="LAT,LON[,ALT] in deg and m, for the world's field.")
 @click.option("--date", help="YYYY-MM-DD of the recording, for the world's field.")
-@click.option("--model", type=click.Choice(_MODELS), default="wmm", show_default=True)
+@click.option("--model", type=click.Choice(_MODELS), default="wmm", show_default=True,
+              help="WMM from 2015 or IGRF from 1900, both to the end of 2029.")  # fmt: skip
 @click.option("--tilt", type=click.Choice(_TILTS), default="auto", show_default=True,
               help="Which way is up: gravity steadied by the gyro, each sample's accelerometer, or "
               "the device's own roll and pitch.")  # fmt: skip

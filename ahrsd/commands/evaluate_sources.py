@@ -21,7 +21,14 @@ from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.replay import replay
 from ahrsd.samples import Array
-from ahrsd.worldfield import Model, WorldField, world_field
+from ahrsd.worldfield import (
+    OLDEST_WMM_YEAR,
+    OLDEST_YEAR,
+    Model,
+    WorldField,
+    WorldFieldError,
+    world_field,
+)
 
 _GPS_SUFFIX = ".gps.csv.gz"
 _GPS_TIME = ("t_s", "time_s")
@@ -152,7 +159,13 @@ def place_and_date(position: str | None, date: str | None, model: Model) -> Worl
     if date is None:
         raise EvaluationError("--position without --date: the field changes; give YYYY-MM-DD")
     height_m = numbers[2] if len(numbers) == 3 else 0.0
-    return world_field(numbers[0], numbers[1], height_m, decimal_year(date), model)
+    year = decimal_year(date)
+    try:
+        return world_field(numbers[0], numbers[1], height_m, year, model)
+    except WorldFieldError as error:
+        if model == "igrf" or not OLDEST_YEAR <= year < OLDEST_WMM_YEAR:
+            raise
+        raise EvaluationError(f"{error}; or take --model igrf, which has older years") from error
 
 
 def decimal_year(date: str) -> float:

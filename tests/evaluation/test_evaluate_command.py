@@ -108,6 +108,7 @@ def test_a_reference_table_with_attitude_or_a_heading(files, run, capsys, tmp_pa
         (("--position", "north", "--date", "2026-01-01"), "LAT,LON[,ALT] in deg and m"),
         (("--position", "95,0", "--date", "2026-01-01"), "latitude 95.0 deg is not within"),
         (("--position", "1,2", "--date", "2031-01-01"), "no world magnetic model for the year 20"),
+        (("--position", "1,2", "--date", "1999-01-01"), "or take --model igrf, which has older"),
         (("--date", "yesterday"), "YYYY-MM-DD is needed"),
         (("--heading-column", "nose_deg"), "no column nose_deg"),
         (("--tilt", "device"), "nothing says which way is up"),
