@@ -30,16 +30,17 @@ def thinned(track: Track, size: int) -> Track:
     """Groups of `size` samples; the remainder of each run is left out.  Covariates are dropped."""
     if size <= 1:
         return track
-    last, begins = _groups(track, size)
+    last, first, begins = _groups(track, size)
     if not begins:
         return track
-    steps = last[:, None] - np.arange(size - 1, -1, -1)
     dt = np.nan_to_num(track.dt_s, nan=0.0)
     angle = track.gyro_b_rad_s * dt[:, None]
-    total = so3.exp(angle[steps[:, 0]])
-    for column in range(1, size):
-        total = total @ so3.exp(angle[steps[:, column]])
-    length = dt[steps].sum(axis=1)
+    total = so3.exp(angle[first])
+    for step in range(1, int(np.max(last - first)) + 1):
+        at = np.minimum(first + step, last)
+        total = total @ so3.exp(np.where((first + step <= last)[:, None], angle[at], 0.0))
+    clock = np.concatenate([[0.0], np.cumsum(dt)])
+    length = clock[last + 1] - clock[first]
     rate = so3.log(total) / np.maximum(length, 1e-12)[:, None]
     length[begins] = np.nan
     runs = tuple(slice(a, b) for a, b in pairwise([*begins, len(last)]))
@@ -47,16 +48,24 @@ def thinned(track: Track, size: int) -> Track:
     return Track(track.time_s[last], length, track.mag_b_gauss[last], rate, accel, {}, runs)
 
 
-def _groups(track: Track, size: int) -> tuple[NDArray[np.intp], list[int]]:
-    """Last sample of each group, and which group is its run's first."""
+def _groups(track: Track, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], list[int]]:
+    """Last and first sample of each group, and which group is its run's first.
+
+    A group ends at the last sample that has a reading; what is behind it goes to the next.
+    """
+    seen = np.isfinite(track.mag_b_gauss).all(axis=1)
+    latest = np.maximum.accumulate(np.where(seen, np.arange(len(track)), -1))
     last: list[int] = []
+    first: list[int] = []
     begins: list[int] = []
     for run in track.runs or (slice(0, len(track)),):
-        mine = range(run.start + size - 1, run.stop, size)
-        if len(mine) > 1:
+        ends = np.unique(latest[run.start + size - 1 : run.stop : size])
+        ends = ends[ends >= run.start]
+        if len(ends) > 1:
             begins.append(len(last))
-            last.extend(mine)
-    return np.array(last, dtype=np.intp), begins
+            first.extend([run.start, *(ends[:-1] + 1).tolist()])
+            last.extend(ends.tolist())
+    return np.array(last, dtype=np.intp), np.array(first, dtype=np.intp), begins
 
 
 def noise_of(track: Track) -> tuple[float, float]:

@@ -23,7 +23,7 @@ _WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
 _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
 _FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 _PIECES, _PIECE_ROWS = 6, 400
-_SAME = 0.05  # relative change of a noise level that changes nothing
+_SAME = 0.02  # relative change of a noise level that changes nothing
 
 
 def first_guess(track: Track, spec: Spec) -> NullModel:
@@ -141,7 +141,7 @@ def _prior(sigma_gyro: float, differenced: float) -> float:
 
 def _by_ratio(track: Track, model: NullModel, differenced: float) -> NullModel:
     def scaled(level: float) -> tuple[NullModel, float]:
-        tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * np.exp(level))
+        tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * float(np.exp(level)))
         done = run_filter(track, tried, sensitive=False)
         scale = max(done.normalised_innovation, 1e-12)
         count = 3 * int(np.count_nonzero(done.used))
@@ -161,7 +161,7 @@ def _by_ratio(track: Track, model: NullModel, differenced: float) -> NullModel:
 
 def _mag_alone(track: Track, model: NullModel) -> NullModel:
     def of_mag(level: float) -> float:
-        return _likelihood(track, replace(model, sigma_mag_gauss=np.exp(level)))
+        return _likelihood(track, replace(model, sigma_mag_gauss=float(np.exp(level))))
 
     best = _highest(of_mag, np.log(model.sigma_mag_gauss))
     return replace(model, sigma_mag_gauss=max(float(np.exp(best)), _FLOOR_MAG_GAUSS))
@@ -169,7 +169,7 @@ def _mag_alone(track: Track, model: NullModel) -> NullModel:
 
 def _gyro_alone(track: Track, model: NullModel, differenced: float) -> NullModel:
     def of_gyro(level: float) -> float:
-        tried = replace(model, sigma_gyro_rad_s=np.exp(level))
+        tried = replace(model, sigma_gyro_rad_s=float(np.exp(level)))
         return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced)
 
     best = float(np.exp(_highest(of_gyro, np.log(differenced))))
@@ -187,7 +187,7 @@ def _walking(track: Track, model: NullModel) -> NullModel:
     top = np.log(WALK_CAP_RAD_S_SQRT_S)
 
     def of_walk(level: float) -> float:
-        return _likelihood(coarse, replace(rate, gyro_walk_rad_s_sqrt_s=np.exp(level)))
+        return _likelihood(coarse, replace(rate, gyro_walk_rad_s_sqrt_s=float(np.exp(level))))
 
     tried = [of_walk(top + level) for level in _WALKS]
     at = int(np.argmax(tried))

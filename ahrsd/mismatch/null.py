@@ -133,13 +133,13 @@ def fit_null(
         fit = _descended(problem, start, _STEPS)
     if not noise:
         return fit
-    again = noise_fit.rescaled(fit.filtered, known)
     if abs(np.log(fit.filtered.normalised_innovation)) > _REESTIMATE:
         again = noise_fit.estimated(fit.filtered, known, fit.terms_mag, fit.terms_gyro, walk=walk)
+        fit = _descended(_Problem(track, fit.terms, prior), again, _STEPS)
+    again = noise_fit.rescaled(fit.filtered, known)
     if noise_fit.alike(again, fit.model):
         return fit
-    fit = _descended(_Problem(track, fit.terms, prior), again, _STEPS)
-    return _descended(_Problem(track, fit.terms, prior), noise_fit.rescaled(fit.filtered, known), 1)
+    return _descended(_Problem(track, fit.terms, prior), again, 2)
 
 
 def cold_start(track: Track, spec: Spec) -> NullModel:
@@ -272,6 +272,8 @@ def _turned(mag: Array) -> float:
 
 def _sphere(mag: Array) -> Array:
     """Centre of the sphere |m - b| = r, |m|^2 = 2 m.b + c, drawn to 0 where the motion is poor."""
+    if not len(mag):
+        return np.zeros(3)
     square = np.sum(mag**2, axis=1)
     off = 2 * (mag - mag.mean(axis=0))
     weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
@@ -347,7 +349,7 @@ def _descended(problem: _Problem, model: NullModel, steps: int) -> NullFit:
         point, cost = new, cost - gained
         largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
         repetition = problem.prior.repetition
-        converged = largest < _DONE * np.sqrt(repetition) or gained < _DONE**2 * repetition
+        converged = bool(largest < _DONE * np.sqrt(repetition) or gained < _DONE**2 * repetition)
     return NullFit(
         model=point.model,
         filtered=point.filtered,
