@@ -33,6 +33,7 @@ log = logging.getLogger("ahrsd")
 
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
 _LONGEST_WAIT_S = 0.2
+_SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
 _STOP_S = 2.0  # for putting things back; a service manager's patience is limited
 _AMENDS_S = 2.0
 _INTERLOCK_S = 0.2
@@ -137,9 +138,12 @@ class Daemon:
             self._feed(inputs.Received(item.host_ns, item.data))
         elif isinstance(item, Lost):
             self._lost(item.host_ns, item.reason)
-        # what is waited for may lie in the inbox already: it is late only against what was taken
-        behind = item is not None and not self._inbox.empty
-        self._tick(item.host_ns if item is not None and behind else self.clock.now_ns())
+        # What is waited for may lie in the inbox or in the port already: a reply is late only
+        # against what was taken, and a silence is one only where nothing waits to be read.
+        if item is not None:
+            self._tick(item.host_ns)
+        elif not self._link.has_more():
+            self._tick(self.clock.now_ns())
         self._look()
         if self._public is not None:
             self._public.turn()
@@ -168,7 +172,7 @@ class Daemon:
         if deadline is not None:
             left_s = (deadline - self.clock.now_ns()) * 1e-9 / self.clock.speed
             longest_s = min(longest_s, left_s)
-        return max(longest_s, 0.0)
+        return max(longest_s, _SHORTEST_WAIT_S)
 
     def _tell_wall(self) -> None:
         """The wall clock, at the start and when it was set: budgets count days by it."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import queue
+import select
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -168,6 +169,14 @@ class SerialLink:
             self._doubtful = None
         self._port = SerialPort(self.path, self.baud)
         self._reader = SerialReader(self._port, self.inbox, self._now_ns)
+
+    def has_more(self) -> bool:
+        """Whether bytes lie in the port that the thread has not come to read."""
+        if self._port is None:
+            return False
+        poll = select.poll()  # one of its own: the thread waits on the port's
+        poll.register(self._port.fileno(), select.POLLIN)
+        return bool(poll.poll(0))
 
     def write(self, data: bytes) -> None:
         """Send; nothing where the port is closed. Raises LinkLost."""

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import itertools
+import os
+import pty
 import threading
+from pathlib import Path
 
 from ahrsd.inputs import LinkLost, Received
 from ahrsd.recording.capture import CaptureReader
-from ahrsd.serial_reader import Bytes, Inbox, Lost, SerialReader
+from ahrsd.serial_reader import Bytes, Inbox, Lost, SerialLink, SerialReader
+from drivers.vn100.deframer import Cause
 
 
 class Endless:
@@ -97,3 +101,54 @@ def test_a_core_that_falls_behind_loses_the_link_and_no_byte(live):
     fed = daemon.core.conversation.session.deframer.counters.fed_bytes
     assert fed == sum(len(item.data) for item in items if isinstance(item, Received))
     assert daemon.core.stream.facts.damaged == 0
+
+
+class Starved:
+    """In place of the daemon's link: an open port whose thread does not come to read."""
+
+    is_open = True
+
+    def __init__(self, link):
+        self.link, self.more = link, True
+
+    def has_more(self):
+        return self.more
+
+    def close(self):
+        return self.link.close()
+
+
+def test_half_a_message_is_not_given_up_while_the_rest_waits_to_be_read(live):
+    with live({"output": "imu"}) as daemon:
+        daemon.flowing()
+        daemon.stop()
+    one, deframer = daemon.daemon, daemon.core.conversation.session.deframer
+    cut = deframer.counters.damage.get(Cause.CUT, 0)
+    one._link = Starved(one._link)
+    one._feed(Received(one.clock.now_ns(), b"$VNIMU,-00.1"))
+    threading.Event().wait(0.15)  # longer than a silence that cuts
+    for _ in range(3):
+        one._turn(0.0)
+    assert deframer.pending > 0
+    one._link.more = False
+    one._turn(0.0)
+    assert deframer.pending == 0
+    assert deframer.counters.damage[Cause.CUT] == cut + 1
+
+
+def test_what_lies_in_the_port_is_seen_while_the_reader_waits_on_it(tmp_path):
+    ours, theirs = pty.openpty()
+    link = SerialLink(Path(os.ttyname(theirs)), 115200, lambda: 7)
+    try:
+        assert link.has_more() is False
+        link.open(may_query=False)
+        threading.Event().wait(0.02)  # the reader waits by now
+        assert link.has_more() is False
+        assert link._reader.stop()
+        os.write(ours, b"$VN")
+        assert link.has_more() is True
+        link.close()
+        assert link.has_more() is False
+    finally:
+        os.close(ours)
+        os.close(theirs)
