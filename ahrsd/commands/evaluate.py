@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
+from ahrsd.commands.progress import byte_progress
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 
 if TYPE_CHECKING:
@@ -58,7 +60,8 @@ def command(
     refuse_unwritable(figure_path)
     if folder is not None:
         json_path, figure_path = _into(folder, json_path, figure_path)
-    found = evaluate(recording, calibration_path, **options)  # type: ignore[arg-type]
+    with byte_progress(recording) as progress:
+        found = evaluate(recording, calibration_path, progress=progress, **options)  # type: ignore[arg-type]
     from ahrsd.evaluation.spoken import evaluation_json, evaluation_lines
 
     if json_path is not None:
@@ -84,6 +87,7 @@ def evaluate(
     tilt: str = "auto",
     least_speed_m_s: float = 4.0,
     rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
     """The evaluation that the command prints.  Raises AhrsdError."""
     from dataclasses import replace
@@ -95,7 +99,7 @@ def evaluate(
 
     calibration = sources.read_calibration(calibration_path, method)
     world = sources.place_and_date(position, date, model)  # type: ignore[arg-type]
-    track, said = sources.read_track(recording, Config(), rate_hz)
+    track, said = sources.read_track(recording, Config(), rate_hz, progress)
     fixes = None
     gps = reference_path or sources.gps_beside(recording)
     if gps is not None and sources.is_gps(gps):

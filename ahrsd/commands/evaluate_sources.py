@@ -7,6 +7,7 @@ import datetime
 import gzip
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,12 @@ _GPS_TIME = ("t_s", "time_s")
 _GPS_PLACE = ("lat_deg", "lon_deg")
 
 
-def read_track(path: Path, config: Config, rate_hz: float | None = None) -> tuple[Track, list[str]]:
+def read_track(
+    path: Path,
+    config: Config,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[Track, list[str]]:
     """A recording's samples, and what a person should know.  RecordingError as `replay`."""
     recording = open_recording(path, rate_hz)
     if recording.table is not None:
@@ -46,6 +52,7 @@ def read_track(path: Path, config: Config, rate_hz: float | None = None) -> tupl
         path,
         config,
         rate_hz=rate_hz,
+        progress=progress,
         listeners=[lambda event: seen.append(event) if isinstance(event, SamplesSeen) else None],
     )
     said = [*done.warnings, *done.core.stream.warnings]

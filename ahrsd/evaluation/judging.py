@@ -177,8 +177,8 @@ def _with_caveats(found: Evaluation) -> Evaluation:
     said = list(found.warnings)
     if not found.held_out:
         said.append(
-            f"the calibration was made from this very recording ({found.recording}): its figures "
-            "are not held out and flatter it"
+            f"by its name the calibration was made from this very recording ({found.recording}): "
+            "its figures are not held out and flatter it"
         )
     if found.world is None:
         said.append(

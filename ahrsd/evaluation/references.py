@@ -17,6 +17,7 @@ from ahrsd.samples import Array
 _EARTH_M = 6_371_000.0
 _UNBROKEN = 1.6  # times the usual distance of fixes; more is a gap that is not bridged
 _LEAST_FIXES = 10
+_LEAST_FORCE_M_S2 = 1.0  # of the mean in the world, below which it is no gravity
 _LEAST_INSTANTS = 10
 _OPINION = "its own filter's opinion, not the truth"
 QUATERNION = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
@@ -124,15 +125,16 @@ def optical(track: Track) -> Reference | None:
     if not all(name in track.covariates for name in QUATERNION):
         return None
     q = np.column_stack([track.covariates[name] for name in QUATERNION])
-    size = np.linalg.norm(q, axis=1)
-    known = np.isfinite(size) & (size > 0.5)
+    norms = np.linalg.norm(q, axis=1)
+    known = np.isfinite(norms) & (norms > 0.5)
     if np.count_nonzero(known) < _LEAST_INSTANTS:
         return None
-    R_wb = _matrices(q[known] / size[known, None])
+    R_wb = _matrices(q[known] / norms[known, None])
     up_w = np.array([0.0, 0.0, 1.0])
     if track.has_accel:
-        up_w = np.mean(np.einsum("kij,kj->ki", R_wb, track.accel_b_m_s2[known]), axis=0)
-        up_w /= np.linalg.norm(up_w)
+        force_w = np.mean(np.einsum("kij,kj->ki", R_wb, track.accel_b_m_s2[known]), axis=0)
+        if (size := float(np.linalg.norm(force_w))) > _LEAST_FORCE_M_S2:
+            up_w = force_w / size
     x_w = R_wb[:, :, 0]
     side = np.array([1.0, 0.0, 0.0]) if abs(up_w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     ahead = side - up_w * (side @ up_w)

@@ -11,6 +11,7 @@ from ahrsd.calibration import Affine
 from ahrsd.errors import AhrsdError
 from ahrsd.samples import Array, SampleBlock
 
+MINIMUM_SAMPLES = 20
 _DEVICE = ("yaw", "pitch", "roll")
 
 
@@ -64,11 +65,11 @@ class Track:
 
 
 def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> Track:
-    """Blocks in order, each with the device's correction of its time.  EvaluationError if empty."""
+    """Blocks in order, each with the correction of its time.  EvaluationError if too few."""
     kept = [(block, present) for block, present in pieces if len(block)]
-    if not kept:
-        raise EvaluationError("the recording holds no samples: record longer")
     blocks = [block for block, _ in kept]
+    if (count := sum(map(len, blocks))) < MINIMUM_SAMPLES:
+        raise EvaluationError(f"{count} samples, {MINIMUM_SAMPLES} are needed: record longer")
     time_s = np.concatenate([block.time_s for block in blocks])
     if not np.all(np.diff(time_s) > 0):
         raise EvaluationError("the time of the recording goes backwards: split it at that place")
