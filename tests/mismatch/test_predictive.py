@@ -1,0 +1,95 @@
+"""Posterior predictive checks: the truth is inside, what was left out is outside until it is in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_motion import moving
+
+from ahrsd.mismatch import forward, predictive
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.null import FittedTerm, fit_null
+from ahrsd.mismatch.values import Term
+
+
+def recorded(name=None, strength=1.0, seed=0, rows=3000):
+    """A recording with an effect, the null that is fitted to it, and the effect's true term."""
+    context, _ = moving(11, rows=rows)
+    truth = forward.truth_along(context)
+    terms = ()
+    if name is not None:
+        value, setting = EFFECTS[name].example(truth, strength)
+        terms = (Term(name, value, 0.1 * np.abs(value), setting),)
+    made = forward.simulated(truth, terms, forward.noise_of(context.model), seed)
+    track = forward.track_of(made)
+    model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
+    return fit_null(track, start=model, walk=False), terms, model
+
+
+def repaired(null, terms, model):
+    fitted = [
+        FittedTerm(
+            term.identifier,
+            lambda context, term=term: EFFECTS[term.identifier].columns(context, term.setting),
+            term.value,
+            np.array([p.scale for p in EFFECTS[term.identifier].parameters]),
+            setting=term.setting,
+        )
+        for term in terms
+    ]
+    return fit_null(null.filtered.track, start=model, terms=fitted, walk=False)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_recording_of_the_null_is_inside_all_its_bands(seed):
+    null, _, _ = recorded(seed=seed)
+    found = predictive.checks(null, null, ())
+    assert set(found) == {
+        "normalised_innovation", "autocorrelation", "shift_sensor", "shift_world", "shift_turn",
+        "field_size", "heading", "tail", "line", "covariates",
+    }  # fmt: skip
+    outside = [name for name, check in found.items() if not check.inside_before]
+    assert outside == []
+    assert all(c.band[0] < c.band[1] and c.inside_after == c.inside_before for c in found.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "seen_in"),
+    [
+        ("motor_current_field", "covariates"),
+        ("hard_iron_step", "shift_sensor"),
+        ("ac_interference", "line"),
+        ("mag_gyro_misalignment", "autocorrelation"),
+    ],
+)
+def test_what_was_left_out_is_outside_and_the_repaired_model_is_not(name, seen_in):
+    null, terms, model = recorded(name, seed=5)
+    fit = repaired(null, terms, model)
+    assert fit.model.sigma_mag_gauss == pytest.approx(model.sigma_mag_gauss, rel=0.1)
+    named = tuple(
+        Term(t.identifier, f.value, t.deviation, t.setting)
+        for t, f in zip(terms, fit.terms, strict=True)
+    )
+    found = predictive.checks(null, fit, named)
+    assert not found[seen_in].inside_before
+    outside = [key for key, check in found.items() if not check.inside_after]
+    assert outside == []
+
+
+def test_the_same_question_has_the_same_answer():
+    null, _, _ = recorded(rows=600)
+    assert predictive.checks(null, null, ()) == predictive.checks(null, null, ())
+
+
+def test_statistics_of_white_noise_are_what_they_say():
+    context, _ = moving(12, rows=4000)
+    e = np.random.default_rng(0).standard_normal((4000, 3))
+    found = predictive.statistics(e, context)
+    assert found["normalised_innovation"] == pytest.approx(1.0, abs=0.05)
+    assert found["autocorrelation"] == pytest.approx(1.0, abs=0.6)
+    assert found["tail"] == pytest.approx(3.29, abs=0.2)
+    assert 1.5 < found["shift_sensor"] < 4.5
+    shifted = e + np.where(context.track.time_s > 100, 0.5, 0.0)[:, None]
+    assert predictive.statistics(shifted, context)["shift_sensor"] > 8
