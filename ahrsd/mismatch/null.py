@@ -4,8 +4,7 @@ Gauss-Newton on the whitened innovations, the gains held within a step.  The col
 a thinned track (`coarse`) from two starts, a sphere and a linear fit with the gyro, with the
 gyro's noise inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.
 
-Gaussian priors keep what the motion does not show (at rest A and b would run away); where it shows
-anything they are a thousand times too wide to matter.
+A Gaussian prior (`prior`) keeps what the motion does not show.
 
 Noise by innovation likelihood: the filter's gain is a function of sigma_gyro / sigma_mag, the
 scale follows from the mean square.  sigma_gyro is never more than CAP times what the gyro's own
@@ -25,8 +24,8 @@ from numpy.typing import NDArray
 from ahrsd.estimator import chain
 from ahrsd.estimator.start import linear_start
 from ahrsd.mismatch import noise_fit
-from ahrsd.mismatch.coarse import group_size, noise_of, thinned
-from ahrsd.mismatch.context import build_context
+from ahrsd.mismatch.coarse import group_size, thinned
+from ahrsd.mismatch.context import attitude, build_context
 from ahrsd.mismatch.innovation import (
     TRACELESS,
     Filtered,
@@ -34,25 +33,21 @@ from ahrsd.mismatch.innovation import (
     run_filter,
     sensitivities,
 )
+from ahrsd.mismatch.prior import PRIOR, TURNED, Prior, prior_of, sphere_centre, turned
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import Columns, Context, NullModel
 from ahrsd.samples import Array
 
-#: prior deviations of the 11: soft iron about I, hard iron (gauss) about 0, gyro bias (rad/s)
-PRIOR = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
+EARTH_RAD_S = 7.292115e-5
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _DONE = 0.05  # largest step in standard deviations
 _STEPS = 6
 _HALVINGS = 3
 _BLOCKS = 40
-_REPEATED = 3.0  # repetition from which the prior is made to count
 _REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
 _GOOD = 1.5  # normalised innovation of a start that needs no rival
 _WORTH = 10.0  # by which a further start's cost must be lower
-_SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
-_TURNED = 0.1  # scatter of the field over its size that shows the iron
 _FARTHEST_GAUSS = 3.0  # hard iron of a start: beyond, the start is nonsense
-_AT_REST_RAD_S = 1e-3  # what the mean of a resting gyro may differ from its bias
 _SMALLEST_EIGENVALUE = 0.05  # of the soft iron: beyond, no calibration
 
 
@@ -79,7 +74,8 @@ class NullFit:
     covariance: (11 + p, 11 + p) of [soft iron (TRACELESS), hard iron, gyro bias, terms in order],
                 for noise as estimated;  informed: (11,) false where the prior decided
     terms:      with their values and deviations
-    terms_mag, terms_gyro: (N, 3) what the terms contribute to the readings, None without terms
+    terms_mag, terms_gyro: (N, 3) what the terms contribute to the readings, None without terms;
+                the Earth's rotation, where it is known, is in the second
     cost:       half the sum of squares, priors included, at the end
     """
 
@@ -112,34 +108,50 @@ def fit_null(
     *,
     noise: bool = True,
     walk: bool = True,
+    latitude_deg: float | None = None,
 ) -> NullFit:
     """Fit calibration, noise and terms to a track.
 
     start: begin there (a fit of nearly the same data) instead of cold
     noise: estimate what the spec leaves open; else keep the noise of `start`
     walk:  let the gyro's bias wander where the data say so
+    latitude_deg: the Earth's rotation is then taken out of the gyro where the attitude is level
     """
     known = spec or Spec()
-    prior = prior_of(track)
-    problem = _Problem(track, tuple(terms), prior)
+    problem = _Problem(track, tuple(terms), prior_of(track))
     if start is None:
         start = noise_fit.estimated(
             run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
         )
     fit = _descended(problem, start, _STEPS)
-    prior = prior.sharper(repetition_of(fit))
-    if prior is not problem.prior:
-        problem = _Problem(track, fit.terms, prior)
+    prior = problem.prior.sharper(repetition_of(fit))
+    fixed = None if latitude_deg is None else earth_rate(track, fit.filtered, latitude_deg)
+    if prior is not problem.prior or fixed is not None:
+        problem = replace(problem, terms=fit.terms, prior=prior, fixed_gyro=fixed)
         fit = _descended(problem, start, _STEPS)
     if not noise:
         return fit
     if abs(np.log(fit.filtered.normalised_innovation)) > _REESTIMATE:
         again = noise_fit.estimated(fit.filtered, known, fit.terms_mag, fit.terms_gyro, walk=walk)
-        fit = _descended(_Problem(track, fit.terms, prior), again, _STEPS)
+        fit = _descended(replace(problem, terms=fit.terms), again, _STEPS)
     again = noise_fit.rescaled(fit.filtered, known)
     if noise_fit.alike(again, fit.model):
         return fit
-    return _descended(_Problem(track, fit.terms, prior), again, 2)
+    return _descended(replace(problem, terms=fit.terms), again, 2)
+
+
+def earth_rate(track: Track, done: Filtered, latitude_deg: float) -> Array | None:
+    """(N, 3) rad/s that the gyro reads of the Earth's rotation, None where level is not known.
+
+    The attitude's north is magnetic: a declination of 10 degrees turns the horizontal part by as
+    much, 1e-5 rad/s, which the gyro bias takes up but for what turns with the heading.
+    """
+    R_nb, levelled = attitude(track, done)
+    if not levelled:
+        return None
+    latitude = np.radians(latitude_deg)
+    rate_n = EARTH_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
+    return np.asarray(np.einsum("nji,j->ni", R_nb, rate_n))
 
 
 def cold_start(track: Track, spec: Spec) -> NullModel:
@@ -178,9 +190,9 @@ def _starts(track: Track, base: NullModel) -> list[NullModel]:
     seen = np.isfinite(track.mag_b_gauss).all(axis=1)
     mag = track.mag_b_gauss[seen]
     out = []
-    out.append(replace(base, hard_iron_gauss=_sphere(mag)))
+    out.append(replace(base, hard_iron_gauss=sphere_centre(mag)))
     out.append(base)
-    well = _turned(mag) > _TURNED and seen.all()
+    well = turned(mag) > TURNED and seen.all()
     linear = linear_start(_epochs(track)) if well else None
     if linear is not None and np.linalg.norm(linear[6:]) < _FARTHEST_GAUSS:
         A = chain.symmetric(linear[:6])
@@ -188,25 +200,6 @@ def _starts(track: Track, base: NullModel) -> list[NullModel]:
         if np.linalg.norm(A - np.eye(3)) < 1.0:
             out.append(replace(base, soft_iron=A, hard_iron_gauss=linear[6:]))
     return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """What is believed before the data: mean and deviation (11,), in the order of the fit.
-
-    repetition: of how many data one says something new: the deviations are for that many
-    """
-
-    mean: Array
-    deviation: Array
-    repetition: float = 1.0
-
-    def sharper(self, repetition: float) -> Prior:
-        """For data of which only one in `repetition` says anything new; itself where all do."""
-        if repetition < _REPEATED:
-            return self
-        sharp = self.deviation / np.sqrt(repetition / self.repetition)
-        return Prior(self.mean, sharp, repetition)
 
 
 def repetition_of(fit: NullFit) -> float:
@@ -224,61 +217,6 @@ def repetition_of(fit: NullFit) -> float:
     ridge = np.diag(1.0 / PRIOR**2)
     ratio = np.trace(np.linalg.solve(flat.T @ flat + ridge, sums.T @ sums))
     return float(ratio / 11 / (1 - 11 / _BLOCKS))
-
-
-def prior_of(track: Track) -> Prior:
-    """The usual one; where the sensor rests for long, its gyro reads its bias.
-
-    Iron shows itself by turning only.  Without turning, slow noise of the magnetometer would be
-    laid at its door, so the less the field turned, the closer the iron is held.
-    """
-    mean, deviation = np.zeros(11), PRIOR.copy()
-    deviation[:8] *= np.clip(_turned(track.mag_b_gauss) / _TURNED, 0.02, 1.0)
-    rest = rate_at_rest(track)
-    if rest is not None:
-        mean[8:], deviation[8:] = rest, _AT_REST_RAD_S
-    return Prior(mean, deviation)
-
-
-def rate_at_rest(track: Track) -> Array | None:
-    """Mean gyro reading (3,) over the still seconds, None where fewer than a fifth are still.
-
-    Still: neither the readings' scatter within the second nor the magnetometer's mean against the
-    second before is more than their noise.
-    """
-    mag_noise, gyro_noise = noise_of(track)
-    rows = max(8, round(1.0 / max(float(np.nanmedian(track.dt_s)), 1e-6)))
-    whole = len(track) // rows * rows
-    if whole < 5 * rows:
-        return None
-    mag = track.mag_b_gauss[:whole].reshape(-1, rows, 3)
-    gyro = track.gyro_b_rad_s[:whole].reshape(-1, rows, 3)
-    moved = np.linalg.norm(np.diff(mag.mean(axis=1), axis=0, prepend=np.nan), axis=1)
-    still = (
-        (np.max(gyro.std(axis=1), axis=1) < 2 * gyro_noise)
-        & (np.max(mag.std(axis=1), axis=1) < 2 * mag_noise)
-        & (moved < 6 * mag_noise / np.sqrt(rows) + 1e-4)
-    )
-    if np.count_nonzero(still) < 0.2 * len(still):
-        return None
-    return np.asarray(np.median(gyro[still].mean(axis=1), axis=0))
-
-
-def _turned(mag: Array) -> float:
-    """Scatter of the field over its size."""
-    size = float(np.nanmedian(np.linalg.norm(mag, axis=1)))
-    return float(np.linalg.norm(np.nanstd(mag, axis=0))) / max(size, 1e-12)
-
-
-def _sphere(mag: Array) -> Array:
-    """Centre of the sphere |m - b| = r, |m|^2 = 2 m.b + c, drawn to 0 where the motion is poor."""
-    if not len(mag):
-        return np.zeros(3)
-    square = np.sum(mag**2, axis=1)
-    off = 2 * (mag - mag.mean(axis=0))
-    weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
-    gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
-    return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
 
 
 def _epochs(track: Track) -> list[chain.Data]:
@@ -302,6 +240,7 @@ class _Problem:
     track: Track
     terms: tuple[FittedTerm, ...]
     prior: Prior
+    fixed_gyro: Array | None = None
 
     @property
     def mean(self) -> Array:
@@ -376,7 +315,7 @@ def _named(problem: _Problem, point: _Point, covariance: Array) -> tuple[FittedT
 
 def _at(problem: _Problem, model: NullModel, values: Array, last: _Point | None) -> _Point:
     """Filter at these parameters; the terms' columns are those of the context before."""
-    mag, gyro = last.terms_mag if last else None, last.terms_gyro if last else None
+    mag, gyro = None, problem.fixed_gyro
     columns: tuple[Columns, ...] = ()
     if problem.terms:
         basis = last or _Point(model, values, run_filter(problem.track, model), None, None, ())
@@ -392,6 +331,8 @@ def _contributions(
 ) -> tuple[Array | None, Array | None]:
     count = len(problem.track)
     mag, gyro = np.zeros((count, 3)), np.zeros((count, 3))
+    if problem.fixed_gyro is not None:
+        gyro += problem.fixed_gyro
     at = 0
     for term, mine in zip(problem.terms, columns, strict=True):
         theta = values[at : at + len(term.value)]
