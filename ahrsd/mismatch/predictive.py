@@ -11,9 +11,10 @@ deviation, Student's t).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from ahrsd.mismatch import forward
@@ -27,7 +28,7 @@ from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, NullModel, Term
 from ahrsd.samples import Array
 
-COPIES = 24
+COPIES = 16
 _OUTSIDE = 0.05
 _SEGMENT_S = 20.0
 _LAGS = 50
@@ -50,11 +51,14 @@ def checks(
     """
     context = null.context()
     noise = forward.noise_of(repaired.model, repaired.filtered)
-    value = statistics(null.filtered.whitened, context)
-    before = _bands(_simulated(null, noise, (), context, library, copies, seed))
+    scene = scene_of(context)
+    value = statistics(null.filtered.whitened, scene)
+    before = _bands(_simulated(null, noise, (), scene, context.model, library, copies, seed))
     after = before
     if terms:
-        after = _bands(_simulated(repaired, noise, terms, context, library, copies, seed + 1))
+        after = _bands(
+            _simulated(repaired, noise, terms, scene, context.model, library, copies, seed + 1)
+        )
     return {
         name: Check(
             value[name],
@@ -66,41 +70,71 @@ def checks(
     }
 
 
-def statistics(e: Array, context: Context) -> dict[str, float]:
-    """What is compared, of whitened innovations (N, 3) along a context's motion.
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What innovations are compared with: directions, segments and courses of unit length.
+
+    unit_b (N, 3): direction of the field;  R_nb (N, 3, 3);  segment (N,): number of the 20 s piece
+    time (N, 1), heading (N, 4), columns (N, c): centred;  columns may have no column
+    """
+
+    unit_b: Array
+    R_nb: Array
+    segment: NDArray[np.intp]
+    time: Array
+    heading: Array
+    columns: Array
+
+
+def scene_of(context: Context) -> Scene:
+    """The scene of a recording."""
+    track = context.track
+    heading = np.arctan2(context.R_nb[:, 1, 0], context.R_nb[:, 0, 0])
+    return Scene(
+        unit_b=context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True),
+        R_nb=context.R_nb,
+        segment=((track.time_s - track.time_s[0]) // _SEGMENT_S).astype(np.intp),
+        time=_courses([track.time_s]),
+        heading=_courses([f(n * heading) for n in (1, 2) for f in (np.cos, np.sin)]),
+        columns=_courses(
+            [
+                course
+                for values in track.covariates.values()
+                if np.isfinite(values).all() and np.ptp(values) > 0
+                for course in (values, series.derivative(values, track.time_s, track.dt_s))
+            ]
+        ).reshape(len(track), -1),
+    )
+
+
+def statistics(e: Array, scene: Scene) -> dict[str, float]:
+    """What is compared, of whitened innovations (N, 3) in a scene.
 
     normalised_innovation   mean square
-    autocorrelation         portmanteau over the first 50 lags
+    autocorrelation         portmanteau over the first 50 lags, 1 for white noise
     shift_sensor, _world    largest mean of a 20 s segment in the frame, in deviations of noise
     shift_turn              the same of the part that a wrong rate leaves: h x e
-    field_size              largest correlation of the part along the field with time, and its
-                            largest segment
-    covariates              largest correlation with a column or its derivative, in deviations
+    field_size              the same of the part along the field, or its trend
     heading                 largest first or second harmonic of heading, in deviations
     tail                    the 99.9 % quantile of the size of a component
     line                    highest line of the periodogram over its mean
+    covariates              largest correlation with a column or its derivative, in deviations
     """
-    track = context.track
-    unit = context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True)
-    along = np.sum(e * unit, axis=1)[:, None]
-    time = track.time_s - track.time_s.mean()
-    heading = np.arctan2(context.R_nb[:, 1, 0], context.R_nb[:, 0, 0])
-    harmonics = np.column_stack([f(n * heading) for n in (1, 2) for f in (np.cos, np.sin)])
+    along = np.sum(e * scene.unit_b, axis=1)[:, None]
     power = np.abs(np.fft.rfft(e, axis=0)[1:]) ** 2
     out = {
         "normalised_innovation": float(np.mean(e**2)),
         "autocorrelation": _portmanteau(e),
-        "shift_sensor": _shift(e, track),
-        "shift_world": _shift(np.einsum("nij,nj->ni", context.R_nb, e), track),
-        "shift_turn": _shift(np.cross(unit, e), track),
-        "field_size": max(_shift(along, track), _follows(along, time[:, None])),
-        "heading": _follows(e, harmonics - harmonics.mean(axis=0)),
+        "shift_sensor": _shift(e, scene),
+        "shift_world": _shift(np.einsum("nij,nj->ni", scene.R_nb, e), scene),
+        "shift_turn": _shift(np.cross(scene.unit_b, e), scene),
+        "field_size": max(_shift(along, scene), _follows(along, scene.time)),
+        "heading": _follows(e, scene.heading),
         "tail": float(np.quantile(np.abs(e), 0.999)),
         "line": float((power / power.mean(axis=0)).max()),
     }
-    columns = _columns(track)
-    if columns is not None:
-        out["covariates"] = _follows(e, columns)
+    if scene.columns.shape[1]:
+        out["covariates"] = _follows(e, scene.columns)
     return out
 
 
@@ -108,21 +142,22 @@ def _simulated(
     fit: NullFit,
     noise: forward.Noise,
     terms: Sequence[Term],
-    seen: Context,
+    scene: Scene,
+    model: NullModel,
     library: Mapping[str, Effect],
     copies: int,
     seed: int,
 ) -> list[dict[str, float]]:
-    """The statistics of simulations of a fit, filtered by the null of the context `seen`."""
+    """The statistics of simulations of a fit, filtered by the null's model."""
     truth = forward.truth_along(fit.context())
     made = [
         forward.track_of(forward.simulated(truth, terms, noise, seed=1000 * seed + k))
         for k in range(copies)
     ]
-    whole = _filtered(_joined(made), seen.model)
-    rows = len(seen.track)
+    whole = _filtered(_joined(made), model)
+    rows = len(scene.segment)
     return [
-        statistics(whole[k * rows : (k + 1) * rows], seen)
+        statistics(whole[k * rows : (k + 1) * rows], scene)
         for k in range(copies)
         if len(made[k]) == rows
     ]
@@ -169,27 +204,23 @@ def _portmanteau(e: Array) -> float:
     return float(np.mean((lags[1:] / max(lags[0], _LEAST)) ** 2) * 3 * count)
 
 
-def _shift(values: Array, track: Track) -> float:
+def _shift(values: Array, scene: Scene) -> float:
     """Largest |mean| of a segment (N, k), in standard deviations of a mean of unit noise."""
-    segment = ((track.time_s - track.time_s[0]) // _SEGMENT_S).astype(int)
-    count = np.bincount(segment)
+    count = np.bincount(scene.segment)
     kept = count > 0.3 * count.max()
-    sums = np.column_stack([np.bincount(segment, weights=column) for column in values.T])
+    sums = np.column_stack([np.bincount(scene.segment, weights=column) for column in values.T])
     return float(np.abs(sums[kept] / np.sqrt(count[kept])[:, None]).max())
 
 
 def _follows(values: Array, courses: Array) -> float:
     """Largest correlation of a column (N, k) with a course (N, c), in deviations of unit noise."""
-    size = np.linalg.norm(courses, axis=0)
-    used = size > 0
-    return float(np.abs(values.T @ (courses[:, used] / size[used])).max()) if used.any() else 0.0
+    return float(np.abs(values.T @ courses).max())
 
 
-def _columns(track: Track) -> Array | None:
-    """Usable covariates and their derivatives, centred, (N, c); None without any."""
-    found = []
-    for values in track.covariates.values():
-        if np.isfinite(values).all() and np.ptp(values) > 0:
-            change = series.derivative(values, track.time_s, track.dt_s)
-            found += [values - values.mean(), change - change.mean()]
-    return np.column_stack(found) if found else None
+def _courses(values: Sequence[Array]) -> Array:
+    """Courses (N,) side by side, centred and of unit length; those that do not change are 0."""
+    if not values:
+        return np.zeros((0, 0))
+    centred = np.column_stack([value - value.mean() for value in values])
+    size = np.linalg.norm(centred, axis=0)
+    return np.asarray(centred / np.where(size > 0, size, 1.0))

@@ -86,10 +86,18 @@ def test_the_same_question_has_the_same_answer():
 def test_statistics_of_white_noise_are_what_they_say():
     context, _ = moving(12, rows=4000)
     e = np.random.default_rng(0).standard_normal((4000, 3))
-    found = predictive.statistics(e, context)
+    found = predictive.statistics(e, predictive.scene_of(context))
     assert found["normalised_innovation"] == pytest.approx(1.0, abs=0.05)
     assert found["autocorrelation"] == pytest.approx(1.0, abs=0.6)
     assert found["tail"] == pytest.approx(3.29, abs=0.2)
     assert 1.5 < found["shift_sensor"] < 4.5
     shifted = e + np.where(context.track.time_s > 100, 0.5, 0.0)[:, None]
-    assert predictive.statistics(shifted, context)["shift_sensor"] > 8
+    assert predictive.statistics(shifted, predictive.scene_of(context))["shift_sensor"] > 8
+
+
+def test_without_columns_nothing_is_said_of_them():
+    context, _ = moving(12, rows=400)
+    still = {"throttle": np.full(400, 0.3), "x": np.full(400, np.nan)}
+    bare = replace(context, track=replace(context.track, covariates=still))
+    e = np.random.default_rng(0).standard_normal((400, 3))
+    assert "covariates" not in predictive.statistics(e, predictive.scene_of(bare))
