@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.factors import Factor
+from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
 
 
@@ -23,6 +24,14 @@ class Epoch:
     factor: Factor
     turned: bool
     _residuals: noise.Residuals | None = None
+    _cells: Cells | None = None
+
+    @property
+    def cells(self) -> Cells:
+        """Where its directions were."""
+        if self._cells is None:
+            self._cells = Cells.of(self.u, self.data.count)
+        return self._cells
 
     @property
     def residuals(self) -> noise.Residuals:

@@ -18,6 +18,7 @@ from ahrsd.samples import Array, SampleBlock
 
 _RATE_ROWS = 33
 _LONGEST_GAP_S = 60.0  # after a longer one the gyro's bias may have moved
+_SPARE = 2  # steps by which the count of what waits may be wrong
 _SMOOTHED = 33  # steps over which the specific force is averaged to tell where down is
 
 
@@ -53,6 +54,8 @@ class Intake:
         self.samples = 0
         self._averager: StepAverager | None = None
         self._rows: list[Array] = []  # samples of a piece whose rate is not known yet
+        self._waiting: list[Array] = []  # samples that are not steps yet
+        self._waiting_count = 0
         self._pending: list[Steps] = []
         self._pending_count = 0
         self._fresh = True
@@ -84,8 +87,19 @@ class Intake:
                 return []
             self._rows.clear()
             closed = self._measure(rows[1:_RATE_ROWS, 1])
-        self._take(rows)
+        self._waiting.append(rows)
+        self._waiting_count += len(rows)
+        enough = self._parameters.epoch_steps + int(self._fresh)
+        if self._pending_count + self._waiting_count // self.averaged + _SPARE >= enough:
+            self._work_off()
         return closed + self._complete()
+
+    def _work_off(self) -> None:
+        """Make steps of what waits; small blocks wait, because each would cost as much as one."""
+        if self._waiting:
+            self._take(np.vstack(self._waiting))
+            self._waiting.clear()
+            self._waiting_count = 0
 
     def _measure(self, dt_s: Array) -> list[chain.Data]:
         """Measure the rate; steps of another length do not share an epoch."""
@@ -105,6 +119,7 @@ class Intake:
 
     def gap(self, next_s: float) -> list[chain.Data]:
         """The next sample, at `next_s`, does not follow the last one; epochs that end here."""
+        self._work_off()
         if self._averager is None and self._pending_count and len(self._rows):
             self._take(np.vstack(self._rows))  # too short to tell its rate: as the one before
         closed = self._complete()
@@ -128,16 +143,20 @@ class Intake:
     @property
     def pending(self) -> int:
         """Steps of the epoch that is not complete yet."""
+        self._work_off()
         return self._pending_count
 
     def twin(self) -> Intake:
         """A copy that goes its own way, for closing the epoch early."""
+        self._work_off()
         other = copy(self)
         other._pending, other._rows = list(self._pending), list(self._rows)
+        other._averager, other._waiting = copy(self._averager), []
         return other
 
     def interrupt(self) -> chain.Data | None:
         """What is pending as a short epoch, if it is worth one; the next one starts anew."""
+        self._work_off()
         data = self._closed()
         self._cut()
         return data

@@ -96,7 +96,7 @@ class Estimator:
             data = intake.with_border(data, window.epochs[-1].data)
         self._down.append(data.down_b[len(data) // 2])
         window.append(data)
-        window.track(everything=len(window.epochs) <= _FEW)
+        window.track(everything=self._searching and len(window.epochs) <= _FEW)
         if self._searching and window.epochs[-1].turned:
             self._moving_epochs += 1
             if self._moving_epochs >= self._next_search:

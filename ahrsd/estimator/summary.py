@@ -18,6 +18,7 @@ _NAMES = (
 )
 _TYPICAL_DIP_RAD = float(np.radians(65.0))  # pessimistic for most of the inhabited earth
 _STEEPEST_RAD = float(np.radians(80.0))
+_HEADINGS = 12
 _FLOOR = 0.1  # ratio at which the observability score is 1
 
 
@@ -45,21 +46,18 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     heading by that over cos(dip).
     """
     M = chain.symmetric(c[:6])
-    worst = 0.0
-    psi = np.arange(12) * np.pi / 6
-    for down in down_b:
-        helper = np.eye(3)[int(np.argmin(np.abs(down)))]
-        north = np.cross(helper, down)
-        north /= np.linalg.norm(north)
-        east = np.cross(down, north)
-        level = np.cos(psi)[:, None] * north + np.sin(psi)[:, None] * east
-        u = np.cos(dip_rad) * level + np.sin(dip_rad) * down
-        across = np.cross(down, level)
-        J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
-        row = np.einsum("ni,nij->nj", across @ np.linalg.inv(M).T, J) / np.cos(dip_rad)
-        variance = np.einsum("ni,ij,nj->n", row, covariance[:9, :9], row)
-        worst = max(worst, float(np.max(variance)))
-    return float(np.degrees(np.sqrt(worst)))
+    psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
+    helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
+    north = np.cross(helper, down_b)
+    north /= np.linalg.norm(north, axis=1, keepdims=True)
+    east = np.cross(down_b, north)
+    level = np.cos(psi)[:, None, None] * north + np.sin(psi)[:, None, None] * east
+    u = (np.cos(dip_rad) * level + np.sin(dip_rad) * down_b).reshape(-1, 3)
+    across = np.cross(down_b, level).reshape(-1, 3) @ np.linalg.inv(M) / np.cos(dip_rad)
+    J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
+    row = (across[:, None, :] @ J)[:, 0]
+    variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
+    return float(np.degrees(np.sqrt(np.max(variance))))
 
 
 def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:

@@ -25,14 +25,18 @@ class Cells:
     def __init__(self, count: Array | None = None) -> None:
         self._count: Array = np.zeros(_BANDS * _SECTORS) if count is None else count
 
-    def with_(self, directions: Array, each: Array | float) -> Cells:
-        """With more unit vectors (n, 3), each standing for that many steps."""
+    @staticmethod
+    def of(directions: Array, each: Array | float) -> Cells:
+        """Of unit vectors (n, 3), each standing for that many steps."""
         band = np.minimum((directions[:, 2] + 1) / 2 * _BANDS, _BANDS - 1).astype(int)
         angle = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) % 1.0
         sector = np.minimum(angle * _SECTORS, _SECTORS - 1).astype(int)
         weights = np.broadcast_to(each, len(directions))
-        cell = band * _SECTORS + sector
-        return Cells(self._count + np.bincount(cell, weights, minlength=len(self._count)))
+        count = np.bincount(band * _SECTORS + sector, weights, minlength=_BANDS * _SECTORS)
+        return Cells(count.astype(np.float64))
+
+    def __add__(self, other: Cells) -> Cells:
+        return Cells(self._count + other._count)
 
     @property
     def steps(self) -> float:

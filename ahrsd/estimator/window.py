@@ -148,7 +148,7 @@ class Window:
             old = self.epochs.pop(0)
             self.folded |= old.turned
             if old.turned:
-                self._folded_cells = self._folded_cells.with_(old.u, old.data.count)
+                self._folded_cells += old.cells
             self.misfit.remember(old.factor, self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
@@ -362,10 +362,7 @@ class Window:
 
     def _repeating(self) -> float:
         """By how much errors that repeat with the attitude shrink the information."""
-        cells = self._folded_cells
-        for epoch in self.epochs:
-            if epoch.turned:
-                cells = cells.with_(epoch.u, epoch.data.count)
+        cells = sum((e.cells for e in self.epochs if e.turned), self._folded_cells)
         white = noise.median(self._guesses).mag_gauss
         return excess(cells, self.usual.mag_gauss, white)
 
