@@ -165,9 +165,10 @@ def cold_start(track: Track, spec: Spec) -> NullModel:
     best: NullFit | None = None
     for model in _starts(coarse, replace(first, gyro_bias_rad_s=problem.prior.mean[8:])):
         fit = _loosely(problem, model, quiet)
+        agreed = best is not None and abs(fit.cost - best.cost) < _WORTH
         if best is None or fit.cost < best.cost - _WORTH:
             best = fit
-        if fit.filtered.normalised_innovation < _GOOD:
+        if agreed or fit.filtered.normalised_innovation < _GOOD:
             break
     found = first if best is None else best.model
     return replace(

@@ -31,7 +31,7 @@ def _apart_deg(R: Array, truth: Array) -> Array:
     """Angles in degrees between attitudes that may differ by one constant rotation of the world."""
     offset = R @ np.swapaxes(truth, 1, 2)
     mean = Rotation.from_matrix(offset).mean().as_matrix()
-    return np.degrees(np.linalg.norm(so3.log(np.swapaxes(offset, 1, 2) @ mean), axis=1))
+    return np.asarray(np.degrees(np.linalg.norm(so3.log(np.swapaxes(offset, 1, 2) @ mean), axis=1)))
 
 
 def test_attitude_is_level_and_does_not_drift() -> None:
