@@ -75,6 +75,20 @@ def xyz(name, vector, unit):
     return tuple((f"{name}_{axis}", float(v), unit) for axis, v in zip("xyz", vector))
 
 
+def nine(name, matrix, unit):
+    """Parameters of a matrix."""
+    return tuple(
+        (f"{name}_{a}{b}", float(matrix[i, j]), unit)
+        for i, a in enumerate("xyz")
+        for j, b in enumerate("xyz")
+    )
+
+
+def six(name, matrix, unit):
+    """Parameters of a symmetric matrix."""
+    return tuple(entry for entry in nine(name, matrix, unit) if entry[0][-2] <= entry[0][-1])
+
+
 def sample_times(world, rate_hz):
     """Instants of the samples on the world's clock; whole milliseconds."""
     step_ms = round(1000 / rate_hz)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from blindworld.chain import Planted, xyz
+from blindworld.chain import Planted
 from blindworld.on_sensor import after, moment, share, stepped, symmetric
 from blindworld.rotations import direction
 from blindworld.world import BEFORE_S
+
+_WAYS = ("north", "east", "down")
 
 
 def dipole(away, moment_vector):
@@ -24,6 +26,11 @@ def strong_spans(world, field_n, part=0.2):
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     t = np.append(world.time_s, world.time_s[-1]) - BEFORE_S
     return tuple((max(0.0, float(t[a])), float(t[b])) for a, b in zip(edges[::2], edges[1::2]))
+
+
+def north_east_down(name, vector, unit):
+    """Parameters of a vector in the world."""
+    return tuple((f"{name}_{way}", float(v), unit) for way, v in zip(_WAYS, vector))
 
 
 def field_gradient(world, stages, strength, rng):
@@ -50,7 +57,7 @@ def geomagnetic_drift(world, stages, strength, rng):
     """The Earth's field changes over the recording."""
     drift = direction(rng) * strength
     stages.field_n.append(share(world)[:, None] * drift)
-    return Planted("world", xyz("drift", drift / (world.time_s[-1] - BEFORE_S), "gauss/s"))
+    return Planted("world", north_east_down("change", drift, "gauss"))
 
 
 def altitude_field(world, stages, strength, rng):
@@ -58,11 +65,11 @@ def altitude_field(world, stages, strength, rng):
     per_metre = direction(rng) * strength
     down = world.motion.position_n[:, 2]
     stages.field_n.append(-(down - down.mean())[:, None] * per_metre)
-    return Planted("world", xyz("per_metre", per_metre, "gauss/m"))
+    return Planted("world", north_east_down("per_metre", per_metre, "gauss/m"))
 
 
 def field_step(world, stages, strength, rng):
     """Iron beside the vehicle is left behind, or comes."""
     t0, step = moment(world, rng), direction(rng) * strength
     stages.field_n.append(after(world, t0)[:, None] * step)
-    return stepped(world, t0, "world", xyz("step", step, "gauss"))
+    return stepped(world, t0, "world", north_east_down("step", step, "gauss"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blindworld.chain import Planted, xyz
+from blindworld.chain import Planted, nine, xyz
 from blindworld.motion import DEG
 from blindworld.on_sensor import after, moment, stepped
 from blindworld.rotations import direction, to_body
@@ -26,7 +26,8 @@ def gyro_nonorthogonality(world, stages, strength, rng):
     S = np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
     stages.rate.append(lambda w: w + w @ S.T)
     return Planted(
-        "gyro", (("xy", float(xy), "rad"), ("xz", float(xz), "rad"), ("yz", float(yz), "rad"))
+        "gyro",
+        tuple((f"shear_{n}", float(v), "rad") for n, v in (("xy", xy), ("xz", xz), ("yz", yz))),
     )
 
 
@@ -35,7 +36,7 @@ def gyro_g_sensitivity(world, stages, strength, rng):
     G = rng.normal(size=(3, 3))
     G *= strength / np.linalg.norm(G) * np.sqrt(3)
     stages.gyro_bias.append(world.motion.force_b @ G.T)
-    return Planted("gyro")
+    return Planted("gyro", nine("per_g", 9.81 * G, "rad/s/g"))
 
 
 def vibration_rectification(world, stages, strength, rng):
@@ -73,13 +74,14 @@ def gyro_nonlinearity(world, stages, strength, rng):
     """Scale that depends on the size of the rate; strength at 1 rad/s."""
     size = direction(rng) * strength
     stages.rate.append(lambda w: w + size * np.abs(w) * w)
-    return Planted("gyro")
+    return Planted("gyro", xyz("per_rate", size, "s/rad"))
 
 
 def gyro_saturation(world, stages, strength, rng):
     """The rate ends at a limit, a part `strength` below its largest value."""
     limit = (1 - strength) * np.max(np.abs(world.motion.rate_b))
-    stages.rate.append(lambda w: np.clip(w, -limit, limit))
+    bias = world.gyro_bias  # the converter's limit is one of readings
+    stages.rate.append(lambda w: np.clip(w + bias, -limit, limit) - bias)
     return Planted("gyro", (("limit", float(limit), "rad/s"),))
 
 
@@ -103,7 +105,7 @@ def gyro_startup(world, stages, strength, rng):
     """A bias that settles after power-on."""
     bias, tau = direction(rng) * strength, rng.uniform(25, 80)
     stages.gyro_bias.append(np.exp(-(world.time_s - BEFORE_S) / tau)[:, None] * bias)
-    return Planted("gyro", (*xyz("start", bias, "rad/s"), ("time_constant", tau, "s")))
+    return Planted("gyro", xyz("at_start", bias, "rad/s"))
 
 
 def gyro_time_lag(world, stages, strength, rng):

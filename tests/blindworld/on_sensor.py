@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blindworld.chain import Planted, magnetometer, xyz
+from blindworld.chain import Planted, magnetometer, nine, six, xyz
 from blindworld.motion import STEP_S
 from blindworld.rotations import direction
 from blindworld.world import BEFORE_S, low_passed
@@ -60,15 +60,15 @@ def hard_iron_drift(world, stages, strength, rng):
     """Magnetisation that creeps."""
     drift = direction(rng) * strength
     stages.body.append(share(world)[:, None] * drift)
-    length = world.time_s[-1] - BEFORE_S
-    return Planted("sensor", xyz("drift", drift / length, "gauss/s"))
+    return Planted("sensor", xyz("change", drift, "gauss"))
 
 
 def soft_iron_step(world, stages, strength, rng):
     """Soft iron came or went."""
     t0 = moment(world, rng)
-    stages.soft_iron.append((after(world, t0), strength * symmetric(rng)))
-    return stepped(world, t0, "sensor", ())
+    dA = strength * symmetric(rng)
+    stages.soft_iron.append((after(world, t0), dA))
+    return stepped(world, t0, "sensor", six("change", dA, "1"))
 
 
 def motor_current_field(world, stages, strength, rng):
@@ -153,7 +153,8 @@ def mag_bias_temperature(world, stages, strength, rng):
 def mag_scale_temperature(world, stages, strength, rng):
     """A sensitivity that follows temperature; strength per degree."""
     per_degree = direction(rng) * strength
-    stages.soft_iron.append((world.temperature - world.temperature.mean(), np.diag(per_degree)))
+    gain = np.diag(per_degree) @ world.soft_iron
+    stages.soft_iron.append((world.temperature - world.temperature.mean(), gain))
     return Planted("sensor", xyz("per_degree", per_degree, "1/degC"))
 
 
@@ -210,21 +211,22 @@ def hysteresis(world, stages, strength, rng):
         return m + weight * (np.stack(follows, axis=1) - m)
 
     stages.electronics.append(play)
-    return Planted("sensor")
+    return Planted("sensor", xyz("width", weight * width, "gauss"))
 
 
 def eddy_current(world, stages, strength, rng):
     """Currents in a plate: E dh/dt; strength in seconds."""
     E = rng.normal(size=(3, 3))
-    stages.field_rate.append(strength * E / np.linalg.norm(E) * np.sqrt(3))
-    return Planted("sensor")
+    E *= strength / np.linalg.norm(E) * np.sqrt(3)
+    stages.field_rate.append(E)
+    return Planted("sensor", nine("eddy", E, "s"))
 
 
 def viscous_magnetisation(world, stages, strength, rng):
     """Induced magnetisation that follows within 15 to 60 s."""
     dA, tau = strength * symmetric(rng), rng.uniform(15, 60)
     stages.from_field.append(lambda h: (low_passed(h, tau) - h) @ dA.T)
-    return Planted("sensor", (("time_constant", tau, "s"),))
+    return Planted("sensor", six("lagging_part", dA, "1"))
 
 
 def mag_time_lag(world, stages, strength, rng):
@@ -256,7 +258,7 @@ def flexible_mount(world, stages, strength, rng):
     C = rng.normal(size=(3, 3))
     C *= strength / np.linalg.norm(C) / 9.81 * np.sqrt(3)
     stages.mount.append(world.motion.force_b @ C.T)
-    return Planted("sensor")
+    return Planted("sensor", nine("bend", 9.81 * C, "rad/g"))
 
 
 def mag_gyro_misalignment(world, stages, strength, rng):
