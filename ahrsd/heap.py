@@ -16,7 +16,7 @@ import ctypes
 from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
 
-EVIDENCE_BYTES = 16 << 20  # an hour of segments, their tracks, one judgement's small temporaries
+EVIDENCE_BYTES = 20 << 20  # an hour of segments, their tracks, small temporaries, and the holes
 STEP_BYTES = 512  # one step of the estimator's window: data, directions, response
 _PIECE_BYTES = 64 << 10
 _MAPPED_BYTES = 256 << 10  # from this size on a block is mapped by itself
