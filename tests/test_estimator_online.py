@@ -284,6 +284,7 @@ def test_a_magnet_passing_by_does_not_move_the_answer():
     estimate, _ = calibrated(passed)
     moved = np.abs(estimate.hard_iron_gauss - clean.hard_iron_gauss) / estimate.sigma[6:9]
     assert moved.max() < 3.0
+    assert not estimate.warnings
 
 
 def test_single_wild_samples_do_not_move_the_answer():
@@ -294,6 +295,26 @@ def test_single_wild_samples_do_not_move_the_answer():
     estimate, _ = calibrated(replace(run, block=replace(run.block, raw_b_gauss=raw)))
     moved = np.abs(estimate.hard_iron_gauss - clean.hard_iron_gauss) / estimate.sigma[6:9]
     assert moved.max() < 3.0
+
+
+@pytest.mark.parametrize("step_gauss", [0.02, 0.1, 0.5])
+def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss):
+    """Body-fixed from 200 s on: what follows is as good as if nothing had been before."""
+    run = bench.simulate("wam", "rov", 4)
+    change = step_gauss * np.array([0.6, -0.48, 0.64])
+    late = run.block.time_s > 200.0
+    raw = run.block.raw_b_gauss + late[:, None] * change
+    after = replace(run, hard_iron_gauss=run.hard_iron_gauss + change)
+    estimator = Estimator()
+    history = bench.feed(estimator, replace(run.block, raw_b_gauss=raw))
+    estimate = estimator.finish()
+    assert not any(e.warnings for t, e in history if t < 205.0)
+    assert len(estimate.warnings) == 1
+    said_s = float(estimate.warnings[0].split(" s:")[0].split()[-1])
+    assert 175.0 < said_s < 225.0
+    assert estimate.converged
+    assert np.all(np.abs(after.errors(estimate)) < 4.5 * estimate.sigma)
+    assert np.linalg.norm(estimate.hard_iron_gauss - after.hard_iron_gauss) < 5e-4
 
 
 # -- cost ----------------------------------------------------------------------------------------

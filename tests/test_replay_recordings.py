@@ -115,7 +115,7 @@ def test_two_people_with_one_sensor_find_one_hard_iron(replayed):
     apart = np.subtract(one["hard_iron_gauss"], other["hard_iron_gauss"])
     sigmas = [c["standard_deviation"]["hard_iron_gauss"] for c in (one, other)]
     assert np.abs(apart / np.hypot(*sigmas)).max() < 3.0
-    assert np.abs(apart).max() < 0.03  # along x, about which a fist turns, the device's value is held
+    assert np.abs(apart).max() < 0.03  # x, which a fist turns about, is held
 
 
 def test_two_walks_with_one_sensor_agree_on_the_horizontal_hard_iron(replayed):

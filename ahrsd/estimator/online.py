@@ -23,6 +23,7 @@ from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
+_CHANGED = 2  # epochs one after the other that contradict the answer: the iron has changed
 _FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
 _FRESH = 1.25  # at the end, a search that saw all but a quarter need not be repeated
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
@@ -57,6 +58,8 @@ class Estimator:
         self._searching, self._agreed, self._apart = True, False, 0.0
         self._moving_epochs, self._last_search = 0, 0
         self._next_search = _FIRST_SEARCH
+        self._strange = 0
+        self._warnings: tuple[str, ...] = ()
 
     def add(self, block: SampleBlock) -> bool:
         """Take samples; true where they completed an epoch, so that `estimate` says something new.
@@ -96,6 +99,9 @@ class Estimator:
             data = intake.with_border(data, window.epochs[-1].data)
         self._down.append(data.down_b[len(data) // 2])
         window.append(data)
+        if self._contradicted(window):
+            return
+        window = self._window or window
         window.track(everything=self._searching and len(window.epochs) <= _FEW)
         if self._searching and window.epochs[-1].turned:
             self._moving_epochs += 1
@@ -103,6 +109,24 @@ class Estimator:
                 self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
                 self._search(window)
         window.fold()
+
+    def _contradicted(self, window: Window) -> bool:
+        """Whether the newest epoch waits for the next one, because it contradicts a sure answer.
+
+        If that does too, the iron has changed: everything before them is forgotten.
+        """
+        sure = self._agreed and window.step_sigmas < _SETTLED and len(window.epochs) > _CHANGED
+        self._strange = self._strange + 1 if sure and window.strange() else 0
+        if self._strange == _CHANGED:
+            at_s = float(window.epochs[-_CHANGED].data.time_s[0])
+            self._warnings = (
+                f"the iron changed at about {at_s:.0f} s: calibrated anew from there",
+            )
+            self._window = window.anew(_CHANGED)
+            self._searching, self._agreed, self._strange = True, False, 0
+            self._moving_epochs = self._last_search = 1
+            self._next_search = _FIRST_SEARCH
+        return self._strange > 0
 
     def _begin(self, data: chain.Data) -> Window:
         A0 = np.linalg.inv(self._present.matrix)
@@ -198,4 +222,5 @@ class Estimator:
             converged=bool(
                 self._agreed and window.step_sigmas < _SETTLED and heading < _HOPELESS_DEG
             ),
+            warnings=self._warnings,
         )

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,6 +53,7 @@ _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
+_MOST_ROWS = 0.6  # of an epoch beyond the limit for outliers: another calibration, not outliers
 _ANOTHER_REST = 0.02  # rad between two directions at rest
 _SHORTEST_GAP_S = 0.1
 
@@ -174,6 +175,32 @@ class Window:
         point = Point(graph.c.copy(), first.copy(), last.copy())
         factor = epoch_factor(q, a, point, walk, rest=None if turned else self._resting(u))
         return Epoch(data, u, used, weights, a, a + 1, q, factor, turned)
+
+    def strange(self) -> bool:
+        """Whether the newest epoch contradicts the calibration in most of its rows, not in some.
+
+        To be asked before it is tracked. A magnet that passes disturbs some rows of one epoch.
+        """
+        epoch = self.epochs[-1]
+        u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
+        error = np.linalg.norm(epoch.data.field_error(u, self.graph.c), axis=1)
+        limit = self.parameters.outlier_sigma * self.usual.mag_gauss / np.sqrt(epoch.data.count)
+        return epoch.turned and float(np.mean(error > limit)) > _MOST_ROWS
+
+    def anew(self, count: int) -> Window:
+        """A window of the last `count` epochs that remembers nothing before but noise and bias."""
+        graph = self.graph
+        kept = self.epochs[-count:]
+        first = replace(kept[0].data, measures_first=True)
+        node = Node.at(graph.nodes[graph.last].bias, kept[0].u[0])
+        mean, information = graph.anchor
+        belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        other = Window(self.parameters, mean, belief, node, self.usual)
+        other._guesses = self._guesses.copy()
+        for epoch, data in zip(kept, [first, *(e.data for e in kept[1:])], strict=True):
+            other.graph.moments.take(data.field_b_gauss)
+            other.attach(data, moving=epoch.turned)
+        return other
 
     def _resting(self, u: Array) -> Array:
         """Direction at rest: that of the last rest unless it is clearly another.
