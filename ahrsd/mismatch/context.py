@@ -51,7 +51,7 @@ def build_context(track: Track, fit: Fit) -> Context:
     if fit.terms_gyro is not None:
         rate = rate - fit.terms_gyro
     runs = track.runs or (slice(0, len(track)),)
-    smooth = smoothed_rate(rate, runs, _step_s(track), done.model.sigma_gyro_rad_s)
+    smooth = smoothed_rate(rate, runs, track.step_s, done.model.sigma_gyro_rad_s)
     R_nb, levelled = attitude(track, done)
     return Context(
         track=track,
@@ -115,7 +115,7 @@ def attitude(track: Track, done: Filtered) -> tuple[Array, bool]:
         return reference, True
     U = done.orientation
     runs = track.runs or (slice(0, len(track)),)
-    width = DRIFT_S / _step_s(track)
+    width = DRIFT_S / track.step_s
     field = _carried(U, done.nominal_b, runs, width)
     if accel is None:
         return np.asarray(_held_by_field(field, runs) @ U), False
@@ -189,8 +189,3 @@ def _derivative(values: Array, runs: Sequence[slice], time_s: Array) -> Array:
 def _unit(vectors: Array) -> Array:
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(size, 1e-300))
-
-
-def _step_s(track: Track) -> float:
-    known = track.dt_s[np.isfinite(track.dt_s)]
-    return float(np.median(known)) if len(known) else 1.0

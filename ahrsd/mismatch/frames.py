@@ -24,7 +24,7 @@ from ahrsd.samples import Array
 from ahrsd.so3 import skew
 
 _WINDOW_S = 0.5
-_ROWS = 4000  # samples in the windows that turn most
+_ROWS, _WINDOWS = 4000, 80  # samples and windows, those that turn most
 _LAGS_S = 0.2
 
 
@@ -72,13 +72,13 @@ def windows(track: Track, shift: int = 0, margin: int = 0) -> Windows | None:
 
     margin: samples kept free at the ends of runs, so that every shift has the same windows
     """
-    step = float(np.nanmedian(track.dt_s))
+    step = track.step_s
     length = max(4, round(_WINDOW_S / step))
     blocks = list(_blocks(track, length, max(margin, abs(shift))))
     if len(blocks) < 12:
         return None
     turn = np.array([np.sum(np.abs(track.gyro_b_rad_s[rows]), axis=0).max() for rows in blocks])
-    chosen = np.argsort(-turn)[: max(12, _ROWS // length)]
+    chosen = np.argsort(-turn)[: max(_WINDOWS, _ROWS // length)]
     rows = np.concatenate([np.arange(blocks[k].start, blocks[k].stop) for k in np.sort(chosen)])
     m0, m1 = track.mag_b_gauss[rows - 1], track.mag_b_gauss[rows]
     middle, dt = (m0 + m1) / 2, track.dt_s[rows][:, None]
@@ -141,7 +141,7 @@ def lag_of(track: Track) -> Lag | None:
 
     All 24 unknowns are free, so that neither frame nor iron can pose as a lag.
     """
-    step = float(np.nanmedian(track.dt_s))
+    step = track.step_s
     most = max(2, round(_LAGS_S / step))
     shifts = np.unique(np.linspace(-most, most, min(2 * most + 1, 41)).round().astype(int))
     costs = []

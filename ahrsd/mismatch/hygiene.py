@@ -47,7 +47,7 @@ def hygiene(track: Track) -> tuple[Fact, ...]:
 
 def mag_unit(track: Track) -> list[Fact]:
     """The magnetometer in another unit, told by the Earth's field only."""
-    size = float(np.nanmedian(np.linalg.norm(track.mag_b_gauss, axis=1)))
+    size = track.usual_gauss
     for name, factor, low, high in MAG_UNITS:
         if low <= size <= high:
             words = f"the magnetometer reads {size:.3g}: that is {name}, not gauss"
@@ -159,7 +159,7 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
 def sensitivity(track: Track) -> tuple[str, ...]:
     """What the checks would have shown here, one line each."""
     mag, gyro = noise_of(track)
-    step = float(np.nanmedian(track.dt_s))
+    step = track.step_s
     found = windows(track)
     lines = [
         f"a magnetometer stuck for 1 s while turning by {1e3 * 8 * mag:.2g} mG",

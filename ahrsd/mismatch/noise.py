@@ -26,6 +26,7 @@ _BLOCK_S = 2.0
 _NATS = 15.0  # by which a change of level must be more likely than none
 _RATIO = 1.3  # of the levels, at least
 _BURST_SHARE = 0.4  # of the recording that a burst may last
+_OPPOSED = -0.3  # correlation of successive differences, at most
 _LEVEL = 1.15  # times the spec's noise
 
 
@@ -63,8 +64,10 @@ def colour_of(done: Filtered) -> Colour:
     r = np.array(
         [float(np.sum(rows[lag:] * rows[: len(rows) - lag])) / count for lag in range(_MOST + 1)]
     )
+    if r[0] < 1e-18:
+        return Colour(np.zeros(0), 1.0, 1.0)
     best, best_value, variance = np.zeros(0), count * np.log(max(r[0], 1e-300)), r[0]
-    for order in range(1, _MOST + 1):
+    for order in range(1, min(_MOST, int(count) // 60) + 1):
         a = solve_toeplitz(r[:order], r[1 : order + 1])
         left = float(r[0] - a @ r[1 : order + 1])
         value = count * np.log(max(left, 1e-300)) + order * np.log(count)
@@ -120,7 +123,7 @@ def levels(done: Filtered, block_s: float = _BLOCK_S) -> tuple[Array, Array, Arr
 def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
     """A burst, or a level that changed or is above the spec's."""
     middle, variance, size = levels(done)
-    if len(middle) < 10:
+    if len(middle) < 10 or not np.any(variance > 1e-18):
         return []
     # neighbouring differences share a sample, and heavy tails scatter more than Gaussian ones
     weight = size / 1.5 / (1.0 + max(tails_of(done).excess_kurtosis, 0.0) / 2.0)
@@ -129,15 +132,29 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
     inside[first:last] = True
     loud = float(np.average(variance[inside], weights=weight[inside])) if inside.any() else 1.0
     quiet = float(np.average(variance[~inside], weights=weight[~inside])) if not inside.all() else 1
-    changed = gain > _NATS and loud > _RATIO * quiet
+    changed = gain > _NATS and loud > _RATIO * quiet and _is_noise(done, middle[inside])
     if changed and last < len(middle) and last - first <= _BURST_SHARE * len(middle):
         return [_fact(done, "noise_burst", middle[first], middle[last - 1], loud, quiet)]
     if changed:
         return [_fact(done, "noise_level", middle[first], middle[last - 1], loud, quiet)]
     overall = float(np.average(variance, weights=weight))
+    spec_given = spec_given and _is_noise(done, middle)
     if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 / weight.sum()):
         return [_fact(done, "noise_level", middle[0], middle[-1], overall, 1.0)]
     return []
+
+
+def _is_noise(done: Filtered, blocks: Array) -> bool:
+    """Whether what is loud there jumps to and fro, as noise does, or moves, as a misfit does.
+
+    Successive differences of white noise are correlated by -1/2.
+    """
+    time_s = done.track.time_s
+    near = np.min(np.abs(time_s[:, None] - blocks), axis=1) <= _BLOCK_S / 2
+    d = np.diff(done.whitened, axis=0)
+    kept = (done.used & near)[2:] & done.used[1:-1] & done.used[:-2]
+    square = float(np.sum(d[1:][kept] ** 2))
+    return square > 0 and float(np.sum((d[1:] * d[:-1])[kept])) / square < _OPPOSED
 
 
 def _loudest(variance: Array, weight: Array) -> tuple[int, int, float]:

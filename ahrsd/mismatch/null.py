@@ -40,6 +40,7 @@ from ahrsd.samples import Array
 
 EARTH_RAD_S = 7.292115e-5
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
+_FEWEST = 15  # steps that a fit needs
 _DONE = 0.05  # largest step in standard deviations
 _STEPS = 6
 _HALVINGS = 3
@@ -116,7 +117,12 @@ def fit_null(
     noise: estimate what the spec leaves open; else keep the noise of `start`
     walk:  let the gyro's bias wander where the data say so
     latitude_deg: the Earth's rotation is then taken out of the gyro where the attitude is level
+
+    ValueError where there is nothing to fit to (`unusable`).
     """
+    reason = unusable(track)
+    if reason:
+        raise ValueError(reason)
     known = spec or Spec()
     problem = _Problem(track, tuple(terms), prior_of(track))
     if start is None:
@@ -138,6 +144,16 @@ def fit_null(
     if noise_fit.alike(again, fit.model):
         return fit
     return _descended(replace(problem, terms=fit.terms), again, 2)
+
+
+def unusable(track: Track) -> str | None:
+    """Why there is nothing that a calibration could be fitted to; None where there is."""
+    if track.usual_gauss == 0.0:
+        return "the magnetometer has no readings: nothing can be said about the field"
+    steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
+    if np.count_nonzero(steps) < _FEWEST:
+        return f"{np.count_nonzero(steps)} samples follow another one, {_FEWEST} are needed"
+    return None
 
 
 def earth_rate(track: Track, done: Filtered, latitude_deg: float) -> Array | None:

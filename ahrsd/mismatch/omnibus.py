@@ -33,9 +33,12 @@ class Test:
 
 
 def omnibus(done: Filtered, context: Context | None = None) -> tuple[Test, ...]:
-    """All tests; those of the variance only with a context.  Empty below 100 innovations."""
+    """All tests; those of the variance only with a context.
+
+    Empty below 100 innovations, and where an axis does not vary at all.
+    """
     rows = done.whitened[done.used]
-    if len(rows) < 100:
+    if len(rows) < 100 or np.any(np.std(rows, axis=0) < 1e-9):
         return ()
     out = [_level(rows), _ljung_box(done), _periodogram(done), _normal(rows)]
     if context is not None:

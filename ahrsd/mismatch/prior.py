@@ -64,7 +64,7 @@ def rate_at_rest(track: Track) -> Array | None:
     second before is more than their noise.
     """
     mag_noise, gyro_noise = noise_of(track)
-    rows = max(8, round(1.0 / max(float(np.nanmedian(track.dt_s)), 1e-6)))
+    rows = max(8, round(1.0 / max(track.step_s, 1e-6)))
     whole = len(track) // rows * rows
     if whole < 5 * rows:
         return None
@@ -82,9 +82,12 @@ def rate_at_rest(track: Track) -> Array | None:
 
 
 def turned(mag: Array) -> float:
-    """Scatter of the field over its size."""
-    size = float(np.nanmedian(np.linalg.norm(mag, axis=1)))
-    return float(np.linalg.norm(np.nanstd(mag, axis=0))) / max(size, 1e-12)
+    """Scatter of the field (N, 3) over its size; 0 where there is no field."""
+    seen = mag[np.isfinite(mag).all(axis=1)]
+    if not len(seen):
+        return 0.0
+    size = float(np.median(np.linalg.norm(seen, axis=1)))
+    return float(np.linalg.norm(np.std(seen, axis=0))) / max(size, 1e-12)
 
 
 def sphere_centre(mag: Array) -> Array:

@@ -47,7 +47,7 @@ def _again(track: Track, values: Array) -> NDArray[np.bool]:
 def _expected_change(track: Track) -> Array:
     """(N,) gauss by which a step turns the field at most, the gyro's middle taken as its bias."""
     rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
-    size = float(np.nanmedian(np.linalg.norm(track.mag_b_gauss, axis=1)))
+    size = track.usual_gauss
     step = np.linalg.norm(rate, axis=1) * np.nan_to_num(track.dt_s, nan=0.0)
     return np.asarray(step * size)
 
@@ -71,7 +71,7 @@ def _stuck(
     if not intervals:
         return [], bad
     total = sum(b - a for a, b in intervals)
-    step = float(np.nanmedian(track.dt_s))
+    step = track.step_s
     words = f"the magnetometer repeats one reading while the sensor turns, {total:.1f} s in all"
     return [
         Fact(
@@ -98,7 +98,7 @@ def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
     usual = int(np.median(lengths))
     if usual < 2 or np.mean(np.abs(lengths - usual) <= 1) < 0.8:
         return []
-    step = float(np.nanmedian(track.dt_s))
+    step = track.step_s
     words = (
         f"the magnetometer has a new reading only every {usual} samples "
         f"({1 / (usual * step):.3g} Hz)"
@@ -128,7 +128,7 @@ def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
     if count < max(3, _DOUBLED_SHARE * len(track)):
         return []
     share = count / len(track)
-    step = float(np.nanmedian(track.dt_s))
+    step = track.step_s
     times = tuple((float(t) - step, float(t)) for t in track.time_s[both][:50])
     return [
         Fact(

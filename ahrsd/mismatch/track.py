@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ahrsd.samples import Array
 
 
@@ -35,6 +37,19 @@ class Track:
     def duration_s(self) -> float:
         """From the first sample to the last, seconds."""
         return float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
+
+    @property
+    def step_s(self) -> float:
+        """The usual step between samples, 1 where none is known."""
+        known = self.dt_s[np.isfinite(self.dt_s)]
+        return float(np.median(known)) if len(known) else 1.0
+
+    @property
+    def usual_gauss(self) -> float:
+        """The usual size of the magnetometer's reading, 0 where there is none."""
+        size = np.linalg.norm(self.mag_b_gauss, axis=1)
+        size = size[np.isfinite(size)]
+        return float(np.median(size)) if len(size) else 0.0
 
 
 @dataclass(frozen=True, slots=True)

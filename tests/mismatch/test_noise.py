@@ -117,6 +117,23 @@ def test_a_higher_level(onset: int) -> None:
     assert abs(fact.parameters[0].value / 1.5e-3 - 1) < 0.2
 
 
+def test_a_field_that_stands_still_bit_by_bit_has_no_noise_to_judge() -> None:
+    done = _filtered(0)
+    flat = replace(done.track, mag_b_gauss=np.tile(done.track.mag_b_gauss[:1], (4000, 1)))
+    still = replace(flat, gyro_b_rad_s=np.zeros((4000, 3)))
+    model = replace(done.model, gyro_bias_rad_s=np.zeros(3))
+    filtered = run_filter(still, model)
+    assert level_facts(filtered, spec_given=True) == []
+    assert colour_of(filtered).order == 0
+
+
+def test_motion_without_a_gyro_is_no_burst() -> None:
+    done = _filtered(0)
+    lost = replace(done.track, gyro_b_rad_s=np.zeros((4000, 3)))
+    model = replace(done.model, sigma_mag_gauss=1e-2)
+    assert level_facts(run_filter(lost, model), spec_given=True) == []
+
+
 def test_a_slow_field_is_no_noise() -> None:
     t = np.arange(4000) * 0.04
     bump = 0.02 * np.exp(-(((t - 80) / 6) ** 2))[:, None] * np.array([1.0, 0.5, -1.0])

@@ -210,3 +210,39 @@ def test_a_stationary_recording_does_not_diverge() -> None:
     assert np.linalg.norm(fit.model.soft_iron - np.eye(3)) < 0.3
     assert np.linalg.norm(fit.model.hard_iron_gauss) < 0.5
     assert np.abs(fit.model.gyro_bias_rad_s - [3.3e-3, 1.5e-3, 7.0e-3]).max() < 1.5e-3
+
+
+def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
+    track = track_of(experiment(samples=200))
+    none = np.full((200, 3), np.nan)
+    with pytest.raises(ValueError, match="no readings"):
+        fit_null(replace(track, mag_b_gauss=none))
+    with pytest.raises(ValueError, match="no readings"):
+        fit_null(replace(track, mag_b_gauss=np.zeros((200, 3))))
+    alone = replace(
+        track, dt_s=np.full(200, np.nan), runs=tuple(slice(k, k + 1) for k in range(200))
+    )
+    with pytest.raises(ValueError, match="0 samples follow another one, 15 are needed"):
+        fit_null(alone)
+
+
+def test_short_interrupted_and_holed_tracks_are_fitted() -> None:
+    track = track_of(experiment(samples=1200))
+    dt_s = track.dt_s.copy()
+    dt_s[::40] = np.nan
+    cut = replace(track, dt_s=dt_s, runs=tuple(slice(k, k + 40) for k in range(0, 1200, 40)))
+    mag = track.mag_b_gauss.copy()
+    mag[300:900] = np.nan
+    for one in (cut, replace(track, mag_b_gauss=mag)):
+        fit = fit_null(one)
+        assert fit.converged
+        assert abs(fit.model.sigma_mag_gauss / 1e-3 - 1) < 0.1
+        assert np.isfinite(fit.covariance).all()
+
+
+def test_a_gyro_that_fits_nothing_leaves_a_finite_answer() -> None:
+    track = track_of(experiment(samples=1200))
+    for gyro in (np.zeros((1200, 3)), track.gyro_b_rad_s * 2000):
+        fit = fit_null(replace(track, gyro_b_rad_s=gyro))
+        assert np.isfinite(fit.model.soft_iron).all()
+        assert fit.model.sigma_mag_gauss > 0.05  # the field moved and nothing says why
