@@ -3,8 +3,9 @@
     truth_along(context)      the motion, made consistent: a body that turns in a constant field
     simulated(truth, ...)     readings of it: calibration, named terms, noise, gaps as recorded
 
-The motion is the smoothed rate's integral, which the smoothed field holds in place over DRIFT_S:
-the headings are the recording's, and each step turns the field exactly as the true rate says.
+The motion is the context's attitude, turned by what brings its smoothed field (over DRIFT_S) to one
+direction of the world: headings are the recording's, each step turns the field exactly as the true
+rate says.  What the gyro's noise did to that attitude counts as motion: a body may shake.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, NullModel, Term
 from ahrsd.samples import Array
 
-DRIFT_S = 20.0
+DRIFT_S = 3.0  # shorter follows the field, longer the gyro; a gyro sampled at 10 Hz needs 3 s
 _RESPONSE = 4000  # rows after which a colour has died away
 
 
@@ -100,14 +101,16 @@ def truth_along(context: Context) -> Readings:
 
     field_b has a constant size, and h_k = Exp(-w_k dt_k) h_(k-1) holds exactly within runs.
     """
-    start = readings_of(context)
+    start, model = readings_of(context), context.model
     size = float(np.mean(np.linalg.norm(start.field_b, axis=1)))
-    R_nb, rate, field_b = start.R_nb.copy(), start.rate_b_rad_s.copy(), start.field_b.copy()
+    seen = np.einsum("nij,nj->ni", start.R_nb, start.field_b)
+    direction = seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0))
+    R_nb, rate = start.R_nb.copy(), start.rate_b_rad_s.copy()
     for run in series.runs(start.dt_s):
-        R_nb[run], rate[run], field_b[run] = _settled(
-            start.R_nb[run], rate[run], start.field_b[run], start.time_s[run], size
-        )
-    model = context.model
+        slow = _both_ways(seen[run], DRIFT_S, start.time_s[run])
+        R_nb[run] = _smallest_turn(slow, direction) @ start.R_nb[run]
+        rate[run] = _mean_rate(R_nb[run], start.time_s[run], rate[run])
+    field_b = size * np.einsum("nji,j->ni", R_nb, direction)
     return replace(
         start,
         R_nb=R_nb,
@@ -158,34 +161,13 @@ def track_of(readings: Readings, like: Track | None = None) -> Track:
     )
 
 
-def _settled(
-    R_nb: Array, rate: Array, field_b: Array, time_s: Array, size: float
-) -> tuple[Array, Array, Array]:
-    """Attitude, mean rate and field of one run, consistent with each other."""
-    carried = _integrated(rate, time_s)
-    seen = np.einsum("nij,nj->ni", carried, field_b)
-    slow = _both_ways(seen, DRIFT_S, time_s)
-    direction = slow.mean(axis=0)
-    direction /= np.linalg.norm(direction)
-    turned = _smallest_turn(slow, direction) @ carried
-    step = np.diff(time_s)[:, None]
-    true_rate = rate.copy()
-    if len(rate) > 1:
-        true_rate[1:] = so3.log(np.swapaxes(turned[:-1], 1, 2) @ turned[1:]) / step
-        true_rate[0] = true_rate[1]
-    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", R_nb, turned))
-    world = left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right
-    return world @ turned, true_rate, size * np.einsum("nji,j->ni", turned, direction)
-
-
-def _integrated(rate: Array, time_s: Array) -> Array:
-    """Body to where the body was at the first row, (N, 3, 3)."""
-    out = np.empty((len(rate), 3, 3))
-    out[0] = np.eye(3)
-    turns = so3.exp(rate[1:] * np.diff(time_s)[:, None])
-    for k, turn in enumerate(turns, start=1):
-        out[k] = out[k - 1] @ turn
-    return out
+def _mean_rate(R_nb: Array, time_s: Array, otherwise: Array) -> Array:
+    """Mean rate (N, 3) over the steps of one run; its first row repeats the second."""
+    if len(R_nb) < 2:
+        return otherwise
+    turned = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:])
+    rate = turned / np.diff(time_s)[:, None]
+    return np.vstack([rate[:1], rate])
 
 
 def _both_ways(values: Array, width_s: float, time_s: Array) -> Array:

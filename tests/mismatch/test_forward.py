@@ -28,10 +28,11 @@ def terms(readings, *names):
 def test_the_truth_turns_exactly_as_its_rate_says():
     context, readings = moving(1, rows=900, gap_at=400)
     rng = np.random.default_rng(0)
+    drift = so3.exp(2e-3 * (readings.time_s - readings.time_s[0])[:, None] * np.ones(3))
     shaken = replace(
         context,
         field_b=context.field_b + 2e-3 * rng.standard_normal((900, 3)),
-        rate_b_rad_s=context.rate_b_rad_s + 2e-3,
+        R_nb=drift @ context.R_nb,
     )
     truth = forward.truth_along(shaken)
     within = np.isfinite(truth.dt_s)
@@ -40,13 +41,13 @@ def test_the_truth_turns_exactly_as_its_rate_says():
     assert np.einsum("nij,nj->ni", turn, before) == pytest.approx(truth.field_b[within], abs=1e-12)
     size = np.linalg.norm(truth.field_b, axis=1)
     assert size == pytest.approx(np.full(900, size[0]))
-    # a constant error of the rate of 2 mrad/s per axis turns 0.1 rad in 30 s; the field holds it
+    # the attitude drifts by 0.17 rad in all; the field holds it but for the turn about itself
     assert np.abs(truth.field_b - readings.field_b).max() < 0.02
     assert truth.R_nb @ np.swapaxes(truth.R_nb, 1, 2) == pytest.approx(
         np.tile(np.eye(3), (900, 1, 1))
     )
     angle = so3.log(np.swapaxes(truth.R_nb, 1, 2) @ readings.R_nb)
-    assert np.linalg.norm(angle, axis=1).max() < 0.12
+    assert np.linalg.norm(angle, axis=1).max() < 0.2
 
 
 def test_a_perfect_context_is_its_own_truth():
