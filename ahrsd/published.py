@@ -12,6 +12,7 @@ from ahrsd.batch import BatchResult
 from ahrsd.estimator.online import Estimator
 from ahrsd.events import SamplesSeen
 from ahrsd.methods import METHODS, MethodResult, calibrate_with
+from ahrsd.methods.checks import stuck
 from ahrsd.methods.comparison import Row, halves, spread_of
 from ahrsd.result import calibration_json
 from ahrsd.samples import Array, SampleBlock
@@ -88,6 +89,8 @@ def our_row(result: BatchResult, *, held_out: bool = True) -> Row:
     reasons = "; ".join(result.reasons())
     if estimate is None:
         return Row(OURS, None, None, None, False, reasons)
+    if words := saturated(result):
+        return Row(OURS, None, None, None, False, words)
     answers: list[Answer] = [(estimate.soft_iron, estimate.hard_iron_gauss)]
     return Row(
         OURS,
@@ -99,6 +102,16 @@ def our_row(result: BatchResult, *, held_out: bool = True) -> Row:
         spread_of([_blocks(result)], answers),
         _unseen(result, OURS) if held_out else None,
     )
+
+
+def saturated(result: BatchResult) -> str:
+    """Which axis stands at its limit in the readings of a calibration that converged, or "".
+
+    Clipped readings fit an ellipsoid of their own: no spread and no sigma shows what is missing.
+    """
+    if not result.converged:
+        return ""
+    return stuck(np.vstack([block.raw_b_gauss for block in _blocks(result)]))
 
 
 def table(rows: Sequence[Row]) -> list[str]:

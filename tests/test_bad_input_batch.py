@@ -20,7 +20,7 @@ from ahrsd.config_sections import Location
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.methods import METHODS, MethodError, Settings
-from ahrsd.published import run_published
+from ahrsd.published import our_row, run_published, saturated
 
 SOFT_IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
 HARD_IRON = np.array([0.04, 0.11, 0.11])
@@ -206,6 +206,9 @@ def test_saturated_readings(tmp_path, seed, axis, part):
     rows[:, 1 + axis] = np.minimum(rows[:, 1 + axis], limit)
     result = tried(tmp_path, rows)
     assert not isinstance(result, str)
+    assert not result.converged or "stick at" in saturated(result)
+    ours = our_row(result, held_out=False)
+    assert not ours.converged
     refused_by(result, list(METHODS))
     assert "stick at" in run_published(result, "ellipsoid").reason
 

@@ -87,3 +87,22 @@ def test_magfactor3_takes_the_devices_attitude_where_place_and_attitude_are_know
     assert np.linalg.norm(error) < 0.04  # it has no soft iron: the published figure is 18 to 63 mG
     nowhere = run_published(calibrate(table, Config()), "magfactor3")
     assert "needs the attitude of every sample and the local field" in nowhere.reason
+
+
+@pytest.mark.parametrize("method", ["magyc", "all"])
+def test_clipped_readings_end_in_one_line(simulated, tmp_path, run, capsys, method):
+    """Ours would converge on them; what it says of itself does not show what was cut off."""
+    path, _ = simulated
+    names = path.read_text().split("\n", 1)[0]
+    rows = np.genfromtxt(path, delimiter=",", skip_header=1)
+    rows[:, 1] = np.minimum(rows[:, 1], np.quantile(rows[:, 1], 0.8))
+    table = tmp_path / "clipped.csv"
+    np.savetxt(table, rows, "%.9g", ",", header=names, comments="")
+    body = tmp_path / "c.json"
+    assert run("calibrate", table, "--method", method, "--json", body) in (1, 2)
+    said = capsys.readouterr()
+    assert "readings of x stick at" in said.err + said.out or "not converged" in said.out
+    if body.exists():
+        ours = json.loads(body.read_text())
+        ours = ours.get("calibrations", [ours])[0]
+        assert ours["converged"] is False

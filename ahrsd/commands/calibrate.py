@@ -10,7 +10,7 @@ import click
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.config import Config, load_config
-from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 
 if TYPE_CHECKING:
     from ahrsd.batch import BatchResult
@@ -46,6 +46,7 @@ def command(
     Exit 1 where the motion does not determine the answer; the output then says what is missing.
     """
     from ahrsd.batch import calibrate
+    from ahrsd.published import saturated
     from ahrsd.summary import estimate_lines
 
     refuse_unwritable(json_path)
@@ -56,6 +57,10 @@ def command(
     config = load_config(path) if path else Config()
     with byte_progress(recording) as progress:
         result = calibrate(recording, config, rate_hz=rate_hz, progress=progress)
+    if method in _METHODS[:2] and (words := saturated(result)):
+        raise RecordingError(
+            recording, words, "record again, away from magnets and strong currents"
+        )
     if report_path is not None:
         result.write_report(report_path)
     if method != _METHODS[0]:
