@@ -33,7 +33,14 @@ from ahrsd.mismatch.innovation import (
     run_filter,
     sensitivities,
 )
-from ahrsd.mismatch.prior import PRIOR, TURNED, Prior, prior_of, sphere_centre, turned
+from ahrsd.mismatch.prior import (
+    TURNED,
+    Prior,
+    prior_of,
+    repetition_of,
+    sphere_centre,
+    turned,
+)
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import Columns, Context, NullModel
 from ahrsd.samples import Array
@@ -44,7 +51,6 @@ _FEWEST = 15  # steps that a fit needs
 _DONE = 0.05  # largest step in standard deviations
 _STEPS = 6
 _HALVINGS = 3
-_BLOCKS = 40
 _REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
 _GOOD = 1.5  # normalised innovation of a start that needs no rival
 _WORTH = 10.0  # by which a further start's cost must be lower
@@ -130,7 +136,7 @@ def fit_null(
             run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
         )
     fit = _descended(problem, start, _STEPS)
-    prior = problem.prior.sharper(repetition_of(fit))
+    prior = problem.prior.sharper(repetition_of(fit.filtered))
     fixed = None if latitude_deg is None else earth_rate(track, fit.filtered, latitude_deg)
     if prior is not problem.prior or fixed is not None:
         problem = replace(problem, terms=fit.terms, prior=prior, fixed_gyro=fixed)
@@ -217,23 +223,6 @@ def _starts(track: Track, base: NullModel) -> list[NullModel]:
         if np.linalg.norm(A - np.eye(3)) < 1.0:
             out.append(replace(base, soft_iron=A, hard_iron_gauss=linear[6:]))
     return out
-
-
-def repetition_of(fit: NullFit) -> float:
-    """How many times larger the variance of the scores is than if the innovations were white.
-
-    A misfit that lasts makes the data look surer than they are: of the sum of a block's scores
-    white innovations have the block's information as variance.  1 on a null.
-    """
-    done = fit.filtered
-    X = sensitivities(done, nuisance_columns(done))
-    score = np.einsum("nia,ni->na", X, done.whitened)
-    edges = np.linspace(0, len(score), _BLOCKS + 1).astype(int)[:-1]
-    sums = np.add.reduceat(score, edges, axis=0)
-    flat = X.reshape(-1, 11)
-    ridge = np.diag(1.0 / PRIOR**2)
-    ratio = np.trace(np.linalg.solve(flat.T @ flat + ridge, sums.T @ sums))
-    return float(ratio / 11 / (1 - 11 / _BLOCKS))
 
 
 def _epochs(track: Track) -> list[chain.Data]:

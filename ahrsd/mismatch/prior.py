@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.mismatch.coarse import noise_of
+from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
@@ -19,6 +20,7 @@ PRIOR = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
 PRIOR.flags.writeable = False
 #: scatter of the field over its size that shows the iron
 TURNED = 0.1
+_BLOCKS = 40  # in which the scores are summed
 _REPEATED = 3.0  # repetition from which the prior is made to count
 _AT_REST_RAD_S = 1e-3  # what the mean of a resting gyro may differ from its bias
 _SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
@@ -99,3 +101,19 @@ def sphere_centre(mag: Array) -> Array:
     weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
     gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
     return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
+
+
+def repetition_of(done: Filtered) -> float:
+    """How many times larger the variance of the scores is than if the innovations were white.
+
+    A misfit that lasts makes the data look surer than they are: of the sum of a block's scores
+    white innovations have the block's information as variance.  1 on a null.
+    """
+    X = sensitivities(done, nuisance_columns(done))
+    score = np.einsum("nia,ni->na", X, done.whitened)
+    edges = np.linspace(0, len(score), _BLOCKS + 1).astype(int)[:-1]
+    sums = np.add.reduceat(score, edges, axis=0)
+    flat = X.reshape(-1, 11)
+    ridge = np.diag(1.0 / PRIOR**2)
+    ratio = np.trace(np.linalg.solve(flat.T @ flat + ridge, sums.T @ sums))
+    return float(ratio / 11 / (1 - 11 / _BLOCKS))
