@@ -59,8 +59,7 @@ _ROWS = (
     Effect("mag_cross_axis", on_sensor.mag_cross_axis, 1 * MG, "gauss"),  # guess
     Effect("mag_nonlinearity", on_sensor.mag_nonlinearity, 1 * MG, "gauss",
            alike=("mag_cross_axis",)),  # guess
-    Effect("mag_saturation", on_sensor.mag_saturation, 15 * MG, "gauss", scaled=False,
-           most=0.2),  # guess
+    Effect("mag_saturation", on_sensor.mag_saturation, 0.01, "1", scaled=False, most=0.2),  # guess
     Effect("mag_quantisation", on_sensor.mag_quantisation, 4 * MG, "gauss", scaled=False),  # guess
     Effect("hysteresis", on_sensor.hysteresis, 0.5 * MG, "gauss"),
     Effect("eddy_current", on_sensor.eddy_current, 3e-3, "s"),  # guess
@@ -92,7 +91,7 @@ _ROWS = (
     Effect("gyro_bias_drift", on_gyro.gyro_bias_drift, 0.02 * DEG, "rad/s"),  # guess
     Effect("gyro_bias_step", on_gyro.gyro_bias_step, 0.01 * DEG, "rad/s"),  # guess
     Effect("gyro_nonlinearity", on_gyro.gyro_nonlinearity, 0.005, "s/rad"),  # guess
-    Effect("gyro_saturation", on_gyro.gyro_saturation, 0.08, "1", scaled=False, most=0.6),  # guess
+    Effect("gyro_saturation", on_gyro.gyro_saturation, 0.01, "1", scaled=False, most=0.2),  # guess
     Effect("earth_rotation", on_gyro.earth_rotation, on_gyro.EARTH_RAD_S, "rad/s",
            most=on_gyro.EARTH_RAD_S),
     Effect("gyro_integration", on_gyro.gyro_integration, 1.0, "1", alike=_LAGS, most=1.0),
@@ -107,7 +106,7 @@ _ROWS = (
     Effect("noise_level", on_sensor.noise_level, 1.3, "1", scaled=False),
     Effect("frame_error", on_link.frame_error, 1.0, "1", scaled=False, most=1.0),
     Effect("unit_error", on_link.unit_error, 1.0, "1", scaled=False, most=1.0),
-    Effect("onboard_calibration_active", on_sensor.onboard_calibration_active, 3 * MG, "gauss"),
+    Effect("onboard_calibration_active", on_sensor.onboard_calibration_active, 0.03, "1", most=1.0),
     # in no library; limits are guesses
     Effect("turret", outside.turret, 0.3 * MG, "gauss", name=None),
     Effect("bursts", outside.bursts, 3 * MG, "gauss", name=None),

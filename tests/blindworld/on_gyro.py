@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from blindworld.chain import Planted, nine, xyz
+from blindworld.chain import Planted, gyroscope, nine, xyz
 from blindworld.motion import DEG
-from blindworld.on_sensor import after, moment, stepped
+from blindworld.on_sensor import after, ceiling, moment, stepped
 from blindworld.rotations import direction, to_body
 from blindworld.world import BEFORE_S
 
@@ -78,11 +78,15 @@ def gyro_nonlinearity(world, stages, strength, rng):
 
 
 def gyro_saturation(world, stages, strength, rng):
-    """The rate ends at a limit, a part `strength` below its largest value."""
-    limit = (1 - strength) * np.max(np.abs(world.motion.rate_b))
-    bias = world.gyro_bias  # the converter's limit is one of readings
-    stages.rate.append(lambda w: np.clip(w + bias, -limit, limit) - bias)
-    return Planted("gyro", (("limit", float(limit), "rad/s"),))
+    """The converter ends where a share `strength` of the readings, on one axis, would be larger."""
+
+    def edit(rows):
+        rows.gyro = np.clip(rows.gyro, -limit, limit)
+        return rows
+
+    limit = ceiling(gyroscope(world, stages), strength)
+    stages.edits.append(edit)
+    return Planted("gyro", (("limit", limit, "rad/s"),))
 
 
 def earth_rotation(world, stages, strength, rng):

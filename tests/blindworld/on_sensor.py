@@ -36,6 +36,11 @@ def share(world):
     return (t - BEFORE_S) / (t[-1] - BEFORE_S)
 
 
+def ceiling(readings, part):
+    """The size that a part of the readings exceeds on the axis that exceeds it most."""
+    return float(np.max(np.quantile(np.abs(readings), 1 - part, axis=0)))
+
+
 def stepped(world, t0, frame, parameters):
     """The key's entry of something that begins at t0 and stays."""
     onset = t0 - BEFORE_S
@@ -173,10 +178,15 @@ def mag_nonlinearity(world, stages, strength, rng):
 
 
 def mag_saturation(world, stages, strength, rng):
-    """Readings end `strength` below the largest that there would have been."""
-    limit = np.max(np.abs(magnetometer(world, stages))) - strength
-    stages.electronics.append(lambda m: np.clip(m, -limit, limit))
-    return Planted("sensor", (("limit", float(limit), "gauss"),))
+    """The converter ends where a share `strength` of the samples, on one axis, would be larger."""
+
+    def edit(rows):
+        rows.mag = np.clip(rows.mag, -limit, limit)
+        return rows
+
+    limit = ceiling(magnetometer(world, stages), strength)
+    stages.edits.append(edit)
+    return Planted("sensor", (("limit", limit, "gauss"),))
 
 
 def mag_quantisation(world, stages, strength, rng):
@@ -269,15 +279,17 @@ def mag_gyro_misalignment(world, stages, strength, rng):
 
 
 def onboard_calibration_active(world, stages, strength, rng):
-    """The device's own calibration runs: every few seconds it moves its hard and soft iron."""
+    """The device's own calibration runs: every few seconds it takes off more of the iron.
+
+    Strength is the part of the iron that it takes off in the end.
+    """
     t = world.time_s
     every, tau = rng.uniform(4, 10), rng.uniform(60, 150)
     held = np.floor(t / every) * every
-    learnt = 1 - np.exp(-held / tau)
-    gone = -strength * direction(rng)
-    stages.body.append(learnt[:, None] * gone)
-    stages.soft_iron.append((learnt, 0.5 * strength / _SCALE_G * symmetric(rng)))
-    return Planted("sensor")
+    learnt = strength * (1 - np.exp(-held / tau)) / (1 - np.exp(-t[-1] / tau))
+    undo = np.linalg.inv(world.soft_iron).T
+    stages.electronics.append(lambda m: m + learnt[:, None] * ((m - world.hard_iron) @ undo - m))
+    return Planted("sensor", (("part", strength, "1"),))
 
 
 def stuck_magnetometer(world, stages, strength, rng):
