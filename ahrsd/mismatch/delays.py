@@ -17,7 +17,7 @@ import numpy as np
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import posterior
 from ahrsd.mismatch.gram import solve
-from ahrsd.mismatch.regression import Base, whiten
+from ahrsd.mismatch.regression import Base
 
 #: effects that are a delay of the magnetometer against the gyro, and their sign
 DELAYS: Mapping[str, float] = {
@@ -60,7 +60,7 @@ def weighed(
 def _low_pass(basis: Base, effect: Effect, lag_s: float) -> float:
     """Log likelihood ratio of a low-pass of that delay against the plain lag."""
     columns = effect.columns(basis.context, {"time_constant_s": lag_s})
-    X = whiten(basis.filtered, [columns])[0].reshape(-1)
+    X = basis.whitened([columns])[0].reshape(-1)
     Z = basis.known.reshape(-1, basis.known.shape[2])
     M = solve(Z.T @ Z, (Z.T @ X)[:, None])[:, 0]
     rest = X - Z @ M

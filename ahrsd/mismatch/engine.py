@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.mismatch import roles, unknown
+from ahrsd.mismatch import locate, roles, unknown
 from ahrsd.mismatch.diagnosis import (
     Baseline,
     Diagnosis,
@@ -22,11 +22,11 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.findings import contribution, finding, whole_term
+from ahrsd.mismatch.findings import added_value, contribution, finding, whole_term
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.null import NullFit, fit_null
-from ahrsd.mismatch.regression import Base, candidate_gram
+from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     Problem,
@@ -81,7 +81,7 @@ def diagnose(
     found = tuple(finding(state, basis, k, seen, last) for k, seen in enumerate(surveys))
     something = unknown.detected(left, limits)
     unexplained = (
-        unknown.described(basis, left, problem.block_s, limits) if something else Unexplained(False)
+        unknown.described(left, problem.block_s, limits) if something else Unexplained(False)
     )
     return Diagnosis(
         recording=recording,
@@ -105,33 +105,56 @@ def without_stand_ins(
     """Names that only stand in for a course in time taken out again, and what is then left.
 
     Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
-    all of what their frame's own coefficients explain, and where a few of them do.
+    all of what their frame's own coefficients explain, and where a few of them do.  Any other name
+    may stay where it explains something that a free course in the strongest frame does not.
     """
-    limits = state.problem.limits
-    basis = basis_of(state)
-    left = unknown.remainder(basis)
+    left = unknown.remainder(basis_of(state))
     for frame, names in TIME_SHAPED.items():
         shaped = [k for k, name in enumerate(state.names) if name in names]
-        if not shaped:
-            continue
-        fires = unknown.detected(left, limits)
-        bare = basis
-        for k in shaped:
-            bare = bare.without(term_group(k), state.fit.terms[k].value)
-        before = unknown.remainder(bare, with_bins=False).located[frame].statistic
-        covered = 1.0 - left.located[frame].statistic / max(before, 1e-300)
-        if (fires and covered < limits.coverage) or len(shaped) > limits.most_shaped:
-            kept = [k for k in range(len(state.named)) if k not in shaped]
-            state = refitted(state, tuple(state.named[k] for k in kept))
-            surveys = [surveys[k] for k in kept]
-            basis = basis_of(state)
-            left = unknown.remainder(basis)
+        doubtful = shaped if len(shaped) > state.problem.limits.most_shaped else []
+        if shaped and not doubtful and unknown.detected(left, state.problem.limits):
+            doubtful = shaped if _leaves_much(state, frame, shaped, left) else []
+        state, surveys, left = _dropped(state, surveys, doubtful, left)
+    if state.named and unknown.detected(left, state.problem.limits):
+        doubtful = [k for k in range(len(state.named)) if not _survives(state, k, left)]
+        much = _leaves_much(state, left.strongest.frame, doubtful, left) if doubtful else False
+        state, surveys, left = _dropped(state, surveys, doubtful if much else [], left)
     return state, surveys, left
+
+
+def _leaves_much(state: State, frame: Frame, terms: list[int], left: unknown.Remainder) -> bool:
+    """Whether the terms leave more of their frame's statistic than a true name would."""
+    bare = basis_of(state)
+    for k in terms:
+        bare = bare.without(term_group(k), added_value(state, k))
+    before = unknown.remainder(bare, with_bins=False).located[frame].statistic
+    return left.located[frame].statistic > (1 - state.problem.limits.coverage) * before
+
+
+def _survives(state: State, number: int, left: unknown.Remainder) -> bool:
+    """Whether a term still explains something beside the strongest frame's free course."""
+    frame, context = left.strongest.frame, left.basis.context
+    course = locate.frame_columns(context, frame, left.strongest.cut)
+    bare = left.basis.without(term_group(number), added_value(state, number))
+    free = bare.beside(locate.group_name(frame), bare.whitened([course])[0])
+    candidate = state.named[number].candidate
+    return evidence_of(free, candidate) > state.problem.limits.evidence_nats
+
+
+def _dropped(
+    state: State, surveys: list[Survey], terms: list[int], left: unknown.Remainder
+) -> tuple[State, list[Survey], unknown.Remainder]:
+    if not terms:
+        return state, surveys, left
+    kept = [k for k in range(len(state.named)) if k not in terms]
+    state = refitted(state, tuple(state.named[k] for k in kept))
+    return state, [surveys[k] for k in kept], unknown.remainder(basis_of(state))
 
 
 def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:
     """The smallest value of every parameter that this recording would have shown."""
-    gram, _ = candidate_gram(basis, first.candidates, problem.track.duration_s)
+    columns = columns_of(basis, first.candidates)
+    gram = candidate_gram(basis, columns, problem.track.duration_s)
     projected = gram.project(list(basis.groups))
     out = []
     for candidate in first.candidates:

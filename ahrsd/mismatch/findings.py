@@ -72,9 +72,8 @@ def whole_term(state: State, basis: Base, number: int, name: str | None = None) 
     name: what a delay is called in the end
     """
     term = state.fit.terms[number]
-    value = added_value(state, number)
-    deviation = np.zeros(len(value)) if term.deviation is None else term.deviation
-    deviation = deviation * np.sqrt(basis.colour)
+    change, deviation = refined(basis, number)
+    value = added_value(state, number) + change
     setting = {k: v for k, v in term.setting.items() if k != "searched"}
     if not _is_delay(state, number):
         return Term(term.identifier, value, deviation, setting)
@@ -87,6 +86,15 @@ def whole_term(state: State, basis: Base, number: int, name: str | None = None) 
     return Term(name, value, deviation, setting)
 
 
+def refined(basis: Base, number: int) -> tuple[Array, Array]:
+    """What is left to change in a term's value (p,), and its deviation (p,) in coloured noise."""
+    Z = basis.known.reshape(-1, basis.known.shape[2])
+    where = basis.groups[term_group(number)]
+    inverse = solve(Z.T @ Z, np.column_stack([Z.T @ basis.innovation.ravel(), np.eye(len(Z.T))]))
+    variance = np.diag(inverse[:, 1:])[where]
+    return inverse[where, 0], np.sqrt(np.maximum(variance, 0.0) * basis.colour)
+
+
 def _is_delay(state: State, number: int) -> bool:
     return state.named[number].candidate.name in DELAYS
 
@@ -95,10 +103,10 @@ def _delay_shares(state: State, basis: Base, number: int) -> dict[str, float] | 
     if not _is_delay(state, number):
         return None
     term = state.fit.terms[number]
-    deviation = 1e-6 if term.deviation is None else float(term.deviation[0])
+    change, deviation = (float(part[0]) for part in refined(basis, number))
     recorded = float(np.nanmedian(state.problem.recorded.dt_s))
-    lag_s = DELAYS[term.identifier] * state.lag_s(number)
-    return weighed(basis, state.problem.library, lag_s, deviation * basis.colour**0.5, recorded)
+    lag_s = DELAYS[term.identifier] * (state.lag_s(number) + change)
+    return weighed(basis, state.problem.library, lag_s, deviation, recorded)
 
 
 def contribution(judged: Judged, value: Array, basis: Base) -> Array:

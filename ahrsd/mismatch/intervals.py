@@ -50,6 +50,13 @@ def change_points(G: Array, s: Array, axes: int = 3, most: int = 12) -> list[int
     return sorted(chosen)
 
 
+def explained(G: Array, s: Array, changes: list[int], axes: int = 3) -> float:
+    """Score statistic that changes at these segments explain; G, s as in `change_points`."""
+    J = len(s) // axes
+    steps = np.kron(np.triu(np.ones((J, J))), np.eye(axes)).T
+    return _explained(steps.T @ G @ steps, steps.T @ s, changes, axes)
+
+
 def levels(course: Array, deviation: Array, changes: list[int]) -> Array:
     """(J, axes) the course averaged between the changes, weighted by its deviations (J,)."""
     edges = [0, *changes, len(course)]

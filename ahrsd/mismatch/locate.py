@@ -29,6 +29,8 @@ from ahrsd.samples import Array
 Frame = Literal["sensor", "world", "gyro"]
 FRAMES: tuple[Frame, ...] = ("sensor", "world", "gyro")
 
+SEGMENT_S = 20.0
+SEGMENTS = (6, 24)
 #: sizes of one coefficient over which the evidence is averaged: gauss, gauss, rad/s
 UNITS: Mapping[Frame, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
 SPAN = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
@@ -53,6 +55,12 @@ class Segments:
 def segments(time_s: Array, count: int) -> Segments:
     """`count` stretches of equal length."""
     return segments_between(time_s, np.linspace(time_s[0], time_s[-1], count + 1))
+
+
+def coarse_cut(track: Track) -> Segments:
+    """Stretches of about 20 s, shorter and longer on short and long recordings."""
+    count = int(np.clip(round(track.duration_s / SEGMENT_S), *SEGMENTS))
+    return segments(track.time_s, count)
 
 
 def segments_between(time_s: Array, edges_s: Array) -> Segments:

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ahrsd.mismatch.effects.base import Effect, Setting
-from ahrsd.mismatch.evidence import log_bayes
+from ahrsd.mismatch.evidence import colour, log_bayes
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.mismatch.prewhitening import prediction_error_filter, prewhitened
 from ahrsd.mismatch.score import Score, score
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
@@ -55,7 +56,8 @@ class Base:
     """What every candidate is measured against: innovations with calibration and terms taken out.
 
     known (N, 3, q): whitened columns of the calibration and of the named terms, in `groups` order;
-    innovation (N, 3): whitened, 0 in unused rows;  colour: its power at low frequency over white.
+    innovation (N, 3): whitened;  taps: what made both white again where the filter left colour;
+    colour: power of the innovation at low frequency over white.
     """
 
     context: Context
@@ -63,27 +65,51 @@ class Base:
     groups: Mapping[str, slice]
     known: Array
     innovation: Array
+    taps: Array
+    rate_hz: float
     colour: float
+
+    def whitened(self, columns: Sequence[Columns]) -> list[Array]:
+        """The columns (N, 3, p) as the innovation sees them, several at a time."""
+        out: list[Array] = []
+        at = 0
+        while at < len(columns):
+            end, width = at, 0
+            while end < len(columns) and (
+                end == at or width + _width(columns[end]) <= BATCH_COLUMNS
+            ):
+                width += _width(columns[end])
+                end += 1
+            joined = _joined(columns[at:end], len(self.innovation))
+            seen = prewhitened(self.taps, sensitivities(self.filtered, joined))
+            edges = np.cumsum([0, *(_width(part) for part in columns[at:end])])
+            out += [seen[:, :, a:b] for a, b in itertools.pairwise(edges)]
+            at = end
+        return out
+
+    def beside(self, name: str, columns: Array) -> Base:
+        """The same with a further group of whitened columns (N, 3, p) known."""
+        widths = [(k, where.stop - where.start) for k, where in self.groups.items()]
+        return replace(
+            self,
+            groups=slices([*widths, (name, columns.shape[2])]),
+            known=np.concatenate([self.known, columns], axis=2),
+        )
 
     def without(self, name: str, value: Array) -> Base:
         """The same with one named term left out, what it explains put back; value (p,)."""
         where = self.groups[name]
         kept = [k for k in self.groups if k != name]
-        return Base(
-            self.context,
-            self.filtered,
-            slices([(k, self.groups[k].stop - self.groups[k].start) for k in kept]),
-            np.concatenate([self.known[:, :, self.groups[k]] for k in kept], axis=2),
-            self.innovation + self.known[:, :, where] @ value,
-            self.colour,
+        return replace(
+            self,
+            groups=slices([(k, self.groups[k].stop - self.groups[k].start) for k in kept]),
+            known=np.concatenate([self.known[:, :, self.groups[k]] for k in kept], axis=2),
+            innovation=self.innovation + self.known[:, :, where] @ value,
         )
 
 
 def base(
-    context: Context,
-    filtered: Filtered,
-    terms: Sequence[tuple[str, Columns]],
-    colour: float,
+    context: Context, filtered: Filtered, terms: Sequence[tuple[str, Columns]], rate_hz: float
 ) -> Base:
     """Whiten the columns of calibration and named terms (group name, columns)."""
     parts = [(CALIBRATION, sensitivities(filtered, nuisance_columns(filtered)))]
@@ -94,24 +120,36 @@ def base(
         slices([(name, part.shape[2]) for name, part in parts]),
         np.concatenate([part for _, part in parts], axis=2),
         filtered.whitened,
-        colour,
+        np.ones(1),
+        rate_hz,
+        colour(filtered.whitened, rate_hz),
     )
 
 
-def whiten(filtered: Filtered, columns: Sequence[Columns]) -> list[Array]:
-    """The columns through the filter, several at a time; a width of 0 stays 0."""
-    out: list[Array] = []
-    at = 0
-    while at < len(columns):
-        end, width = at, 0
-        while end < len(columns) and (end == at or width + _width(columns[end]) <= BATCH_COLUMNS):
-            width += _width(columns[end])
-            end += 1
-        joined = sensitivities(filtered, _joined(columns[at:end], len(filtered.track)))
-        edges = np.cumsum([0, *(_width(part) for part in columns[at:end])])
-        out += [joined[:, :, a:b] for a, b in itertools.pairwise(edges)]
-        at = end
-    return out
+def quieter(basis: Base, columns: Array) -> Base:
+    """The basis with its colour taken from what the columns (N, 3, p) leave."""
+    left = residual(np.concatenate([basis.known, columns], axis=2), basis.innovation)
+    return replace(basis, colour=colour(left, basis.rate_hz))
+
+
+def generalised(basis: Base) -> Base:
+    """The basis as generalised least squares sees it: colour made white, not only paid for."""
+    taps = prediction_error_filter(basis.innovation, basis.rate_hz)
+    innovation = prewhitened(taps, basis.innovation)
+    return replace(
+        basis,
+        known=prewhitened(taps, basis.known),
+        innovation=innovation,
+        taps=np.convolve(basis.taps, taps),
+        colour=colour(innovation, basis.rate_hz),
+    )
+
+
+def residual(columns: Array, innovation: Array) -> Array:
+    """(N, 3) innovation with (N, 3, p) columns regressed out."""
+    flat = columns.reshape(-1, columns.shape[2])
+    theta = solve(flat.T @ flat, (flat.T @ innovation.ravel())[:, None])[:, 0]
+    return np.asarray((innovation.ravel() - flat @ theta).reshape(innovation.shape))
 
 
 def best_settings(
@@ -129,30 +167,30 @@ def best_settings(
     return sorted(found, key=lambda candidate: -candidate.evidence)
 
 
-def candidate_gram(
-    basis: Base, candidates: Sequence[Candidate], block_s: float
-) -> tuple[Gram, dict[str, Array]]:
-    """Gram of calibration, terms and candidates with a matrix per block, and the columns."""
-    columns = whiten(
-        basis.filtered,
-        [candidate.effect.columns(basis.context, candidate.setting) for candidate in candidates],
-    )
+def evidence_of(basis: Base, candidate: Candidate) -> float:
+    """Evidence of a candidate in its own setting, whose choice is not paid for."""
+    return _scan(basis, candidate.effect, [candidate.setting])[0].evidence
+
+
+def candidate_gram(basis: Base, columns: Mapping[str, Array], block_s: float) -> Gram:
+    """Gram of calibration, terms and the given whitened columns, with a matrix per block."""
     groups = {name: basis.known[:, :, where] for name, where in basis.groups.items()}
-    found = {c.name: part for c, part in zip(candidates, columns, strict=True)}
     time_s = basis.context.track.time_s
-    return gram({**groups, **found}, basis.innovation, time_s, block_edges(time_s, block_s)), found
+    return gram({**groups, **columns}, basis.innovation, time_s, block_edges(time_s, block_s))
+
+
+def columns_of(basis: Base, candidates: Sequence[Candidate]) -> dict[str, Array]:
+    """Whitened columns (N, 3, p) of the candidates by name."""
+    columns = basis.whitened([c.effect.columns(basis.context, c.setting) for c in candidates])
+    return {c.name: part for c, part in zip(candidates, columns, strict=True)}
 
 
 def group_gram(basis: Base, groups: Mapping[str, Columns], block_s: float | None = None) -> Gram:
     """Gram of the given groups, calibration and terms projected out; one block by default."""
-    whitened = whiten(basis.filtered, list(groups.values()))
-    known = {name: basis.known[:, :, where] for name, where in basis.groups.items()}
-    time_s = basis.context.track.time_s
-    edges = [0, len(time_s)] if block_s is None else block_edges(time_s, block_s)
-    whole = gram(
-        {**known, **dict(zip(groups, whitened, strict=True))}, basis.innovation, time_s, edges
-    )
-    return whole.project(list(known))
+    whitened = basis.whitened(list(groups.values()))
+    length_s = basis.context.track.duration_s if block_s is None else block_s
+    whole = candidate_gram(basis, dict(zip(groups, whitened, strict=True)), length_s)
+    return whole.project(list(basis.groups))
 
 
 def without_known(basis: Base, columns: Array) -> tuple[Array, Array]:
@@ -168,7 +206,7 @@ def without_known(basis: Base, columns: Array) -> tuple[Array, Array]:
 def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candidate]:
     """Evidence of each setting, its choice paid for."""
     columns = [effect.columns(basis.context, option) for option in options]
-    whitened = whiten(basis.filtered, columns)
+    whitened = basis.whitened(columns)
     Z = basis.known.reshape(-1, basis.known.shape[2])
     inner = Z.T @ Z
     known_e = Z.T @ basis.innovation.ravel()
@@ -192,19 +230,26 @@ def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
     times = np.unique([option["onset_s"] for option in options if "onset_s" in option])
     if len(times) < 2:
         return best
-    reach = float(np.median(np.diff(times)))
+    finer = closest_onset(basis, best, float(np.median(np.diff(times))))
+    paid = finer.evidence - np.log(len(options) * 4)
+    if paid <= best.evidence:
+        return best
+    return replace(finer, tried=len(options) * 4, evidence=paid)
+
+
+def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:
+    """The best onset within `reach_s`, to a small part of it; the choice is not paid for."""
     time_s = basis.context.track.time_s
+    best = start
     for _ in range(ONSET_PASSES):
-        grid = best.setting["onset_s"] + reach * np.linspace(-1, 1, ONSET_STEPS + 1)
+        grid = best.setting["onset_s"] + reach_s * np.linspace(-1, 1, ONSET_STEPS + 1)
         inside = grid[(grid > time_s[0]) & (grid < time_s[-1])]
         if not len(inside):
             break
         closer = [{**best.setting, "onset_s": round(float(t), 4)} for t in inside]
-        finer = max(_scan(basis, best.effect, closer), key=lambda candidate: candidate.evidence)
-        paid = finer.evidence + np.log(len(closer)) - np.log(len(options) * 4)
-        if paid > best.evidence:
-            best = Candidate(best.effect, finer.setting, len(options) * 4, paid)
-        reach *= 2.0 / ONSET_STEPS
+        best = max(_scan(basis, best.effect, closer), key=lambda candidate: candidate.evidence)
+        best = replace(best, tried=start.tried, evidence=best.evidence + np.log(len(closer)))
+        reach_s *= 2.0 / ONSET_STEPS
     return best
 
 

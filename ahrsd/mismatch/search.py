@@ -16,8 +16,8 @@ import numpy as np
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS, plain
 from ahrsd.mismatch.effects.base import Effect
-from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.limits import Limits
+from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.null import FittedTerm, NullFit, cold_start, fit_null
 from ahrsd.mismatch.regression import (
@@ -26,9 +26,14 @@ from ahrsd.mismatch.regression import (
     base,
     best_settings,
     candidate_gram,
+    closest_onset,
+    columns_of,
 )
+from ahrsd.mismatch.score import Score
 from ahrsd.mismatch.thin import thin_factor, thinned
 from ahrsd.mismatch.track import Spec, Track
+from ahrsd.mismatch.unknown import course, detected, remainder
+from ahrsd.mismatch.validate import Gain
 from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
@@ -40,6 +45,19 @@ LOOKED_AT = 8
 LOOSE = 30.0
 #: rows per second that the search works with; faster recordings are averaged down to it
 WORKING_HZ = 12.0
+#: samples per working row from which the gyro's noise is taken from the recorded rate
+OVERSAMPLED = 5
+#: colour of the innovations beyond which delays are looked for in whitened ones
+MUCH_COLOUR = 3.0
+#: nats by which a frame must lead before steps in it are believed
+FRAME_LEAD = 10.0
+#: a jump in each frame, and how often its time is sought again in the joint fit
+STEPS: Mapping[Frame, str] = {
+    "sensor": "hard_iron_step",
+    "world": "field_step",
+    "gyro": "gyro_bias_step",
+}
+STEP_PASSES = 2
 SMALL_LAG_S = 2e-3
 LAG_STEPS = 3
 #: names of a gyro bias that changes with time alone
@@ -92,7 +110,11 @@ def problem_of(
         sigma_gyro_rad_s=cold.sigma_gyro_rad_s / root,
     )
     work = thinned(track, m, cold)
-    return Problem(work, noise_of_thinned(spec, m), library, limits, track, m, cold), start
+    known = spec
+    if m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
+        # the gyro's differences at the working rate would be its motion
+        known = replace(spec, sigma_gyro_rad_s=cold.sigma_gyro_rad_s)
+    return Problem(work, noise_of_thinned(known, m), library, limits, track, m, cold), start
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,8 +158,7 @@ def basis_of(state: State) -> Base:
     """Whitened columns of calibration and terms at the state's fit."""
     context = state.fit.context()
     terms = [(term_group(k), term.columns(context)) for k, term in enumerate(state.fit.terms)]
-    whitened = state.fit.filtered.whitened
-    return base(context, state.fit.filtered, terms, colour(whitened, state.problem.rate_hz))
+    return base(context, state.fit.filtered, terms, state.problem.rate_hz)
 
 
 def survey(state: State, basis: Base | None = None) -> Survey:
@@ -148,13 +169,14 @@ def survey(state: State, basis: Base | None = None) -> Survey:
     library = problem.library
     if any(name in DELAYS for name in state.names):
         library = {name: effect for name, effect in library.items() if name not in DELAYS}
-    candidates = best_settings(basis, library, taken)
+    candidates = tuple(best_settings(basis, library, taken))
     near = [c for c in candidates if c.evidence > problem.limits.evidence_nats][:LOOKED_AT]
     if not near:
-        return Survey(basis, tuple(candidates), ())
-    gram, columns = candidate_gram(basis, near, problem.block_s)
+        return Survey(basis, candidates, ())
+    columns = columns_of(basis, near)
+    gram = candidate_gram(basis, columns, problem.block_s)
     judged = [judge(c, gram, columns[c.name], basis, len(candidates), problem.limits) for c in near]
-    return Survey(basis, tuple(candidates), tuple(judged))
+    return Survey(basis, candidates, tuple(judged))
 
 
 def forward(state: State) -> tuple[State, Survey, Survey]:
@@ -166,13 +188,67 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
     while len(state.named) < state.problem.limits.most_terms:
         accepted = [judged for judged in last.judged if judged.accepted]
         if not accepted:
-            break
+            more = stepped(state)
+            if more is state:
+                break
+            state, last = more, survey(more)
+            continue
         if accepted[0].candidate.name in WANDERING and not state.walk:
             state = refitted(replace(state, walk=True), state.named)
         else:
             state = added(state, accepted[0])
         last = survey(state)
     return state, first, last
+
+
+def stepped(state: State) -> State:
+    """Steps where the strongest frame's course changes, if a few of them explain nearly all of it.
+
+    A large jump, and more so one and back again, spoils the calibration so thoroughly that no test
+    of a single step sees it; the course does.  Fitted together, each must still prove itself.
+    """
+    left = remainder(basis_of(state), with_bins=False)
+    limits = state.problem.limits
+    effect = state.problem.library.get(STEPS[left.strongest.frame])
+    others = [one.evidence for one in left.located.values() if one is not left.strongest]
+    clear = left.strongest.evidence > max(others) + FRAME_LEAD
+    if effect is None or not clear or not detected(left, limits):
+        return state
+    seen = course(left)
+    if not 0 < len(seen.changes_s) <= limits.most_shaped or seen.covered < limits.coverage:
+        return state
+    scale = np.array([parameter.scale for parameter in effect.parameters])
+    named = tuple(
+        _unjudged(Candidate(effect, {"onset_s": time_s}, 1, 0.0), scale)
+        for time_s in seen.changes_s
+    )
+    tried = refitted(state, (*state.named, *named))
+    for _ in range(STEP_PASSES):
+        tried = _judged_again(tried, len(state.named))
+    kept = tuple(j for j in tried.named if j.accepted)
+    return refitted(tried, kept) if len(kept) > len(state.named) else state
+
+
+def _unjudged(candidate: Candidate, scale: Array) -> Judged:
+    nothing = np.zeros((0, 0))
+    what = Score(
+        np.zeros((len(scale), 0)), np.zeros(0), np.zeros(0), nothing, nothing, np.zeros(0), 1.0
+    )
+    return Judged(candidate, what, 0.0, 1.0, 1.0, Gain(0.0, 0.0), 0.0, 0.0, ("not judged",))
+
+
+def _judged_again(state: State, first: int) -> State:
+    """Terms from number `first` on with their onsets sought again, all fitted and judged."""
+    basis = basis_of(state)
+    named = list(state.named)
+    for k in range(first, len(named)):
+        left = basis.without(term_group(k), state.fit.terms[k].value)
+        at = named[k].candidate
+        near = closest_onset(left, at, 0.02 * state.problem.track.duration_s)
+        columns = columns_of(left, [near])
+        gram = candidate_gram(left, columns, state.problem.block_s)
+        named[k] = judge(near, gram, columns[near.name], left, 1, state.problem.limits)
+    return refitted(state, tuple(named))
 
 
 def added(state: State, judged: Judged) -> State:
@@ -244,9 +320,10 @@ def pruned(state: State) -> State:
         evidence = []
         for k, judged in enumerate(state.named):
             left = without_term(state, k, basis)
-            gram, columns = candidate_gram(left, [judged.candidate], state.problem.block_s)
-            name = judged.candidate.name
-            again = judge(judged.candidate, gram, columns[name], left, 1, state.problem.limits)
+            columns = columns_of(left, [judged.candidate])
+            gram = candidate_gram(left, columns, state.problem.block_s)
+            own = columns[judged.candidate.name]
+            again = judge(judged.candidate, gram, own, left, 1, state.problem.limits)
             evidence.append(again.evidence)
         weakest = int(np.argmin(evidence))
         if evidence[weakest] > state.problem.limits.evidence_nats:

@@ -19,25 +19,25 @@ from ahrsd.mismatch.gram import Gram
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import FRAMES, Frame, Located
 from ahrsd.mismatch.regime import Regime
-from ahrsd.mismatch.regression import Base, group_gram
+from ahrsd.mismatch.regression import Base, group_gram, quieter
 from ahrsd.mismatch.score import chi2_p, score
 from ahrsd.mismatch.validate import heldout
 from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
 
-SEGMENT_S = 20.0
-SEGMENTS = (6, 24)
 FINE = 80
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Remainder:
-    """The agnostic tests on one basis.
+    """The agnostic tests.
 
-    located: by frame;  bins: (regime, evidence, p-value) with the strongest first
+    basis: with the noise that the strongest frame leaves;  located: by frame
+    bins: (regime, evidence, p-value), the strongest first
     """
 
+    basis: Base
     located: dict[Frame, Located]
     bins: tuple[tuple[Regime, float, float], ...]
 
@@ -48,29 +48,73 @@ class Remainder:
 
 
 def remainder(basis: Base, with_bins: bool = True) -> Remainder:
-    """Test the three frames, and the regimes where wanted."""
-    cut = coarse_cut(basis)
+    """Test the three frames, and the regimes where wanted.
+
+    The noise is taken from what the strongest frame leaves: a course that is to be found must not
+    count as noise.
+    """
+    cut = locate.coarse_cut(basis.context.track)
     groups: dict[str, Columns] = {
         locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
         for frame in FRAMES
     }
+    loud = group_gram(basis, groups)
+    first = max(
+        (locate.locate(loud, frame, cut, basis.colour) for frame in FRAMES),
+        key=lambda one: one.statistic,
+    )
+    strongest = groups[locate.group_name(first.frame)]
+    quiet = quieter(basis, basis.whitened([strongest])[0])
     found = regime.regimes(basis.context) if with_bins else ()
     groups |= {one.group: regime.regime_columns(one) for one in found}
-    gram = group_gram(basis, groups)
-    located = {frame: locate.locate(gram, frame, cut, basis.colour) for frame in FRAMES}
+    gram = group_gram(quiet, groups)
+    located = {frame: locate.locate(gram, frame, cut, quiet.colour) for frame in FRAMES}
     bins = []
     for one in found:
         width = gram.groups[one.group].stop - gram.groups[one.group].start
         what = score(gram, one.group, np.full(width, locate.UNITS["sensor"]), 1e-3)
-        bins.append((one, log_bayes(what, basis.colour, locate.SPAN), chi2_p(what, basis.colour)))
-    return Remainder(located, tuple(sorted(bins, key=lambda item: -item[1])))
+        bins.append((one, log_bayes(what, quiet.colour, locate.SPAN), chi2_p(what, quiet.colour)))
+    return Remainder(quiet, located, tuple(sorted(bins, key=lambda item: -item[1])))
 
 
-def coarse_cut(basis: Base) -> locate.Segments:
-    """Segments of about 20 s, fewer and more on short and long recordings."""
-    track = basis.context.track
-    count = int(np.clip(round(track.duration_s / SEGMENT_S), *SEGMENTS))
-    return locate.segments(track.time_s, count)
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """A frame's course in finer segments: where it changes, and its levels between the changes.
+
+    changes_s: times of the changes;  covered: share of the frame's statistic that they explain;
+    level: (J, 3);  spans: where it is away from its usual level
+    """
+
+    fine: Located
+    gram: Gram
+    changes_s: tuple[float, ...]
+    covered: float
+    level: Array
+    spans: tuple[tuple[float, float], ...]
+
+
+def course(left: Remainder, block_s: float | None = None) -> Course:
+    """The strongest frame's course in segments of an eightieth of the recording."""
+    basis, frame = left.basis, left.strongest.frame
+    name = locate.group_name(frame)
+    cut = locate.segments(basis.context.track.time_s, FINE)
+    gram = group_gram(basis, {name: locate.frame_columns(basis.context, frame, cut)}, block_s)
+    where = gram.groups[name]
+    total = gram.total / basis.colour
+    G, s = total[where, where], total[where, -1]
+    changes = intervals.change_points(G, s)
+    fine = locate.locate(gram, frame, cut, basis.colour)
+    level = intervals.levels(fine.course, fine.deviation, changes)
+    found = intervals.departures(cut.edges_s, level, fine.deviation)
+    whole = [(float(cut.edges_s[0]), float(cut.edges_s[-1]))]
+    return Course(
+        fine,
+        gram,
+        tuple(float(cut.edges_s[k]) for k in changes),
+        intervals.explained(G, s, changes) / max(left.strongest.statistic / basis.colour, 1e-300),
+        level,
+        tuple(found or whole),
+    )
 
 
 def detected(left: Remainder, limits: Limits) -> bool:
@@ -83,30 +127,18 @@ def detected(left: Remainder, limits: Limits) -> bool:
     return by_time or by_bin
 
 
-def described(basis: Base, left: Remainder, block_s: float, limits: Limits) -> Unexplained:
+def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
     """The address of what is left."""
-    best = left.strongest
-    regime_first = bool(left.bins) and left.bins[0][1] > best.evidence
-    frame = best.frame
-    cut = locate.segments(basis.context.track.time_s, FINE)
-    gram = group_gram(
-        basis, {locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)}, block_s
-    )
-    columns = gram.groups[locate.group_name(frame)]
-    total = gram.total / basis.colour
-    changes = intervals.change_points(total[columns, columns], total[columns, -1])
-    fine = locate.locate(gram, frame, cut, basis.colour)
-    level = intervals.levels(fine.course, fine.deviation, changes)
-    spans = intervals.departures(cut.edges_s, level, fine.deviation)
+    best, basis = left.strongest, left.basis
+    seen = course(left, block_s)
     words = None
     if left.bins and left.bins[0][1] > limits.unknown_nats:
         words = _bin_words(left.bins[0][0], basis)
-    if regime_first:
-        track = basis.context.track
-        spans = [(float(track.time_s[0]), float(track.time_s[-1]))]
-        frame = "sensor"
+    by_bin = bool(left.bins) and left.bins[0][1] > best.evidence
+    time_s = basis.context.track.time_s
+    whole = ((float(time_s[0]), float(time_s[-1])),)
     spread = np.sqrt(np.average((best.course - best.course.mean(0)) ** 2, axis=0))
-    axes = tuple(AXES[k] for k in range(3) if spread[k] > 0.3 * spread.max())
+    x, y, z = (float(part) for part in best.direction)
     follows = tuple(
         Suspect(m.channel, m.correlation, m.p_value)
         for m in locate.matches(basis.context.track, best)
@@ -115,18 +147,16 @@ def described(basis: Base, left: Remainder, block_s: float, limits: Limits) -> U
     return Unexplained(
         detected=True,
         where=Where(
-            tuple(spans),
-            axes,
-            frame,
+            whole if by_bin else seen.spans,
+            tuple(AXES[k] for k in range(3) if spread[k] > 0.3 * spread.max()),
+            "sensor" if by_bin else best.frame,
             words,
             None,
-            (float(best.direction[0]), float(best.direction[1]), float(best.direction[2])),
+            (x, y, z),
         ),
-        heldout=_heldout(
-            gram, locate.group_name(frame) if not regime_first else None, frame, basis
-        ),
+        heldout=None if by_bin else _heldout(seen, basis),
         size=float(np.ptp(best.source)),
-        unit="rad/s" if frame == "gyro" else "gauss",
+        unit="rad/s" if best.frame == "gyro" else "gauss",
         single_source_share=best.single_share,
         follows=follows,
         evidence_nats=max(best.evidence, left.bins[0][1] if left.bins else -np.inf),
@@ -143,27 +173,17 @@ def _bin_words(one: Regime, basis: Base) -> str:
     return one.words(size > 0.5 * size.max())
 
 
-def _heldout(gram: Gram, name: str | None, frame: Frame, basis: Base) -> Heldout | None:
-    if name is None:
-        return None
-    width = gram.groups[name].stop - gram.groups[name].start
-    gain = heldout(gram, [], name, np.full(width, 10.0 * locate.UNITS[frame]))
+def _heldout(seen: Course, basis: Base) -> Heldout:
+    frame = seen.fine.frame
+    name = locate.group_name(frame)
+    width = seen.gram.groups[name].stop - seen.gram.groups[name].start
+    gain = heldout(seen.gram, [], name, np.full(width, 10.0 * locate.UNITS[frame]))
     rms = innovation_rms(basis)
-    return Heldout(
-        rms,
-        rms * float(np.sqrt(max(gain.after, 0.0) / max(gain.before, 1e-12))),
-        gain.nats_per_sample,
-        0.0,
-    )
+    after = rms * float(np.sqrt(max(gain.after, 0.0) / max(gain.before, 1e-12)))
+    return Heldout(rms, after, gain.nats_per_sample, 0.0)
 
 
 def innovation_rms(basis: Base) -> float:
     """Root mean square of the magnetometer's one-step errors, gauss."""
     done = basis.filtered
     return float(np.sqrt(np.mean(done.innovation[done.used] ** 2)))
-
-
-def coverage(without: Array, with_terms: Array) -> float:
-    """Share of an agnostic statistic that named terms explain, 0..1."""
-    before, after = float(np.sum(without)), float(np.sum(with_terms))
-    return float(np.clip(1.0 - after / max(before, 1e-300), 0.0, 1.0))
