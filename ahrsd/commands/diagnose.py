@@ -62,6 +62,7 @@ def command(
 
 
 def _write_report(folder: Path, found: Diagnosis) -> None:
+    from ahrsd.mismatch.model_file import of_diagnosis, to_text
     from ahrsd.report.diagnosis_page import write_diagnosis_report
     from ahrsd.rerun_diagnosis import write_rrd
 
@@ -73,6 +74,8 @@ def _write_report(folder: Path, found: Diagnosis) -> None:
             f"ahrsd diagnose {found.recording} --report {folder.name}",
         )
         write_rrd(folder / "diagnosis.rrd", found)
+        if found.model is not None:
+            (folder / "model.json").write_text(to_text(of_diagnosis(found)), encoding="utf-8")
     except OSError as error:
         raise AhrsdError(f"{folder}: cannot be written: {error.strerror}") from error
     write_json(str(folder / "diagnosis.json"), found.to_json())

@@ -66,6 +66,13 @@ def test_a_current_is_named_and_all_files_are_written(run, saved, clean, tmp_pat
     assert (folder / "diagnosis.rrd").stat().st_size > 10_000
     assert json.loads((folder / "diagnosis.json").read_text())["findings"] == body["findings"]
     assert "motor_current_field" in capsys.readouterr().out
+    again = tmp_path / "again.csv"
+    model = ("--model", str(folder / "model.json"), "--along", str(path))
+    assert run("simulate", *model, "-o", str(again)) == 0
+    found = tmp_path / "found.json"
+    assert run("diagnose", str(again), "--json", str(found)) == 0
+    effects = [finding["effect"] for finding in json.loads(found.read_text())["findings"]]
+    assert effects == ["motor_current_field"]
 
 
 class Pictures(HTMLParser):
