@@ -17,8 +17,8 @@ from ahrsd.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.mismatch.aligned import align, differing
+from ahrsd.mismatch.answer import answer
 from ahrsd.mismatch.diagnosis import Diagnosis
-from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.recording.opening import Kind, open_recording
 from ahrsd.recording.table import read_table
@@ -125,14 +125,21 @@ def diagnose_recording(
     known = Spec() if spec is None else load_spec(spec)
     track, notes = load_track(real, rate_hz or known.rate_hz, progress)
     if simulation is None:
-        found = diagnose(track, known, recording=real.name)
+        found = _answered(real, track, known)
         return replace(found, notes=(*notes, *found.notes))
     simulated, _ = load_track(simulation, rate_hz or known.rate_hz)
     try:
         overlap = align(track, simulated)
     except ValueError as error:
         raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
-    found = diagnose(overlap.real, known, recording=real.name)
-    own = diagnose(overlap.simulated, Spec(), recording=simulation.name)
+    found = _answered(real, overlap.real, known)
+    own = _answered(simulation, overlap.simulated, Spec())
     left = differing(found, own)
     return replace(left, notes=(*notes, *overlap.notes, *left.notes))
+
+
+def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
+    try:
+        return answer(track, spec, recording=path.name)
+    except ValueError as error:
+        raise RecordingError(path, str(error), "record again, with the vehicle turning") from None

@@ -96,6 +96,7 @@ def diagnose(
         model=state.fit.model,
         terms=tuple(whole_term(state, basis, k, one.effect) for k, one in enumerate(found)),
         drawn=_drawn(start, state, basis, first, left),
+        fits=(start, state.fit),
     )
 
 
