@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd.estimator import chain
-from ahrsd.estimator.retraction import Moments, moved
+from ahrsd.estimator.retraction import Moments, curvature, moved
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
 B = np.array([0.1, -0.2, 0.05])
@@ -58,3 +58,15 @@ def test_where_the_matrix_would_not_stay_positive_the_step_is_plain():
 def test_without_data_the_scale_is_left_alone():
     dc = np.r_[np.zeros(6), 0.01, 0.0, 0.0]
     np.testing.assert_allclose(moved(C9, dc, Moments()), C9 + dc, atol=1e-12)
+
+
+def test_curvature_is_what_the_straight_covariance_misses():
+    """Along the valley of a planar turn, against moves of a standard normal size."""
+    _, moments = planar(0.3)
+    step = 0.05 * np.r_[chain.upper_triangle(0.3 * M), -M[:, 2]]
+    t = np.random.default_rng(0).normal(size=4000)
+    beside = np.array([moved(C9, k * step, moments) - C9 - k * step for k in t])
+    expected = beside.T @ beside / len(t)
+    added = curvature(C9, np.outer(step, step) + 1e-16 * np.eye(9), moments)
+    assert np.trace(expected) > 0
+    np.testing.assert_allclose(added, expected, atol=0.12 * np.abs(expected).max())

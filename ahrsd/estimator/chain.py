@@ -186,7 +186,7 @@ def linearise(
         tangents=T,
         sum_mag=sum_mag,
         sum_gyro=sum_gyro,
-        count_mag=3.0 * float(np.count_nonzero(w)),
+        count_mag=3.0 * float(np.sum(w)),
         count_gyro=2.0 * float(np.count_nonzero(motion.scale)),
     )
 

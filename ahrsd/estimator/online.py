@@ -18,6 +18,7 @@ from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
+from ahrsd.estimator.retraction import curvature
 from ahrsd.estimator.search import search
 from ahrsd.estimator.window import Window
 from ahrsd.samples import Array, SampleBlock
@@ -115,8 +116,8 @@ class Estimator:
 
         If that does too, the iron has changed: everything before them is forgotten.
         """
-        sure = self._agreed and window.step_sigmas < _SETTLED and len(window.epochs) > _CHANGED
-        self._strange = self._strange + 1 if sure and window.strange() else 0
+        sure = not self._searching and window.step_sigmas < _SETTLED
+        self._strange = self._strange + 1 if sure and window.contradicted() else 0
         if self._strange == _CHANGED:
             at_s = float(window.epochs[-_CHANGED].data.time_s[0])
             self._warnings = (
@@ -199,6 +200,7 @@ class Estimator:
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         covariance = covariance * (1.0 + doubt**2)
+        covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)
         K[:9, :9] = J

@@ -49,3 +49,19 @@ def moved(c: Array, dc: Array, moments: Moments) -> Array:
     scale = np.sqrt(1.0 + moments.mean_square(dC, dd))
     new = np.linalg.inv((C + dC) / scale)
     return np.concatenate([chain.upper_triangle(new), new @ (d + dd) / scale])
+
+
+def curvature(c: Array, covariance: Array, moments: Moments) -> Array:
+    """What the valley's curvature adds to the covariance (9, 9) of c.
+
+    One sigma along a principal direction ends q beside the straight line, t sigmas t^2 q: of a
+    standard normal t that has the mean square 3 q q^T.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    added = np.zeros((9, 9))
+    for value, vector in zip(values, vectors.T, strict=True):
+        step = np.sqrt(max(float(value), 0.0)) * scale * vector
+        q = (moved(c, step, moments) + moved(c, -step, moments)) / 2 - c
+        added += 3 * np.outer(q, q)
+    return added

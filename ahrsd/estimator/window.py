@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.estimator import chain, noise
+from ahrsd.estimator.change import contradicts
 from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
@@ -45,7 +46,7 @@ _MAX_STEPS = 12
 _MAX_TRACKS = 6
 _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
 BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
-_FINISH_WORK = 6  # linearisations per epoch at the end of a recording
+_FINISH_WORK = 20  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
 _DAMPING, _DAMPING_FAR = 1e-3, 1e2
@@ -53,7 +54,6 @@ _DAMPING_LIMITS = (1e-9, 1e6)
 _GAIN = 0.05  # of log likelihood: less is not worth another step
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
-_MOST_ROWS = 0.6  # of an epoch beyond the limit for outliers: another calibration, not outliers
 _ANOTHER_REST = 0.02  # rad between two directions at rest
 _SHORTEST_GAP_S = 0.1
 
@@ -88,6 +88,7 @@ class Window:
         self._folded_cells = Cells()
         self._damping = _DAMPING
         self._rest: Array | None = None
+        self._covariance = belief  # of c, when it was last weighed
         self._work = 0
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
@@ -176,16 +177,10 @@ class Window:
         factor = epoch_factor(q, a, point, walk, rest=None if turned else self._resting(u))
         return Epoch(data, u, used, weights, a, a + 1, q, factor, turned)
 
-    def strange(self) -> bool:
-        """Whether the newest epoch contradicts the calibration in most of its rows, not in some.
-
-        To be asked before it is tracked. A magnet that passes disturbs some rows of one epoch.
-        """
-        epoch = self.epochs[-1]
-        u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
-        error = np.linalg.norm(epoch.data.field_error(u, self.graph.c), axis=1)
-        limit = self.parameters.outlier_sigma * self.usual.mag_gauss / np.sqrt(epoch.data.count)
-        return epoch.turned and float(np.mean(error > limit)) > _MOST_ROWS
+    def contradicted(self) -> bool:
+        """Whether the newest epoch contradicts the calibration; to be asked before it is tracked."""
+        limit = self.parameters.outlier_sigma
+        return contradicts(self.epochs[-1], self.graph.c, self._covariance, self.usual, limit)
 
     def anew(self, count: int) -> Window:
         """A window of the last `count` epochs that remembers nothing before but noise and bias."""
@@ -383,7 +378,7 @@ class Window:
         factors = [e.factor for e in self.epochs]
         self.found_misfit = self.misfit.value(factors, graph, graph.step())
         graph.temper = max(1.0, self.found_misfit, self._repeating())
-        covariance = graph.covariance()[:9, :9] * graph.temper
+        covariance = self._covariance = graph.covariance()[:9, :9] * graph.temper
         graph.hold_blind(BLIND, covariance)
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
