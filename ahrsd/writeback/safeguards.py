@@ -50,6 +50,7 @@ class Safeguards:
     ) -> None:
         """Judge a device that was identified and read; the first one is the one to write to."""
         self.journal_ok = journal_readable
+        self.gates = self.flash_gates = ()  # what was judged before is of before
         hsi = registers.get(HSI_CONTROL)
         self._hsi_applied = hsi is None or hsi[1] == HSI_APPLIED
         self._serial = identity.serial if self._serial is None else self._serial
@@ -113,6 +114,8 @@ class Safeguards:
         if unattended and not self.policy.commit_unattended:
             reasons.append("no operator approved it and commit_unattended is off")
         reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.flash_gates if not gate.ok]
+        if not self.flash_gates:
+            reasons.append("no gate has judged for flash yet")
         reasons += flash_budget(self.policy, history, wall_s)
         if still := self.stillness.why_not(host_s):
             reasons.append(still)

@@ -363,3 +363,46 @@ def test_a_movement_ends_the_rest_and_old_shaking_is_forgotten():
     assert still.why_not(8.0) is None
     still.update(block(8.0 + 0.01 * np.arange(10), rate=0.1), np.full(3, 0.01))
     assert still.why_not(8.1) is not None
+
+
+def test_without_a_verdict_for_flash_nothing_is_saved(make_rig):
+    rig = make_rig()
+    rig.connect()
+    rig.pass_time(0.1)
+    rig.verdict(flash_gates=())
+    rig.approve()
+    rig.live()
+    rig.stand_still()
+    assert rig.wb.state is State.PROVEN
+    assert rig.device.flash_writes == 0
+    assert any("no gate has judged" in text for text in rig.wb.holds())
+
+
+def test_a_new_process_saves_nothing_before_its_own_gates_have_judged(make_rig):
+    rig = make_rig()
+    rig.connect()
+    rig.pass_time(0.1)
+    rig.verdict(flash_gates=rig.RED)
+    rig.approve()
+    rig.live()
+    rig.back("program")
+    assert rig.wb.state is State.PROVEN
+    rig.stand_still()
+    assert rig.device.flash_writes == 0
+    rig.verdict()
+    rig.stand_still()
+    assert rig.device.flash_writes == 1
+
+
+def test_a_device_that_was_read_anew_is_not_saved_by_the_gates_of_before(make_rig):
+    rig = make_rig()
+    rig.connect()
+    rig.pass_time(0.1)
+    rig.verdict()
+    rig.approve()
+    rig.live()
+    rig.do(rig.wb.on_link_lost(rig.now_s))
+    rig.connect()
+    rig.stand_still()
+    assert rig.wb.state is State.PROVEN
+    assert rig.device.flash_writes == 0
