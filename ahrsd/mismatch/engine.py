@@ -13,19 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch import locate, roles, unknown
+from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
     Baseline,
+    Check,
     Diagnosis,
     Drawn,
+    Finding,
     Limit,
     Unexplained,
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.findings import added_value, contribution, finding, whole_term
+from ahrsd.mismatch.facts import Fact
+from ahrsd.mismatch.findings import (
+    added_value,
+    contribution,
+    finding,
+    of_fact,
+    whole_term,
+)
+from ahrsd.mismatch.hygiene import hygiene, put_right
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null
+from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
@@ -42,7 +55,7 @@ from ahrsd.mismatch.search import (
     term_group,
 )
 from ahrsd.mismatch.track import Spec, Track
-from ahrsd.mismatch.values import NullModel
+from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import Array
 
 #: names that are a course in time and nothing else, by the frame that they act in
@@ -70,7 +83,10 @@ def diagnose(
     """
     spec = spec or Spec()
     track, notes = roles.prepared(track)
-    problem, cold = problem_of(track, spec, library, limits)
+    facts = hygiene(track)
+    if any(fact.stops for fact in facts):
+        return _stopped(recording, [fact for fact in facts if fact.stops], notes)
+    problem, cold = problem_of(put_right(track, facts), spec, library, limits)
     start = fit_null(problem.track, problem.spec, cold, walk=False)
     state, first, last = forward(State(problem, start))
     slim = pruned(state)
@@ -78,26 +94,59 @@ def diagnose(
     state, surveys, last = swapped(slim, last)
     state, surveys, left = without_stand_ins(state, surveys)
     basis = basis_of(state)
-    found = tuple(finding(state, basis, k, seen, last) for k, seen in enumerate(surveys))
-    something = unknown.detected(left, limits)
-    unexplained = (
-        unknown.described(left, problem.block_s, limits) if something else Unexplained(False)
+    named = [finding(state, basis, k, seen, last) for k, seen in enumerate(surveys)]
+    noise = level_facts(state.fit.filtered, spec_given=spec.sigma_mag_gauss is not None)
+    found = (
+        *(of_fact(fact, library) for fact in facts),
+        *sorted(named, key=lambda one: -one.heldout.nll_gain_per_sample),
+        *(of_fact(fact, library) for fact in noise),
     )
+    something = unknown.detected(left, limits)
+    terms = tuple(whole_term(state, basis, k, one.effect) for k, one in enumerate(named))
     return Diagnosis(
         recording=recording,
         baseline=_baseline(start),
         mismatch=bool(found) or something,
-        p_value=_p_value(first, left),
-        findings=tuple(sorted(found, key=lambda one: -one.heldout.nll_gain_per_sample)),
-        unexplained=unexplained,
-        posterior_predictive={},
+        p_value=_p_value(state, found, left),
+        findings=found,
+        unexplained=(
+            unknown.described(left, problem.block_s, limits) if something else Unexplained(False)
+        ),
+        posterior_predictive=_checked(start, state, terms, library),
         sensitivity=() if found or something else sensitivity(problem, basis, first),
         notes=notes,
         model=state.fit.model,
-        terms=tuple(whole_term(state, basis, k, one.effect) for k, one in enumerate(found)),
+        terms=terms,
         drawn=_drawn(start, state, basis, first, left),
-        fits=(start, state.fit),
     )
+
+
+def _stopped(recording: str, facts: list[Fact], notes: tuple[str, ...]) -> Diagnosis:
+    """The answer where nothing that is fitted would mean anything."""
+    return Diagnosis(
+        recording=recording,
+        baseline=None,
+        mismatch=True,
+        p_value=0.0,
+        findings=tuple(of_fact(fact, EFFECTS) for fact in facts),
+        unexplained=Unexplained(False),
+        posterior_predictive={},
+        notes=(*notes, *(fact.words for fact in facts), "put this right first, then ask again"),
+    )
+
+
+def _checked(
+    start: NullFit, state: State, terms: tuple[Term, ...], library: Mapping[str, Effect]
+) -> dict[str, Check]:
+    """Posterior predictive checks; a delay that is out of the track stays out of the model."""
+    null = start
+    if state.problem.lag_s != 0.0:
+        null = fit_null(state.problem.track, state.problem.spec, start.model, walk=False)
+    kept = [
+        replace(term, value=fitted.value) if fitted.identifier in DELAYS else term
+        for term, fitted in zip(terms, state.fit.terms, strict=True)
+    ]
+    return checks(null, state.fit, kept, library=library)
 
 
 def without_stand_ins(
@@ -183,12 +232,13 @@ def _baseline(start: NullFit) -> Baseline:
     )
 
 
-def _p_value(first: Survey, left: unknown.Remainder) -> float:
-    """The smallest family-wise probability of all tests."""
-    named = [judged.family_p for judged in first.judged if judged.accepted]
+def _p_value(state: State, found: tuple[Finding, ...], left: unknown.Remainder) -> float:
+    """The smallest family-wise probability of what is found, or of what was looked at in vain."""
+    named = [judged.family_p for judged in state.named]
+    counted = [0.0] if len(found) > len(named) else []
     frames = [min(1.0, 3.0 * one.p_value) for one in left.located.values()]
     bins = [min(1.0, len(left.bins) * p) for _, _, p in left.bins]
-    return float(min([1.0, *named, *frames, *bins]))
+    return float(min([1.0, *named, *counted, *frames, *bins]))
 
 
 def _drawn(

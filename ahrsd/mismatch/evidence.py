@@ -68,16 +68,22 @@ def posterior(
     return dict(zip(names, (share / share.sum()).tolist(), strict=True))
 
 
-def colour(innovation: Array, rate_hz: float, reach_s: float = 3.0) -> float:
-    """Power of whitened innovations (N, 3) at low frequency over that of white noise, at least 1.
+#: peaks of the smoothed spectrum below this are its own scatter
+CLEAR_PEAK = 1.35
 
-    Bartlett's long-run variance over `reach_s`, averaged over the axes: correlated noise of a
+
+def colour(innovation: Array, rate_hz: float, reach_s: float = 3.0) -> float:
+    """Power of whitened innovations (N, 3) where their spectrum is strongest over white noise's.
+
+    Bartlett's spectrum over `reach_s`, averaged over the axes, at least 1: correlated noise of a
     second or so counts in full, the slow and small traces of an effect near its limit hardly do.
+    The filter takes the slowest noise away, so the peak is seldom at zero frequency.
     """
     reach = min(max(1, round(reach_s * rate_hz)), len(innovation) // 4)
     size = 1 << (len(innovation) + reach).bit_length()
-    spectrum = np.fft.rfft(innovation - innovation.mean(axis=0), n=size, axis=0)
-    lags = np.fft.irfft(np.abs(spectrum) ** 2, n=size, axis=0)[: reach + 1] / len(innovation)
-    weights = 1.0 - np.arange(reach + 1) / (reach + 1)
-    power = lags[0] + 2.0 * (weights[1:, None] * lags[1:]).sum(axis=0)
-    return max(1.0, float(np.mean(power)))
+    spectrum = np.abs(np.fft.rfft(innovation - innovation.mean(axis=0), n=size, axis=0)) ** 2
+    lags = np.fft.irfft(spectrum.mean(axis=1), n=size)[: reach + 1] / len(innovation)
+    tapered = lags * (1.0 - np.arange(reach + 1) / (reach + 1))
+    density = np.fft.rfft(np.concatenate([tapered, tapered[:0:-1]])).real
+    peak = float(density.max())
+    return max(1.0, float(density[0]), peak if peak > CLEAR_PEAK else 1.0)

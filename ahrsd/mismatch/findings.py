@@ -9,7 +9,9 @@ import numpy as np
 from ahrsd.mismatch.confound import separating_manoeuvre
 from ahrsd.mismatch.delays import DELAYS, weighed
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
+from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import posterior
+from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.innovation import TRACELESS
 from ahrsd.mismatch.intervals import spans
@@ -57,6 +59,24 @@ def finding(state: State, basis: Base, number: int, seen: Survey, last: Survey) 
         equation=effect.equation,
         setting=term.setting,
         evidence_nats=judged.evidence,
+    )
+
+
+def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
+    """A fact that was counted, not fitted, as a finding; nothing is held out from counting."""
+    effect = library.get(fact.effect)
+    return Finding(
+        effect=fact.effect,
+        confidence=fact.confidence,
+        alternatives=(),
+        where=fact.where,
+        parameters=fact.parameters,
+        heldout=Heldout(0.0, 0.0, 0.0, 0.0),
+        cost_if_left_out=Cost(0.0, 0.0),
+        separate_from=None,
+        words=fact.words,
+        equation="" if effect is None else effect.equation,
+        setting=fact.setting,
     )
 
 

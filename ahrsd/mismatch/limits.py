@@ -10,11 +10,11 @@ class Limits:
     """Smaller probabilities and more nats make the engine more silent.
 
     family_p:       family-wise probability below which a candidate may be named; times the number
-                    of candidates and settings tried it is the chance of a false name, 1 in 500
+                    of candidates and settings tried it is the chance of a false name, 1 in 1000
                     before the other gates
     robust_family_p: the same for the block-robust test, whose tails are heavy with few blocks; it
                     guards against coloured and bursty noise, where the score test does not
-    evidence_nats:  evidence over the calibration alone: odds 20 to 1 for every candidate's size
+    evidence_nats:  evidence over the calibration alone: odds 50 to 1 for every candidate's size
     lead_nats:      two candidates closer than this are told as one set (odds of 20 to 1)
     cv_gain:        held-out gain, nats per sample, must be above this
     placebo_beaten: share of time-shifted copies of a candidate that it must beat
@@ -26,9 +26,9 @@ class Limits:
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 
-    family_p: float = 2e-3
-    robust_family_p: float = 2e-2
-    evidence_nats: float = 3.0
+    family_p: float = 1e-3
+    robust_family_p: float = 5e-4
+    evidence_nats: float = 4.0
     lead_nats: float = 3.0
     cv_gain: float = 0.0
     placebo_beaten: float = 0.99

@@ -13,9 +13,11 @@ from functools import partial
 
 import numpy as np
 
+from ahrsd.mismatch import roles
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS, plain
 from ahrsd.mismatch.effects.base import Effect
+from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.name import Judged, judge
@@ -30,6 +32,7 @@ from ahrsd.mismatch.regression import (
     columns_of,
 )
 from ahrsd.mismatch.score import Score
+from ahrsd.mismatch.spectrum import lines
 from ahrsd.mismatch.thin import thin_factor, thinned
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.unknown import course, detected, remainder
@@ -60,6 +63,8 @@ STEPS: Mapping[Frame, str] = {
 STEP_PASSES = 2
 SMALL_LAG_S = 2e-3
 LAG_STEPS = 3
+#: a gyro bias that wanders by 20 deg/h in 400 s is noise of an ordinary gyro and gets no name
+ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
 #: names of a gyro bias that changes with time alone
 WANDERING = ("gyro_bias_drift", "gyro_bias_step", "gyro_startup", "gyro_bias_temperature")
 
@@ -102,7 +107,7 @@ def problem_of(
 ) -> tuple[Problem, NullModel]:
     """The recording at working rate, and a calibration to start from."""
     cold = cold_start(track, spec)
-    m = thin_factor(track, WORKING_HZ)
+    m = 1 if _is_fast(track, cold) else thin_factor(track, WORKING_HZ)
     root = float(np.sqrt(m))
     start = replace(
         cold,
@@ -115,6 +120,17 @@ def problem_of(
         # the gyro's differences at the working rate would be its motion
         known = replace(spec, sigma_gyro_rad_s=cold.sigma_gyro_rad_s)
     return Problem(work, noise_of_thinned(known, m), library, limits, track, m, cold), start
+
+
+def _is_fast(track: Track, cold: NullModel) -> bool:
+    """Whether averaging would lose something: a turning shaft, or a line above the working rate."""
+    if roles.named(track.covariates, "rpm"):
+        return True
+    rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
+    if rate_hz < 2 * WORKING_HZ:
+        return False
+    whitened = run_filter(track, cold, sensitive=False).whitened
+    return any(line.frequency_hz > WORKING_HZ / 3 for line in lines(whitened, rate_hz))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,7 +198,8 @@ def survey(state: State, basis: Base | None = None) -> Survey:
 def forward(state: State) -> tuple[State, Survey, Survey]:
     """Name one effect after the other until nothing passes; the first and the last survey.
 
-    Before a wandering gyro is given a name, the null may wander itself: noise is no physics.
+    Before a gyro bias that changes is given a name, the null may wander as an ordinary gyro does:
+    noise is no physics.
     """
     first = last = survey(state)
     while len(state.named) < state.problem.limits.most_terms:
@@ -274,12 +291,11 @@ def refitted(state: State, named: tuple[Judged, ...]) -> State:
             value = np.zeros(1)
         term = fitted_term(judged.candidate, value)
         fitted.append(known.get((term.identifier, str(term.setting)), term))
+    start, problem = state.fit.model, state.problem
+    if state.walk:
+        start = replace(start, gyro_walk_rad_s_sqrt_s=ORDINARY_WALK_RAD_S_SQRT_S)
     fit = fit_null(
-        state.problem.track,
-        state.problem.spec,
-        state.fit.model,
-        tuple(fitted),
-        walk=state.walk,
+        problem.track, problem.spec, start, tuple(fitted), noise=not state.walk, walk=state.walk
     )
     return replace(state, fit=fit, named=named)
 

@@ -73,12 +73,22 @@ def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str
     out = {
         "time_s": track.time_s[rows][half::m],
         "dt_s": np.concatenate([[np.nan], dt]),
-        "mag": mean(carried),
+        "mag": _mean_of_known(carried.reshape(groups, m, 3)),
         "gyro": gyro,
     }
     if track.accel_b_m_s2 is not None:
         out["accel"] = mean(track.accel_b_m_s2)
     return out | {name: mean(values) for name, values in track.covariates.items()}
+
+
+def _mean_of_known(values: Array) -> Array:
+    """(n, 3) mean over the rows (n, m, 3) that are readings; nan where none is."""
+    known = np.asarray(np.isfinite(values).all(axis=2))
+    count = known.sum(axis=1)
+    total = np.where(known[:, :, None], values, 0.0).sum(axis=1)
+    return np.asarray(
+        np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], np.nan), float
+    )
 
 
 def _carried(track: Track, rows: slice, m: int, model: NullModel) -> Array:
