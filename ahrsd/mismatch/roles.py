@@ -19,6 +19,10 @@ _SHORT_GAP_S = 2.0  # a column of 1 Hz beside samples of 25 Hz is filled, a fail
 _MOST_MISSING = 0.98
 _LONG_ON_ROWS = 4  # a 0/1 column that stays on longer is a switch, else a train of pulses
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
+# what the sensor itself makes of the same readings: it moves with every error and causes none
+_OWN_OUTPUT = re.compile(
+    r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|yaw|pitch|roll|mag_|gyro_|accel_|uncomp|delta_|lin_?acc)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,17 +143,22 @@ def fault(name: str, values: Array) -> str:
 def prepared(track: Track) -> tuple[Track, tuple[str, ...]]:
     """The track with usable covariates only, short holes filled, and a sentence per refusal.
 
-    Columns without a role are kept where they are complete: they serve to look for courses.
+    Columns without a role are kept where they are complete: they serve to look for courses; not
+    so the sensor's own outputs, which are made of the readings that are being explained.
     """
     kept: dict[str, Array] = {}
     notes: list[str] = []
     for name, values in track.covariates.items():
+        if _OWN_OUTPUT.match(name.lower()):
+            continue
         filled, note = _filled(name, values, track.time_s)
         note = note or fault(name, filled)
         if note:
             notes.append(note)
         elif np.isfinite(filled).all():
             kept[name] = filled
+        else:
+            notes.append(f"column {name} was left out: its values are no numbers to compute with")
     return replace(track, covariates=kept), tuple(notes)
 
 

@@ -123,12 +123,19 @@ def test_columns_without_a_role_are_kept():
     assert notes == ()
 
 
+def test_what_the_sensor_makes_of_its_own_readings_is_no_cause():
+    own = {"vn_yaw_deg": RAMP, "dcm_01": RAMP, "mag_n_d_gauss": RAMP, "pitch_rad": RAMP}
+    found, notes = roles.prepared(track(**own, linkage_m=RAMP))
+    assert list(found.covariates) == ["linkage_m"]
+    assert notes == ()
+
+
 @given(
     st.text(max_size=12),
     st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),
 )
 def test_no_column_is_kept_that_is_not_finite(name, values):
-    found, notes = roles.prepared(track(5, **{name: np.array(values)}))
+    found, notes = roles.prepared(track(5, **{f"x{name}": np.array(values)}))
     assert all(np.isfinite(column).all() for column in found.covariates.values())
     if not np.isfinite(values).all() and np.isfinite(values).any():
         assert len(found.covariates) + len(notes) == 1
