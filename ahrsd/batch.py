@@ -11,11 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from ahrsd.calibration import Estimate
 from ahrsd.calibrator import Calibrator
 from ahrsd.config import Config
 from ahrsd.core import Core
 from ahrsd.errors import AhrsdError
+from ahrsd.estimator.misalignment import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
 from ahrsd.replay import Replayed, replay
 from ahrsd.result import calibration_json, why_not_converged
@@ -31,6 +34,7 @@ class BatchResult:
     estimate: Estimate | None
     events: tuple[Event, ...]
     warnings: tuple[str, ...]
+    misalignment: Misalignment | None = None
 
     @property
     def samples(self) -> int:
@@ -44,7 +48,12 @@ class BatchResult:
 
     def said(self) -> list[str]:
         """Warnings of recording and stream."""
-        return said_of(self.core, self.warnings)
+        turned = self.misalignment
+        return [
+            *said_of(self.core, self.warnings),
+            *(self.estimate.warnings if self.estimate is not None else ()),
+            *([] if turned is None or not turned.significant else [_spoken(turned)]),
+        ]
 
     def reasons(self) -> list[str]:
         """Why it has not converged; empty where it has."""
@@ -94,10 +103,22 @@ def calibrate(
     done = replay(
         path, config, rate_hz=rate_hz, listeners=[seen.append], progress=progress, held_out=False
     )
-    estimate = _of_everything(done, seen).finish()
+    calibrator = _of_everything(done, seen)
+    estimate = calibrator.finish()
     if estimate is not None:
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
-    return BatchResult(path.name, done.core, estimate, tuple(seen), tuple(done.warnings))
+    turned = calibrator.estimator.misalignment()
+    return BatchResult(path.name, done.core, estimate, tuple(seen), tuple(done.warnings), turned)
+
+
+def _spoken(turned: Misalignment) -> str:
+    x, y, z = np.degrees(turned.rotation_rad)
+    rows = ", ".join(f"{v:.4f}" for v in turned.correction.matrix.ravel())
+    return (
+        f"the magnetometer is turned against the gyro by ({x:.2f}, {y:.2f}, {z:.2f}) deg "
+        f"({np.sqrt(turned.chi2):.0f} sigma): the correction that includes it is C = [{rows}], "
+        f"b = {np.round(turned.correction.offset, 4).tolist()} gauss"
+    )
 
 
 def _of_everything(done: Replayed, seen: list[Event]) -> Calibrator:

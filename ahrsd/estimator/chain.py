@@ -167,12 +167,9 @@ def linearise(
 ) -> Quadratic:
     """Quadratic of one epoch at directions u (n, 3), x = [M6, b], bias (3,) in rad/s."""
     T = so3.tangent_basis(u)
-    w = np.ones(len(u)) if weights is None else weights.copy()
-    if not data.measures_first:
-        w[0] = 0.0
-    field = _field(data, u, T, x, np.sqrt(w * data.count) / noise.mag_gauss)
-    motion = _motion(data, u, T, bias, noise)
-    H, g, response = _eliminate(*_interior(field, motion), *_shared_part(field, motion))
+    w = _weights(data, weights)
+    field, motion = parts(data, u, x, bias, noise, weights)
+    H, g, response = _eliminate(*interior(field, motion), *_shared_part(field, motion))
     d = np.zeros((len(u), 2))
     d[1:-1] = response[:, :, WIDTH]
     r_best = field.r + _times(field.J_own, d)
@@ -191,8 +188,24 @@ def linearise(
     )
 
 
+def _weights(data: Data, weights: Array | None) -> Array:
+    w = np.ones(len(data)) if weights is None else weights.copy()
+    if not data.measures_first:
+        w[0] = 0.0
+    return w
+
+
+def parts(
+    data: Data, u: Array, x: Array, bias: Array, noise: Noise, weights: Array | None
+) -> tuple[FieldPart, MotionPart]:
+    """Whitened residuals of field and motion with their derivatives, at directions u."""
+    T = so3.tangent_basis(u)
+    root = np.sqrt(_weights(data, weights) * data.count) / noise.mag_gauss
+    return _field(data, u, T, x, root), _motion(data, u, T, bias, noise)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class _Field:
+class FieldPart:
     """Whitened field residuals r (n, 3), d r/d d_k (n, 3, 2) and d r/d x (n, 3, 9)."""
 
     r: Array
@@ -201,7 +214,7 @@ class _Field:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
+class MotionPart:
     """Whitened motion residuals q (n-1, 2), d q/d d_(k-1), d q/d w_b, and -d q/d d_k = scale I."""
 
     q: Array
@@ -210,17 +223,17 @@ class _Motion:
     scale: Array
 
 
-def _field(data: Data, u: Array, T: Array, x: Array, root: Array) -> _Field:
+def _field(data: Data, u: Array, T: Array, x: Array, root: Array) -> FieldPart:
     M = symmetric(x[:6])
     J_x = np.zeros((len(u), 3, SHARED))
     J_x[:, :, :6] = symmetric_columns(data.seen(u))
     J_x[:, [0, 1, 2], [6, 7, 8]] = 1.0
     J_x *= -root[:, None, None]
     r = data.field_error(u, x) * root[:, None]
-    return _Field(r, -(M @ data.seen(T)) * root[:, None, None], J_x)
+    return FieldPart(r, -(M @ data.seen(T)) * root[:, None, None], J_x)
 
 
-def _motion(data: Data, u: Array, T: Array, bias: Array, noise: Noise) -> _Motion:
+def _motion(data: Data, u: Array, T: Array, bias: Array, noise: Noise) -> MotionPart:
     dt = data.dt_s[1:]
     R, Jl = so3.exp_and_left_jacobian(-(data.angle_b_rad[1:] - bias * dt[:, None]))
     turned = _times(R, u[:-1])
@@ -230,10 +243,10 @@ def _motion(data: Data, u: Array, T: Array, bias: Array, noise: Noise) -> _Motio
         scale *= data.linked[1:]
     Tt = np.swapaxes(T[1:], 1, 2) * scale[:, None, None]
     J_bias = -Tt @ so3.skew(turned) @ Jl * dt[:, None, None]
-    return _Motion(_times(Tt, turned), Tt @ R @ T[:-1], J_bias, scale)
+    return MotionPart(_times(Tt, turned), Tt @ R @ T[:-1], J_bias, scale)
 
 
-def _interior(field: _Field, motion: _Motion) -> tuple[Array, Array, Array]:
+def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
     """Diagonal blocks, blocks above them, and the border columns x (9), bias (3), gradient."""
     n, scale = len(field.r), motion.scale[:, None]
     own, prev = np.swapaxes(field.J_own, 1, 2), np.swapaxes(motion.J_prev, 1, 2)
@@ -255,7 +268,7 @@ def _times(J: Array, v: Array) -> Array:
     return np.asarray((J @ v[:, :, None])[:, :, 0])
 
 
-def _shared_part(field: _Field, motion: _Motion) -> tuple[Array, Array]:
+def _shared_part(field: FieldPart, motion: MotionPart) -> tuple[Array, Array]:
     H, g = np.zeros((WIDTH, WIDTH)), np.zeros(WIDTH)
     Jx = field.J_x.reshape(-1, SHARED)
     Jb = motion.J_bias.reshape(-1, 3)
@@ -277,14 +290,14 @@ def _eliminate(
         H[where, :12] += border[k, :, :12]
         H[:12, where] += border[k, :, :12].T
         g[where] += border[k, :, 12]
-    band = _band(diag[1:-1], upper[1:-1])
+    banded = band(diag[1:-1], upper[1:-1])
     right = np.zeros((n - 2, 2, WIDTH + 1))
     right[:, :, :12] = border[1:-1, :, :12]
     right[0, :, FIRST] = upper[0].T
     right[-1, :, LAST] = upper[-1]
     right[:, :, WIDTH] = border[1:-1, :, 12]
     flat = right.reshape(-1, WIDTH + 1)
-    _, solved, info = dpbsv(band, np.asfortranarray(flat), lower=1, overwrite_b=1)
+    _, solved, info = dpbsv(banded, np.asfortranarray(flat), lower=1, overwrite_b=1)
     if info != 0:
         raise np.linalg.LinAlgError(f"directions of an epoch are not determined (dpbsv {info})")
     S = flat.T @ solved
@@ -293,16 +306,16 @@ def _eliminate(
     return H, g, -solved.reshape(n - 2, 2, WIDTH + 1)
 
 
-def _band(diag: Array, upper: Array) -> Array:
+def band(diag: Array, upper: Array) -> Array:
     """Lower banded storage (4, 2n) of a symmetric block tridiagonal matrix with 2x2 blocks."""
     n = len(diag)
-    band = np.zeros((4, 2 * n))
-    band[0, 0::2], band[0, 1::2] = diag[:, 0, 0], diag[:, 1, 1]
-    band[1, 0::2] = diag[:, 1, 0]
-    band[1, 1:-1:2] = upper[:, 1, 0]
-    band[2, 0:-2:2], band[2, 1:-2:2] = upper[:, 0, 0], upper[:, 1, 1]
-    band[3, 0:-2:2] = upper[:, 0, 1]
-    return band
+    out = np.zeros((4, 2 * n))
+    out[0, 0::2], out[0, 1::2] = diag[:, 0, 0], diag[:, 1, 1]
+    out[1, 0::2] = diag[:, 1, 0]
+    out[1, 1:-1:2] = upper[:, 1, 0]
+    out[2, 0:-2:2], out[2, 1:-2:2] = upper[:, 0, 0], upper[:, 1, 1]
+    out[3, 0:-2:2] = upper[:, 0, 1]
+    return out
 
 
 def move(u: Array, quadratic: Quadratic, z: Array) -> Array:

@@ -17,6 +17,7 @@ from ahrsd.estimator import chain, intake, noise, summary
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
 from ahrsd.estimator.intake import Intake
+from ahrsd.estimator.misalignment import Misalignment, misalignment
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.estimator.retraction import curvature
 from ahrsd.estimator.search import search
@@ -179,6 +180,16 @@ class Estimator:
         if self._window is not None and self._intake.pending >= MIN_EPOCH_STEPS:
             return self._twin().finish()
         return self._answer()
+
+    def misalignment(self) -> Misalignment | None:
+        """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
+        window = self._window
+        if window is None or not self._agreed:
+            return None
+        try:
+            return misalignment(window.epochs, window.graph, self.parameters.prior_gyro_bias_rad_s)
+        except np.linalg.LinAlgError:
+            return None
 
     def _twin(self) -> Estimator:
         other = copy(self)

@@ -178,7 +178,7 @@ class Window:
         return Epoch(data, u, used, weights, a, a + 1, q, factor, turned)
 
     def contradicted(self) -> bool:
-        """Whether the newest epoch contradicts the calibration; to be asked before it is tracked."""
+        """Whether the newest epoch contradicts the calibration; ask before it is tracked."""
         limit = self.parameters.outlier_sigma
         return contradicts(self.epochs[-1], self.graph.c, self._covariance, self.usual, limit)
 
