@@ -17,8 +17,8 @@ from ahrsd.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.mismatch.aligned import align, differing
-from ahrsd.mismatch.answer import answer
 from ahrsd.mismatch.diagnosis import Diagnosis
+from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.recording.opening import Kind, open_recording
 from ahrsd.recording.table import read_table
@@ -140,6 +140,6 @@ def diagnose_recording(
 
 def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
     try:
-        return answer(track, spec, recording=path.name)
+        return diagnose(track, spec, recording=path.name)
     except ValueError as error:
         raise RecordingError(path, str(error), "record again, with the vehicle turning") from None

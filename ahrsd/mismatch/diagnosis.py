@@ -171,7 +171,6 @@ class Diagnosis:
     model: NullModel | None = None
     terms: tuple[Term, ...] = ()
     drawn: Drawn | None = None
-    fits: tuple[Any, Any] | None = None  # NullFit without and with the terms, for further checks
 
     def to_json(self) -> dict[str, Any]:
         """The contract's object, plus notes, sensitivity and the repaired model."""

@@ -25,7 +25,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.facts import Fact
+from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
     added_value,
     contribution,
@@ -37,7 +37,7 @@ from ahrsd.mismatch.hygiene import hygiene, put_right
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.noise import level_facts
-from ahrsd.mismatch.null import NullFit, fit_null
+from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.score import score
@@ -72,17 +72,18 @@ def diagnose(
     track: Track,
     spec: Spec | None = None,
     *,
-    simulation: Track | None = None,
     library: Mapping[str, Effect] = EFFECTS,
     limits: Limits = LIMITS,
     recording: str = "",
 ) -> Diagnosis:
     """Where the recording and the model differ, and which physics was left out.
 
-    Deterministic.  simulation: the user's own, whose calibration is then the one to start from.
+    Deterministic.  ValueError, one line, where nothing can be fitted.
     """
     spec = spec or Spec()
     track, notes = roles.prepared(track)
+    if why := unusable(track):
+        raise ValueError(why)
     facts = hygiene(track)
     if any(fact.stops for fact in facts):
         return _stopped(recording, [fact for fact in facts if fact.stops], notes)
@@ -97,7 +98,7 @@ def diagnose(
     named = [finding(state, basis, k, seen, last) for k, seen in enumerate(surveys)]
     noise = level_facts(state.fit.filtered, spec_given=spec.sigma_mag_gauss is not None)
     found = (
-        *(of_fact(fact, library) for fact in facts),
+        *(of_fact(fact, library) for fact in facts if matters(fact)),
         *sorted(named, key=lambda one: -one.heldout.nll_gain_per_sample),
         *(of_fact(fact, library) for fact in noise),
     )
@@ -114,8 +115,8 @@ def diagnose(
         ),
         posterior_predictive=_checked(start, state, terms, library),
         sensitivity=() if found or something else sensitivity(problem, basis, first),
-        notes=notes,
-        model=state.fit.model,
+        notes=(*notes, *(fact.words for fact in facts if not matters(fact))),
+        model=model_at_rate(state.fit.model, problem.thin),
         terms=terms,
         drawn=_drawn(start, state, basis, first, left),
     )

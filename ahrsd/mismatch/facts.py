@@ -33,6 +33,21 @@ class Fact:
     stops: bool = False
 
 
+#: samples that are missing by honest stamps, and stamps that scatter, are part of the recording and
+#: not a difference from its simulation, which has the same stamps, unless there are so many
+MISSING_SHARE = 0.02
+JITTER_SHARE = 0.05  # of the step
+
+
+def matters(fact: Fact) -> bool:
+    """Whether the fact is a finding; else it is worth a note."""
+    if fact.effect == "dropped_samples" and not fact.setting:
+        return fact.parameters[0].value > MISSING_SHARE
+    if fact.effect == "timestamp_jitter" and not fact.stops:
+        return fact.parameters[0].value > JITTER_SHARE * float(fact.setting["step_s"])
+    return True
+
+
 def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:
     """First row and row behind the last of each stretch of true rows; gaps up to `gap` closed."""
     at = np.flatnonzero(rows)
