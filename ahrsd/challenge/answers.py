@@ -45,7 +45,7 @@ class Answer:
 
     failure: str | None
     said: str
-    seconds: float | None
+    seconds: float | None  # CPU
     mismatch: bool = False
     findings: tuple[Finding, ...] = ()
     unexplained: bool = False
@@ -66,7 +66,7 @@ class Answer:
 
 def read_answer(record: Json) -> Answer:
     """An answer out of what `running` wrote."""
-    seconds, said = _number(record.get("seconds")), str(record.get("said", ""))
+    seconds, said = _number(record.get("cpu_seconds")), str(record.get("said", ""))
     value = record.get("answer")
     if not isinstance(value, dict):
         return Answer(str(record.get("failure") or "no answer"), said, seconds)

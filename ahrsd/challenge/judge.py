@@ -144,8 +144,11 @@ def _pair(case: str, truth: Json, answer: Answer) -> Verdict:
     hit = [any(name in effect["right"] for name in answer.names) for effect in effects]
     others = [n for n in answer.names if n not in right and n not in truth["allowed"]]
     detected = answer.mismatch or bool(answer.findings) or answer.unexplained
+    in_set = all(any(name in e["right"] for name in answer.everything) for e in effects)
     if all(hit):
         word = ADDED if others else RIGHT
+    elif in_set:
+        word = IN_SET
     elif others:
         word = WRONG
     else:
@@ -159,7 +162,7 @@ def _pair(case: str, truth: Json, answer: Answer) -> Verdict:
         multiple=_least(effects),
         detected=detected,
         first_right=(answer.names[0] in right if answer.findings else None),
-        in_set=all(any(n in e["right"] for n in answer.everything) for e in effects),
+        in_set=in_set,
         called_unknown=answer.unexplained,
     )
 
@@ -189,8 +192,8 @@ def _unknowable(case: str, truth: Json, answer: Answer) -> Verdict:
         multiple=_least([effect]),
         detected=detected,
         called_unknown=said,
-        frame_right=frame == effect["frame"] if said else None,
-        overlap=overlap(_true_spans(truth, effect), spans) if said else None,
+        frame_right=frame in effect["frames"] if said else None,
+        overlap=_overlap(truth, effect, spans) if said else None,
     )
 
 
@@ -241,8 +244,8 @@ def _measured(truth: Json, effect: Json, found: Finding | None) -> dict[str, Any
     pulls, relative = compare(effect["parameters"], found)
     oracle = truth["oracle_gain_nats_per_sample"]
     return {
-        "frame_right": found.frame == effect["frame"],
-        "overlap": overlap(_true_spans(truth, effect), found.spans_s),
+        "frame_right": found.frame in effect["frames"],
+        "overlap": _overlap(truth, effect, found.spans_s),
         "onset_error_s": _onset_error(effect, found),
         "pulls": pulls,
         "relative": relative,
@@ -256,6 +259,17 @@ def _true_spans(truth: Json, effect: Json) -> list[Span]:
         for begin, end in effect["intervals_s"]
         if end - begin < SHORT_PART * truth["duration_s"]
     ]
+
+
+def _overlap(truth: Json, effect: Json, said: Sequence[Span]) -> float | None:
+    """Of the true intervals, or of what they leave out where the hard iron makes both the same."""
+    true = _true_spans(truth, effect)
+    value = overlap(true, said)
+    if value is None or not effect["either_half"]:
+        return value
+    edges = [0.0, *(edge for span in true for edge in span), float(truth["duration_s"])]
+    between = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+    return max(value, overlap(between, said) or 0.0)
 
 
 def overlap(true: Sequence[Span], said: Sequence[Span]) -> float | None:

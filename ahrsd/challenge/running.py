@@ -8,9 +8,11 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 
 from ahrsd.challenge.sealing import Json, Round, close_answers, refuse_opened, write_object
@@ -80,30 +82,53 @@ def _answer(trial: Round, case: str, command: list[str]) -> Json:
         out = Path(scratch) / "answer.json"
         files = {"case": trial.case(case), "spec": trial.spec(case), "json": out}
         filled = [part.format(**files) if "{" in part else part for part in command]
-        begun = time.monotonic()
-        try:
-            ended = subprocess.run(
-                filled,
-                capture_output=True,
-                text=True,
-                timeout=_TIMEOUT_S,
-                check=False,
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            return {"case": case, "failure": str(error), "seconds": None, "answer": None}
-        seconds = time.monotonic() - begun
-        said = ended.stderr.strip().splitlines()
+        ended = _timed(filled, Path(scratch) / "stderr")
         record: Json = {
             "case": case,
-            "exit": ended.returncode,
-            "said": said[-1] if said else "",
-            "seconds": round(seconds, 3),
+            "exit": ended.code,
+            "said": ended.said,
+            "seconds": round(ended.seconds, 3),
+            "cpu_seconds": round(ended.cpu_seconds, 3),
             "failure": None,
             "answer": None,
         }
         try:
             record["answer"] = json.loads(out.read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            record["failure"] = record["said"] or f"no answer, exit {ended.returncode}"
+            record["failure"] = ended.said or f"no answer, exit {ended.code}"
         return record
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    code: int
+    said: str  # the last line on stderr
+    seconds: float
+    cpu_seconds: float
+
+
+def _timed(command: list[str], errors: Path) -> _Ended:
+    """Run to the end or to the time limit; wall and CPU seconds of this process alone."""
+    begun = time.monotonic()
+    try:
+        with errors.open("wb") as stderr:
+            process = subprocess.Popen(
+                command,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+            )
+    except OSError as error:
+        return _Ended(127, str(error), 0.0, 0.0)
+    limit = threading.Timer(_TIMEOUT_S, process.kill)
+    limit.start()
+    _, status, used = os.wait4(process.pid, 0)
+    limit.cancel()
+    process.returncode = os.waitstatus_to_exitcode(status)
+    lines = errors.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return _Ended(
+        process.returncode,
+        lines[-1] if lines else "",
+        time.monotonic() - begun,
+        used.ru_utime + used.ru_stime,
+    )

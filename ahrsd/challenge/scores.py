@@ -210,7 +210,7 @@ def _of_all(verdicts: Sequence[Verdict]) -> list[Score]:
     ]
     error = calibration_error(stated)
     seconds = [v.answer.seconds for v in verdicts if v.answer.seconds is not None]
-    rows = [middle("seconds a case, median", seconds, most=5.0)]
+    rows = [middle("CPU seconds a case, median", seconds, most=5.0)]
     if error is not None:
         met = error <= 0.02
         rows.append(

@@ -97,7 +97,7 @@ def _json(result: Result) -> dict[str, Any]:
                 "onset_error_s": v.onset_error_s,
                 "pulls": list(v.pulls),
                 "gain_share": v.gain,
-                "seconds": v.answer.seconds,
+                "cpu_seconds": v.answer.seconds,
                 "failure": v.answer.failure,
             }
             for v in result.verdicts

@@ -8,7 +8,7 @@ import numpy as np
 
 from blindworld import ideal, noise
 from blindworld.chain import Rows, Stages, body_field, readings
-from blindworld.limits import EFFECTS, GROUPS, PARENTS
+from blindworld.limits import EFFECTS, FRAMES, GROUPS, PARENTS
 from blindworld.world import BEFORE_S, make_world
 
 SEEN = 7.0  # signal to noise at which an ideal observer is sure among some sixty candidates
@@ -102,7 +102,7 @@ def _attempt(order, entropy):
                 order.effects, strengths, planted, shown
             )
         ],
-        "oracle_gain_nats_per_sample": shown[-1]["gain"] if shown else 0.0,
+        "oracle_gain_nats_per_sample": shown[0]["gain"] if order.kind == "single" else None,
     }
     return Case(rows, _spec(world, setting, rng), truth)
 
@@ -157,14 +157,14 @@ def _strengths(order, world, setting, seeds):
             shown.append({"limit": effect.limit, "snr": None, "gain": None})
             continue
         reference = _alone(key, world, effect.limit, seed, setting.rate_hz)
-        seen = ideal.signal_to_noise(
-            gram, [column(reference[0] - mag, reference[1] - gyro)], others
-        )[0]
+        effect_column = column(reference[0] - mag, reference[1] - gyro)
+        seen = ideal.signal_to_noise(gram, [effect_column], others)[0]
         limit = _limit(effect, seen, order)
         strength = min(limit * multiple, effect.most)
         snr = seen * strength / effect.limit
         strengths.append(strength)
-        shown.append({"limit": limit, "snr": float(snr), "gain": float(snr**2 / 2 / len(at))})
+        gain = ideal.held_out_gain(gram, effect_column * strength / effect.limit, others, len(at))
+        shown.append({"limit": limit, "snr": float(snr), "gain": gain})
     return strengths, shown
 
 
@@ -195,6 +195,8 @@ def _entry(key, multiple, strength, planted, seen, order):
         "effect": effect.identifier,
         "source": key,
         "frame": planted.frame,
+        "frames": [planted.frame, *FRAMES.get(key, ())],
+        "either_half": key == "unlogged_switch",
         "strength": strength,
         "unit": effect.unit,
         "limit": seen["limit"],

@@ -7,10 +7,14 @@ nuisances, comes from one banded solve. Signal to noise is the root of the nonce
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.linalg import solveh_banded
 
 from blindworld.rotations import skew, to_world
+
+_START = 1e2  # 1/rad^2: an attitude that is known to 0.1 rad; about the field it stays so
 
 
 def observer(R_nb, h_b, soft_iron, step_s, sigma_mag, sigma_gyro):
@@ -21,10 +25,11 @@ def observer(R_nb, h_b, soft_iron, step_s, sigma_mag, sigma_gyro):
         turned = np.cumsum(to_world(R_nb, gyro) * step_s, axis=0)
         return mag - np.einsum("kij,kj->ki", H, turned)
 
-    def gram(columns):
-        Z = np.stack(columns, axis=-1)
+    def gram(columns, rows=slice(None), known_start=True):
+        Z = np.stack(columns, axis=-1)[rows]
+        lever = H[rows]
         K, _, p = Z.shape
-        inner = np.einsum("kji,kjl->kil", H, H) / sigma_mag**2
+        inner = np.einsum("kji,kjl->kil", lever, lever) / sigma_mag**2
         walk = 1.0 / (sigma_gyro * step_s) ** 2
         banded = np.zeros((4, 3 * K))
         for row in range(3):
@@ -32,8 +37,10 @@ def observer(R_nb, h_b, soft_iron, step_s, sigma_mag, sigma_gyro):
                 banded[lower, row::3] += inner[:, row + lower, row]
         banded[0] += 2 * walk
         banded[0, -3:] -= walk
+        if not known_start:
+            banded[0, :3] -= walk - _START
         banded[3, : 3 * (K - 1)] = -walk
-        projected = np.einsum("kji,kjp->kip", H, Z).reshape(3 * K, p) / sigma_mag**2
+        projected = np.einsum("kji,kjp->kip", lever, Z).reshape(3 * K, p) / sigma_mag**2
         absorbed = projected.T @ solveh_banded(banded, projected, lower=True)
         flat = Z.reshape(3 * K, p)
         return flat.T @ flat / sigma_mag**2 - absorbed
@@ -67,3 +74,21 @@ def signal_to_noise(gram, wanted, others):
     cross = G[:n, n:] / scale[:, None]
     left = np.diag(G)[n:] - np.sum(cross * (np.linalg.pinv(inner, rcond=1e-9) @ cross), axis=0)
     return np.sqrt(np.maximum(left, 0.0))
+
+
+def held_out_gain(gram, wanted, others, samples, folds=5):
+    """Nats per sample that knowing the effect gains on each fifth, the calibration fitted on the
+    other four without it.
+    """
+    edges = np.linspace(0, samples, folds + 1).astype(int)
+    columns = [*others, wanted]
+    parts = [gram(columns, slice(a, b), known_start=False) for a, b in pairwise(edges)]
+    whole, n, gain = sum(parts), len(others), 0.0
+    for part in parts:
+        train = whole - part
+        scale = np.sqrt(np.maximum(np.diag(train)[:n], 1e-300))
+        inverse = np.linalg.pinv(train[:n, :n] / np.outer(scale, scale), rcond=1e-7)
+        absorbed = inverse @ (train[:n, n] / scale) / scale
+        left = np.append(-absorbed, 1.0)
+        gain += 0.5 * left @ part @ left
+    return float(gain / samples)

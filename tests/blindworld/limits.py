@@ -139,3 +139,17 @@ PARENTS = {
     "passing_object": ("field_anomaly",),
     "gyro_bump": ("gyro_bias_drift",),
 }
+
+#: frames in which the very same signal may be told, beside the effect's own
+FRAMES = {
+    "mag_gyro_misalignment": ("gyro",),
+    "mag_time_lag": ("gyro",),
+    "mag_low_pass": ("gyro",),
+    "gyro_time_lag": ("sensor",),
+    "gyro_integration": ("sensor",),
+    "bent_mount": ("gyro",),
+    "clock_rate": ("gyro",),
+    "frame_error": ("gyro", "sensor"),
+    "unit_error": ("gyro",),
+    "gyro_scale": ("link",),
+}

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from blindworld.chain import Planted, Rows, xyz
+from blindworld.limits import FRAMES
 from blindworld.motion import DEG
 from blindworld.on_link import signed_permutations
 from blindworld.rotations import direction, turned
@@ -187,6 +188,8 @@ def make_semireal(folder, base, key, entropy):
                 "effect": row.key,
                 "source": row.key,
                 "frame": planted.frame,
+                "frames": [planted.frame, *FRAMES.get(row.key, ())],
+                "either_half": False,
                 "strength": strength,
                 "unit": row.unit,
                 "limit": row.least,

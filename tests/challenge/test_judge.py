@@ -16,6 +16,8 @@ def effect(name="hard_iron_step", **changes):
         "effect": name,
         "source": name,
         "frame": "sensor",
+        "frames": ["sensor"],
+        "either_half": False,
         "strength": 1e-3,
         "unit": "gauss",
         "limit": 5e-4,
@@ -94,12 +96,13 @@ def test_every_verdict(case, answer, word, error):
         (["a"], j.PARTLY),
         (["a", "b", "c"], j.ADDED),
         (["a", "c"], j.WRONG),
+        (["a", "c|b"], j.IN_SET),
         ([], j.MISSED),
     ],
 )
 def test_pairs(names, word):
     pair = truth("pair", effect("a", multiple=3.0), effect("b", multiple=2.5))
-    verdict = judge(pair, said(*map(finding, names)))
+    verdict = judge(pair, said(*(finding(*name.split("|")) for name in names)))
     assert (verdict.word, verdict.multiple) == (word, 2.5)
 
 
@@ -170,6 +173,13 @@ def test_overlap_of_unions():
     assert overlap([(0, 2), (4, 6)], [(0, 6)]) == pytest.approx(4 / 6)
     assert overlap([(0, 2)], []) == 0.0
     assert overlap([], [(0, 1)]) is None
+
+
+def test_on_and_off_are_the_same_to_the_hard_iron():
+    lamp = effect(None, right=[], intervals_s=[[50.0, 150.0], [300.0, 400.0]], either_half=True)
+    off = said(unexplained=True, frame="sensor", spans=((0.0, 50.0), (150.0, 300.0)))
+    assert judge(truth("outside", lamp), off).overlap == pytest.approx(1.0)
+    assert judge(truth("outside", lamp | {"either_half": False}), off).overlap == 0.0
 
 
 def test_a_coefficient_of_another_unit_is_not_compared():
@@ -243,7 +253,7 @@ def test_calibration_error_of_an_honest_and_of_a_boasting_tool():
 def test_the_contracts_answer_is_read():
     answer = read_answer(
         {
-            "seconds": 2.5,
+            "cpu_seconds": 2.5,
             "said": "",
             "answer": {
                 "schema": "ahrsd.diagnosis/1",

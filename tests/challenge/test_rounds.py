@@ -45,6 +45,8 @@ def case(name, kind, *effects):
                 "multiple": 3.0,
                 "snr": 20.0,
                 "frame": "sensor",
+                "frames": ["sensor"],
+                "either_half": False,
                 "parameters": [],
                 "onset_s": None,
                 "intervals_s": [],
