@@ -10,13 +10,17 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.events import GateResult
+from ahrsd.events import GateResult, Noted
 from ahrsd.evidence.collector import EvidenceCollector
 from ahrsd.evidence.history import Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
+from ahrsd.mismatch.online import Step, StepDetector
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.worldfield import WorldField
+
+_PATIENCE_S = 60.0  # after a step was told, for the estimator to see it and begin anew by itself
+_ANEW = "calibrated anew"  # in the estimator's warning that it forgot what was before a change
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,23 @@ class Calibrator:
         self.gates: tuple[GateResult, ...] = ()
         self._gap = True
         self.started = False
+        self.steps = StepDetector()
+        self.step: Step | None = None  # the newest one that was told
+        self.step_open = False  # the estimate still rests on data from before it
+        self._notes: list[tuple[float, str]] = []
+        self._at_s = float("nan")
+        self._said: list[str] = []
+
+    @property
+    def proposed(self) -> Affine | None:
+        """The correction of the estimate, once it has converged."""
+        found = self.estimate
+        return found.correction if found is not None and found.converged else None
+
+    def take_notes(self, host_s: float) -> list[Noted]:
+        """Warnings since the last call: what changed on the vehicle."""
+        notes, self._notes = self._notes, []
+        return [Noted(at_s, host_s, "warning", text) for at_s, text in notes]
 
     def compare_with(self, present: Affine, present_gyro_bias_rad_s: Array) -> None:
         """What a candidate must be better than; before the first sample also the prior's centre."""
@@ -59,9 +80,11 @@ class Calibrator:
         return Calibrator(self.settings, self.present, self.present_gyro_bias_rad_s)
 
     def take(self, block: SampleBlock) -> bool:
-        """Samples in order; true where there is a new estimate."""
+        """Samples in order; true where there is something new to judge."""
         new = False
         self.started = True
+        self._at_s = float(block.time_s[-1]) if len(block) else self._at_s
+        stepped = self._watch(block)
         parts = self.collector.parts(block)
         for _, part in parts:
             self.collector.add(part)
@@ -69,7 +92,40 @@ class Calibrator:
             new |= self.estimator.add(_unknown_first_step(piece))
         if new:
             self.estimate = self._scaled(self.estimator.estimate())
-        return new and self.estimate is not None
+            self._heed(self.estimate)
+        return (new or stepped) and self.estimate is not None
+
+    def _watch(self, block: SampleBlock) -> bool:
+        """Whether hard iron or gyro bias are seen to have stepped since the estimate was made."""
+        step = self.steps.add(block, self.estimate)
+        if step is not None:
+            self.step, self.step_open = step, True
+            self._notes.append((step.told_s, step.words))
+        elif self.step_open and self._waited_enough:
+            self.estimator = Estimator(
+                self.settings.estimator, self.present, self.present_gyro_bias_rad_s
+            )
+            self.estimate, self._gap, self._said = None, True, []
+            self._begin_anew([f"calibrated anew from {self._at_s:.0f} s"])
+        return step is not None
+
+    @property
+    def _waited_enough(self) -> bool:
+        return self.step is None or not 0.0 <= self._at_s - self.step.told_s <= _PATIENCE_S
+
+    def _heed(self, estimate: Estimate | None) -> None:
+        """Whether the estimator says, for the first time, that it began anew by itself."""
+        said = [] if estimate is None else [text for text in estimate.warnings if _ANEW in text]
+        if said and said != self._said:
+            self._said = said
+            self._begin_anew(said)
+
+    def _begin_anew(self, notes: list[str]) -> None:
+        """The estimate forgot what was before a change: evidence from then proves nothing now."""
+        self._notes += [(self._at_s, text) for text in notes]
+        self.collector = EvidenceCollector()
+        self.steps.restart()
+        self.step_open = False
 
     def _training(self, parts: Iterable[tuple[Role, SampleBlock]]) -> Iterator[SampleBlock]:
         """What the estimator may see; nothing is bridged over what is held out."""
@@ -100,7 +156,7 @@ class Calibrator:
             self.present_gyro_bias_rad_s,
             self.settings.world_field,
             health,
-            basis,
+            replace(basis, stepped=self.step_open),
         )
         self.gates = judge(
             self.evidence, self.settings.limits.with_margin(margin), at_s, self.gates

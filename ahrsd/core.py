@@ -341,14 +341,14 @@ class Core:
             self.calibrator = self.calibrator.anew()
         calibrator = self.calibrator
         new = calibrator.take(block)
-        estimate = calibrator.estimate
-        proposed = estimate.correction if estimate is not None and estimate.converged else None
-        self._out.append(events.SamplesSeen(block, _affine(self.registers.get(_MAG)), proposed))
+        present, proposed = _affine(self.registers.get(_MAG)), calibrator.proposed
+        self._out.append(events.SamplesSeen(block, present, proposed))
+        self._out += calibrator.take_notes(self._host_s)
         self._errands.add(self.writeback.on_samples(block))
         if self._trial is not None:
             metrics = self._trial.take(block)
             self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-        if new and estimate is not None:
+        if new:
             self._judge()
         self._errands.let_out(self)
 

@@ -25,13 +25,17 @@ class HealthFacts:
 
 @dataclass(frozen=True, slots=True)
 class BasisFacts:
-    """What the samples rest on. `changed`: a compensation register changed within the window."""
+    """What the samples rest on. `changed`: a compensation register changed within the window.
+
+    stepped: hard iron or gyro bias stepped, and the estimate rests on data from before that
+    """
 
     registers_read: bool
     changed: bool
     hsi_applied: bool
     compensated_only: bool
     firmware_known: bool
+    stepped: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ahrsd.gates.row import Level, least, most
+from ahrsd.gates.row import Level, least, most, no
 
 _MOVE = "drive at least two full circles in calm surroundings"
 _TILT = "pitch and roll by 30 deg if the vehicle can"
@@ -246,6 +246,15 @@ CHANGE = (
 )
 
 STEADY = (
+    no(
+        "stationarity.step",
+        "G11",
+        "basis.stepped",
+        Level.CANDIDATE,
+        meaning="hard iron or gyro bias stepped, and the estimate rests on data from before that",
+        advice="the iron changed on the vehicle: find what was mounted, moved or removed, fix it "
+        "for good, then drive two full circles",
+    ),
     most(
         "stationarity.field",
         "G11",

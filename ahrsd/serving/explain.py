@@ -50,6 +50,7 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "mode": status["mode"],
         "mode_now": status["mode_now"],
         "stream": _stream(status),
+        "mismatch": _mismatch(status),
         "gates": shut,
         "others": [text for text in back["holds"] if text not in said],
         "next": _next(status, state, shut),
@@ -66,6 +67,12 @@ def _stream(status: Mapping[str, Any]) -> str:
     if not status["stream"]["samples"]:
         return "no samples yet"
     return ""
+
+
+def _mismatch(status: Mapping[str, Any]) -> str:
+    """What stepped on the vehicle, while the estimate still rests on data from before it."""
+    found = status["mismatch"]
+    return str(found["step"]["text"]) if found["open"] else ""
 
 
 def _next(status: Mapping[str, Any], state: str, shut: Sequence[Mapping[str, Any]]) -> str:
@@ -96,6 +103,8 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
     lines = [f"{explained['state']}: {explained['meaning']}", f"mode {mode}"]
     if explained["stream"]:
         lines.append(f"stream: {explained['stream']}")
+    if explained["mismatch"]:
+        lines.append(f"mismatch: {explained['mismatch']}")
     gates: Sequence[Mapping[str, Any]] = explained["gates"]
     if gates:
         holds = "1 gate holds" if len(gates) == 1 else f"{len(gates)} gates hold"

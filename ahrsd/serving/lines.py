@@ -13,7 +13,7 @@ Status = Mapping[str, Any]
 def status_lines(status: Status) -> list[str]:
     """How the daemon stands, for a person: device, stream, motion, estimate, write-back."""
     lines = [device_line(status), stream_line(status), errors_line(status), motion_line(status)]
-    lines += [*estimate_lines_of(status), write_back_line(status)]
+    lines += [*estimate_lines_of(status), mismatch_line(status), write_back_line(status)]
     lines += [f"warning: {text}" for text in status["warnings"]]
     return [line for line in lines if not line.endswith(": ")]
 
@@ -79,6 +79,15 @@ def estimate_lines_of(status: Status) -> list[str]:
         f"  hard iron {iron} mG",
         f"  gyro bias {bias} mrad/s",
     ]
+
+
+def mismatch_line(status: Status) -> str:
+    """What stepped last; ends in ": " where nothing did."""
+    step = status["mismatch"]["step"]
+    if step is None:
+        return "mismatch: "
+    ended = "" if status["mismatch"]["open"] else " (calibrated anew since)"
+    return f"mismatch: {step['text']}{ended}"
 
 
 def write_back_line(status: Status) -> str:

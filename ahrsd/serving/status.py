@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ahrsd.calibration import Estimate
+from ahrsd.calibrator import Calibrator
 from ahrsd.core import Core
 from ahrsd.events import GateResult
 from ahrsd.evidence.values import Evidence
@@ -66,6 +67,7 @@ class StatusMaker:
             "stream": self._stream(core),
             "motion": _motion(core.calibrator.evidence),
             "estimate": _estimate(core.calibrator.estimate),
+            "mismatch": _mismatch(core.calibrator),
             "gates": [_gate(gate, core.at_s) for gate in core.calibrator.gates],
             "write_back": _write_back(core),
             "interlock": link.interlock,
@@ -132,6 +134,28 @@ def _estimate(estimate: Estimate | None) -> dict[str, object] | None:
         "heading_sigma_deg": estimate.heading_sigma_deg,
         "misfit": estimate.misfit,
         "unobservable": list(estimate.observability.unobservable),
+    }
+
+
+def _mismatch(calibrator: Calibrator) -> dict[str, object]:
+    """What the model beside the estimator says: whether it watches, and what stepped last."""
+    step = calibrator.step
+    return {
+        "watching": calibrator.steps.armed,
+        "blocks": calibrator.steps.scored,
+        "open": calibrator.step_open,
+        "step": None
+        if step is None
+        else {
+            "what": step.what,
+            "frame": step.frame,
+            "at_s": step.at_s,
+            "told_s": step.told_s,
+            "size": step.size,
+            "sigma": step.sigma,
+            "unit": step.unit,
+            "text": step.words,
+        },
     }
 
 

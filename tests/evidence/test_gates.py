@@ -185,6 +185,7 @@ def test_a_stream_without_gravity_never_passes(world) -> None:
         ("hsi_applied", True, "input_basis.hsi_applied", "set register 44 to 0,1,5"),
         ("compensated_only", True, "input_basis.compensated_only", "use VNIMU"),
         ("firmware_known", False, "input_basis.firmware_known", "firmware is unknown"),
+        ("stepped", True, "stationarity.step", "the iron changed on the vehicle"),
     ],
 )
 def test_an_unsound_basis_never_passes(good, field, value, gate, words) -> None:

@@ -13,6 +13,7 @@ def status(**changes):
         "mode_now": "commit",
         "link": {"open": True, "port": "/dev/vn100"},
         "stream": {"samples": 5000, "refused": []},
+        "mismatch": {"open": False, "step": None},
         "gates": [],
         "write_back": {"state": "CANDIDATE", "holds": [], "proposal": None},
     }
