@@ -26,6 +26,8 @@ from ahrsd.samples import Array
 _TURN = slice(12, 15)
 _SIZE = 15
 _EVIDENCE = 30.0  # chi squared with 3 degrees of freedom: once in a million where there is none
+_MISFIT = 5.0
+_WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
 _WORTH_RAD = 0.002  # less is not worth a correction of its own
 
 
@@ -33,28 +35,32 @@ _WORTH_RAD = 0.002  # less is not worth a correction of its own
 class Misalignment:
     """Rotation vector theta (3,) in rad from the gyro's to the magnetometer's axes.
 
-    covariance (3, 3), chi2: theta in sigmas, squared; correction: C (3, 3) and b that include it,
-    det C = 1, and give the field in the gyro's axes.
+    covariance (3, 3), chi2: theta in sigmas, squared; misfit: how much the epochs still disagree,
+    because a lag or a wandering field can look like a rotation; correction: C (3, 3) and b that
+    include it, det C = 1, and give the field in the gyro's axes.
     """
 
     rotation_rad: Array
     covariance: Array
     chi2: float
+    misfit: float
     correction: Affine
 
     @property
     def significant(self) -> bool:
         """Whether the full correction should be preferred to the symmetric one."""
-        return self.chi2 > _EVIDENCE and float(np.linalg.norm(self.rotation_rad)) > _WORTH_RAD
+        worth = float(np.linalg.norm(self.rotation_rad)) > _WORTH_RAD
+        return worth and self.chi2 > _EVIDENCE and self.misfit < _MISFIT
 
 
 def misalignment(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Misalignment:
     """From the epochs of a settled window.  LinAlgError where the motion does not tell."""
-    H, g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
-    for epoch in epochs:
-        if epoch.turned:
-            own_H, own_g = _information(epoch, graph.c, graph.nodes[epoch.a].bias)
-            H, g = H + own_H, g + own_g
+    own = [
+        _information(epoch, graph.c, graph.nodes[epoch.a].bias) for epoch in epochs if epoch.turned
+    ]
+    if not own:
+        raise np.linalg.LinAlgError("no epoch with motion")
+    H, g = np.sum([h for h, _ in own], axis=0), np.sum([k for _, k in own], axis=0)
     mean, information = graph.anchor
     H[:9, :9] += graph.temper * information + graph.hold
     g[:9] += (graph.temper * information + graph.hold) @ (graph.c - mean)
@@ -63,11 +69,26 @@ def misalignment(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Mi
     covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
     step = -covariance @ g
     theta = step[_TURN]
-    own = graph.temper * covariance[_TURN, _TURN]
+    misfit = max(1.0, _disagreement(own, step))
+    spread = misfit * covariance[_TURN, _TURN]
     c = moved(graph.c, step[:9], graph.moments)
     C = so3.exp(-theta[None])[0] @ np.linalg.inv(chain.symmetric(c[:6]))
     full = Affine(C / np.cbrt(np.linalg.det(C)), c[6:9].copy())
-    return Misalignment(theta, own, float(theta @ np.linalg.solve(own, theta)), full)
+    chi2 = float(theta @ np.linalg.solve(spread, theta))
+    return Misalignment(theta, spread, chi2, misfit, full)
+
+
+def _disagreement(own: Sequence[tuple[Array, Array]], step: Array) -> float:
+    """Mean square per degree of freedom of what each epoch still asks for after the step."""
+    total, count = 0.0, 0
+    for H, g in own:
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
+        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+        good = values > _WEAKEST
+        asked = (vectors.T @ (scale * (g + H @ step)))[good]
+        total += float(np.sum(asked**2 / values[good]))
+        count += int(np.count_nonzero(good))
+    return total / max(count - _SIZE, 0.2 * count)
 
 
 def _information(epoch: Epoch, c: Array, bias: Array) -> tuple[Array, Array]:
