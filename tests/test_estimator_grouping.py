@@ -1,0 +1,106 @@
+"""Groups of steps: exact without noise, never over a gap, nothing lost but what is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.estimator import chain
+from ahrsd.estimator.grouping import group_size, grouped
+from ahrsd.estimator.systematic import Cells, excess
+
+M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
+B = np.array([0.1, -0.2, 0.05])
+X = np.r_[chain.upper_triangle(M), B]
+DT = 0.04
+NOISE = chain.Noise(2e-3, 5e-3)
+
+
+def epoch(n=60, *, cut=None, noise=0.0, speed=0.03):
+    """A turning chain with its true directions; `cut`: the row that nothing leads to."""
+    rng = np.random.default_rng(0)
+    t = np.arange(n)
+    angle = speed * np.column_stack([np.sin(0.05 * t), np.cos(0.07 * t), np.sin(0.03 * t + 1)])
+    u = np.empty((n, 3))
+    u[0] = [0.36, -0.48, 0.8]
+    for k in range(1, n):
+        u[k] = [0.8, 0.0, -0.6] if k == cut else so3.exp(-angle[k]) @ u[k - 1]
+    linked = np.ones(n)
+    if cut is not None:
+        linked[cut], angle[cut] = 0.0, 0.0
+    field = u @ M + B + noise * rng.normal(size=(n, 3))
+    angle = angle + noise * 0.1 * rng.normal(size=(n, 3)) * linked[:, None]
+    data = chain.Data(
+        field, angle, np.full(n, DT), np.full((n, 3), np.nan), t * DT, True,
+        linked=None if cut is None else linked,
+    )  # fmt: skip
+    return data, u
+
+
+@pytest.mark.parametrize("cut", [None, 1, 2, 23, 58, 59])
+@pytest.mark.parametrize("size", [3, 5, 7])
+def test_without_noise_nothing_is_left_over(cut, size):
+    """The true directions at the groups' middles explain mean field and turns exactly."""
+    data, u = epoch(cut=cut)
+    small = grouped(data, size)
+    rows = np.searchsorted(data.time_s, small.time_s)
+    assert (rows[0], rows[-1]) == (0, len(data) - 1)
+    assert small.steps == len(data)
+    np.testing.assert_allclose(small.field_error(u[rows], X), 0.0, atol=1e-12)
+    q = chain.linearise(small, u[rows], X, np.zeros(3), NOISE)
+    assert q.cost < 1e-16
+    cuts = 0 if small.linked is None else np.count_nonzero(small.linked[1:] == 0)
+    assert cuts == (0 if cut is None else 1)
+
+
+def test_derivatives_of_a_group():
+    """Gradient of the cost at fixed directions, against differences, and that H is its slope."""
+    data, u = epoch(noise=2e-3)
+    small = grouped(data, 5)
+    rows = np.searchsorted(data.time_s, small.time_s)
+    q = chain.linearise(small, u[rows], X, np.zeros(3), NOISE)
+    step = np.random.default_rng(1).normal(size=12) * 1e-5
+
+    def cost(s):
+        return chain.linearise(small, u[rows], X + s * step[:9], s * step[9:], NOISE).cost
+
+    assert cost(1) - cost(-1) == pytest.approx(2 * q.g[:12] @ step, rel=5e-3)
+    curved = cost(1) + cost(-1) - 2 * cost(0)
+    assert curved == pytest.approx(step @ q.H[:12, :12] @ step, rel=0.05)
+
+
+def test_the_information_of_a_group_is_that_of_its_steps():
+    data, u = epoch(n=500)
+    small = grouped(data, 5)
+    rows = np.searchsorted(data.time_s, small.time_s)
+    quiet = chain.Noise(2e-3, 2e-3)
+    found = []
+    for d, at in ((data, u), (small, u[rows])):
+        H = chain.linearise(d, at, X, np.zeros(3), quiet).H
+        found.append(np.sqrt(np.diag(np.linalg.inv(H))))
+    np.testing.assert_allclose(found[1], found[0], rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("noise", "speed", "expected"),
+    [
+        (chain.Noise(2e-3, 2e-3), 0.01, 7),
+        (chain.Noise(2e-3, 0.02), 0.01, 3),
+        (chain.Noise(2e-3, 0.2), 0.01, 1),  # the gyro is poor
+        (chain.Noise(2e-3, 2e-3), 0.2, 1),  # it turns fast
+    ],
+)
+def test_the_size_of_a_group(noise, speed, expected):
+    assert group_size(epoch(speed=speed)[0], noise, 0.5) == expected
+
+
+def test_what_repeats_with_the_attitude_counts_once_per_cell():
+    ring = np.linspace(0, 2 * np.pi, 1200, endpoint=False)
+    level = np.column_stack([np.cos(ring), np.sin(ring), np.full(1200, 0.05)])
+    cells = Cells.of(level, 5.0) + Cells.of(level, 5.0)
+    assert cells.visited == 12
+    assert cells.steps == 12_000
+    assert excess(cells, 1e-3, 1e-3) == 1.0  # white
+    assert excess(cells, 1e-2, 1e-3) == pytest.approx(1000 * (1 - 1.5e-2))
+    assert excess(Cells(), 1e-2, 1e-3) == 1.0
