@@ -106,7 +106,8 @@ _ROWS = (
     Effect("noise_level", on_sensor.noise_level, 1.3, "1", scaled=False),
     Effect("frame_error", on_link.frame_error, 1.0, "1", scaled=False, most=1.0),
     Effect("unit_error", on_link.unit_error, 1.0, "1", scaled=False, most=1.0),
-    Effect("onboard_calibration_active", on_sensor.onboard_calibration_active, 0.03, "1", most=1.0),
+    Effect("onboard_calibration_active", on_sensor.onboard_calibration_active, 0.03, "1",
+           most=1.0),  # guess
     # in no library; limits are guesses
     Effect("turret", outside.turret, 0.3 * MG, "gauss", name=None),
     Effect("bursts", outside.bursts, 3 * MG, "gauss", name=None),

@@ -178,6 +178,9 @@ def test_unidentifiable_cases_cannot_be_seen_and_others_can():
     seen = cases.make_case(cases.Order("single", (("gyro_scale", 2.0),)), [9, 99]).truth
     assert seen["effects"][0]["snr"] >= 2 * cases.SEEN * 0.999
     assert seen["effects"][0]["multiple"] == pytest.approx(2.0)
+    # on a part that the calibration has not seen, an effect can only cost more
+    samples = seen["duration_s"] * seen["rate_hz"] + 1
+    assert seen["oracle_gain_nats_per_sample"] > seen["effects"][0]["snr"] ** 2 / 2 / samples
 
 
 def test_the_ring_of_600_has_the_dossiers_composition():
