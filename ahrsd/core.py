@@ -46,7 +46,6 @@ from drivers.vn100.session import Event as SessionEvent
 
 _WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01
 _MAG, _GYRO, _RATE = 23, 84, 7
-_IDENTITY = Affine.identity().to_register()
 
 
 class Core:
@@ -319,7 +318,9 @@ class Core:
         if change.new == State.TRIAL:
             new = _affine(self.registers.get(_MAG))
             transaction = self.writeback.history.open
-            old = new if transaction is None else _affine(transaction.old.get(_MAG, _IDENTITY))
+            old = new  # also where only the gyro's register was written
+            if transaction is not None and _MAG in transaction.old:
+                old = _affine(transaction.old[_MAG])
             self._trial = LiveTrial(new, old, _affine(self.registers.get(_GYRO)).offset)
         elif change.old == State.TRIAL:
             self._trial = None

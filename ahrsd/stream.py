@@ -135,6 +135,8 @@ class Stream:
     def _cut(self) -> None:
         self._timeline.forget()
         self._turns.forget()
+        if self._steps is not None:  # counted time stood still meanwhile and the host's did not
+            self.clock = DeviceClock()
         self._lost_next = max(self._lost_next, 1)
 
     def forgive(self) -> None:

@@ -197,6 +197,8 @@ class Emulator:
         try:
             if error:
                 raise RegisterValueError("the line was damaged", error)
+            if refusal := self._plan.active("refused_command", now_s):
+                raise RegisterValueError("refused by fault", int(refusal.parameter))
             if write:
                 self._refuse_by_fault(body, now_s)
             kept = dict(self.memory.ram)

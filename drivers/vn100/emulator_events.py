@@ -13,6 +13,7 @@ from typing import Protocol
 
 from drivers.vn100.emulator_faults import Fault
 from drivers.vn100.emulator_memory import Memory
+from drivers.vn100.emulator_physics import TICK_HZ
 from drivers.vn100.emulator_sensor import Sensor
 from drivers.vn100.register_codec import Values
 from drivers.vn100.registers import REGISTERS, format_reply
@@ -69,6 +70,7 @@ class Events:
             "third_party_write": self._third_party,
             "third_party_change": self._third_party,
             "clock_step": self._clock_step,
+            "clock_wrap": self._clock_wrap,
         }
         for fault in faults:
             what = strike.get(fault.name)
@@ -141,6 +143,13 @@ class Events:
     def _clock_step(self, fault: Fault, _: float) -> None:
         sensor = self._device.sensor
         sensor.clock = replace(sensor.clock, step_s=sensor.clock.step_s + fault.parameter)
+        sensor.changed()
+
+    def _clock_wrap(self, _: Fault, now_s: float) -> None:
+        sensor = self._device.sensor
+        clock = sensor.clock
+        age_s = (now_s - clock.boot_tick / TICK_HZ) * (1.0 + clock.ppm * 1e-6)
+        sensor.clock = replace(clock, step_s=-age_s)
         sensor.changed()
 
 

@@ -50,6 +50,7 @@ FAULTS: dict[str, FaultKind] = {
     "false_header": FaultKind("0xFA and headers of long packets before it", 0.05, "per message"),
     "garbage": FaultKind("messages turn into random bytes", 1.0, "per message"),
     "duplicate": FaultKind("messages arrive twice", 0.05, "per message"),
+    "intermittent": FaultKind("whole messages get lost", 0.3, "per message"),
     "burst_latency": FaultKind("the USB adapter delivers in bunches", 16.0, "ms"),
     "baud_mismatch": FaultKind("both ends run at different rates", 0.0, ""),
     "mute": FaultKind("the device hears but sends nothing", 0.0, ""),
@@ -60,6 +61,7 @@ FAULTS: dict[str, FaultKind] = {
     "wrong_reply": FaultKind("replies name another register", 1.0, "per reply"),
     "altered_reply": FaultKind("a digit of the reply changes, checksum valid", 1.0, "per reply"),
     "refused_write": FaultKind("VNWRG is answered with this VNERR code", 7.0, "code"),
+    "refused_command": FaultKind("every command is answered with this VNERR code", 4.0, "code"),
     "silent_refusal": FaultKind(
         "VNWRG of this register (0: of all) is echoed, not stored", 0.0, "register"
     ),
@@ -71,6 +73,7 @@ FAULTS: dict[str, FaultKind] = {
     "dipole": _once("a magnet is carried past", 5.0, "A m2", 4.0),
     "iron_step": _once("the vehicle picks up iron", 0.1, "gauss"),
     "clock_step": _once("TimeStartup jumps ahead", 1.0, "s"),
+    "clock_wrap": _once("TimeStartup begins again at 0, without a restart"),
     # power and people
     "reset": _once("the device restarts: RAM lost, TimeStartup from 0"),
     "unplug": _once("the port disappears; 1: the device loses power too", 1.0, "", 2.0),
@@ -241,6 +244,10 @@ def _duplicate(message: bytes, rate: float, draw: _Draw) -> bytes:
     return message * 2 if draw.random() < rate else message
 
 
+def _intermittent(message: bytes, rate: float, draw: _Draw) -> bytes:
+    return b"" if draw.random() < rate else message
+
+
 _DISTORTIONS: dict[str, Callable[[bytes, float, _Draw], bytes]] = {
     "byte_drop": _byte_drop,
     "bit_flip": _bit_flip,
@@ -248,5 +255,6 @@ _DISTORTIONS: dict[str, Callable[[bytes, float, _Draw], bytes]] = {
     "false_header": _false_header,
     "garbage": _garbage,
     "duplicate": _duplicate,
+    "intermittent": _intermittent,
     "baud_mismatch": lambda message, _, draw: garble(message, draw),
 }

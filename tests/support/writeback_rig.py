@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -45,8 +46,14 @@ class Cut(Exception):
     """The power went."""
 
 
+@lru_cache(maxsize=4096)
 def printed(number: int, values: Values) -> Values:
     return parse(number, format_reply(number, values).split(",")[1:])
+
+
+@lru_cache(maxsize=4096)
+def stored(number: int, values: Values) -> Values:
+    return as_stored(number, values)
 
 
 @dataclass
@@ -75,7 +82,7 @@ class Device:
         if (code := self.refuse(command)) is not None:
             raise DeviceRefused(code)
         if isinstance(command, Write):
-            self.ram[command.register] = as_stored(command.register, command.values)
+            self.ram[command.register] = stored(command.register, command.values)
         if isinstance(command, Word) and command.word == "VNASY":
             self.asynchronous = command.arguments == (1,)
         if isinstance(command, Word) and command.word == "VNWNV":

@@ -205,3 +205,18 @@ def test_setups_that_cannot_be_are_explained():
         build(Setup(output="binary", rate_hz=30))
     with pytest.raises(ValueError, match="does not fit"):
         build(Setup(output="binary", rate_hz=200))
+
+
+def test_a_clock_that_wraps_begins_again_and_the_device_does_not():
+    made = device("clock_wrap@2", presets=TIMES)
+    stamps = times(made.advance(3.0))
+    fall = int(np.argmin(np.diff(stamps)))
+    assert stamps[fall] == pytest.approx(2.0, abs=0.02)
+    assert stamps[fall + 1] == pytest.approx(0.0, abs=0.02)
+    assert made.counters["restarts"] == 0
+
+
+def test_any_command_can_be_refused_with_a_code():
+    refusing = device("refused_command=6@1+1")
+    assert say(refusing, b"$VNRRG,23*72\r\n", 1.5).startswith(b"$VNERR,06*")
+    assert say(refusing, b"$VNRRG,23*72\r\n", 2.5).startswith(b"$VNRRG,23,")

@@ -122,3 +122,9 @@ def test_same_seed_same_damage_and_faults_do_not_disturb_each_other():
     alone = FaultPlan(["byte_drop=0.5@0+1", "noise_insert@5"], 3)
     other = FaultPlan(["byte_drop=0.5@0+1", "garbage@5"], 3)
     assert alone.distort(MESSAGE, 0.5) == other.distort(MESSAGE, 0.5)
+
+
+def test_intermittent_loses_whole_messages():
+    out = distorted("intermittent=0.25")
+    assert set(out) == {b"", MESSAGE}
+    assert out.count(b"") == pytest.approx(100, rel=0.25)
