@@ -36,6 +36,7 @@ from ahrsd.samples import Array, SampleBlock
 
 RATE_HZ = 12.5  # of the thinned samples: larger follows faster motion and costs more
 KEPT = 16  # blocks
+_RATE_ROWS = 9  # from which a piece's rate is measured, whatever blocks they came in
 _WINDOWS = (1, 2, 4, 8)  # informative blocks that are tested together; 1: for the usual size only
 _LEAST_USUAL, _MOST_USUAL = 4, 24  # blocks that say what is usual
 _LIMIT = 50.0  # T over what is usual; chi-squared of 3 exceeds it once in 10^10
@@ -198,11 +199,11 @@ class _Intake:
         if len(block) == 0:
             return []
         out = self._close() if self._breaks(block) else []
-        if not self._averaged and len(block) > 1:
-            usual_s = float(np.median(np.diff(block.time_s)))
-            self._averaged = max(1, round(1.0 / (usual_s * RATE_HZ)))
         self._waiting.append(block)
         self._count += len(block)
+        if not self._averaged and self._count >= _RATE_ROWS:
+            first = np.concatenate([b.time_s for b in self._waiting])[:_RATE_ROWS]
+            self._averaged = max(1, round(1.0 / (float(np.median(np.diff(first))) * RATE_HZ)))
         while self._averaged and self._count >= ROWS * self._averaged:
             out += self._cut(ROWS)
         return out
