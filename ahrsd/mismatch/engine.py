@@ -157,29 +157,48 @@ def without_stand_ins(
 
     Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
     all of what their frame's own coefficients explain, and where a few of them do.  Any other name
-    may stay where it explains something that a free course in the strongest frame does not.
+    may stay where it explains something that a free course in the strongest frame does not.  A gyro
+    whose bias wanders as an ordinary one's does is noise.
     """
+    limits = state.problem.limits
     left = unknown.remainder(basis_of(state))
+    if not state.walk and left.strongest.frame == "gyro" and unknown.detected(left, limits):
+        state = refitted(replace(state, walk=True), state.named)
+        left = unknown.remainder(basis_of(state))
     for frame, names in TIME_SHAPED.items():
         shaped = [k for k, name in enumerate(state.names) if name in names]
-        doubtful = shaped if len(shaped) > state.problem.limits.most_shaped else []
-        if shaped and not doubtful and unknown.detected(left, state.problem.limits):
-            doubtful = shaped if _leaves_much(state, frame, shaped, left) else []
+        doubtful = shaped if len(shaped) > limits.most_shaped else []
+        if shaped and not doubtful:
+            doubtful = shaped if _stand_in(state, frame, shaped, left) else []
         state, surveys, left = _dropped(state, surveys, doubtful, left)
-    if state.named and unknown.detected(left, state.problem.limits):
+    if state.named and unknown.detected(left, limits):
         doubtful = [k for k in range(len(state.named)) if not _survives(state, k, left)]
-        much = _leaves_much(state, left.strongest.frame, doubtful, left) if doubtful else False
+        much = _stand_in(state, left.strongest.frame, doubtful, left) if doubtful else False
         state, surveys, left = _dropped(state, surveys, doubtful if much else [], left)
     return state, surveys, left
 
 
-def _leaves_much(state: State, frame: Frame, terms: list[int], left: unknown.Remainder) -> bool:
-    """Whether the terms leave more of their frame's statistic than a true name would."""
+def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remainder) -> bool:
+    """Whether the terms explain less than true names would.
+
+    They do if what they leave fires and is more than the part that a true name may leave, or if the
+    frame's free course is likelier than they are, however many its coefficients.
+    """
+    limits = state.problem.limits
     bare = basis_of(state)
     for k in terms:
         bare = bare.without(term_group(k), added_value(state, k))
-    before = unknown.remainder(bare, with_bins=False).located[frame].statistic
-    return left.located[frame].statistic > (1 - state.problem.limits.coverage) * before
+    before = unknown.remainder(bare, with_bins=False)
+    free = before.located[frame]
+    fires = unknown.detected(left, limits)
+    if fires and left.located[frame].statistic > (1 - limits.coverage) * free.statistic:
+        return True
+    evidence, known = 0.0, before.basis
+    for k in terms:
+        candidate = state.named[k].candidate
+        evidence += evidence_of(known, candidate)
+        known = known.beside(term_group(k), columns_of(known, [candidate])[candidate.name])
+    return free.evidence > evidence + limits.lead_nats
 
 
 def _survives(state: State, number: int, left: unknown.Remainder) -> bool:

@@ -34,8 +34,8 @@ class Limits:
     placebo_beaten: float = 0.99
     coverage: float = 0.9
     most_shaped: int = 3
-    unknown_nats: float = 8.0
-    unknown_p: float = 1e-4
+    unknown_nats: float = 12.0
+    unknown_p: float = 1e-6
     most_terms: int = 5
 
 

@@ -28,8 +28,8 @@ def prediction_error_filter(innovation: Array, rate_hz: float) -> Array:
         return np.ones(1)
     if np.all(np.abs(lags[1:]) < level):
         return np.array([1.0 / float(np.sqrt(lags[0]))])
-    predictor, variance = _predictor(lags)
-    return np.asarray(np.concatenate([[1.0], -predictor]) / np.sqrt(variance), float)
+    taps = np.concatenate([[1.0], -_predictor(lags)])
+    return np.asarray(taps / float(np.std(prewhitened(taps, innovation))), float)
 
 
 def _autocorrelation(innovation: Array, rate_hz: float) -> Array:
@@ -41,11 +41,10 @@ def _autocorrelation(innovation: Array, rate_hz: float) -> Array:
     return np.asarray(fft.irfft(spectrum, n=size)[: reach + 1] / (3 * count), float)
 
 
-def _predictor(lags: Array) -> tuple[Array, float]:
-    """Coefficients of the best linear prediction from the tapered lags, and its error variance."""
+def _predictor(lags: Array) -> Array:
+    """Coefficients of the best linear prediction from the tapered lags."""
     tapered = lags * (1.0 - np.arange(len(lags)) / len(lags))
-    predictor = np.asarray(linalg.solve_toeplitz(tapered[:-1], tapered[1:]), float)
-    return predictor, max(float(tapered[0] - predictor @ tapered[1:]), 1e-12 * float(lags[0]))
+    return np.asarray(linalg.solve_toeplitz(tapered[:-1], tapered[1:]), float)
 
 
 def prewhitened(taps: Array, values: Array) -> Array:

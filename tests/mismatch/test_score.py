@@ -1,0 +1,124 @@
+"""Tests have the size that they claim, under white and under red noise, and find what is there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal, stats
+
+from ahrsd.mismatch.evidence import colour, log_bayes, log_bayes_walk, posterior
+from ahrsd.mismatch.gram import block_edges, gram
+from ahrsd.mismatch.prewhitening import prediction_error_filter, prewhitened
+from ahrsd.mismatch.score import bootstrap_p, chi2_p, robust_p, score, shift_statistics
+
+COUNT, RATE_HZ = 1600, 10.0
+
+
+def regression(rng, share=0.0, theta=0.0, width=3):
+    """Slow columns and noise of which `share` has a time constant of a second."""
+    time_s = np.arange(COUNT) / RATE_HZ
+    keep = np.exp(-1 / RATE_HZ)
+    X = signal.lfilter([1.0], [1.0, -0.98], rng.standard_normal((COUNT, 3, width)), axis=0)
+    red = signal.lfilter(
+        [np.sqrt(1 - keep**2)], [1, -keep], rng.standard_normal((COUNT, 3)), axis=0
+    )
+    e = np.sqrt(1 - share) * rng.standard_normal((COUNT, 3)) + np.sqrt(share) * red
+    e = e + X @ np.full(width, theta)
+    whole = gram({"x": X}, e, time_s, block_edges(time_s, 2.0))
+    return whole, e, X
+
+
+def p_values(test, share, runs=250):
+    rng = np.random.default_rng(5)
+    return np.array([test(*regression(rng, share)) for _ in range(runs)])
+
+
+def test_score_statistic_is_uniform_under_white_noise():
+    p = p_values(lambda g, e, X: chi2_p(score(g, "x", np.ones(3))), 0.0)
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+
+
+def test_robust_test_keeps_its_size_where_the_plain_one_does_not():
+    plain = p_values(lambda g, e, X: chi2_p(score(g, "x", np.ones(3))), 0.2)
+    robust = p_values(lambda g, e, X: robust_p(score(g, "x", np.ones(3))), 0.2)
+    assert np.mean(plain < 0.01) > 0.15
+    assert np.mean(robust < 0.01) < 0.04
+
+
+def test_dividing_by_the_colour_keeps_the_size_too():
+    p = p_values(lambda g, e, X: chi2_p(score(g, "x", np.ones(3)), colour(e, RATE_HZ)), 0.2)
+    assert np.mean(p < 0.01) < 0.04
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_an_effect_is_found_and_its_value_is_right(share):
+    whole, e, _ = regression(np.random.default_rng(2), share, theta=0.05)
+    what = score(whole, "x", np.ones(3))
+    assert chi2_p(what, colour(e, RATE_HZ)) < 1e-6
+    assert robust_p(what) < 1e-6
+    assert bootstrap_p(what, np.random.default_rng(0)) < 0.01
+    np.testing.assert_allclose(what.value, 0.05, atol=0.02)
+
+
+def test_shifted_copies_do_not_reach_a_real_effect():
+    _, e, X = regression(np.random.default_rng(3), theta=0.05)
+    found, shifted = shift_statistics(X, e, 80)
+    assert found > shifted.max()
+    _, e, X = regression(np.random.default_rng(3), theta=0.0)
+    found, shifted = shift_statistics(X, e, 80)
+    assert np.mean(shifted < found) < 0.999
+
+
+def test_directions_that_one_prior_deviation_would_not_show_are_left_out():
+    whole, _, _ = regression(np.random.default_rng(4))
+    assert score(whole, "x", np.array([1.0, 1.0, 1e-9])).rank == 2
+
+
+def test_evidence_is_the_closed_form_of_one_size():
+    whole, _, _ = regression(np.random.default_rng(6), theta=0.02, width=1)
+    what = score(whole, "x", np.ones(1))
+    information, s = float(what.information[0]), float(what.score[0])
+    expected = 0.5 * s**2 / (information + 4.0) - 0.5 * np.log1p(information / 4.0)
+    assert log_bayes(what, 1.0, (0.5,)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_smaller_family_wins_over_one_that_contains_it():
+    _, _, X = regression(np.random.default_rng(7), theta=0.0, width=4)
+    e = X[:, :, 0] * 0.05 + np.random.default_rng(8).standard_normal((COUNT, 3))
+    time_s = np.arange(COUNT) / RATE_HZ
+    both = gram({"one": X[:, :, :1], "all": X}, e, time_s, block_edges(time_s, 2.0))
+    one = log_bayes(score(both.select(["one"]), "one", np.ones(1)))
+    four = log_bayes(score(both.select(["all"]), "all", np.ones(4)))
+    assert one > four + 3 > 20
+
+
+def test_a_wandering_course_is_likelier_as_a_walk_than_as_independent_segments():
+    rng = np.random.default_rng(9)
+    walk = np.cumsum(rng.standard_normal((30, 3)), axis=0) * 0.2
+    G = np.eye(90) * 10.0
+    s = 10.0 * (walk - walk.mean(0)).ravel() + np.sqrt(10.0) * rng.standard_normal(90)
+    sizes = np.array([0.1, 0.3, 1.0])
+    walked = log_bayes_walk(G, s, 3, sizes)
+    shuffled = s.reshape(30, 3)[rng.permutation(30)].ravel()
+    assert walked > log_bayes_walk(G, shuffled, 3, sizes) + 10
+
+
+def test_posterior_sums_to_one_and_follows_the_odds():
+    found = posterior({"a": 3.0, "b": 0.0, "c": 0.0}, {"c": -1.0})
+    assert sum(found.values()) == pytest.approx(1.0, abs=1e-12)
+    assert found["a"] / found["b"] == pytest.approx(np.exp(3.0))
+    assert found["b"] / found["c"] == pytest.approx(np.e)
+
+
+def test_red_innovations_are_made_white():
+    rng = np.random.default_rng(10)
+    keep = np.exp(-1 / RATE_HZ)
+    red = signal.lfilter([1.0], [1, -keep], rng.standard_normal((20_000, 3)), axis=0)
+    taps = prediction_error_filter(red, RATE_HZ)
+    white = prewhitened(taps, red)
+    assert colour(red / red.std(), RATE_HZ) > 5
+    assert colour(white, RATE_HZ) < 2.0  # the taper leaves some
+    assert np.std(white) == pytest.approx(1.0, abs=0.1)
+    once = signal.lfilter(taps, [1.0], red, axis=0)
+    np.testing.assert_allclose(white, once, atol=1e-10)
+    assert len(prediction_error_filter(rng.standard_normal((20_000, 3)), RATE_HZ)) == 1
