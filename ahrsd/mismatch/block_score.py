@@ -9,7 +9,8 @@ reading into the frame of the block's first one, where the field stands still,
 and the noise is white (magnetometer) plus, across the field, a random walk (gyro). The inverse of
 the Cholesky factor of its covariance gives the innovations of the filter that starts knowing
 nothing of h; it is the same for every block. The field h of the block is projected out, so a block
-says nothing while the vehicle stands, whatever is the matter with the field around it.
+says nothing while the vehicle stands, whatever is the matter with the field around it; so is a lag
+between the two sensors, which nearly every stream has and no calibration knows of.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ahrsd.calibration import Estimate
 from ahrsd.samples import Array
 
 ROWS = 128  # thinned samples in a block
+LAG_S = 0.05  # 1-sigma of a lag between magnetometer and gyro
 LEAST_ROWS = 64  # in a piece before a gap that is worth scoring
 #: columns of a block: those of `Estimate.covariance`, then a drift of the field in the world
 SOFT, IRON, GYRO, DRIFT = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 15)
@@ -74,7 +76,7 @@ class Thinned:
 class Block:
     """A scored block.
 
-    information (15, 15), score (15,): of the columns, the block's own field projected out
+    information (15, 15), score (15,): of the columns, the block's own field and lag projected out
     residual (n, 3), lever (n, 3, 3): y - h and how it moves with the hard iron, carried frame
     """
 
@@ -98,20 +100,23 @@ class Scorer:
         n = len(rows.time_s)
         dt_s = np.diff(rows.time_s, prepend=rows.time_s[:1])
         turn = np.diff(rows.angle_b_rad, axis=0, prepend=rows.angle_b_rad[:1])
-        R = carried(so3.exp(turn - dt_s[:, None] * reference.gyro_bias_rad_s))
+        turn -= dt_s[:, None] * reference.gyro_bias_rad_s
+        R = carried(so3.exp(turn))
         lever = R @ reference.correction
         y = (lever @ (rows.raw_b_gauss - reference.offset)[:, :, None])[:, :, 0]
         h = y.mean(axis=0)
-        Z = np.zeros((n, 3, 19))
+        Z = np.zeros((n, 3, 20))
         Z[:, :, SOFT] = lever @ _soft(h @ R)
         Z[:, :, IRON] = lever
         Z[:, :, GYRO] = -so3.skew(h) @ np.cumsum(R * dt_s[:, None, None], axis=0)
         Z[:, [0, 1, 2], [12, 13, 14]] = np.linspace(-1.0, 1.0, n)[:, None]
         Z[:, [0, 1, 2], [15, 16, 17]] = 1.0
-        Z[:, :, 18] = y - h
+        Z[:, :, 18] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])
+        Z[:, :, 19] = y - h
         G = self._gram(Z, h, reference, float(dt_s[1:].mean()), rows.averaged)
-        G = G - G[:, 15:18] @ np.linalg.solve(G[15:18, 15:18], G[15:18])
-        return Block(reference, rows.time_s, G[:15, :15], G[:15, 18], y - h, lever)
+        own = G[15:19, 15:19] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
+        G = G - G[:, 15:19] @ np.linalg.solve(own, G[15:19])
+        return Block(reference, rows.time_s, G[:15, :15], G[:15, 19], y - h, lever)
 
     def _gram(self, Z: Array, h: Array, reference: Reference, dt_s: float, averaged: int) -> Array:
         """Along the field nothing but the magnetometer's noise, across it the gyro's walk too."""
@@ -142,6 +147,14 @@ def carried(turns: Array) -> Array:
     while step < len(out):
         out = np.concatenate([out[:step], out[:-step] @ out[step:]])
         step *= 2
+    return out
+
+
+def _rate(turn: Array, dt_s: Array) -> Array:
+    """Rate (n, 3) at the rows' instants, of the turns between them."""
+    rate = turn[1:] / dt_s[1:, None]
+    out = np.concatenate([rate[:1], rate])
+    out[1:-1] = (rate[:-1] + rate[1:]) / 2
     return out
 
 

@@ -259,12 +259,16 @@ def test_real_motion_is_silent_and_an_injected_step_is_told(name):
     blocks = [part for block in read_table(path).blocks() for part in cut(block, 100)]
     notes, calibrator = calibrated(blocks)
     assert notes == []
-    assert calibrator.steps.armed
-    notes, calibrator = calibrated([magnet_on(block, 145.0) for block in blocks])
-    assert calibrator.step is not None
-    assert calibrator.step.at_s - blocks[0].time_s[0] == pytest.approx(145.0, abs=2.0)
-    assert np.all(np.abs(calibrator.step.size - MAGNET) < 4 * calibrator.step.sigma + 3e-3)
-    assert notes[0] == calibrator.step.words
+    estimate = calibrator.finish()
+    assert estimate is not None
+    assert estimate.converged
+    at_s = float(blocks[0].time_s[0]) + 105.0
+    assert watched(blocks, estimate) is None
+    step = watched([magnet_on(block, at_s) for block in blocks], estimate)
+    assert step is not None
+    assert step.at_s == pytest.approx(at_s, abs=2.0)
+    assert np.all(np.abs(step.size - MAGNET) < 4 * step.sigma + 2e-3)
+    assert np.all(step.sigma < 8e-3)
 
 
 def cut(block: SampleBlock, rows: int) -> Iterator[SampleBlock]:
