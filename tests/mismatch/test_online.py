@@ -142,6 +142,22 @@ def test_an_hour_without_a_change_is_silent(scenario, seed):
     assert detector.scored == 45000 // 128
 
 
+def test_heavy_tails_colour_and_a_lag_are_no_steps():
+    made = experiment("mam", samples=45000, rate_hz=12.5, seed=3)
+    rng, raw = np.random.default_rng(3), made.samples.raw_b_gauss.copy()
+    raw += 1e-3 * np.clip(rng.standard_t(3, raw.shape), -15, 15)
+    wander = np.cumsum(rng.standard_normal((len(raw) // 125 + 2, 3)), axis=0)
+    at = np.arange(len(raw)) / 125.0
+    knots = np.arange(len(wander))
+    raw += 1e-4 * np.column_stack([np.interp(at, knots, wander[:, k] % 7) for k in range(3)])
+    late = raw[1:] + 0.2 * (raw[:-1] - raw[1:])  # 16 ms
+    raw = np.concatenate([raw[:1], late])
+    other = replace(made, samples=replace(made.samples, raw_b_gauss=raw))
+    detector = StepDetector()
+    assert watched(other.blocks(512), estimate_of(made), detector) is None
+    assert detector.scored == 45000 // 128
+
+
 def test_a_magnet_put_on_at_rest_is_told_after_the_next_turns_and_dated_to_the_rest():
     plain = parked(experiment("mam", samples=7500, seed=5), 5000, 1000)
     at_s = float(plain.samples.time_s[5500])
