@@ -48,6 +48,8 @@ LOOKED_AT = 8
 LOOSE = 30.0
 #: rows per second that the search works with; faster recordings are averaged down to it
 WORKING_HZ = 12.0
+#: recordings longer than this are averaged whatever lines they have: a search takes too long
+MOST_ROWS = 24_000
 #: samples per working row from which the gyro's noise is taken from the recorded rate
 OVERSAMPLED = 5
 #: colour of the innovations beyond which delays are looked for in whitened ones
@@ -127,7 +129,7 @@ def _is_fast(track: Track, cold: NullModel) -> bool:
     if roles.named(track.covariates, "rpm"):
         return True
     rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
-    if rate_hz < 2 * WORKING_HZ:
+    if rate_hz < 2 * WORKING_HZ or len(track) > MOST_ROWS:
         return False
     whitened = run_filter(track, cold, sensitive=False).whitened
     return any(line.frequency_hz > WORKING_HZ / 3 for line in lines(whitened, rate_hz))
