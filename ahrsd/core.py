@@ -318,10 +318,9 @@ class Core:
         if change.new == State.TRIAL:
             new = _affine(self.registers.get(_MAG))
             transaction = self.writeback.history.open
-            old = new  # also where only the gyro's register was written
-            if transaction is not None and _MAG in transaction.old:
-                old = _affine(transaction.old[_MAG])
-            self._trial = LiveTrial(new, old, _affine(self.registers.get(_GYRO)).offset)
+            before = {**self.registers, **({} if transaction is None else transaction.old)}
+            old = (_affine(before.get(_MAG)), _affine(before.get(_GYRO)).offset)
+            self._trial = LiveTrial(new, old[0], _affine(self.registers.get(_GYRO)).offset, old[1])
         elif change.old == State.TRIAL:
             self._trial = None
 

@@ -2,7 +2,9 @@
 
 The figure is the spread (std / mean) of the corrected field over the newest minute: both
 corrections see the same motion and the same disturbances, so only their quality differs. At rest
-both show the sensor's noise and neither is worse. The heading's jump is the difference of the two
+both show the sensor's noise and neither is worse. That says nothing of the gyroscope, nor of a
+matrix that is turned: `carried_field` does, with the new registers and with each alternative to
+them (either one put back, or both). The heading's jump is the difference of the two
 tilt-compensated headings of the same samples, averaged over the first seconds.
 """
 
@@ -13,6 +15,7 @@ from collections import deque
 import numpy as np
 
 from ahrsd.calibration import Affine
+from ahrsd.carried_field import CarriedField
 from ahrsd.headings import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.trial import TrialMetrics
@@ -25,8 +28,18 @@ _SPACING_S = 0.1  # samples closer than this add nothing to a spread
 class LiveTrial:
     """Collects what `TrialMetrics` needs from the moment the new registers are in force."""
 
-    def __init__(self, new: Affine, old: Affine, gyro_bias_rad_s: Array) -> None:
+    def __init__(
+        self,
+        new: Affine,
+        old: Affine,
+        gyro_bias_rad_s: Array,
+        old_gyro_bias_rad_s: Array | None = None,
+    ) -> None:
         self._new, self._old, self._bias = new, old, gyro_bias_rad_s.copy()
+        before = self._bias if old_gyro_bias_rad_s is None else old_gyro_bias_rad_s
+        self._carried = CarriedField(
+            [(new, self._bias), (old, self._bias), (new, before), (old, before)]
+        )
         self._rows: deque[tuple[float, Array]] = deque()
         self._jumps: list[float] = []
         self._start_s: float | None = None
@@ -37,6 +50,7 @@ class LiveTrial:
         """Further samples; the figures so far."""
         if self._start_s is None:
             self._start_s = self._last_s = float(block.time_s[0])
+        self._carried.take(block)
         down = _down(block.accel_b_m_s2)
         rate = (block.gyro_b_rad_s - self._bias) @ down if np.isfinite(down).all() else np.zeros(1)
         self._turned_rad += abs(float(np.nansum(rate * np.nan_to_num(block.dt_s))))
@@ -63,6 +77,7 @@ class LiveTrial:
         if self._jumps:
             angles = np.array(self._jumps)
             jump = float(np.degrees(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())))
+        swing = np.nan_to_num(self._carried.spreads)
         start = self._last_s if self._start_s is None else self._start_s
         return TrialMetrics(
             duration_s=self._last_s - start,
@@ -71,6 +86,8 @@ class LiveTrial:
             old_figure=float(old.std() / old.mean()) if len(field) > 1 else float("nan"),
             field_spread=spread,
             heading_jump_deg=jump,
+            new_swing=float(swing[0]),
+            old_swing=float(swing[1:].min()),
         )
 
 

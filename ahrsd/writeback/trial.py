@@ -20,6 +20,9 @@ class TrialMetrics:
     new_figure, old_figure: the same figure of quality (heading or field error, smaller is better)
                        over the newest stretch with the new and with the old registers
     field_spread:      std/mean of the corrected field
+    new_swing, old_swing: how far the corrected field moves when the corrected gyroscope carries it
+                       into one frame, in parts of the field; `old`: the least with either or both
+                       of the registers put back; 0 while nothing is known
     heading_jump_deg:  how far the heading moved when the registers changed; None: not seen yet
     """
 
@@ -29,6 +32,8 @@ class TrialMetrics:
     old_figure: float
     field_spread: float
     heading_jump_deg: float | None = None
+    new_swing: float = 0.0
+    old_swing: float = 0.0
 
     @property
     def finite(self) -> bool:
@@ -82,16 +87,14 @@ class Trial:
             )
         if (jump := metrics.heading_jump_deg) is not None and self._unexpected(jump):
             return f"the heading jumped by {jump:.1f} deg, predicted {self._predicted_deg:.1f} deg"
-        if metrics.new_figure <= metrics.old_figure * (1.0 + policy.worse_percent / 100.0):
+        worse = _worse(metrics, 1.0 + policy.worse_percent / 100.0)
+        if worse is None:
             self._worse_since_s = None
             return None
         if self._worse_since_s is None:
             self._worse_since_s = metrics.duration_s
         if metrics.duration_s - self._worse_since_s >= policy.worse_for_s:
-            return (
-                f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
-                f"{metrics.old_figure:.2%}, for {policy.worse_for_s:.0f} s"
-            )
+            return f"{worse}, for {policy.worse_for_s:.0f} s"
         return None
 
     def _unexpected(self, jump_deg: float) -> bool:
@@ -99,3 +102,18 @@ class Trial:
         size = abs(jump_deg)
         likely = size <= 2.0 * self._predicted_deg + JUMP_NOISE_DEG
         return not (likely and size <= self._predicted_deg + self._policy.max_jump_deg)
+
+
+def _worse(metrics: TrialMetrics, factor: float) -> str | None:
+    """What is worse with the new registers than with the old ones, in words."""
+    if metrics.new_figure > metrics.old_figure * factor:
+        return (
+            f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
+            f"{metrics.old_figure:.2%}"
+        )
+    if metrics.new_swing > metrics.old_swing * factor:
+        return (
+            f"carried by the gyroscope the field moves by {metrics.new_swing:.2%}, with a register "
+            f"put back by {metrics.old_swing:.2%}"
+        )
+    return None
