@@ -153,4 +153,9 @@ FRAMES = {
     "frame_error": ("gyro", "sensor"),
     "unit_error": ("gyro",),
     "gyro_scale": ("link",),
+    "noise_burst": ("link",),
+    "noise_level": ("link",),
+    "stuck_magnetometer": ("link",),
+    "mag_sample_hold": ("link",),
+    "mag_quantisation": ("link",),
 }
