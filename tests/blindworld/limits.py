@@ -153,9 +153,10 @@ FRAMES = {
     "frame_error": ("gyro", "sensor"),
     "unit_error": ("gyro",),
     "gyro_scale": ("link",),
-    "noise_burst": ("link",),
-    "noise_level": ("link",),
+    "noise_burst": ("link", "noise"),
+    "noise_level": ("link", "noise"),
     "stuck_magnetometer": ("link",),
     "mag_sample_hold": ("link",),
-    "mag_quantisation": ("link",),
+    "timestamp_jitter": ("noise",),
+    "mag_quantisation": ("link", "noise"),
 }
