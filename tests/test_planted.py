@@ -6,6 +6,7 @@ virtual time; the calibrator is one that always says the planted values, with ev
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from virtual_run import VirtualRun
 
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config import Config
+from ahrsd.config_sections import Location
 from ahrsd.samples import Array
 from ahrsd.settings import core_settings
 from ahrsd.so3 import exp
@@ -234,3 +236,44 @@ def test_a_better_gyro_bias_alone_is_proven_on_a_calibrated_device():
     assert run.sent["VNWRG 23"] == 0
     assert run.until(lambda: state(run) != "TRIAL", TRIAL_S)
     assert state(run) == "PROVEN", run.states
+
+
+GATED = {
+    "planar motion": Setup("planar", SEED, output="binary", rate_hz=20),
+    "partial motion": Setup("lam", SEED, output="binary", rate_hz=20),
+    "a magnet nearby": Setup(
+        "rov",
+        SEED,
+        tuple(f"dipole=4@{start}+9" for start in range(5, 200, 10)),
+        output="binary",
+        rate_hz=20,
+    ),
+    "the on-board estimator": Setup("hsi-active", SEED, output="binary", rate_hz=20),
+}
+
+GUARDS = {  # one of these is red in the end
+    "planar motion": {"motion.planar_circle", "observability.held", "heldout_heading.windows"},
+    "partial motion": {"motion.heading", "observability.converged"},
+    "a magnet nearby": {"stationarity.field", "field.spread_flash", "field.spread_ram"},
+    "the on-board estimator": {"input_basis.hsi_applied"},
+}
+
+
+@pytest.mark.parametrize("name", GATED)
+def test_through_the_real_gates_nothing_of_it_reaches_the_flash(name):
+    """Whatever qualifies is approved at once; three minutes, with the world model's field."""
+    policy = WriteBackPolicy(mode=Mode.COMMIT)
+    place = Location(latitude_deg=48.0, longitude_deg=8.0, date=datetime.date(2026, 1, 1))
+    settings = core_settings(Config(location=place), policy=policy)
+    run = VirtualRun(build(GATED[name]), settings, step_s=0.1)
+    while run.now_s < 180.0:
+        run.step()
+        if state(run) == "QUALIFIED":
+            run.operate("approve", run.core.writeback.proposal.id)
+    assert run.core.calibrator.estimate is not None
+    assert run.samples > 3000
+    assert run.saves == 0
+    if name == "the on-board estimator":
+        assert run.writes == 0
+    red = {gate.gate for gate in run.core.calibrator.gates if not gate.ok}
+    assert red & GUARDS[name], red
