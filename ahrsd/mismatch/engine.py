@@ -181,8 +181,8 @@ def without_stand_ins(
 def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remainder) -> bool:
     """Whether the terms explain less than true names would.
 
-    They do if what they leave fires and is more than the part that a true name may leave, or if the
-    frame's free course is likelier than they are, however many its coefficients.
+    They do if what they leave fires and is more than the part that a true name may leave, or, a
+    single one, if the frame's free course is likelier, however many its coefficients.
     """
     limits = state.problem.limits
     bare = basis_of(state)
@@ -193,11 +193,9 @@ def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remain
     fires = unknown.detected(left, limits)
     if fires and left.located[frame].statistic > (1 - limits.coverage) * free.statistic:
         return True
-    evidence, known = 0.0, before.basis
-    for k in terms:
-        candidate = state.named[k].candidate
-        evidence += evidence_of(known, candidate)
-        known = known.beside(term_group(k), columns_of(known, [candidate])[candidate.name])
+    if len(terms) > 1:  # on and off again: neither proves much without the other
+        return False
+    evidence = evidence_of(before.basis, state.named[terms[0]].candidate)
     return free.evidence > evidence + limits.lead_nats
 
 
