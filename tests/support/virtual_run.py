@@ -67,9 +67,11 @@ class VirtualRun:
                 records = list(self.journal.setdefault(serial, []))
                 waiting.append(inputs.JournalOpened(self.now_ns, serial, records))
             case events.JournalAppend(kind, facts):
-                if not self.disk_full:
-                    self.journal[self._serial].append({"kind": kind, "facts": dict(facts)})
                 error = "no space left" if self.disk_full else ""
+                if self._serial not in self.journal:
+                    error = "no journal is open"
+                if not error:
+                    self.journal[self._serial].append({"kind": kind, "facts": dict(facts)})
                 waiting.append(inputs.Journalled(self.now_ns, kind, error))
             case events.SamplesSeen(block=block):
                 self.samples += len(block)
