@@ -39,15 +39,14 @@ from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.predictive import checks
+from ahrsd.mismatch.problem import Problem, problem_of
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
-    Problem,
     State,
     Survey,
     basis_of,
     forward,
-    problem_of,
     pruned,
     refitted,
     survey,

@@ -13,15 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from ahrsd.mismatch import roles
-from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS, plain
-from ahrsd.mismatch.effects.base import Effect
-from ahrsd.mismatch.innovation import run_filter
-from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.name import Judged, judge
-from ahrsd.mismatch.null import FittedTerm, NullFit, cold_start, fit_null
+from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
+from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.regression import (
     Base,
     Candidate,
@@ -32,26 +28,14 @@ from ahrsd.mismatch.regression import (
     columns_of,
 )
 from ahrsd.mismatch.score import Score
-from ahrsd.mismatch.spectrum import lines
-from ahrsd.mismatch.thin import thin_factor, thinned
-from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.unknown import course, detected, remainder
 from ahrsd.mismatch.validate import Gain
-from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
-BLOCKS = 80
-BLOCK_S = (2.0, 10.0)
 #: candidates that are held against the gate in one round, strongest first
 LOOKED_AT = 8
 #: prior of a term in the joint fit, in its own prior deviations: next to none
 LOOSE = 30.0
-#: rows per second that the search works with; faster recordings are averaged down to it
-WORKING_HZ = 12.0
-#: recordings longer than this are averaged whatever lines they have: a search takes too long
-MOST_ROWS = 24_000
-#: samples per working row from which the gyro's noise is taken from the recorded rate
-OVERSAMPLED = 5
 #: colour of the innovations beyond which delays are looked for in whitened ones
 MUCH_COLOUR = 3.0
 #: nats by which a frame must lead before steps in it are believed
@@ -69,70 +53,6 @@ LAG_STEPS = 3
 ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
 #: names of a gyro bias that changes with time alone
 WANDERING = ("gyro_bias_drift", "gyro_bias_step", "gyro_startup", "gyro_bias_temperature")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """What is asked: the track, what is known of the sensor, the library, the thresholds.
-
-    recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
-    lag_s:    lag of the magnetometer that is already taken out of the track
-    """
-
-    track: Track
-    spec: Spec
-    library: Mapping[str, Effect]
-    limits: Limits
-    recorded: Track
-    thin: int
-    cold: NullModel
-    lag_s: float = 0.0
-
-    @property
-    def rate_hz(self) -> float:
-        """Rows per second."""
-        return 1.0 / float(np.nanmedian(self.track.dt_s))
-
-    @property
-    def block_s(self) -> float:
-        """Length of the Gram's blocks: about 80, longer than correlated noise where possible."""
-        return float(np.clip(self.track.duration_s / BLOCKS, *BLOCK_S))
-
-    def lagging(self, lag_s: float) -> Problem:
-        """The same with a lag of the magnetometer taken out."""
-        track = thinned(delayed_gyro(self.recorded, lag_s), self.thin, self.cold)
-        return replace(self, track=track, lag_s=lag_s)
-
-
-def problem_of(
-    track: Track, spec: Spec, library: Mapping[str, Effect], limits: Limits
-) -> tuple[Problem, NullModel]:
-    """The recording at working rate, and a calibration to start from."""
-    cold = cold_start(track, spec)
-    m = 1 if _is_fast(track, cold) else thin_factor(track, WORKING_HZ)
-    root = float(np.sqrt(m))
-    start = replace(
-        cold,
-        sigma_mag_gauss=cold.sigma_mag_gauss / root,
-        sigma_gyro_rad_s=cold.sigma_gyro_rad_s / root,
-    )
-    work = thinned(track, m, cold)
-    known = spec
-    if m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
-        # the gyro's differences at the working rate would be its motion
-        known = replace(spec, sigma_gyro_rad_s=cold.sigma_gyro_rad_s)
-    return Problem(work, noise_of_thinned(known, m), library, limits, track, m, cold), start
-
-
-def _is_fast(track: Track, cold: NullModel) -> bool:
-    """Whether averaging would lose something: a turning shaft, or a line above the working rate."""
-    if roles.named(track.covariates, "rpm"):
-        return True
-    rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
-    if rate_hz < 2 * WORKING_HZ or len(track) > MOST_ROWS:
-        return False
-    whitened = run_filter(track, cold, sensitive=False).whitened
-    return any(line.frequency_hz > WORKING_HZ / 3 for line in lines(whitened, rate_hz))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -396,13 +316,3 @@ def _without(state: State, number: int) -> tuple[Survey, float]:
     seen = survey(replace(state, named=others), left)
     name = state.named[number].candidate.name
     return seen, max((c.evidence for c in seen.candidates if c.name == name), default=0.0)
-
-
-def noise_of_thinned(spec: Spec, m: int) -> Spec:
-    """What is known of the noise, for averages of m samples."""
-    root = float(np.sqrt(m))
-    return replace(
-        spec,
-        sigma_mag_gauss=None if spec.sigma_mag_gauss is None else spec.sigma_mag_gauss / root,
-        sigma_gyro_rad_s=None if spec.sigma_gyro_rad_s is None else spec.sigma_gyro_rad_s / root,
-    )
