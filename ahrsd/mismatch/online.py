@@ -167,9 +167,12 @@ class StepDetector:
             return None
         at_s = float(newest[0].time_s[0])
         if what == "hard iron":
-            at_s = self._when(newest[0], size)
-            if at_s > newest[0].time_s[0]:  # within the first: the others have all of the step
-                _, size, information = _gains(newest[1:], newest[0].reference)[what]
+            # it may have come within the first block: then only the others have all of it
+            _, late, of_late = _gains(newest[1:], newest[0].reference)[what]
+            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, late)]
+            at_s = self._when(newest[0], late if explained[1] > explained[0] else size)
+            if at_s > newest[0].time_s[0]:
+                size, information = late, of_late
         sigma = np.sqrt(usual * np.diag(np.linalg.inv(information)))
         return Step(what, at_s, float(newest[-1].time_s[-1]), size, sigma, len(newest))
 
