@@ -45,6 +45,7 @@ from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     State,
     Survey,
+    at_rest,
     basis_of,
     forward,
     pruned,
@@ -88,6 +89,8 @@ def diagnose(
         return _stopped(recording, [fact for fact in facts if fact.stops], notes)
     problem, cold = problem_of(put_right(track, facts), spec, library, limits)
     start = fit_null(problem.track, problem.spec, cold, walk=False)
+    if at_rest(start):
+        notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
     state, first, last = forward(State(problem, start))
     slim = pruned(state)
     last = last if slim.names == state.names else survey(slim)

@@ -17,7 +17,6 @@ from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.evidence import colour, log_bayes
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
-from ahrsd.mismatch.prewhitening import prediction_error_filter, prewhitened
 from ahrsd.mismatch.score import Score, score
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
@@ -56,7 +55,7 @@ class Base:
     """What every candidate is measured against: innovations with calibration and terms taken out.
 
     known (N, 3, q): whitened columns of the calibration and of the named terms, in `groups` order;
-    innovation (N, 3): whitened;  taps: what made both white again where the filter left colour;
+    innovation (N, 3): whitened;  rate_hz: rows per second;
     colour: power of the innovation at low frequency over white.
     """
 
@@ -65,7 +64,6 @@ class Base:
     groups: Mapping[str, slice]
     known: Array
     innovation: Array
-    taps: Array
     rate_hz: float
     colour: float
 
@@ -81,7 +79,7 @@ class Base:
                 width += _width(columns[end])
                 end += 1
             joined = _joined(columns[at:end], len(self.innovation))
-            seen = prewhitened(self.taps, sensitivities(self.filtered, joined))
+            seen = sensitivities(self.filtered, joined)
             edges = np.cumsum([0, *(_width(part) for part in columns[at:end])])
             out += [seen[:, :, a:b] for a, b in itertools.pairwise(edges)]
             at = end
@@ -120,7 +118,6 @@ def base(
         slices([(name, part.shape[2]) for name, part in parts]),
         np.concatenate([part for _, part in parts], axis=2),
         filtered.whitened,
-        np.ones(1),
         rate_hz,
         colour(filtered.whitened, rate_hz),
     )
@@ -130,19 +127,6 @@ def quieter(basis: Base, columns: Array) -> Base:
     """The basis with its colour taken from what the columns (N, 3, p) leave."""
     left = residual(np.concatenate([basis.known, columns], axis=2), basis.innovation)
     return replace(basis, colour=colour(left, basis.rate_hz))
-
-
-def generalised(basis: Base) -> Base:
-    """The basis as generalised least squares sees it: colour made white, not only paid for."""
-    taps = prediction_error_filter(basis.innovation, basis.rate_hz)
-    innovation = prewhitened(taps, basis.innovation)
-    return replace(
-        basis,
-        known=prewhitened(taps, basis.known),
-        innovation=innovation,
-        taps=np.convolve(basis.taps, taps),
-        colour=colour(innovation, basis.rate_hz),
-    )
 
 
 def residual(columns: Array, innovation: Array) -> Array:

@@ -36,8 +36,6 @@ from ahrsd.samples import Array
 LOOKED_AT = 8
 #: prior of a term in the joint fit, in its own prior deviations: next to none
 LOOSE = 30.0
-#: colour of the innovations beyond which delays are looked for in whitened ones
-MUCH_COLOUR = 3.0
 #: nats by which a frame must lead before steps in it are believed
 FRAME_LEAD = 10.0
 #: a jump in each frame, and how often its time is sought again in the joint fit
@@ -105,6 +103,8 @@ def survey(state: State, basis: Base | None = None) -> Survey:
     basis = basis or basis_of(state)
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
     library = problem.library
+    if at_rest(state.fit):
+        library = {name: effect for name, effect in library.items() if effect.family == "gyro"}
     if any(name in DELAYS for name in state.names):
         library = {name: effect for name, effect in library.items() if name not in DELAYS}
     candidates = tuple(best_settings(basis, library, taken))
@@ -115,6 +115,11 @@ def survey(state: State, basis: Base | None = None) -> Survey:
     gram = candidate_gram(basis, columns, problem.block_s)
     judged = [judge(c, gram, columns[c.name], basis, len(candidates), problem.limits) for c in near]
     return Survey(basis, candidates, tuple(judged))
+
+
+def at_rest(fit: NullFit) -> bool:
+    """Whether the motion says nothing of the soft iron: then only the gyro can be told about."""
+    return not bool(np.any(fit.informed[:5]))
 
 
 def forward(state: State) -> tuple[State, Survey, Survey]:

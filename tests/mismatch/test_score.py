@@ -8,7 +8,6 @@ from scipy import signal, stats
 
 from ahrsd.mismatch.evidence import colour, log_bayes, log_bayes_walk, posterior
 from ahrsd.mismatch.gram import block_edges, gram
-from ahrsd.mismatch.prewhitening import prediction_error_filter, prewhitened
 from ahrsd.mismatch.score import bootstrap_p, chi2_p, robust_p, score, shift_statistics
 
 COUNT, RATE_HZ = 1600, 10.0
@@ -108,17 +107,3 @@ def test_posterior_sums_to_one_and_follows_the_odds():
     assert sum(found.values()) == pytest.approx(1.0, abs=1e-12)
     assert found["a"] / found["b"] == pytest.approx(np.exp(3.0))
     assert found["b"] / found["c"] == pytest.approx(np.e)
-
-
-def test_red_innovations_are_made_white():
-    rng = np.random.default_rng(10)
-    keep = np.exp(-1 / RATE_HZ)
-    red = signal.lfilter([1.0], [1, -keep], rng.standard_normal((20_000, 3)), axis=0)
-    taps = prediction_error_filter(red, RATE_HZ)
-    white = prewhitened(taps, red)
-    assert colour(red / red.std(), RATE_HZ) > 5
-    assert colour(white, RATE_HZ) < 2.0  # the taper leaves some
-    assert np.std(white) == pytest.approx(1.0, abs=0.1)
-    once = signal.lfilter(taps, [1.0], red, axis=0)
-    np.testing.assert_allclose(white, once, atol=1e-10)
-    assert len(prediction_error_filter(rng.standard_normal((20_000, 3)), RATE_HZ)) == 1
