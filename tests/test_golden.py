@@ -62,8 +62,10 @@ def test_what_is_wrong_shows():
     }  # fmt: skip
     for name in ("fault_byte_drop", "fault_bit_flip", "fault_mute", "fault_clock_step"):
         assert FACTS[name]["gaps"] > 0, name
-    for name in ("fault_bit_flip", "fault_noise_insert", "fault_wrong_rate"):
+    for name in ("fault_bit_flip", "fault_noise_insert", "fault_byte_drop"):
         assert FACTS[name]["rejected"] > 0, name
+    for name in ("fault_garbage", "fault_wrong_rate"):  # not even the shape of a message
+        assert FACTS[name]["gaps"] > 0, name
 
 
 @pytest.mark.parametrize("name", ["clean_tumble_vnymr", "fault_garbage"])
