@@ -36,6 +36,8 @@ from ahrsd.samples import Array
 LOOKED_AT = 8
 #: prior of a term in the joint fit, in its own prior deviations: next to none
 LOOSE = 30.0
+#: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
+REST_SPREAD = 4e-3
 #: nats by which a frame must lead before steps in it are believed
 FRAME_LEAD = 10.0
 #: a jump in each frame, and how often its time is sought again in the joint fit
@@ -118,8 +120,10 @@ def survey(state: State, basis: Base | None = None) -> Survey:
 
 
 def at_rest(fit: NullFit) -> bool:
-    """Whether the motion says nothing of the soft iron: then only the gyro can be told about."""
-    return not bool(np.any(fit.informed[:5]))
+    """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
+    field = fit.filtered.nominal_b
+    unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
+    return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < REST_SPREAD)
 
 
 def forward(state: State) -> tuple[State, Survey, Survey]:
