@@ -86,6 +86,9 @@ def machine():
     if not program.exists():
         pytest.skip("ahrsd is not installed beside this Python")
     hidden = {sys.prefix, sys.base_prefix, str(PROJECT)}
+    closed = [path for path in hidden if Path(path).stat().st_mode & 0o005 != 0o005]
+    if closed:
+        pytest.skip(f"the service's own user may not read {', '.join(closed)}")
     drop_in = _DROP_IN.format(program=program, paths=" ".join(sorted(hidden)))
     units = {
         "ahrsd.service": (UNITS / "ahrsd.service").read_text(),
