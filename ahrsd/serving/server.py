@@ -116,7 +116,7 @@ class SocketServer:
                 elif key.fileobj is self._wake:
                     self._drain()
                 else:
-                    self._serve(self._clients[key.fd], mask)
+                    self._serve(key.data, mask)
         for client in list(self._clients.values()):
             self._end(client)
         for one in (self._listener, self._wake, self._waker):
@@ -137,7 +137,7 @@ class SocketServer:
             connection.close()
             return
         self._clients[connection.fileno()] = client
-        self._selector.register(connection, selectors.EVENT_READ)
+        self._selector.register(connection, selectors.EVENT_READ, client)
         client.outbox.answer(line_of({"schema": SCHEMA, "version": ahrsd.__version__}))
         self._send(client)
 
@@ -161,7 +161,8 @@ class SocketServer:
             self._send(client)
 
     def _serve(self, client: Client, mask: int) -> None:
-        if mask & selectors.EVENT_READ:
+        # Records handed out earlier in the same turn may have found the client gone.
+        if mask & selectors.EVENT_READ and not client.ended:
             self._hear(client)
         if mask & selectors.EVENT_WRITE and not client.ended:
             self._send(client)
@@ -215,7 +216,7 @@ class SocketServer:
                 self._end(client)
                 return
         wants = selectors.EVENT_READ | (selectors.EVENT_WRITE if len(client.outbox) else 0)
-        self._selector.modify(client.connection, wants)
+        self._selector.modify(client.connection, wants, client)
 
     def _end(self, client: Client) -> None:
         if client.ended:

@@ -151,3 +151,20 @@ def test_a_slow_reader_gets_a_gap_record(tmp_path):
     assert gaps[0]["first_seq"] == seqs[-1]["seq"] + 1
     assert gaps[0]["lost"] == gaps[0]["last_seq"] - gaps[0]["first_seq"] + 1
     assert json.dumps(seqs[0])  # plain values
+
+
+def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
+    server = SocketServer(tmp_path / "s")
+    try:
+        server.status({"number": 0})
+        for number in range(400):
+            with Asked(tmp_path / "s") as asked:
+                asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
+                assert asked._line() == {"watching": ["status"]}
+                asked._socket.sendall(b'{"ask": "status"}\n')
+                server.status({"number": number})
+            server.status({"number": number})
+        with Asked(tmp_path / "s") as asked:
+            assert asked.ask("status") == {"number": 399}
+    finally:
+        server.close()
