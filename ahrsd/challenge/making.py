@@ -12,16 +12,6 @@ from ahrsd.challenge.sealing import Round, seal
 from ahrsd.errors import AhrsdError
 
 GENERATOR = "blindworld"
-RINGS = (
-    "full",
-    "nulls",
-    "singles",
-    "pairs",
-    "withheld",
-    "outside",
-    "unidentifiable",
-    "semireal",
-)
 
 
 def find_generator() -> Path:

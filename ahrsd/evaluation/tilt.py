@@ -9,7 +9,7 @@ device:        roll and pitch as the device says them.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.signal import lfilter
@@ -19,7 +19,6 @@ from ahrsd.evaluation.track import EvaluationError, Track
 from ahrsd.samples import Array
 
 Tilt = Literal["auto", "gravity", "accelerometer", "device"]
-TILTS = get_args(Tilt)
 _MEMORY_S = 10.0
 
 

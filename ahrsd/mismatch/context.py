@@ -59,7 +59,6 @@ def build_context(track: Track, fit: Fit) -> Context:
         field_b=done.nominal_b,
         rate_b_rad_s=smooth,
         field_dot_b=np.cross(done.nominal_b, _at_the_sample(smooth, runs)),
-        rate_dot_b=_derivative(smooth, runs, track.time_s),
         R_nb=R_nb,
         world_levelled=levelled,
     )
@@ -175,14 +174,6 @@ def _at_the_sample(rate: Array, runs: Sequence[slice]) -> Array:
         rows = rate[run]
         out[run][:-1] = (rows[:-1] + rows[1:]) / 2
         out[run][0] = rows[min(1, len(rows) - 1)]
-    return out
-
-
-def _derivative(values: Array, runs: Sequence[slice], time_s: Array) -> Array:
-    out = np.zeros_like(values)
-    for run in runs:
-        if run.stop - run.start > 2:
-            out[run] = np.gradient(values[run], time_s[run], axis=0)
     return out
 
 

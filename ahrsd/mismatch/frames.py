@@ -1,4 +1,4 @@
-"""Do gyro and magnetometer mean the same axes, the same unit and the same time?
+"""Do gyro and magnetometer mean the same axes and the same unit?
 
 A field that is fixed in the world turns against the sensor: with iron b, gyro bias -c, and the
 gyro's axes and unit P between it and the magnetometer,
@@ -25,7 +25,6 @@ from ahrsd.so3 import skew
 
 _WINDOW_S = 0.5
 _ROWS, _WINDOWS = 4000, 80  # samples and windows, those that turn most
-_LAGS_S = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,17 +46,6 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lag:
-    """lag_s: how much later the magnetometer is than the gyro; cost as in `Frame`; at_edge: the
-    best of the grid is its end."""
-
-    lag_s: float
-    cost: float
-    cost_at_zero: float
-    at_edge: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Windows:
     """Normal equations of windows: gram (24, 24), right (24,), total of the readings' changes."""
 
@@ -67,14 +55,11 @@ class Windows:
     count: int
 
 
-def windows(track: Track, shift: int = 0, margin: int = 0) -> Windows | None:
-    """Normal equations with the gyro `shift` samples later; None where there is too little.
-
-    margin: samples kept free at the ends of runs, so that every shift has the same windows
-    """
+def windows(track: Track) -> Windows | None:
+    """Normal equations of the windows that turn most; None where there is too little."""
     step = track.step_s
     length = max(4, round(_WINDOW_S / step))
-    blocks = list(_blocks(track, length, max(margin, abs(shift))))
+    blocks = list(_blocks(track, length))
     if len(blocks) < 12:
         return None
     turn = np.array([np.sum(np.abs(track.gyro_b_rad_s[rows]), axis=0).max() for rows in blocks])
@@ -82,7 +67,7 @@ def windows(track: Track, shift: int = 0, margin: int = 0) -> Windows | None:
     rows = np.concatenate([np.arange(blocks[k].start, blocks[k].stop) for k in np.sort(chosen)])
     m0, m1 = track.mag_b_gauss[rows - 1], track.mag_b_gauss[rows]
     middle, dt = (m0 + m1) / 2, track.dt_s[rows][:, None]
-    rate = track.gyro_b_rad_s[rows + shift] * dt
+    rate = track.gyro_b_rad_s[rows] * dt
     starts = np.arange(0, len(rows), length)
     cross = skew(middle)
     parts = [
@@ -99,9 +84,9 @@ def windows(track: Track, shift: int = 0, margin: int = 0) -> Windows | None:
     return Windows(X.T @ X, X.T @ y, float(y @ y), len(starts))
 
 
-def _blocks(track: Track, length: int, margin: int) -> Iterator[slice]:
+def _blocks(track: Track, length: int) -> Iterator[slice]:
     for run in track.runs or (slice(0, len(track)),):
-        for first in range(run.start + 1 + margin, run.stop - length - margin + 1, length):
+        for first in range(run.start + 1, run.stop - length + 1, length):
             yield slice(first, first + length)
 
 
@@ -134,37 +119,3 @@ def _fitted(found: Windows, P: Array) -> tuple[float, float]:
     # twice the linear part less the quadratic one: right also where the ridge acts
     gained = 2 * solved @ (right / scale) - solved @ (gram / scale[:, None] / scale) @ solved
     return float(solved[0] / scale[0]), float(1.0 - gained / max(found.total, 1e-300))
-
-
-def lag_of(track: Track) -> Lag | None:
-    """The lag of a grid over +-200 ms at which gyro and magnetometer agree best, interpolated.
-
-    All 24 unknowns are free, so that neither frame nor iron can pose as a lag.
-    """
-    step = track.step_s
-    most = max(2, round(_LAGS_S / step))
-    shifts = np.unique(np.linspace(-most, most, min(2 * most + 1, 41)).round().astype(int))
-    costs = []
-    for shift in shifts:
-        found = windows(track, int(shift), most)
-        if found is None:
-            return None
-        costs.append(_free_cost(found))
-    best = int(np.argmin(costs))
-    at_edge = best in (0, len(costs) - 1)
-    offset = 0.0
-    if not at_edge:
-        left, middle, right = costs[best - 1 : best + 2]
-        bend = left - 2 * middle + right
-        offset = 0.5 * (left - right) / bend if bend > 0 else 0.0
-    spacing = float(np.median(np.diff(shifts)))
-    zero = costs[int(np.argmin(np.abs(shifts)))]
-    # the gyro's earlier samples fit: what the magnetometer shows now happened before
-    return Lag(float(-(shifts[best] + offset * spacing) * step), costs[best], zero, at_edge)
-
-
-def _free_cost(found: Windows) -> float:
-    scale = np.sqrt(np.maximum(np.diag(found.gram), 1e-300))
-    normal = found.gram / scale[:, None] / scale + 1e-9 * np.eye(24)
-    right = found.right / scale
-    return float(1.0 - right @ np.linalg.solve(normal, right) / max(found.total, 1e-300))

@@ -98,18 +98,6 @@ class Gram:
             self.information[outer[:-1]],
         )
 
-    def merge(self, other: Gram) -> Gram:
-        """The same columns over another stretch of time appended.  ValueError where they differ."""
-        if list(self.groups.items()) != list(other.groups.items()):
-            raise ValueError("Gram matrices of different columns cannot be merged")
-        return Gram(
-            self.groups,
-            np.concatenate([self.blocks, other.blocks]),
-            np.concatenate([self.counts, other.counts]),
-            np.concatenate([self.spans_s, other.spans_s]),
-            self.information + other.information,
-        )
-
     def json(self) -> dict[str, object]:
         """Groups, spans, counts and upper triangles, with a SHA-256 over the numbers."""
         upper = np.triu_indices(self.blocks.shape[1])

@@ -1,9 +1,7 @@
 """The noise law of the whitened innovations: colour, tails, and when it changed.
 
 Colour: autoregression over time, the same on the three axes; its order by the Bayesian criterion.
-What is regressed on coloured innovations should be whitened by it first (`whitened_again`): least
-squares is then efficient again and its chi-squared tests keep their level, which
-`tests/mismatch/test_noise.py` measures on red noise.
+It is simulated with the repaired model, so that its bands are as wide as the recording's noise.
 
 Level: half the mean square of successive differences per block, which no slow misfit enters, so a
 field that the model does not know is not called noise.
@@ -32,14 +30,10 @@ _LEVEL = 1.15  # times the spec's noise
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colour:
-    """e_k = sum_j coefficients_j e_(k-j) + white of `variance`; no coefficients: white.
-
-    long_run: variance of a sum of innovations over their number, over that of one: 1 where white
-    """
+    """e_k = sum_j coefficients_j e_(k-j) + white of `variance`; no coefficients: white."""
 
     coefficients: Array
     variance: float
-    long_run: float
 
     @property
     def order(self) -> int:
@@ -65,7 +59,7 @@ def colour_of(done: Filtered) -> Colour:
         [float(np.sum(rows[lag:] * rows[: len(rows) - lag])) / count for lag in range(_MOST + 1)]
     )
     if r[0] < 1e-18:
-        return Colour(np.zeros(0), 1.0, 1.0)
+        return Colour(np.zeros(0), 1.0)
     best, best_value, variance = np.zeros(0), count * np.log(max(r[0], 1e-300)), r[0]
     for order in range(1, min(_MOST, int(count) // 60) + 1):
         a = solve_toeplitz(r[:order], r[1 : order + 1])
@@ -73,25 +67,7 @@ def colour_of(done: Filtered) -> Colour:
         value = count * np.log(max(left, 1e-300)) + order * np.log(count)
         if value < best_value - 2.0:
             best, best_value, variance = np.asarray(a), value, left
-    gain = 1.0 - float(best.sum())
-    return Colour(best, float(variance), float(variance / max(gain**2, 1e-6) / max(r[0], 1e-300)))
-
-
-def whitened_again(values: Array, done: Filtered, colour: Colour) -> Array:
-    """Innovations or regressors (N, 3, ...) with the colour taken out, of variance 1 again.
-
-    Each run starts anew; its first rows, which lack a past, are taken as they are.
-    """
-    if colour.order == 0:
-        return values
-    out = values.copy()
-    track = done.track
-    for run in track.runs or (slice(0, len(track)),):
-        mine = values[run]
-        for j, a in enumerate(colour.coefficients, start=1):
-            if j < len(mine):
-                out[run][j:] -= a * mine[:-j]
-    return np.asarray(out / np.sqrt(colour.variance))
+    return Colour(best, float(variance))
 
 
 def tails_of(done: Filtered) -> Tails:

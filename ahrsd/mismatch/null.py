@@ -25,7 +25,7 @@ from ahrsd.estimator import chain
 from ahrsd.estimator.start import linear_start
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.coarse import group_size, thinned
-from ahrsd.mismatch.context import attitude, build_context
+from ahrsd.mismatch.context import build_context
 from ahrsd.mismatch.innovation import (
     TRACELESS,
     Filtered,
@@ -45,7 +45,6 @@ from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import Columns, Context, NullModel
 from ahrsd.samples import Array
 
-EARTH_RAD_S = 7.292115e-5
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _FEWEST = 15  # steps that a fit needs
 _DONE = 0.05  # largest step in standard deviations
@@ -115,14 +114,12 @@ def fit_null(
     *,
     noise: bool = True,
     walk: bool = True,
-    latitude_deg: float | None = None,
 ) -> NullFit:
     """Fit calibration, noise and terms to a track.
 
     start: begin there (a fit of nearly the same data) instead of cold
     noise: estimate what the spec leaves open; else keep the noise of `start`
     walk:  let the gyro's bias wander where the data say so
-    latitude_deg: the Earth's rotation is then taken out of the gyro where the attitude is level
 
     ValueError where there is nothing to fit to (`unusable`).
     """
@@ -137,9 +134,8 @@ def fit_null(
         )
     fit = _descended(problem, start, _STEPS)
     prior = problem.prior.sharper(repetition_of(fit.filtered))
-    fixed = None if latitude_deg is None else earth_rate(track, fit.filtered, latitude_deg)
-    if prior is not problem.prior or fixed is not None:
-        problem = replace(problem, terms=fit.terms, prior=prior, fixed_gyro=fixed)
+    if prior is not problem.prior:
+        problem = replace(problem, terms=fit.terms, prior=prior)
         fit = _descended(problem, start, _STEPS)
     if not noise:
         return fit
@@ -160,20 +156,6 @@ def unusable(track: Track) -> str | None:
     if np.count_nonzero(steps) < _FEWEST:
         return f"{np.count_nonzero(steps)} samples follow another one, {_FEWEST} are needed"
     return None
-
-
-def earth_rate(track: Track, done: Filtered, latitude_deg: float) -> Array | None:
-    """(N, 3) rad/s that the gyro reads of the Earth's rotation, None where level is not known.
-
-    The attitude's north is magnetic: a declination of 10 degrees turns the horizontal part by as
-    much, 1e-5 rad/s, which the gyro bias takes up but for what turns with the heading.
-    """
-    R_nb, levelled = attitude(track, done)
-    if not levelled:
-        return None
-    latitude = np.radians(latitude_deg)
-    rate_n = EARTH_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
-    return np.asarray(np.einsum("nji,j->ni", R_nb, rate_n))
 
 
 def cold_start(track: Track, spec: Spec) -> NullModel:
@@ -246,7 +228,6 @@ class _Problem:
     track: Track
     terms: tuple[FittedTerm, ...]
     prior: Prior
-    fixed_gyro: Array | None = None
 
     @property
     def mean(self) -> Array:
@@ -321,7 +302,8 @@ def _named(problem: _Problem, point: _Point, covariance: Array) -> tuple[FittedT
 
 def _at(problem: _Problem, model: NullModel, values: Array, last: _Point | None) -> _Point:
     """Filter at these parameters; the terms' columns are those of the context before."""
-    mag, gyro = None, problem.fixed_gyro
+    mag: Array | None = None
+    gyro: Array | None = None
     columns: tuple[Columns, ...] = ()
     if problem.terms:
         basis = last or _Point(model, values, run_filter(problem.track, model), None, None, ())
@@ -337,8 +319,6 @@ def _contributions(
 ) -> tuple[Array | None, Array | None]:
     count = len(problem.track)
     mag, gyro = np.zeros((count, 3)), np.zeros((count, 3))
-    if problem.fixed_gyro is not None:
-        gyro += problem.fixed_gyro
     at = 0
     for term, mine in zip(problem.terms, columns, strict=True):
         theta = values[at : at + len(term.value)]

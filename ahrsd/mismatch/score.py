@@ -133,17 +133,6 @@ def _jackknifed(H: Array, s: Array) -> Array:
     return np.asarray(np.einsum("bij,bj->bi", vectors, turned))
 
 
-def bootstrap_p(what: Score, rng: np.random.Generator, flips: int = 1000) -> float:
-    """Share of random block-sign flips whose score statistic is at least the one found."""
-    if what.rank == 0:
-        return 1.0
-    s = what.block_s / np.sqrt(what.information)
-    signs = rng.choice([-1.0, 1.0], size=(flips, len(s)))
-    found = float(np.sum(s.sum(axis=0) ** 2))
-    drawn = np.sum((signs @ s) ** 2, axis=1)
-    return (1.0 + float(np.sum(drawn >= found))) / (1.0 + flips)
-
-
 def shift_statistics(columns: Array, innovation: Array, minimum_shift: int) -> tuple[float, Array]:
     """Score statistic, and those with the innovations shifted in time around the circle.
 

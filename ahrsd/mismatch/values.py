@@ -56,7 +56,6 @@ class Context:
     rate_b_rad_s: (N, 3) true rate: gyro minus bias and terms, zero-phase smoothed: it shares
                   next to no noise with a single innovation
     field_dot_b:  (N, 3) gauss/s, field_b x rate_b_rad_s
-    rate_dot_b:   (N, 3) rad/s^2, of the smoothed rate
     R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
                   is an accelerometer or a reference attitude (`world_levelled`), else fixed but
                   of unknown orientation
@@ -67,7 +66,6 @@ class Context:
     field_b: Array
     rate_b_rad_s: Array
     field_dot_b: Array
-    rate_dot_b: Array
     R_nb: Array
     world_levelled: bool
 

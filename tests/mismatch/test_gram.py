@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from ahrsd.mismatch.gram import block_edges, gram, solve
 
@@ -42,20 +41,6 @@ def test_blocks_of_the_projection_sum_to_the_schur_complement_and_are_the_blocks
     for k in range(8):
         part = rest[edges[k] : edges[k + 1]].reshape(-1, 3)
         np.testing.assert_allclose(left.blocks[k], part.T @ part, atol=1e-9)
-
-
-def test_two_halves_merge_to_the_whole():
-    Z, X, e, time_s = made(2)
-    edges = block_edges(time_s, 5.0)
-    whole = gram({"z": Z, "x": X}, e, time_s, edges)
-    cut = edges[4]
-    first = gram({"z": Z[:cut], "x": X[:cut]}, e[:cut], time_s[:cut], edges[:5])
-    rest = [edge - cut for edge in edges[4:]]
-    second = gram({"z": Z[cut:], "x": X[cut:]}, e[cut:], time_s[cut:], rest)
-    np.testing.assert_allclose(first.merge(second).blocks, whole.blocks, rtol=1e-12)
-    assert first.merge(second).json()["sha256"] == whole.json()["sha256"]
-    with pytest.raises(ValueError, match="different columns"):
-        first.merge(second.select(["x"]))
 
 
 def test_the_order_of_the_groups_does_not_matter():

@@ -12,7 +12,7 @@ from tracks import experiment, recorded, track_of, true_model
 from ahrsd import so3
 from ahrsd.mismatch.coarse import noise_of, thinned
 from ahrsd.mismatch.noise_fit import WALK_CAP_RAD_S_SQRT_S
-from ahrsd.mismatch.null import EARTH_RAD_S, FittedTerm, NullFit, fit_null
+from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
 from ahrsd.mismatch.prior import rate_at_rest
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import Columns, Context, NullModel
@@ -121,26 +121,6 @@ def test_terms_are_fitted_jointly_and_linearised_again() -> None:
     assert fit.terms_mag is not None
     assert np.abs(fit.terms_mag[-1] - 0.5 * ramp.value).max() < 1e-9
     assert np.abs(fit.model.hard_iron_gauss - truth.hard_iron_gauss).max() < 3e-4
-
-
-def test_the_earths_rotation_is_taken_out_where_the_latitude_is_known() -> None:
-    """Left in, its 73 urad/s goes into the gyro bias: ten deviations of a good gyro."""
-    made = experiment("mam", samples=8000, seed=1, sigma_gyro=2e-4)
-    track, truth = track_of(made), true_model(made)
-    rate_n = EARTH_RAD_S * np.array([np.cos(0.8), 0.0, -np.sin(0.8)])
-    # the simulation's north is true; what the fit calls north is where its field points
-    field_n = np.einsum("nij,nj->ni", made.R_nb, made.field_b)[0]
-    east = np.arctan2(field_n[1], field_n[0])
-    turn = so3.exp(np.array([0.0, 0.0, east]))
-    earth = np.einsum("nji,j->ni", made.R_nb, turn @ rate_n)
-    turning = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + earth)
-    with_it = fit_null(turning, latitude_deg=np.degrees(0.8), walk=False)
-    without = fit_null(turning, walk=False)
-    off = np.linalg.norm(with_it.model.gyro_bias_rad_s - truth.gyro_bias_rad_s)
-    assert with_it.terms_gyro is not None
-    assert np.abs(with_it.terms_gyro - earth).max() < 2e-6
-    assert off < 1e-5
-    assert np.linalg.norm(without.model.gyro_bias_rad_s - truth.gyro_bias_rad_s) > 3 * off
 
 
 def test_thinning_composes_rotations_exactly() -> None:

@@ -143,10 +143,6 @@ class Scatter(Effect):
 
     kind: Kind = "variance"
 
-    @abstractmethod
-    def variance(self, context: Context, setting: Setting) -> Array:
-        """(N, 3, p) gauss^2 per squared unit of the parameter."""
-
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """None: there is nothing to regress the readings on."""
         return ()

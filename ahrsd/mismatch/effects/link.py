@@ -8,7 +8,7 @@ import numpy as np
 
 from ahrsd.mismatch.effects import series, shapes
 from ahrsd.mismatch.effects.base import Discrete, Linear, Parameter, Readings, Scatter, Setting
-from ahrsd.mismatch.values import Columns, Context
+from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
 
 _MG = 1e-3
@@ -59,11 +59,6 @@ class TimestampJitter(Scatter):
     size = "1 to 20 ms on a loaded host"
     source = "dossier C2"
 
-    def variance(self, context: Context, setting: Setting) -> Array:
-        """Squared change of the reading per second."""
-        change = np.cross(context.field_b, context.rate_b_rad_s) @ context.model.soft_iron.T
-        return np.asarray(change**2)[:, :, None]
-
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Stamps off by a normal deviate, never so far that time would go back."""
         draw = np.random.default_rng(setting["seed"]).standard_normal(len(readings.time_s))
@@ -97,10 +92,6 @@ class NoiseBurst(Scatter):
     manoeuvre = "find out what was running then"
     size = "1 to 100 mG"
     source = "dossier N1"
-
-    def variance(self, context: Context, setting: Setting) -> Array:
-        """1 within the burst, on each axis."""
-        return np.repeat(_within(context.track.time_s, setting)[:, None, None], 3, axis=1)
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Normal noise within the burst."""
@@ -136,11 +127,6 @@ class NoiseLevel(Scatter):
     manoeuvre = "rest with everything off, then on"
     size = "two to five times the data sheet's"
     source = "dossier N1"
-
-    def variance(self, context: Context, setting: Setting) -> Array:
-        """1 from the onset on for the magnetometer; the gyro's shows nowhere in its reading."""
-        on = np.where(context.track.time_s >= setting["onset_s"], 1.0, 0.0)
-        return np.stack([np.repeat(on[:, None], 3, axis=1), np.zeros((len(on), 3))], axis=2)
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Normal noise on both sensors."""
