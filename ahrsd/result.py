@@ -47,9 +47,20 @@ def calibration_json(
         return base | _nothing(warnings)
     written, refusal = _registers(estimate, registers, gyro_is_raw)
     said = [*warnings, *estimate.warnings, *refusal, *why_not_converged(estimate)]
-    found = heading or HeadingErrors()
-    sigma = estimate.sigma
-    return base | {
+    return (
+        base
+        | _found(estimate, heading or HeadingErrors())
+        | {
+            "registers": written,
+            "warnings": said,
+        }
+    )
+
+
+def _found(estimate: Estimate, heading: HeadingErrors) -> dict[str, object]:
+    """What the estimate says, in the contract's names."""
+    parts = np.split(estimate.sigma, [6, 9])
+    return {
         "samples": estimate.samples,
         "duration_s": _number(estimate.duration_s),
         "converged": estimate.converged,
@@ -60,7 +71,7 @@ def calibration_json(
         "field_gauss": _number(estimate.field_gauss),
         "field_known": estimate.field_known,
         "standard_deviation": {
-            name: part.tolist() for name, part in zip(_SIGMAS, np.split(sigma, [6, 9]), strict=True)
+            name: part.tolist() for name, part in zip(_SIGMAS, parts, strict=True)
         },
         "noise": {
             "mag_gauss": _number(estimate.noise_mag_gauss),
@@ -69,16 +80,14 @@ def calibration_json(
         },
         "heading_error_deg": {
             "expected_worst": _number(estimate.heading_sigma_deg),
-            "before_rms": found.before_rms,
-            "after_rms": found.after_rms,
+            "before_rms": heading.before_rms,
+            "after_rms": heading.after_rms,
         },
         "observability": {
             "score": _number(estimate.observability.score),
             "unobservable": list(estimate.observability.unobservable),
             "prior_ratio": estimate.observability.prior_ratio.tolist(),
         },
-        "registers": written,
-        "warnings": said,
     }
 
 

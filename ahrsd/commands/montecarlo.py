@@ -89,25 +89,9 @@ def command(
 
     Exit 1 where a method had no answer at the last time in some run.
     """
-    from ahrsd.montecarlo import Plan, plans
-    from ahrsd.montecarlo_methods import known_methods
-
-    everyone = known_methods() if _ALL in methods else ()
-    chosen = tuple(dict.fromkeys(name for name in (*everyone, *methods) if name != _ALL))
-    try:
-        base = Plan(
-            "wam",
-            methods=chosen,
-            at_s=at_s,
-            rate_hz=rate_hz,
-            noise_gyro_rad_s=gyro_mrad * _MRAD,
-            offset_behind_iron=hard_iron_as_read,
-        )
-        scenarios = ("wam", "mam", "lam") if scenario == _ALL else (scenario,)
-        motions = ("slow", "rov") if motion == _ALL else (motion,)
-        wanted = plans(base, scenarios, motions, [mg * _MG for mg in noise_mg], scales)
-    except ValueError as error:
-        raise AhrsdError(str(error)) from None
+    wanted = _plans(
+        scenario, motion, methods, at_s, rate_hz, noise_mg, scales, gyro_mrad, hard_iron_as_read
+    )
     sets = []
     for plan in wanted:
         rows = _run(plan, range(seed, seed + runs), jobs, resume)
@@ -122,6 +106,39 @@ def command(
         _draw(figure_path, sets)
     last = [row for _, rows in sets for row in rows if row.at_s == at_s[-1]]
     raise SystemExit(EXIT_NO if any(row.answered < row.runs for row in last) else EXIT_DONE)
+
+
+def _plans(
+    scenario: str,
+    motion: str,
+    methods: tuple[str, ...],
+    at_s: tuple[float, ...],
+    rate_hz: float,
+    noise_mg: tuple[float, ...],
+    scales: tuple[float, ...],
+    gyro_mrad: float,
+    hard_iron_as_read: bool,
+) -> list[Plan]:
+    """One plan per scenario, motion, noise and hard iron that were asked for."""
+    from ahrsd.montecarlo import Plan, plans
+    from ahrsd.montecarlo_methods import known_methods
+
+    everyone = known_methods() if _ALL in methods else ()
+    chosen = tuple(dict.fromkeys(name for name in (*everyone, *methods) if name != _ALL))
+    scenarios = ("wam", "mam", "lam") if scenario == _ALL else (scenario,)
+    motions = ("slow", "rov") if motion == _ALL else (motion,)
+    try:
+        base = Plan(
+            "wam",
+            methods=chosen,
+            at_s=at_s,
+            rate_hz=rate_hz,
+            noise_gyro_rad_s=gyro_mrad * _MRAD,
+            offset_behind_iron=hard_iron_as_read,
+        )
+        return plans(base, scenarios, motions, [mg * _MG for mg in noise_mg], scales)
+    except ValueError as error:
+        raise AhrsdError(str(error)) from None
 
 
 def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[Row]:

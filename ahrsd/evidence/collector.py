@@ -79,11 +79,7 @@ class EvidenceCollector:
         `halves`: corrections from two disjoint halves of the data; without them they are fitted
         here. `present_gyro_bias_rad_s` (3,) is what register 84 takes off now.
         """
-        judged = proposed
-        if judged is None and estimate.field_known:
-            judged = estimate.correction
-        elif judged is None:
-            judged = comparison.in_scale_of(present, estimate.correction)
+        judged = proposed or comparison.proposed_by(estimate, present)
         nodes = self._nodes(estimate.gyro_bias_rad_s)
         motion, field, proof = UNKNOWN_MOTION, UNKNOWN_FIELD, NO_PROOF
         if nodes is not None:
@@ -96,12 +92,7 @@ class EvidenceCollector:
         return Evidence(
             health=health,
             basis=basis,
-            estimate=EstimateFacts(
-                estimate.converged,
-                estimate.observability.unobservable,
-                float(estimate.observability.score),
-                float(estimate.heading_sigma_deg),
-            ),
+            estimate=_facts(estimate),
             motion=motion,
             field=field,
             world=comparison.against_world(field, world),
@@ -125,3 +116,12 @@ class EvidenceCollector:
                 derived[segment.number] = _Derived(track(segment, bias_b_rad_s), bins)
         self._derived = derived
         return nodes_at([d.track for d in derived.values()], np.asarray(bias_b_rad_s))
+
+
+def _facts(estimate: Estimate) -> EstimateFacts:
+    return EstimateFacts(
+        estimate.converged,
+        estimate.observability.unobservable,
+        float(estimate.observability.score),
+        float(estimate.heading_sigma_deg),
+    )

@@ -36,6 +36,13 @@ def in_scale_of(model: Affine, correction: Affine) -> Affine:
     return Affine(scale * correction.matrix, correction.offset)
 
 
+def proposed_by(estimate: Estimate, present: Affine) -> Affine:
+    """The estimate's correction; in the scale of `present` where the field is not known."""
+    if estimate.field_known:
+        return estimate.correction
+    return in_scale_of(present, estimate.correction)
+
+
 def against_world(field: FieldFacts, world: WorldField | None) -> WorldFacts | None:
     """Magnitude and dip against the model; None without a position."""
     if world is None:
