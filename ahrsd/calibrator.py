@@ -20,7 +20,6 @@ from ahrsd.samples import Array, SampleBlock
 from ahrsd.worldfield import WorldField
 
 _PATIENCE_S = 60.0  # after a step was told, for the estimator to see it and begin anew by itself
-_ANEW = "calibrated anew"  # in the estimator's warning that it forgot what was before a change
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,7 @@ class Calibrator:
         self.step_open = False  # the estimate still rests on data from before it
         self._notes: list[tuple[float, str]] = []
         self._at_s = float("nan")
-        self._said: list[str] = []
+        self._heeded_s: float | None = None  # the estimator's restart that was told
 
     @property
     def proposed(self) -> Affine | None:
@@ -105,7 +104,7 @@ class Calibrator:
             self.estimator = Estimator(
                 self.settings.estimator, self.present, self.present_gyro_bias_rad_s
             )
-            self.estimate, self._gap, self._said = None, True, []
+            self.estimate, self._gap, self._heeded_s = None, True, None
             self._begin_anew([f"calibrated anew from {self._at_s:.0f} s"])
         return step is not None
 
@@ -114,11 +113,10 @@ class Calibrator:
         return self.step is None or not 0.0 <= self._at_s - self.step.told_s <= _PATIENCE_S
 
     def _heed(self, estimate: Estimate | None) -> None:
-        """Whether the estimator says, for the first time, that it began anew by itself."""
-        said = [] if estimate is None else [text for text in estimate.warnings if _ANEW in text]
-        if said and said != self._said:
-            self._said = said
-            self._begin_anew(said)
+        """Whether the estimator began anew by itself since the last call."""
+        if estimate is not None and self.estimator.restarted_s != self._heeded_s:
+            self._heeded_s = self.estimator.restarted_s
+            self._begin_anew(list(estimate.warnings))
 
     def _begin_anew(self, notes: list[str]) -> None:
         """The estimate forgot what was before a change: evidence from then proves nothing now."""

@@ -61,6 +61,7 @@ class Estimator:
         self._moving_epochs, self._last_search = 0, 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
+        self.restarted_s: float | None = None  # when the iron changed, if it did
         self._warnings: tuple[str, ...] = ()
 
     def add(self, block: SampleBlock) -> bool:
@@ -120,7 +121,7 @@ class Estimator:
         sure = not self._searching and window.step_sigmas < _SETTLED
         self._strange = self._strange + 1 if sure and window.contradicted() else 0
         if self._strange == _CHANGED:
-            at_s = float(window.epochs[-_CHANGED].data.time_s[0])
+            at_s = self.restarted_s = float(window.epochs[-_CHANGED].data.time_s[0])
             self._warnings = (
                 f"the iron changed at about {at_s:.0f} s: calibrated anew from there",
             )
