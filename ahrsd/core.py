@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ahrsd import events, inputs
-from ahrsd.calibration import Affine
+from ahrsd.calibration import Affine, Estimate
 from ahrsd.calibrator import Calibrator
 from ahrsd.conversation import (
     Closed,
@@ -30,12 +30,13 @@ from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
 from ahrsd.errands import Errands
 from ahrsd.evidence.values import BasisFacts
+from ahrsd.examination import Circumstances, Desk, Finding, Piece
 from ahrsd.gates import Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.rollcall import Rollcall
-from ahrsd.samples import SampleBlock
+from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream import Stream
-from ahrsd.unmapping import Compensation, RegisterEpochs
+from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.states import State
@@ -45,7 +46,7 @@ from drivers.vn100.session import DeviceFault, Stray
 from drivers.vn100.session import Event as SessionEvent
 
 _WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01
-_MAG, _GYRO, _RATE = 23, 84, 7
+_RATE = 7
 
 
 class Core:
@@ -65,27 +66,29 @@ class Core:
         )
         self.writeback = WriteBack(settings.policy)
         self.registers: dict[int, Values] = {}
-        self._from_scratch = (settings.calibrator, Affine.identity(), np.zeros(3))
+        self._compared: tuple[Affine, Array] = (Affine.identity(), np.zeros(3))
+        self._from_scratch = (settings.calibrator, *self._compared)
         self.calibrator = Calibrator(*self._from_scratch)
+        self._desk = Desk()
+        self._proposed: Affine | None = None
         self.at_s = 0.0
         self.first_s = float("nan")
-        self.faults = 0
-        self.strays = 0
-        self.undecodable = 0
+        self.faults = self.strays = self.undecodable = 0
         self._host_s = 0.0
         self._stopping = ""
         self._closing = self._uptime_due = self._unread = False
-        self._restarts = 0
+        self._links = self._restarts = 0
         self._serial: int | None = None
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
+        self._out: list[events.Event] = []
         if settings.policy.mode is Mode.PASSIVE:
             self._no_device()
-        self._out: list[events.Event] = []
+        talk = self.conversation
         self._handlers: dict[type, Callable[..., None]] = {
-            inputs.Received: self._received,
-            inputs.Tick: self._tick,
+            inputs.Received: lambda it: self.take(talk.received(it.data, self._host_s)),
+            inputs.Tick: lambda _: self.take(talk.tick(self._host_s)),
             inputs.WallClock: self._wall_clock,
             inputs.LinkOpened: self._link_opened,
             inputs.LinkLost: self._link_lost,
@@ -94,7 +97,8 @@ class Core:
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
             inputs.JournalOpened: self._journal_opened,
-            inputs.Journalled: self._journalled,
+            inputs.Journalled: lambda it: self._errands.journalled(it, self._host_s),
+            inputs.Examined: lambda it: self._take_findings(it.pieces),
             inputs.Stop: self._stop,
         }
 
@@ -120,12 +124,6 @@ class Core:
 
     # -- inputs ------------------------------------------------------------------------------------
 
-    def _received(self, item: inputs.Received) -> None:
-        self.take(self.conversation.received(item.data, self._host_s))
-
-    def _tick(self, _: inputs.Tick) -> None:
-        self.take(self.conversation.tick(self._host_s))
-
     def _wall_clock(self, item: inputs.WallClock) -> None:
         self._rollcall.wall_offset_s = item.wall_s - self._host_s
 
@@ -141,6 +139,7 @@ class Core:
 
     def _link_lost(self, item: inputs.LinkLost) -> None:
         self._flush()
+        self._links += 1
         self._note("warning", f"link lost: {item.reason}")
         self.take(self.conversation.lost(self._host_s))
         self.stream.forget()
@@ -169,9 +168,6 @@ class Core:
             self._note("error", f"journal: {item.error}; nothing can be written")
         self._rollcall.journal(item)
         self._device_known()
-
-    def _journalled(self, item: inputs.Journalled) -> None:
-        self._errands.journalled(item, self._host_s)
 
     def _stop(self, item: inputs.Stop) -> None:
         self._flush()
@@ -239,7 +235,8 @@ class Core:
         # on trial, a candidate is still compared with what the user had before it
         trial = self.writeback.history.open
         users = values if trial is None else {**values, **trial.old}
-        self.calibrator.compare_with(_affine(users.get(_MAG)), _affine(users.get(_GYRO)).offset)
+        self._compared = user_compensation(users)
+        self._begin(self._desk.compare(self.calibrator, *self._compared))
 
     def _digest(self, said: Said) -> None:
         match said:
@@ -316,11 +313,11 @@ class Core:
     def _on_state(self, change: events.StateChanged) -> None:
         self.decisions.add(self.at_s, change.new, reason=change.reason)
         if change.new == State.TRIAL:
-            new = _affine(self.registers.get(_MAG))
             transaction = self.writeback.history.open
-            before = {**self.registers, **({} if transaction is None else transaction.old)}
-            old = (_affine(before.get(_MAG)), _affine(before.get(_GYRO)).offset)
-            self._trial = LiveTrial(new, old[0], _affine(self.registers.get(_GYRO)).offset, old[1])
+            old = {} if transaction is None else transaction.old
+            mag, bias = user_compensation(self.registers)
+            old_mag, old_bias = user_compensation({**self.registers, **old})
+            self._trial = LiveTrial(mag, old_mag, bias, old_bias)
         elif change.old == State.TRIAL:
             self._trial = None
 
@@ -339,62 +336,65 @@ class Core:
             self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
         if self.stream.take_replaced():
             self.calibrator = self.calibrator.anew()
-        calibrator = self.calibrator
-        new = calibrator.take(block)
-        present, proposed = _affine(self.registers.get(_MAG)), calibrator.proposed
-        self._out.append(events.SamplesSeen(block, present, proposed))
-        self._out += calibrator.take_notes(self._host_s)
+            self._begin(self._desk.compare(self.calibrator, *self._compared))
+        present, _ = user_compensation(self.registers)
+        self._out.append(events.SamplesSeen(block, present, self._proposed))
         self._errands.add(self.writeback.on_samples(block))
         if self._trial is not None:
             metrics = self._trial.take(block)
             self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-        if new:
-            self._judge()
+        how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+        now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
+        self._begin(self._desk.examine(self.calibrator, block, now))
         self._errands.let_out(self)
 
-    def _judge(self) -> None:
-        estimate = self.calibrator.estimate
-        assert estimate is not None
-        host_s = self._host_s or self.at_s
-        self._out.append(events.Estimated(self.at_s, host_s, estimate))
-        gates = self.calibrator.judged(
-            self.at_s, self.stream.health(), self.basis(), self.writeback.margin
-        )
-        self._out.append(events.Judged(self.at_s, host_s, gates))
-        self.decisions.add(
-            self.at_s,
-            self.writeback.state.value,
-            gates,
-            hard_iron_gauss=estimate.hard_iron_gauss.tolist(),
-            gyro_bias_rad_s=estimate.gyro_bias_rad_s.tolist(),
-            converged=estimate.converged,
-        )
+    def _begin(self, piece: Piece) -> None:
+        """Have it done beside the core, or do it now."""
+        if self.settings.beside:
+            self._out.append(events.Examine(piece.work))
+        else:
+            self._take_findings(1)
+
+    def _take_findings(self, pieces: int) -> None:
+        for found in self._desk.take(pieces):
+            if found.calibrator is not self.calibrator:
+                continue  # another device or other quantities since
+            self._proposed = found.proposed
+            self._out += found.notes
+            if found.estimate is not None:
+                self._judged(found, found.estimate)
+
+    def _judged(self, found: Finding, estimate: Estimate) -> None:
+        at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates
+        self._out.append(events.Estimated(at_s, host_s, estimate))
+        self._out.append(events.Judged(at_s, host_s, gates))
+        self.decisions.judged(at_s, self.writeback.state.value, gates, estimate)
+        if found.when.era != self._era():
+            return  # it judged what is in force no more; nothing may be written by it
         self._errands.add(
             self.writeback.on_verdict(
                 estimate,
                 for_level(gates, self.settings.level),
-                self.at_s,
+                at_s,
                 self._host_s,
                 gyro_is_raw=not self.stream.compensated_gyro,
                 flash_gates=for_level(gates, Level.FLASH),
             )
         )
 
-    def basis(self) -> BasisFacts:
+    def _era(self) -> tuple[int, int]:
+        return self.epochs.now.number, self._links
+
+    def _basis(self) -> BasisFacts:
         """What is known of where the samples come from."""
-        identity = self.conversation.identity
+        identity, applied = self.conversation.identity, self.epochs.now.compensation
         return BasisFacts(
             registers_read=bool(self.registers),
             changed=False,
-            hsi_applied=self.epochs.now.compensation is not None
-            and self.epochs.now.compensation.hsi is not None,
+            hsi_applied=applied is not None and applied.hsi is not None,
             compensated_only=self.stream.compensated_mag,
             firmware_known=identity is not None and identity.profile.writable,
         )
 
     def _note(self, level: str, text: str) -> None:
         self._out.append(events.Noted(self.at_s, self._host_s, level, text))
-
-
-def _affine(values: Values | None) -> Affine:
-    return Affine.identity() if values is None else Affine.from_register(tuple(map(float, values)))

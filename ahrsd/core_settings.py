@@ -8,6 +8,8 @@ from ahrsd.calibrator import CalibratorSettings
 from ahrsd.gates import Level
 from ahrsd.writeback.policy import WriteBackPolicy
 
+BESIDE_KEY = "examined"  # in a capture's header where `beside` was set
+
 
 @dataclass(frozen=True, slots=True)
 class CoreSettings:
@@ -19,6 +21,7 @@ class CoreSettings:
     keep: how many decisions, and how many of the first and of the newest gaps, stay in memory for
         a summary; None: all, for a recording, whose length is known. Counts and hash are always
         those of everything.
+    beside: the slow part of the work is done beside the core (`examination`), not at once
     """
 
     calibrator: CalibratorSettings
@@ -28,6 +31,7 @@ class CoreSettings:
     stream_rate_hz: float | None = None
     stream_rate_source: str = "as given"
     keep: int | None = None
+    beside: bool = False
 
     @property
     def level(self) -> Level:

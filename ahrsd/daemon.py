@@ -34,7 +34,7 @@ log = logging.getLogger("ahrsd")
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
 _LONGEST_WAIT_S = 0.2
 _SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
-_STOP_S = 2.0  # for putting things back; a service manager's patience is limited
+_STOP_S = 1.6  # for putting things back; a service manager's patience is limited
 _AMENDS_S = 2.0
 _INTERLOCK_S = 0.2
 _WATCH_S = 1.0
@@ -84,11 +84,14 @@ class Daemon:
         known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
         self._link = SerialLink(port_path, known, clock.now_ns)
         self._inbox = self._link.inbox
+        if shell.worker is not None:
+            shell.worker.woken = self._inbox.wake
         self._interlock, self._box, self._public = interlock, box, public
         self._safe: bool | None = None
         self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
+        self.stopped_s: float | None = None  # when `stop` was called, monotonic
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
         self._next_interlock_ns = 0
         self._wall_offset_s = float("nan")
@@ -101,7 +104,8 @@ class Daemon:
 
     def stop(self, reason: str) -> None:
         """End the run; safe from a signal handler and from another thread."""
-        self._stop_reason = self._stop_reason or reason
+        if not self._stop_reason:
+            self._stop_reason, self.stopped_s = reason, time.monotonic()
         self._inbox.wake()
 
     def operate(self, verb: str, argument: str = "") -> None:
@@ -140,13 +144,23 @@ class Daemon:
             self._lost(item.host_ns, item.reason)
         # What is waited for may lie in the inbox or in the port already: a reply is late only
         # against what was taken, and a silence is one only where nothing waits to be read.
-        if item is not None:
-            self._tick(item.host_ns)
-        elif not self._link.has_more():
-            self._tick(self.clock.now_ns())
+        now_ns = self.clock.now_ns() if item is None else item.host_ns
+        if item is not None or not self._link.has_more():
+            self._tick(now_ns)
+        self._take_findings(now_ns)
         self._look()
-        if self._public is not None:
+        if self._public is not None and not self._stuck:
             self._public.turn()
+
+    @property
+    def _stuck(self) -> bool:
+        return self.shell.worker is not None and self.shell.worker.stuck
+
+    def _take_findings(self, now_ns: int) -> None:
+        """What was done beside the core, told at the time of what was taken last."""
+        worker = self.shell.worker
+        if worker is not None and (pieces := worker.take_done()):
+            self._feed(inputs.Examined(now_ns, pieces))
 
     def _tick(self, now_ns: int) -> None:
         deadline = self.shell.core.deadline_ns
@@ -266,7 +280,7 @@ class Daemon:
 
     def _finish(self) -> None:
         """Let the core put back what it changed; bounded in time."""
-        until = time.monotonic() + _STOP_S
+        until = (self.stopped_s or time.monotonic()) + _STOP_S
         if self._public is not None:
             self._public.stopping()
         self._feed(inputs.Stop(self.clock.now_ns(), self._stop_reason))

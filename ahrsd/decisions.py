@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from ahrsd.calibration import Estimate
 from ahrsd.events import GateResult
 
 _DIGITS = 9
@@ -53,6 +54,19 @@ class DecisionLog:
         self._lines.append(line)
         if self.keep is not None and len(self._lines) > self.keep:
             self._lines.popleft()
+
+    def judged(
+        self, at_s: float, state: str, gates: Iterable[GateResult], estimate: Estimate
+    ) -> None:
+        """A verdict on an estimate."""
+        self.add(
+            at_s,
+            state,
+            gates,
+            hard_iron_gauss=estimate.hard_iron_gauss.tolist(),
+            gyro_bias_rad_s=estimate.gyro_bias_rad_s.tolist(),
+            converged=estimate.converged,
+        )
 
     @property
     def entries(self) -> list[dict[str, object]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ahrsd.calibration import Affine, Estimate
@@ -103,6 +104,13 @@ class JournalAppend:
     facts: dict[str, object]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Examine:
+    """Do this beside the core, each after the one before; then answer with `Examined`."""
+
+    work: Callable[[], None]
+
+
 @dataclass(frozen=True, slots=True)
 class RegistersRead:
     """A full reading of the device's configuration."""
@@ -128,6 +136,7 @@ Event = (
     | Noted
     | OpenJournal
     | JournalAppend
+    | Examine
     | RegistersRead
     | Finished
 )

@@ -107,6 +107,14 @@ class Journalled:
 
 
 @dataclass(frozen=True, slots=True)
+class Examined:
+    """So many pieces of the work that is done beside the core are done, oldest first."""
+
+    host_ns: int
+    pieces: int
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Shut down: undo what was changed for the session, then finish."""
 
@@ -126,5 +134,6 @@ Input = (
     | Samples
     | JournalOpened
     | Journalled
+    | Examined
     | Stop
 )

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ahrsd.config import CONFIG_KEY, Config, recorded_config
 from ahrsd.core import Core
-from ahrsd.core_settings import CoreSettings
+from ahrsd.core_settings import BESIDE_KEY, CoreSettings
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, RegistersKnown, Samples
 from ahrsd.recording.bytestream import read_chunks
@@ -89,7 +89,7 @@ def _settings(
         own = recorded_config(text)
         if config not in (Config(), own):
             recording.notes.append("the configuration in the capture was used, not the given one")
-        return core_settings(own)
+        return replace(core_settings(own), beside=BESIDE_KEY in recording.header)
     if recording.kind is not Kind.BYTES:
         return core_settings(config, policy=_PASSIVE, held_out=held_out)
     found = None if rate_hz is not None else rate_of(read_chunks(recording.path))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -14,6 +16,7 @@ from types import FrameType
 from ahrsd.config import CONFIG_KEY, Config
 from ahrsd.config_text import print_config
 from ahrsd.core import Core
+from ahrsd.core_settings import BESIDE_KEY
 from ahrsd.daemon import Daemon, HostClock
 from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.heap import needed_bytes, take_heap
@@ -28,11 +31,14 @@ from ahrsd.serving.public import Public
 from ahrsd.settings import core_settings, with_date
 from ahrsd.shell import JournalKeeper, Shell, journal_in
 from ahrsd.summary import summary_lines
+from ahrsd.worker import SWITCH_S, Worker
 from drivers.serial_port import BaudFound, PortError
 
 log = logging.getLogger("ahrsd")
 
-_VIEWER_S = 3.0
+_CLOSE_S = 3.0
+_EXIT_S = 2.6  # from a signal to the end of everything that is waited for
+_LEAST_S = 0.2
 _SEARCH_AGAIN_S = 0.5
 DAEMON_KEEPS = 64  # decisions and gaps in memory; the capture has them all
 
@@ -65,14 +71,14 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
 
     Raises CaptureError where there can be no capture.
     """
-    core = Core(replace(core_settings(config), keep=DAEMON_KEEPS))
+    core = Core(replace(core_settings(config), keep=DAEMON_KEEPS, beside=True))
     writer = None if capture is None else _open_capture(config, capture)
     viewer = None
     if config.rerun.file is not None or config.rerun.serve:
         limits = RerunLimits(server_bytes=config.rerun.memory_megabytes * 1_000_000)
         viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port, limits=limits)
     keeper = JournalKeeper(journal_in(config.state), clock.now_ns)
-    return Shell(core, writer, keeper, viewer)
+    return Shell(core, writer, keeper, viewer, worker=Worker())
 
 
 def _open_capture(config: Config, path: Path) -> CaptureWriter:
@@ -85,7 +91,7 @@ def _open_capture(config: Config, path: Path) -> CaptureWriter:
         ) from error
     return CaptureWriter(
         path,
-        {"program": "ahrsd run", CONFIG_KEY: print_config(config)},
+        {"program": "ahrsd run", CONFIG_KEY: print_config(config), BESIDE_KEY: "beside"},
         part_bytes=config.capture.part_megabytes * 1_000_000,
         keep_bytes=config.capture.keep_megabytes * 1_000_000,
     )
@@ -115,16 +121,23 @@ def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
     return public
 
 
-def close_shell(shell: Shell) -> None:
-    """Close what `open_shell` opened, each bounded in time."""
-    if isinstance(shell.viewer, RerunSink):
-        shell.viewer.close(_VIEWER_S)
-        if fault := shell.viewer.counters.last_fault:
-            log.warning("rerun: %s", fault)
+def close_shell(shell: Shell, until_s: float | None = None) -> None:
+    """Close what `open_shell` opened, all of it by `until_s` (monotonic) or soon."""
+    until_s = time.monotonic() + _CLOSE_S if until_s is None else until_s
+
+    def left_s() -> float:
+        return max(until_s - time.monotonic(), _LEAST_S)
+
+    if shell.worker is not None:
+        shell.worker.close(left_s() / 4)
     if shell.capture is not None:
-        status = shell.capture.close()
+        status = shell.capture.close(left_s() / 2)
         if not status.complete:
             log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
+    if isinstance(shell.viewer, RerunSink):
+        shell.viewer.close(left_s())
+        if fault := shell.viewer.counters.last_fault:
+            log.warning("rerun: %s", fault)
 
 
 def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudFound:
@@ -172,12 +185,14 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     box = _open_box(config)
     public = open_public(config, shell, notifier)
     daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud, box=box, public=public)
+    gc.freeze()  # what is there now stays: the collector need not look through it again and again
+    sys.setswitchinterval(SWITCH_S)
     try:
         with _signals(daemon.stop):
             daemon.run()
     finally:
         public.close()
-        close_shell(shell)
+        close_shell(shell, (daemon.stopped_s or time.monotonic()) + _EXIT_S)
     for line in summary_lines(shell.core, str(capture or port)):
         say(line)
     return EXIT_DONE

@@ -19,6 +19,7 @@ from ahrsd.errors import JournalError
 from ahrsd.inputs import Input, Journalled, JournalOpened
 from ahrsd.journal import Journal
 from ahrsd.recording.capture import CaptureWriter
+from ahrsd.worker import Worker
 
 log = logging.getLogger("ahrsd")
 
@@ -114,6 +115,7 @@ class Shell:
     listeners: list[Listener] = field(default_factory=list)
     finished: bool = False
     folded: FoldedLog = field(default_factory=FoldedLog)
+    worker: Worker | None = None
 
     def feed(self, item: Input) -> bytes:
         """One input through the core; returns what must be written to the port."""
@@ -148,6 +150,8 @@ class Shell:
                 waiting.append(self.journal.opened(serial))
             case events.JournalAppend() if self.journal is not None:
                 waiting.append(self.journal.append(event))
+            case events.Examine(work) if self.worker is not None:
+                self.worker.put(work)
             case events.RegistersRead(_, values) if self.capture is not None:
                 self.capture.write_registers(host_ns, {str(n): v for n, v in values.items()})
             case events.Finished():

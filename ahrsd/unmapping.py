@@ -133,6 +133,11 @@ class Epoch:
     compensation: Compensation | None
 
 
+def user_compensation(registers: RegisterValues) -> tuple[Affine, Array]:
+    """What register 23 does to the field, and the gyro bias (3,) that register 84 takes off."""
+    return _affine(registers, MAG, []), _affine(registers, GYRO, []).offset
+
+
 class RegisterEpochs:
     """Which registers were in force when, on the host's time line; the newest 64 are kept."""
 

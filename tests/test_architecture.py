@@ -57,6 +57,7 @@ SHELL = (
     "ahrsd.serving.server",
     "ahrsd.settings",
     "ahrsd.shell",
+    "ahrsd.worker",
     "drivers.port_holders",
     "drivers.serial_port",
     "drivers.usb",

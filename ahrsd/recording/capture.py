@@ -34,7 +34,7 @@ from ahrsd.recording.retention import prune
 SCHEMA = "ahrsd.capture/1"
 FLUSH_S = 0.25  # a chunk is on its way to the kernel at most this long after its first record
 SYNC_S = 5.0  # a power cut costs at most this much, a kill only FLUSH_S
-CLOSE_S = 5.0  # how long `close` waits for a disk that hangs
+CLOSE_S = 5.0  # how long `close` waits for a disk that hangs, unless told
 QUEUE_BYTES = 16 * 1024 * 1024  # about two minutes of stream at 800 Hz
 WAKE_BYTES = 256 * 1024  # a chunk is not larger than this and one record
 _OVERHEAD = 200  # bytes that a queued record costs besides its data
@@ -186,11 +186,11 @@ class CaptureWriter:
                 lost_bytes=self._lost_bytes,
             )
 
-    def close(self) -> CaptureStatus:
-        """Store what is queued and end the file; gives up on a disk that hangs for 5 s."""
+    def close(self, timeout_s: float = CLOSE_S) -> CaptureStatus:
+        """Store what is queued and end the file; gives up on a disk that hangs for so long."""
         self._closing = True
         self._wake.set()
-        self._thread.join(CLOSE_S)
+        self._thread.join(timeout_s)
         with self._lock:
             lost = len(self._queue), sum(len(entry.data) for entry in self._queue)
         status = self.status

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ahrsd.inputs import (
+    Examined,
     Input,
     Interlock,
     Journalled,
@@ -41,6 +42,7 @@ _TYPES = {
         Samples,
         JournalOpened,
         Journalled,
+        Examined,
         Stop,
     )
 }
