@@ -149,12 +149,9 @@ class Daemon:
             self._tick(now_ns)
         self._take_findings(now_ns)
         self._look()
-        if self._public is not None and not self._stuck:
-            self._public.turn()
-
-    @property
-    def _stuck(self) -> bool:
-        return self.shell.worker is not None and self.shell.worker.stuck
+        if self._public is not None:
+            well = self.shell.worker is None or not self.shell.worker.stuck
+            self._public.turn(self.shell.core, time.monotonic(), well=well)
 
     def _take_findings(self, now_ns: int) -> None:
         """What was done beside the core, told at the time of what was taken last."""

@@ -16,6 +16,7 @@ damage in front of each, never by what else came with them.
 from __future__ import annotations
 
 from collections import Counter
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -265,17 +266,28 @@ class Stream:
         steps = self._timeline.extend(time_s, extracted.usable)
         self._note(steps)
         host_s = self._host(time_s, arrivals)
-        blocks = sample_blocks(extractor, extracted, steps, host_s, self.epochs)
-        return self._unbridged(blocks, time_s[steps.keep])
+        blocks = self._unbridged(sample_blocks(extractor, extracted, steps, host_s, self.epochs))
+        if steps.keep.any():
+            self._left_out = not blocks or blocks[-1].time_s[-1] != time_s[steps.keep][-1]
+        return blocks
 
-    def _unbridged(self, blocks: list[SampleBlock], kept_s: Array) -> list[SampleBlock]:
-        """Samples that nobody could un-map are left out: what comes next does not follow on."""
+    def peek(self) -> list[SampleBlock]:
+        """What waits for its block to be full, as far as it carries its time; changes nothing."""
+        if (extractor := self._extractor) is None or not self._rows:
+            return []
+        extracted = extractor.extract_table(np.array(self._rows, dtype=np.float64))
+        if extracted.time_s is None:
+            return []
+        steps = deepcopy(self._timeline).extend(extracted.time_s, extracted.usable)
+        host_s = self._line(steps.time_s, np.array(self._arrivals))
+        blocks = sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+        return [] if steps.restarts else self._unbridged(blocks)
+
+    def _unbridged(self, blocks: list[SampleBlock]) -> list[SampleBlock]:
+        """Samples that nobody could un-map were left out: what comes next does not follow on."""
         if blocks and self._left_out and not blocks[0].gap_before:
-            first = blocks[0]
-            dt_s = np.concatenate([[np.nan], first.dt_s[1:]])
-            blocks[0] = replace(first, dt_s=dt_s, gap_before=True)
-        if len(kept_s):
-            self._left_out = not blocks or blocks[-1].time_s[-1] != kept_s[-1]
+            dt_s = np.concatenate([[np.nan], blocks[0].dt_s[1:]])
+            blocks[0] = replace(blocks[0], dt_s=dt_s, gap_before=True)
         return blocks
 
     def _times(self, extracted: Extracted, table: Array) -> Array:
@@ -310,6 +322,9 @@ class Stream:
         if arrivals[-1] == 0.0:
             return time_s
         self.clock.update(float(time_s[-1]), float(arrivals[-1]))
+        return self._line(time_s, arrivals)
+
+    def _line(self, time_s: Array, arrivals: Array) -> Array:
         line = np.minimum(self.clock.to_host(time_s), arrivals)
         return np.asarray(np.maximum.accumulate(np.where(np.isfinite(line), line, arrivals)))
 
@@ -382,8 +397,5 @@ def _rows(rate_hz: float) -> int:
 
 def _better(new: Extractor, old: Extractor) -> bool:
     """Uncompensated before compensated, with device time before without."""
-
-    def rank(e: Extractor) -> tuple[bool, bool]:
-        return (not e.mag_compensated, e.has_time)
-
-    return rank(new) > rank(old)
+    new_rank, old_rank = ((not e.mag_compensated, e.has_time) for e in (new, old))
+    return new_rank > old_rank

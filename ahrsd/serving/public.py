@@ -9,13 +9,19 @@ import logging
 from pathlib import Path
 
 from ahrsd import events
+from ahrsd.calibration import Affine
 from ahrsd.core import Core
+from ahrsd.samples import SampleBlock
 from ahrsd.sdnotify import Notifier
 from ahrsd.serving.client import default_socket_path
 from ahrsd.serving.lines import service_line
 from ahrsd.serving.metrics import MetricsServer
+from ahrsd.serving.records import Newest
 from ahrsd.serving.server import SocketServer
 from ahrsd.serving.status import LinkFacts, StatusMaker
+from ahrsd.unmapping import user_compensation
+
+_PACE_S = 0.008  # samples are told so often at most
 
 log = logging.getLogger("ahrsd")
 
@@ -28,6 +34,7 @@ class Public:
         self.socket: SocketServer | None = None
         self.metrics: MetricsServer | None = None
         self._maker = StatusMaker(now_s)
+        self._newest, self._next_s = Newest(), now_s
 
     def open_socket(self, path: Path | None, state: Path) -> None:
         """Serve the socket, at its default place where no path is given."""
@@ -46,12 +53,29 @@ class Public:
 
     def event(self, event: events.Event) -> None:
         """Something happened in the core."""
-        if self.socket is not None:
+        if isinstance(event, events.SamplesSeen):
+            self._samples([event.block], event.present)
+        elif self.socket is not None:
             self.socket.publish(event)
 
-    def turn(self) -> None:
-        """The daemon's loop turned once."""
-        self.notifier.feed()
+    def turn(self, core: Core, now_s: float, *, well: bool = True) -> None:
+        """The daemon's loop turned once; the watchdog is fed while all is `well`."""
+        if well:
+            self.notifier.feed()
+        if self._watched and now_s >= self._next_s:  # samples that wait for their block
+            self._next_s = now_s + _PACE_S
+            self._samples(core.stream.peek(), user_compensation(core.registers)[0])
+
+    @property
+    def _watched(self) -> bool:
+        return self.socket is not None and self.socket.wants("samples")
+
+    def _samples(self, blocks: list[SampleBlock], present: Affine) -> None:
+        if self.socket is None or not self._watched:
+            return
+        for block in blocks:
+            if record := self._newest.of(block, present):
+                self.socket.samples(record)
 
     def look(self, core: Core, link: LinkFacts, now_s: float) -> None:
         """About once a second: the newest status for everybody who asks."""

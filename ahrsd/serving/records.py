@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ahrsd import events
+from ahrsd.calibration import Affine
+from ahrsd.samples import SampleBlock
+
+_ANEW_S = 1.0  # time that falls by more is that of a device that restarted, or of another one
 
 Record = dict[str, object]
 
@@ -25,16 +31,7 @@ def record_of(event: events.Event) -> Record:
     """The event as plain values. Times: `at_s` of the device, `host_s` monotonic of the host."""
     match event:
         case events.SamplesSeen(block):
-            return {
-                "record": "samples",
-                "time_s": block.time_s,
-                "host_s": block.host_s,
-                "raw_b_gauss": block.raw_b_gauss,
-                "gyro_b_rad_s": block.gyro_b_rad_s,
-                "corrected_b_gauss": event.present.apply(block.raw_b_gauss),
-                "calibration_epoch": block.epoch,
-                "gap_before": block.gap_before,
-            }
+            return samples_record(block, event.present)
         case events.Noted(at_s, host_s, level, text):
             return _at("note", at_s, host_s) | {"level": level, "text": text}
         case events.StateChanged(at_s, host_s, old, new, reason):
@@ -55,6 +52,38 @@ def record_of(event: events.Event) -> Record:
             shut = [gate.gate for gate in gates if not gate.ok]
             return _at("gates", at_s, host_s) | {"shut": shut, "count": len(gates)}
     raise TypeError(f"{type(event).__name__} is not for the socket")
+
+
+def samples_record(block: SampleBlock, present: Affine, first: int = 0) -> Record:
+    """The samples of a block from row `first` on; `present` is register 23."""
+    raw_b_gauss = block.raw_b_gauss[first:]
+    return {
+        "record": "samples",
+        "time_s": block.time_s[first:],
+        "host_s": block.host_s[first:],
+        "raw_b_gauss": raw_b_gauss,
+        "gyro_b_rad_s": block.gyro_b_rad_s[first:],
+        "corrected_b_gauss": present.apply(raw_b_gauss),
+        "calibration_epoch": block.epoch,
+        "gap_before": block.gap_before and not first,
+    }
+
+
+class Newest:
+    """Each sample once, though it is told before its block is full; by the device's time."""
+
+    def __init__(self) -> None:
+        self._told_s = -np.inf
+
+    def of(self, block: SampleBlock, present: Affine) -> Record | None:
+        """What was not told yet."""
+        if block.time_s[-1] < self._told_s - _ANEW_S:
+            self._told_s = -np.inf
+        first = int(np.searchsorted(block.time_s, self._told_s, side="right"))
+        if first == len(block):
+            return None
+        self._told_s = float(block.time_s[-1])
+        return samples_record(block, present, first)
 
 
 def _at(kind: str, at_s: float, host_s: float) -> Record:

@@ -74,11 +74,19 @@ class SocketServer:
 
     # -- the daemon's thread -----------------------------------------------------------------------
 
+    def wants(self, stream: str) -> bool:
+        """Whether anybody watches the stream."""
+        return stream in self._wanted
+
     def publish(self, event: events.Event) -> None:
         """An event of the core; costs nothing where nobody watches its stream."""
         stream = stream_of(event)
         if stream in self._wanted:
             self._put(stream, event)
+
+    def samples(self, record: Record) -> None:
+        """Samples for who watches them."""
+        self._put("samples", record)
 
     def status(self, status: dict[str, object]) -> None:
         """The newest status: the answer to `status`, and a record for who watches it."""

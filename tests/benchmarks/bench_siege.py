@@ -5,8 +5,8 @@
 The viewer's process is stopped (SIGSTOP), the disk of the capture is full (a small tmpfs, so root
 is needed), and eight readers of the socket ask for everything and never read. A ninth reader
 measures: samples by the device's time against samples received, and how long it takes from the
-bytes of a sample (its `host_s`, which is never later than its arrival) to the record on the socket.
-A record holds the samples of about a tenth of a second; `latency` is that of its newest.
+bytes of each sample (its `host_s`, which is never later than its arrival) to its record on the
+socket.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Figures:
-    """expected: by the device's time; latency in s of each record; stopped: the viewer's state."""
+    """expected: by the device's time; latency in s of each sample; stopped: the viewer's state."""
 
     rate_hz: int
     seconds: float
@@ -58,7 +58,7 @@ class Figures:
 
     @property
     def p99_s(self) -> float:
-        """99 % of the records came so soon."""
+        """99 % of the samples came so soon."""
         return float(np.quantile(self.latency_s, 0.99))
 
     def __str__(self) -> str:
@@ -101,7 +101,7 @@ def fill(disk: Path) -> bool:
 
 
 def listen(path: Path, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Device times of all samples, and the latency of each record."""
+    """Device times of all samples, and how late each was."""
     times: list[float] = []
     latency: list[float] = []
     with Asked(path) as asked:
@@ -110,7 +110,7 @@ def listen(path: Path, seconds: float) -> tuple[np.ndarray, np.ndarray]:
             now = time.monotonic()
             if record.get("record") == "samples":
                 times += record["time_s"]
-                latency.append(now - record["host_s"][-1])
+                latency += [now - host_s for host_s in record["host_s"]]
             if now > end:
                 break
     return np.array(times), np.array(latency)
