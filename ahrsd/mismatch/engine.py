@@ -6,8 +6,8 @@ hygiene -> null fit -> survey -> (name -> joint refit -> survey)* -> prune -> sw
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.exam import examined
 from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
     added_value,
@@ -36,10 +37,13 @@ from ahrsd.mismatch.findings import (
 from ahrsd.mismatch.hygiene import hygiene, put_right
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.missing import lost_turns
+from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.problem import Problem, problem_of
+from ahrsd.mismatch.quick import Quick, cleaned, model_at_rate, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
@@ -88,40 +92,98 @@ def diagnose(
     if any(fact.stops for fact in facts):
         return _stopped(recording, [fact for fact in facts if fact.stops], notes)
     problem, cold = problem_of(put_right(track, facts), spec, library, limits)
-    start = fit_null(problem.track, problem.spec, cold, walk=False)
-    if at_rest(start):
+    lost = lost_turns(problem)
+    if lost:
+        facts = (*facts, *lost)
+        problem, cold = problem_of(put_right(track, facts), spec, library, limits)
+    done = _searched(without_quick(problem), cold)
+    fast = quick(done.state, problem)
+    if fast:
+        done = _searched(cleaned(fast, problem), done.start.model)
+        fast = quick(done.state, problem)
+    if at_rest(done.start):
         notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
+    return _told(recording, problem, done, fast, facts, notes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Searched:
+    """The null fit, the state with all names, the surveys without each of them, what is left."""
+
+    start: NullFit
+    state: State
+    surveys: list[Survey]
+    first: Survey
+    last: Survey
+    left: unknown.Remainder
+
+
+def _searched(problem: Problem, model: NullModel) -> _Searched:
+    start = fit_null(problem.track, problem.spec, model, walk=False)
     state, first, last = forward(State(problem, start))
-    slim = pruned(state)
+    slim = examined(pruned(state))
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = swapped(slim, last)
     state, surveys, left = without_stand_ins(state, surveys)
+    return _Searched(start, state, surveys, first, last, left)
+
+
+def _told(
+    recording: str,
+    problem: Problem,
+    done: _Searched,
+    fast: Quick,
+    facts: Sequence[Fact],
+    notes: tuple[str, ...],
+) -> Diagnosis:
+    """Everything that was found, in the contract's form."""
+    state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
-    named = [finding(state, basis, k, seen, last) for k, seen in enumerate(surveys)]
-    noise = level_facts(state.fit.filtered, spec_given=spec.sigma_mag_gauss is not None)
+    named = [finding(state, basis, k, seen, done.last) for k, seen in enumerate(done.surveys)]
+    quickly = [
+        finding(fast.state, fast.last.basis, k, seen, fast.last)
+        for k, seen in enumerate(fast.surveys, start=fast.known)
+    ]
+    filtered = fast.state.fit.filtered
+    noise = level_facts(filtered, spec_given=problem.spec.sigma_mag_gauss is not None)
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
-        *sorted(named, key=lambda one: -one.heldout.nll_gain_per_sample),
+        *sorted((*named, *quickly), key=lambda one: -one.heldout.nll_gain_per_sample),
         *(of_fact(fact, library) for fact in noise),
     )
-    something = unknown.detected(left, limits)
+    something = unknown.detected(done.left, limits)
     terms = tuple(whole_term(state, basis, k, one.effect) for k, one in enumerate(named))
+    quick_terms = tuple(
+        whole_term(fast.state, fast.last.basis, k, one.effect)
+        for k, one in enumerate(quickly, start=fast.known)
+    )
+    seen = (*state.named, *fast.state.named[fast.known :])
     return Diagnosis(
         recording=recording,
-        baseline=_baseline(start),
+        baseline=_baseline(done.start),
         mismatch=bool(found) or something,
-        p_value=_p_value(state, found, left),
+        p_value=_p_value(seen, found, done.left),
         findings=found,
         unexplained=(
-            unknown.described(left, problem.block_s, limits) if something else Unexplained(False)
+            unknown.described(done.left, problem.block_s, limits)
+            if something
+            else Unexplained(False)
         ),
-        posterior_predictive=_checked(start, state, terms, library),
-        sensitivity=() if found or something else sensitivity(problem, basis, first),
+        posterior_predictive=_checked(done, fast, (*terms, *quick_terms), library),
+        sensitivity=() if found or something else _limits(problem, basis, done.first, fast),
         notes=(*notes, *(fact.words for fact in facts if not matters(fact))),
         model=model_at_rate(state.fit.model, problem.thin),
-        terms=terms,
-        drawn=_drawn(start, state, basis, first, left),
+        terms=(*terms, *quick_terms),
+        drawn=_drawn(done, basis),
     )
+
+
+def _limits(problem: Problem, basis: Base, first: Survey, fast: Quick) -> tuple[Limit, ...]:
+    """What the search would have shown, and what only the recorded rate shows."""
+    quickly = sensitivity(fast.state.problem, fast.last.basis, fast.last)
+    slowly = sensitivity(problem, basis, first)
+    told = {(limit.effect, limit.parameter) for limit in slowly}
+    return (*slowly, *(one for one in quickly if (one.effect, one.parameter) not in told))
 
 
 def _stopped(recording: str, facts: list[Fact], notes: tuple[str, ...]) -> Diagnosis:
@@ -139,12 +201,18 @@ def _stopped(recording: str, facts: list[Fact], notes: tuple[str, ...]) -> Diagn
 
 
 def _checked(
-    start: NullFit, state: State, terms: tuple[Term, ...], library: Mapping[str, Effect]
+    done: _Searched, fast: Quick, terms: tuple[Term, ...], library: Mapping[str, Effect]
 ) -> dict[str, Check]:
-    """Posterior predictive checks; a delay that is out of the track stays out of the model."""
-    null = start
-    if state.problem.lag_s != 0.0:
-        null = fit_null(state.problem.track, state.problem.spec, start.model, walk=False)
+    """Posterior predictive checks; a delay that is out of the track stays out of the model.
+
+    At the working rate, unless something was found that only the recorded rate shows.
+    """
+    state, null = done.state, done.start
+    if fast:
+        state = fast.state
+        null = fit_null(state.problem.track, state.problem.spec, done.start.model, walk=False)
+    elif state.problem.lag_s != 0.0:
+        null = fit_null(state.problem.track, state.problem.spec, null.model, walk=False)
     kept = [
         replace(term, value=fitted.value) if fitted.identifier in DELAYS else term
         for term, fitted in zip(terms, state.fit.terms, strict=True)
@@ -252,37 +320,25 @@ def _baseline(start: NullFit) -> Baseline:
     )
 
 
-def _p_value(state: State, found: tuple[Finding, ...], left: unknown.Remainder) -> float:
+def _p_value(named: Sequence[Judged], found: tuple[Finding, ...], left: unknown.Remainder) -> float:
     """The smallest family-wise probability of what is found, or of what was looked at in vain."""
-    named = [judged.family_p for judged in state.named]
     counted = [0.0] if len(found) > len(named) else []
     frames = [min(1.0, 3.0 * one.p_value) for one in left.located.values()]
     bins = [min(1.0, len(left.bins) * p) for _, _, p in left.bins]
-    return float(min([1.0, *named, *counted, *frames, *bins]))
+    return float(min([1.0, *(judged.family_p for judged in named), *counted, *frames, *bins]))
 
 
-def _drawn(
-    start: NullFit, state: State, basis: Base, first: Survey, left: unknown.Remainder
-) -> Drawn:
+def _drawn(done: _Searched, basis: Base) -> Drawn:
+    state = done.state
     contributions = {
         f"{judged.candidate.name} {k}": contribution(judged, term.value, basis)
         for k, (judged, term) in enumerate(zip(state.named, state.fit.terms, strict=True))
     }
     return Drawn(
         basis.context.track.time_s,
-        start.filtered.whitened,
+        done.start.filtered.whitened,
         state.fit.filtered.whitened,
         contributions,
-        tuple(left.located.values()),
-        {candidate.name: candidate.evidence for candidate in first.candidates},
-    )
-
-
-def model_at_rate(model: NullModel, m: int) -> NullModel:
-    """A model of averages of m samples as one of single samples."""
-    root = float(np.sqrt(m))
-    return replace(
-        model,
-        sigma_mag_gauss=model.sigma_mag_gauss * root,
-        sigma_gyro_rad_s=model.sigma_gyro_rad_s * root,
+        tuple(done.left.located.values()),
+        {candidate.name: candidate.evidence for candidate in done.first.candidates},
     )

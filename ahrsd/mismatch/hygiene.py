@@ -135,7 +135,8 @@ def _unit_error(
 def put_right(track: Track, facts: Sequence[Fact]) -> Track:
     """The track without what the facts say: frames and units undone, false readings nan.
 
-    Jittering stamps are put on their regular clock.  Rows stay as they are in number and order.
+    Jittering stamps are put on their regular clock, the turn of lost samples is put back.  Rows
+    stay as they are in number and order.
     """
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     time_s, dt_s = track.time_s, track.dt_s
@@ -151,6 +152,8 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
         elif fact.effect == "timestamp_jitter" and not fact.stops:
             time_s = regular(track)
             dt_s = np.where(np.isnan(dt_s), np.nan, np.diff(time_s, prepend=np.nan))
+        elif fact.setting.get("hidden"):
+            gyro[fact.setting["rows"]] *= 1.0 + np.array(fact.setting["turns"])[:, None]
         if fact.bad is not None:
             mag[fact.bad] = np.nan
     return replace(track, time_s=time_s, dt_s=dt_s, mag_b_gauss=mag, gyro_b_rad_s=gyro)

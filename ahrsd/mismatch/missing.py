@@ -12,13 +12,20 @@ from numpy.typing import NDArray
 
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
-from ahrsd.mismatch.innovation import Filtered
+from ahrsd.mismatch.innovation import Filtered, run_filter
+from ahrsd.mismatch.problem import Problem
 from ahrsd.samples import Array
 
 _MEAN = 3  # samples after the jump that are averaged
 _SEEN = 5.0  # deviations of a step's turn that can be told
 _NEAR = 0.3  # of a whole number
 _FEWEST = 5
+
+
+def lost_turns(problem: Problem) -> list[Fact]:
+    """`missing_turns` of a recording at its own rate, with the calibration that it starts from."""
+    done = run_filter(problem.recorded, problem.cold, sensitive=False)
+    return missing_turns(done, problem.recorded.gyro_b_rad_s - problem.cold.gyro_bias_rad_s)
 
 
 def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
@@ -56,7 +63,9 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
     )
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, deviation, "1"),)
-    return [Fact("dropped_samples", words, where, 0.9, parameters, {"hidden": True})]
+    rows, turns = forward.tolist(), np.round(steps[forward]).tolist()
+    setting = {"hidden": True, "rows": rows, "turns": turns}
+    return [Fact("dropped_samples", words, where, 0.9, parameters, setting)]
 
 
 def _peaks(rows: NDArray[np.bool], size: Array) -> NDArray[np.intp]:

@@ -148,6 +148,11 @@ def fit_null(
     return _descended(replace(problem, terms=fit.terms), again, 2)
 
 
+def at_model(track: Track, model: NullModel, terms: Sequence[FittedTerm]) -> NullFit:
+    """The filter at a model and terms of the same data cut otherwise; nothing is fitted."""
+    return _descended(_Problem(track, tuple(terms), prior_of(track)), model, 0)
+
+
 def unusable(track: Track) -> str | None:
     """Why there is nothing that a calibration could be fitted to; None where there is."""
     if track.usual_gauss == 0.0:

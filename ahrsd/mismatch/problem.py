@@ -7,23 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.mismatch import roles
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.effects.base import Effect
-from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.null import cold_start
-from ahrsd.mismatch.spectrum import lines
-from ahrsd.mismatch.thin import thin_factor, thinned
+from ahrsd.mismatch.thin import thinned, working_factor
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel
 
 BLOCKS = 80
 BLOCK_S = (2.0, 10.0)
-#: rows per second that the search works with; faster recordings are averaged down to it
-WORKING_HZ = 12.0
-#: recordings longer than this are averaged whatever lines they have: a search takes too long
-MOST_ROWS = 24_000
 #: samples per working row from which the gyro's noise is taken from the recorded rate
 OVERSAMPLED = 5
 
@@ -66,7 +59,7 @@ def problem_of(
 ) -> tuple[Problem, NullModel]:
     """The recording at working rate, and a calibration to start from."""
     cold = cold_start(track, spec)
-    m = 1 if _is_fast(track, cold) else thin_factor(track, WORKING_HZ)
+    m = working_factor(track)
     root = float(np.sqrt(m))
     start = replace(
         cold,
@@ -81,18 +74,7 @@ def problem_of(
     return Problem(work, noise_of_thinned(known, m), library, limits, track, m, cold), start
 
 
-def _is_fast(track: Track, cold: NullModel) -> bool:
-    """Whether averaging would lose something: a turning shaft, or a line above the working rate."""
-    if roles.named(track.covariates, "rpm"):
-        return True
-    rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
-    if rate_hz < 2 * WORKING_HZ or len(track) > MOST_ROWS:
-        return False
-    whitened = run_filter(track, cold, sensitive=False).whitened
-    return any(line.frequency_hz > WORKING_HZ / 3 for line in lines(whitened, rate_hz))
-
-
-def noise_of_thinned(spec: Spec, m: int) -> Spec:
+def noise_of_thinned(spec: Spec, m: float) -> Spec:
     """What is known of the noise, for averages of m samples."""
     root = float(np.sqrt(m))
     return replace(

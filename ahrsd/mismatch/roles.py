@@ -70,7 +70,14 @@ ROLES: Mapping[str, Role] = {
         (-1e3, 1e3),
         "encoder counts",
     ),
-    "rpm": Role("revolutions per minute", r"(^|_)rpm($|_)", "zero", (-3e5, 3e5), "another unit"),
+    "rpm": Role(
+        "revolutions per minute",
+        r"(^|_)rpm($|_)",
+        "zero",
+        (-3e5, 3e5),
+        "another unit",
+        constant=True,  # of a rotor that turns steadily
+    ),
     "speed": Role("speed, m/s", r"(speed|velocity)\w*_m_s$", "zero", (-1e3, 1e3), "another unit"),
     "ping": Role(
         "sync or transmit pulses, 0 or 1", r"(ping|sync|pulse|transmit)", "zero", (0, 1), "no 0/1"

@@ -15,6 +15,10 @@ from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
+#: rows per second that a search works with, and what is enough where a group of samples hardly
+#: turns, root mean square
+WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
+
 
 def thin_factor(track: Track, wanted_hz: float) -> int:
     """The largest odd m that leaves at least `wanted_hz`, 1 where nothing can be saved."""
@@ -22,6 +26,14 @@ def thin_factor(track: Track, wanted_hz: float) -> int:
     rate_hz = 1.0 / float(np.median(steps)) if len(steps) else wanted_hz
     ratio = max(1, int(rate_hz / wanted_hz))
     return ratio if ratio % 2 else ratio - 1
+
+
+def working_factor(track: Track) -> int:
+    """The largest odd m for which a group hardly turns, or that leaves WORKING_HZ."""
+    least, most = (thin_factor(track, hz) for hz in (WORKING_HZ, SLOWEST_HZ))
+    step = np.linalg.norm(track.gyro_b_rad_s, axis=1) * np.nan_to_num(track.dt_s)
+    turn_rad = float(np.sqrt(np.mean(step**2)))
+    return next((m for m in range(most, least, -2) if m * turn_rad < GROUP_TURN_RAD), least)
 
 
 def thinned(track: Track, m: int, model: NullModel) -> Track:

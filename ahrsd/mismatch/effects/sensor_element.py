@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch.effects import series, shapes
-from ahrsd.mismatch.effects.base import Discrete, Effect, Linear, Parameter, Readings, Setting
+from ahrsd.mismatch.effects.base import (
+    Discrete,
+    Effect,
+    Linear,
+    Parameter,
+    Readings,
+    Setting,
+    left_over,
+)
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -46,9 +54,7 @@ class AcInterference(Linear):
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The two strongest lines."""
-        track, model = context.track, context.model
-        left = track.mag_b_gauss - context.field_b @ model.soft_iron.T - model.hard_iron_gauss
-        return lines(left, track.time_s, track.dt_s)
+        return lines(left_over(context), context.track.time_s, context.track.dt_s)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The alias of 60 Hz at this rate, or a line in the middle of the band."""
@@ -297,7 +303,8 @@ def lines(residual: Array, time_s: Array, dt_s: Array) -> tuple[Setting, ...]:
     width = 2.0 / (len(values) * step_s)
     found: list[Setting] = []
     for _ in range(_LINES):
-        best = float(frequency[int(np.argmax(power))])
+        at = int(np.argmax(power))
+        best = float(frequency[at] + series.peak(power, at) * frequency[1])
         mains = [f for f in _MAINS_HZ if abs(aliased(f, 1 / step_s) - best) < width + 5e-4 * f]
         found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
         power = np.where(np.abs(frequency - best) < 2 * width, 0.0, power)

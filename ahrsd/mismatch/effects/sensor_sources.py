@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.mismatch.effects import series, shapes
-from ahrsd.mismatch.effects.base import Linear, Readings, Setting
-from ahrsd.mismatch.values import Columns
+from ahrsd.mismatch.effects import pulses, series, shapes
+from ahrsd.mismatch.effects.base import Linear, Readings, Setting, left_over, readings_of
+from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
+_TACHOMETER = 1e-3  # part of its reading by which a shaft's speed may be wrong
 
 
 class MotorCurrentField(Linear):
@@ -122,8 +123,7 @@ class SyncPulses(Linear):
     equation = "m += k in the samples that a pulse hits"
     parameters = shapes.vector("pulse", "gauss", 1.0 * _MG, 100.0 * _MG)
     typical = shapes.along(2.0 * _MG)
-    needs = ("ping",)
-    signature = "outliers of one size in one direction, in step with the pings"
+    signature = "outliers of one size in one direction, in step with the pings or with themselves"
     confusers = (
         ("switched_device", "pulses last a sample or two, a device stays on"),
         ("noise_burst", "log the ping times"),
@@ -132,13 +132,23 @@ class SyncPulses(Linear):
     size = "0.2 to 5 mG"
     source = "dossier M9"
 
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """One per column of pulses, and the likeliest regular train that nobody logged."""
+        track = context.track
+        logged = shapes.per_covariate(readings_of(context), "ping")
+        return (*logged, *pulses.trains(left_over(context), track.time_s, track.step_s))
+
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """One per column of pulses."""
-        return shapes.per_covariate(readings, "ping")
+        """The columns of pulses, else 60 ms every two seconds."""
+        start_s = float(readings.time_s[0])
+        regular = {"start_s": start_s, "period_s": 2.0, "phase_s": 0.5, "width_s": 0.06}
+        return shapes.per_covariate(readings, "ping") or (regular,)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The pulses on each axis."""
-        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+        if "covariate" in setting:
+            return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+        return Columns(mag=shapes.on_axes(pulses.train(readings.time_s, setting)[:, None]))
 
 
 class MagBiasTemperature(Linear):
@@ -256,6 +266,20 @@ class RotorField(Linear):
     size = "0.1 to 10 mG"
     source = "dossier M25"
 
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """The shaft and its second harmonic, each at the speed nearby that fits best.
+
+        A tachometer is right to a few parts in a thousand, and a tenth of a turn a minute is a
+        whole turn in ten minutes.
+        """
+        readings, left = readings_of(context), left_over(context)
+        found = []
+        for setting in self.choices(readings):
+            phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
+            off_hz, searched = _strongest_near(left, phase, context.track.time_s)
+            found.append({**setting, "off_hz": off_hz, "searched": searched})
+        return tuple(found)
+
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The shaft and its second harmonic."""
         return tuple(
@@ -267,6 +291,7 @@ class RotorField(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """cos, then sin, of the shaft's phase on each axis."""
         phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
+        phase += 2 * np.pi * setting.get("off_hz", 0.0) * (readings.time_s - readings.time_s[0])
         return Columns(mag=shapes.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
 
 
@@ -275,3 +300,16 @@ def _shaft_phase(readings: Readings, name: str) -> Array:
     rate = readings.covariates[name] * 2 * np.pi / 60.0
     step = np.diff(readings.time_s) * (rate[1:] + rate[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(step)])
+
+
+def _strongest_near(left: Array, phase: Array, time_s: Array) -> tuple[float, int]:
+    """By how many hertz a line in (N, 3) is off the phase (N,), and how many were looked at."""
+    since, cycles = time_s - time_s[0], (phase[-1] - phase[0]) / (2 * np.pi)
+    reach = max(1, int(np.ceil(2 * _TACHOMETER * cycles)))
+    off_hz = np.arange(-reach, reach + 1) / (2 * max(since[-1], 1e-9))
+    turned = left * np.exp(-1j * phase)[:, None]
+    starts = np.arange(0, len(since), max(1, len(since) // (16 * (reach + 1))))
+    sums, middle = np.add.reduceat(turned, starts), since[starts]
+    power = np.sum(np.abs(np.exp(-2j * np.pi * np.outer(off_hz, middle)) @ sums) ** 2, axis=1)
+    best = int(np.argmax(power))
+    return float(off_hz[best]) + series.peak(power, best) * float(off_hz[1] - off_hz[0]), reach + 1

@@ -156,3 +156,12 @@ def kept(readings: Readings, rows: NDArray[np.bool]) -> Readings:
         R_nb=readings.R_nb[index],
         covariates={name: values[index] for name, values in readings.covariates.items()},
     )
+
+
+def peak(power: Array, best: int) -> float:
+    """Where the parabola through a largest value and its neighbours is highest, in steps."""
+    if not 0 < best < len(power) - 1:
+        return 0.0
+    left, middle, right = (float(p) for p in power[best - 1 : best + 2])
+    bend = left - 2 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0 else 0.0
