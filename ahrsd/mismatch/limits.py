@@ -21,6 +21,9 @@ class Limits:
     coverage:       share of the agnostic statistic of its own frame that a time-shaped name must
                     explain, else it is a stand-in for an unlogged source
     most_shaped:    steps, drifts and bumps of one frame beyond this are one source that changes
+    beyond_nats:    what a name must be worth beyond the random effects of what the model leaves
+                    (`discrepancy`), where it leaves something: a library of a hundred names and
+                    settings against a remainder whose form is only roughly known
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
@@ -34,6 +37,7 @@ class Limits:
     placebo_beaten: float = 0.99
     coverage: float = 0.9
     most_shaped: int = 3
+    beyond_nats: float = 30.0
     unknown_nats: float = 12.0
     unknown_p: float = 1e-6
     most_terms: int = 5

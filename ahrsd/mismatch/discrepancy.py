@@ -1,0 +1,196 @@
+"""What a model leaves that no name explains, as random effects: the yardstick for names.
+
+Real recordings hold many small things that no library has: a room's field that differs from place
+to place, a sensor that is not quite linear, a mount that gives.  Innovations are then not white,
+and against white noise everything is significant.  The remainder is therefore given its own
+variances, found by marginal likelihood (Kennedy and O'Hagan's discrepancy, restricted to what the
+calibration and the other names leave):
+
+    sensor, world, gyro   a free value in every twenty-fourth of the recording
+    attitude              a field in sensor axes by the field's and gravity's direction
+    rest                  a field in sensor axes wherever the vehicle stands: that is one place
+
+A name is worth what it explains beyond them: the maximum of the marginal likelihood with it, over
+the one without it.  Where nothing is left the variances are zero and nothing changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize
+
+from ahrsd.mismatch import locate
+from ahrsd.mismatch.evidence import SIZES, colour
+from ahrsd.mismatch.gram import solve
+from ahrsd.mismatch.regression import Base, residual
+from ahrsd.mismatch.values import Columns, Context
+from ahrsd.samples import Array
+
+PIECES = 24
+#: unit of the random effects, gauss and rad/s; sizes are sought from e^-6 to e^8 of it
+UNIT_GAUSS, UNIT_RAD_S = 1e-3, 1e-4
+SMALLEST, LARGEST = -6.0, 8.0
+#: standing: slower than this for longer than that; it takes a moment to get away from a place
+STILL_RAD_S, STILL_S, LEAVING_S = 0.05, 2.0, 1.0
+MOST_RESTS = 24
+ITERATIONS = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Discrepancy:
+    """Random effects beside a model's own columns.
+
+    basis:   the model with all its names;  columns: (N, 3, q) whitened, in units
+    group:   (q,) number of the variance that a column has
+    noise:   power of what is left beside everything, at least 1
+    sizes:   (groups,) logarithms of the deviations of the whole model
+    nats:    log marginal likelihood of the whole model over that without random effects
+    """
+
+    basis: Base
+    columns: Array
+    group: NDArray[np.intp]
+    noise: float
+    sizes: Array
+    nats: float
+
+
+def discrepancy(basis: Base) -> Discrepancy:
+    """The random effects that a model needs."""
+    parts = _random_effects(basis.context)
+    columns = basis.whitened([make(basis.context) for make, _ in parts])
+    units = [unit for _, unit in parts]
+    scaled = [part * unit for part, unit in zip(columns, units, strict=True)]
+    group = np.repeat(np.arange(len(parts)), [part.shape[2] for part in scaled])
+    together = np.concatenate(scaled, axis=2)
+    left = residual(np.concatenate([basis.known, together], axis=2), basis.innovation)
+    noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
+    G, s = _projected(basis, together)
+    nats, sizes = _fitted(G, s, group, noise, np.zeros(len(parts)))
+    return Discrepancy(basis, together, group, noise, sizes, nats)
+
+
+def beyond(found: Discrepancy, without: Base, columns: Array, scale: Array) -> float:
+    """Nats by which a name is more than the random effects can be.
+
+    without: the basis without it;  columns (N, 3, p) whitened;  scale (p,): prior deviations
+    """
+    count = len(found.sizes)
+    G, s = _projected(without, np.concatenate([found.columns, columns * scale], axis=2))
+    plain = slice(0, len(found.group))
+    start = np.maximum(found.sizes, 0.0)  # from a variance of zero no slope leads away
+    less, sizes = _fitted(G[plain, plain], s[plain], found.group, found.noise, start)
+    group = np.concatenate([found.group, np.full(len(scale), count)])
+    starts = [np.append(found.sizes, 0.0), np.append(sizes, 0.0)]
+    more = max(_fitted(G, s, group, found.noise, at, count)[0] for at in starts)
+    return more - less - float(np.log(len(SIZES)))
+
+
+def _random_effects(context: Context) -> list[tuple[Callable[[Context], Columns], float]]:
+    """What makes the columns of each group, and their unit."""
+    cut = locate.segments(context.track.time_s, PIECES)
+
+    def course(frame: locate.Frame) -> Callable[[Context], Columns]:
+        return lambda here: locate.frame_columns(here, frame, cut)
+
+    out: list[tuple[Callable[[Context], Columns], float]] = [
+        (course("sensor"), UNIT_GAUSS),
+        (course("world"), UNIT_GAUSS),
+        (course("gyro"), UNIT_RAD_S),
+        (by_attitude, UNIT_GAUSS),
+    ]
+    rests = places(context)
+    if len(rests):
+        out.append((lambda _: locate.frame_columns(context, "sensor", rests), UNIT_GAUSS))
+    return out
+
+
+def by_attitude(context: Context) -> Columns:
+    """A field in sensor axes by direction: degrees 2 and 3 of the field's, 1 and 2 of gravity's.
+
+    Degree 1 of the field's is the soft iron.
+    """
+    size = np.linalg.norm(context.field_b, axis=1, keepdims=True)
+    x, y, z = (context.field_b / np.maximum(size, 1e-300)).T
+    shapes = [
+        *_second(x, y, z),
+        x * (x * x - 3 * y * y), y * (3 * x * x - y * y), z * (x * x - y * y), x * y * z,
+        x * (5 * z * z - 1), y * (5 * z * z - 1), z * (5 * z * z - 3),
+    ]  # fmt: skip
+    if context.world_levelled:
+        down = context.R_nb[:, 2, :].T
+        shapes += [*down, *_second(*down), *(a * b for a in (x, y, z) for b in down)]
+    values = np.stack(shapes, axis=1)
+    values = values / np.maximum(values.std(axis=0), 1e-3)
+    return Columns(mag=np.einsum("np,ij->nipj", values, np.eye(3)).reshape(len(values), 3, -1))
+
+
+def _second(x: Array, y: Array, z: Array) -> list[Array]:
+    return [x * y, x * z, y * z, x * x - y * y, 2 * z * z - x * x - y * y]
+
+
+def places(context: Context) -> locate.Segments:
+    """The stretches in which the vehicle stands, the longest of them."""
+    track = context.track
+    still = np.linalg.norm(context.rate_b_rad_s, axis=1) < STILL_RAD_S
+    padded = np.concatenate([[False], still, [False]]).astype(int)
+    firsts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
+    lasts = ends - 1
+    length = track.time_s[lasts] - track.time_s[firsts]
+    longest = np.argsort(-length)[:MOST_RESTS]
+    kept = np.sort(longest[length[longest] > STILL_S])
+    index = np.full(len(track), -1)
+    for number, k in enumerate(kept):
+        near = track.time_s > track.time_s[firsts[k]] - LEAVING_S
+        near &= track.time_s < track.time_s[lasts[k]] + LEAVING_S
+        index[near] = number
+    return locate.Segments(np.arange(len(kept) + 1.0), index)
+
+
+def _projected(basis: Base, columns: Array) -> tuple[Array, Array]:
+    """Information (q, q) and score (q,) of the columns with the known ones regressed out."""
+    Z = basis.known.reshape(-1, basis.known.shape[2])
+    X = columns.reshape(len(Z), -1)
+    e = basis.innovation.ravel()
+    cross = Z.T @ X
+    M = solve(Z.T @ Z, cross)
+    return X.T @ X - cross.T @ M, X.T @ e - M.T @ (Z.T @ e)
+
+
+def _fitted(
+    G: Array,
+    s: Array,
+    group: NDArray[np.intp],
+    noise: float,
+    start: Array,
+    named: int | None = None,
+) -> tuple[float, Array]:
+    """Largest log marginal likelihood, nats, and the logarithms of the groups' deviations there.
+
+    named: the group that is a name: its deviation stays near its prior
+    """
+    count = len(start)
+
+    def loss(sizes: Array) -> tuple[float, Array]:
+        deviation = np.exp(sizes)[group]
+        A = G * deviation[:, None] * deviation / noise
+        A[np.diag_indices_from(A)] += 1.0
+        L = linalg.cholesky(A, lower=True, check_finite=False)
+        mean = linalg.cho_solve((L, True), deviation * s / noise, check_finite=False)
+        inverse, _ = linalg.lapack.dpotri(L, lower=1)
+        nats = 0.5 * float(mean @ (deviation * s)) / noise - float(np.sum(np.log(np.diag(L))))
+        pull = mean**2 + np.diag(inverse) - 1.0
+        slope = [float(pull[group == k].sum()) for k in range(count)]
+        return -nats, -np.asarray(slope)
+
+    bounds = [(SMALLEST, LARGEST)] * count
+    if named is not None:
+        bounds[named] = (float(np.log(SIZES[0])), float(np.log(SIZES[-1])))
+    result = optimize.minimize(
+        loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS}
+    )
+    return float(-result.fun), np.asarray(result.x, float)
