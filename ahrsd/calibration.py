@@ -101,6 +101,8 @@ class Estimate:
     noise_mag_gauss, noise_gyro_rad_s: per-sample standard deviations found in the data
     misfit:          residual mean square over its expectation, 1 where the model explains the data
     heading_sigma_deg: worst 1-sigma heading error over the headings and tilts that were driven
+    mag_lag_s:       how late the field's readings are against the gyro's, taken into account;
+                     0 where the data do not ask for it
     """
 
     soft_iron: Array
@@ -118,6 +120,7 @@ class Estimate:
     duration_s: float
     converged: bool
     warnings: tuple[str, ...] = field(default=())
+    mag_lag_s: float = 0.0
 
     @property
     def correction(self) -> Affine:

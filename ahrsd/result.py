@@ -83,6 +83,7 @@ def _found(estimate: Estimate, heading: HeadingErrors) -> dict[str, object]:
             "before_rms": heading.before_rms,
             "after_rms": heading.after_rms,
         },
+        "mag_lag_s": _number(estimate.mag_lag_s),
         "observability": {
             "score": _number(estimate.observability.score),
             "unobservable": list(estimate.observability.unobservable),

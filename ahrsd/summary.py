@@ -138,10 +138,12 @@ def estimate_lines(estimate: Estimate | None) -> list[str]:
         _value(number, sigma, 2 if k < 3 else 3) if not blind[k] else "not determined"
         for k, (number, sigma) in enumerate(zip(numbers, sigmas, strict=True))
     ]
+    late_ms = 1e3 * estimate.mag_lag_s
     return [
         f"  hard iron  {', '.join(values[:3])} mG",
         f"  gyro bias  {', '.join(values[3:])} mrad/s",
         f"  heading    known to {estimate.heading_sigma_deg:.2f} deg (1 sigma, worst direction)",
+        *([f"  lag        the field is {late_ms:.1f} ms late against the gyro"] if late_ms else []),
         *(f"  {text}" for text in why_not_converged(estimate)),
     ]
 

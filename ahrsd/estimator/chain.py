@@ -79,12 +79,14 @@ class Averaging:
 
     count (n,) steps in a row, turn (n, 3, 3) mean rotation P from the row's direction u to those of
     its steps: the row measured M P u + b with the noise of one step / sqrt(count); spread_s (n,)
-    root of the sum of squared steps of time on the way from the row before: the gyro's noise.
+    root of the sum of squared steps of time on the way from the row before: the gyro's noise;
+    rate_b_rad_s (n, 3) mean of its steps.
     """
 
     count: Array
     turn: Array
     spread_s: Array
+    rate_b_rad_s: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

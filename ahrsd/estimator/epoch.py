@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ahrsd.estimator import chain, noise
-from ahrsd.estimator.factors import Factor
+from ahrsd.estimator.factors import Factor, Node
 from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
 
@@ -45,3 +45,13 @@ class Epoch:
     def cost(self) -> float:
         """Half the sum of squares with the interior directions at their best."""
         return self.quadratic.cost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """A window's calibration c (9,), nodes by index, epochs and factors at one moment."""
+
+    c: Array
+    nodes: dict[int, Node]
+    epochs: list[Epoch]
+    factors: list[Factor]

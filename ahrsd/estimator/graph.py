@@ -244,6 +244,12 @@ def _information(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
     return H / np.outer(_UNITS, _UNITS), g / _UNITS
 
 
+def sigmas(step: Array, information: Array) -> float:
+    """Length of a step in standard deviations, per square root of its dimension."""
+    squared = float(step @ information @ step)
+    return float(np.sqrt(max(squared, 0.0) / len(step)))
+
+
 def whitening(covariance: Array) -> Array:
     """W with W P W^T = I that mixes the numbers as little as it can: R^(-1/2) D^-1 of P = D R D."""
     sigma = np.sqrt(np.diag(covariance))

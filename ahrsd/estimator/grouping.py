@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.estimator import chain
+from ahrsd.estimator.lag import rates
 from ahrsd.samples import Array
 
 Index = NDArray[np.intp]
@@ -54,6 +55,9 @@ def grouped(data: chain.Data, size: int) -> chain.Data:
     angle, dt, spread, joins = _between(data, turn, linked, rows)
     field = data.field_b_gauss.copy()[rows]
     field[1:-1] = np.add.reduceat(data.field_b_gauss[: n - 1], start) / length[:, None]
+    rate = rates(data)
+    mean_rate = rate[rows]
+    mean_rate[1:-1] = np.add.reduceat(rate[: n - 1], start) / length[:, None]
     return chain.Data(
         field,
         angle,
@@ -63,7 +67,7 @@ def grouped(data: chain.Data, size: int) -> chain.Data:
         data.measures_first,
         linked=None if joins.all() else joins.astype(np.float64),
         averaging=chain.Averaging(
-            np.r_[1, length, 1].astype(float), _means(turn, rows, start, length), spread
+            np.r_[1, length, 1].astype(float), _means(turn, rows, start, length), spread, mean_rate
         ),
     )
 

@@ -16,6 +16,7 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, intake, noise, summary
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
+from ahrsd.estimator.instrument import LAG, instrument
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.misalignment import Misalignment, misalignment
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
@@ -35,6 +36,8 @@ _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the esti
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
 _MOST_SIGMAS = 100.0  # of movement or disagreement that are counted
 _SCALE = 0.5  # 1-sigma of the field's magnitude over its size in the present calibration
+_LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is one; settled
+_LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
@@ -61,6 +64,7 @@ class Estimator:
         self._moving_epochs, self._last_search = 0, 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
+        self._lag_spread: Array = np.zeros(12)  # what a lag that is one sigma off does
         self.restarted_s: float | None = None  # when the iron changed, if it did
         self._warnings: tuple[str, ...] = ()
 
@@ -92,6 +96,9 @@ class Estimator:
             if self._searching and self._moving_epochs > _FRESH * self._last_search:
                 self._search(self._window)
             self._window.track(everything=True)
+            if self._delay(self._window) and self._searching:
+                self._search(self._window)
+                self._window.track(everything=True)
         return self._answer()
 
     def _append(self, data: chain.Data) -> None:
@@ -106,11 +113,13 @@ class Estimator:
             return
         window = self._window or window
         window.track(everything=self._searching and len(window.epochs) <= _FEW)
-        if self._searching and window.epochs[-1].turned:
+        if window.epochs[-1].turned:
             self._moving_epochs += 1
             if self._moving_epochs >= self._next_search:
                 self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
-                self._search(window)
+                if self._searching:
+                    self._search(window)
+                self._delay(window)
         window.fold()
 
     def _contradicted(self, window: Window) -> bool:
@@ -164,6 +173,26 @@ class Estimator:
         settled = window.step_sigmas < _SETTLED
         self._searching = not (found.agreed and settled and self._sure(window))
 
+    def _delay(self, window: Window) -> bool:
+        """Take a lag of the field out where the epochs ask for one; whether they did."""
+        least, changed = _LAG_SIGMAS if window.lag_s == 0.0 else 1.0, False
+        for _ in range(_LAG_PASSES):
+            try:
+                found = instrument(
+                    window.epochs, window.graph, self.parameters.prior_gyro_bias_rad_s
+                )
+            except np.linalg.LinAlgError:
+                return changed
+            more, sigma = float(found.step[LAG]), float(np.sqrt(found.covariance[LAG, LAG]))
+            if changed:
+                self._lag_spread = found.covariance[:12, LAG] / sigma
+            if abs(more) < least * sigma:
+                return changed
+            window.delay(float(np.clip(window.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)))
+            window.track(everything=True)
+            least, changed = _LAG_SAME, True
+        return changed
+
     @staticmethod
     def _sure(window: Window) -> bool:
         try:
@@ -212,6 +241,7 @@ class Estimator:
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         covariance = covariance * (1.0 + doubt**2)
+        covariance = covariance + np.outer(self._lag_spread, self._lag_spread)
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)
@@ -237,4 +267,5 @@ class Estimator:
                 self._agreed and window.step_sigmas < _SETTLED and heading < _HOPELESS_DEG
             ),
             warnings=self._warnings,
+            mag_lag_s=window.lag_s,
         )

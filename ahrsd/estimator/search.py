@@ -17,10 +17,11 @@ import numpy as np
 from ahrsd.estimator import chain, start
 from ahrsd.estimator.excitation import spread
 from ahrsd.estimator.factors import Node
-from ahrsd.estimator.graph import SingularError
+from ahrsd.estimator.graph import SingularError, sigmas
+from ahrsd.estimator.lag import rates
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.steps import compose
-from ahrsd.estimator.window import Window, sigmas
+from ahrsd.estimator.window import Window
 from ahrsd.samples import Array
 
 _EPOCHS = 6
@@ -121,8 +122,8 @@ def _distance(c: Array, best: _Reached, temper: float) -> float:
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:
-    """Every k-th step of an epoch, by itself; all of one whose steps are grouped."""
-    if k == 1 or data.averaging is not None:
+    """Every k-th row of an epoch, by itself."""
+    if k == 1:
         return data
     count = (len(data) - 1) // k
     rows = np.arange(count + 1) * k
@@ -132,8 +133,20 @@ def thinned(data: chain.Data, k: int) -> chain.Data:
     angle = np.zeros((count + 1, 3))
     angle[1:] = compose(data.angle_b_rad[1 : count * k + 1].reshape(count, k, 3))
     dt = np.r_[data.dt_s[1], data.dt_s[1 : count * k + 1].reshape(count, k).sum(axis=1)]
+    averaging = data.averaging
+    if averaging is not None:
+        averaging = chain.Averaging(
+            averaging.count[rows], averaging.turn[rows], dt, averaging.rate_b_rad_s[rows]
+        )
     return chain.Data(
-        data.field_b_gauss[rows], angle, dt, data.down_b[rows], data.time_s[rows], True, linked
+        data.field_b_gauss[rows],
+        angle,
+        dt,
+        data.down_b[rows],
+        data.time_s[rows],
+        measures_first=True,
+        linked=linked,
+        averaging=averaging,
     )
 
 
@@ -147,13 +160,14 @@ def joined(parts: Sequence[chain.Data]) -> chain.Data:
     averaging = None
     if any(p.averaging is not None for p in parts):
         all_ = [
-            p.averaging or chain.Averaging(o, np.tile(np.eye(3), (len(p), 1, 1)), p.dt_s)
+            p.averaging or chain.Averaging(o, np.tile(np.eye(3), (len(p), 1, 1)), p.dt_s, rates(p))
             for p, o in zip(parts, ones, strict=True)
         ]
         averaging = chain.Averaging(
             np.concatenate([a.count for a in all_]),
             np.concatenate([a.turn for a in all_]),
             np.concatenate([a.spread_s for a in all_]),
+            np.concatenate([a.rate_b_rad_s for a in all_]),
         )
     return chain.Data(
         np.vstack([p.field_b_gauss for p in parts]),

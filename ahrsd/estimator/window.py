@@ -14,16 +14,15 @@ from __future__ import annotations
 
 from collections import deque
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.epoch import Epoch, Snapshot
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
-    Factor,
     Node,
     Point,
     Stack,
@@ -32,8 +31,9 @@ from ahrsd.estimator.factors import (
     epoch_factor,
     gap_factor,
 )
-from ahrsd.estimator.graph import Graph, SingularError
+from ahrsd.estimator.graph import Graph, SingularError, sigmas
 from ahrsd.estimator.grouping import group_size, grouped
+from ahrsd.estimator.lag import delayed
 from ahrsd.estimator.misfit import Misfit
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.systematic import Cells, excess
@@ -58,14 +58,6 @@ _ANOTHER_REST = 0.02  # rad between two directions at rest
 _SHORTEST_GAP_S = 0.1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Snapshot:
-    c: Array
-    nodes: dict[int, Node]
-    epochs: list[Epoch]
-    factors: list[Factor]
-
-
 class Window:
     """Epochs and graph. `c` = [M (6), b (3)] in gauss is the calibration as it stands."""
 
@@ -84,6 +76,7 @@ class Window:
         self.found_misfit = 1.0
         self.step_sigmas = float(np.inf)
         self.folded = False
+        self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
         self.loud = 1.0  # what searching found the model to leave over (`search.Found`)
         self._folded_cells = Cells()
         self._damping = _DAMPING
@@ -111,7 +104,8 @@ class Window:
         if moving:
             self.graph.moments.take(data.field_b_gauss)
         size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
-        self.attach(grouped(data, group_size(data, guess, size)), moving=moving)
+        data = grouped(data, group_size(data, guess, size))
+        self.attach(data if self.lag_s == 0.0 else delayed(data, self.lag_s), moving=moving)
 
     def learn_from(self, other: Window) -> None:
         """First guesses of the noise and moments of the field, for a part of the other's data."""
@@ -191,7 +185,7 @@ class Window:
         mean, information = graph.anchor
         belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
         other = Window(self.parameters, mean, belief, node, self.usual)
-        other._guesses = self._guesses.copy()
+        other._guesses, other.lag_s = self._guesses.copy(), self.lag_s
         for epoch, data in zip(kept, [first, *(e.data for e in kept[1:])], strict=True):
             other.graph.moments.take(data.field_b_gauss)
             other.attach(data, moving=epoch.turned)
@@ -243,6 +237,15 @@ class Window:
             noise.pooled(found, guess, self.parameters), _GYRO_LEAST * guess.gyro_rad_s
         )
 
+    def delay(self, lag_s: float) -> None:
+        """Take the field to be `lag_s` late in every epoch of the window, and in those to come."""
+        everyone = list(range(len(self.epochs)))
+        for k, u in zip(everyone, self._moved_directions(everyone), strict=True):
+            epoch = self.epochs[k]
+            self.epochs[k] = replace(epoch, data=delayed(epoch.data, lag_s - self.lag_s))
+            self._replace(k, u, epoch.used, epoch.weights)
+        self.lag_s = lag_s
+
     # -- moving ----------------------------------------------------------------------------------
 
     def restart_at(self, c: Array, bias: Array) -> None:
@@ -266,12 +269,12 @@ class Window:
         guess = noise.median(self._guesses)
         return chain.Noise(min(self.usual.mag_gauss, _WIDER * guess.mag_gauss), guess.gyro_rad_s)
 
-    def snapshot(self) -> _Snapshot:
+    def snapshot(self) -> Snapshot:
         """The whole state; cheap, because epochs, nodes and factors are replaced, never changed."""
         graph = self.graph
-        return _Snapshot(graph.c, dict(graph.nodes), list(self.epochs), list(graph.factors))
+        return Snapshot(graph.c, dict(graph.nodes), list(self.epochs), list(graph.factors))
 
-    def restore(self, kept: _Snapshot) -> None:
+    def restore(self, kept: Snapshot) -> None:
         """Back to a snapshot of the same epochs."""
         self.graph.c, self.graph.nodes = kept.c, dict(kept.nodes)
         self.epochs, self.graph.factors = list(kept.epochs), list(kept.factors)
@@ -387,9 +390,3 @@ class Window:
         cells = sum((e.cells for e in self.epochs if e.turned), self._folded_cells)
         white = noise.median(self._guesses).mag_gauss
         return excess(cells, self.usual.mag_gauss, white)
-
-
-def sigmas(step: Array, information: Array) -> float:
-    """Length of a step in standard deviations, per square root of its dimension."""
-    squared = float(step @ information @ step)
-    return float(np.sqrt(max(squared, 0.0) / len(step)))

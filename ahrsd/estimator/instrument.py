@@ -1,0 +1,102 @@
+"""What an instrument may have besides iron and bias: a turned magnetometer, and a late one.
+
+Turn: the magnetometer's axes are taken to be the gyro's. If they are not, the rate in the
+magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi. Derivative:
+dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt) [phi]x.
+
+Lag: a reading of the field that is tau late is that of the direction u(t - tau). With
+du/dt = -w x u its derivative is dr/dtau = -M (w x u) / s_m.
+
+One Gauss-Newton step from the answer gives both beside M, b and the bias. On fast motion one looks
+like the other, so they are asked for together. Every epoch stands alone here, its borders free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from ahrsd import so3
+from ahrsd.estimator import chain
+from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.graph import Graph
+from ahrsd.estimator.lag import rates
+from ahrsd.samples import Array
+
+TURN, LAG = slice(12, 15), 15
+_SIZE = 16
+_PRIOR_TURN_RAD, _PRIOR_LAG_S = 0.2, 0.05
+_WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instrument:
+    """Step from the answer in [M (6), b (3), w_b (3), theta (3), tau] and its covariance (16, 16).
+
+    misfit: how much the epochs still disagree after the step; it is in the covariance
+    """
+
+    step: Array
+    covariance: Array
+    misfit: float
+
+
+def instrument(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Instrument:
+    """From the epochs of a settled window.  LinAlgError where the motion does not tell."""
+    own = [
+        _information(epoch, graph.c, graph.nodes[epoch.a].bias) for epoch in epochs if epoch.turned
+    ]
+    if not own:
+        raise np.linalg.LinAlgError("no epoch with motion")
+    H, g = np.sum([h for h, _ in own], axis=0), np.sum([k for _, k in own], axis=0)
+    mean, information = graph.anchor
+    H[:9, :9] += graph.temper * information + graph.hold
+    g[:9] += (graph.temper * information + graph.hold) @ (graph.c - mean)
+    prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S]
+    H[9:, 9:] += np.diag(graph.temper / np.square(prior))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
+    covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
+    step = -covariance @ g
+    misfit = max(1.0, _disagreement(own, step))
+    return Instrument(step, misfit * covariance, misfit)
+
+
+def _disagreement(own: Sequence[tuple[Array, Array]], step: Array) -> float:
+    """Mean square per degree of freedom of what each epoch still asks for after the step."""
+    total, count = 0.0, 0
+    for H, g in own:
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
+        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+        good = values > _WEAKEST
+        asked = (vectors.T @ (scale * (g + H @ step)))[good]
+        total += float(np.sum(asked**2 / values[good]))
+        count += int(np.count_nonzero(good))
+    return total / max(count - _SIZE, 0.2 * count)
+
+
+def _information(epoch: Epoch, c: Array, bias: Array) -> tuple[Array, Array]:
+    """H (16, 16) and gradient, all directions eliminated."""
+    data, u = epoch.data, epoch.u
+    field, motion = chain.parts(data, u, c, bias, epoch.used, epoch.weights)
+    dt = data.dt_s[1:, None, None]
+    turn = motion.J_bias / dt @ so3.skew(data.angle_b_rad[1:])
+    swept = np.cross(rates(data), data.seen(u)) @ chain.symmetric(c[:6])
+    late = field.J_x[:, 0, 6, None] * swept  # J_x holds - sqrt(weight) / s_m in that place
+    diag, upper, border = chain.interior(field, motion)
+    columns = np.zeros((len(u), 2, _SIZE + 1))
+    columns[:, :, :12], columns[:, :, _SIZE] = border[:, :, :12], border[:, :, 12]
+    columns[1:, :, TURN] -= motion.scale[:, None, None] * turn
+    columns[:-1, :, TURN] += np.swapaxes(motion.J_prev, 1, 2) @ turn
+    columns[:, :, LAG] = (late[:, None, :] @ field.J_own)[:, 0]
+    H, g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
+    from_field, from_motion = np.r_[0:9, LAG], np.r_[9:15]
+    Jx = np.concatenate([field.J_x, late[:, :, None]], axis=2).reshape(-1, len(from_field))
+    Jw = np.concatenate([motion.J_bias, turn], axis=2).reshape(-1, 6)
+    H[np.ix_(from_field, from_field)], g[from_field] = Jx.T @ Jx, Jx.T @ field.r.ravel()
+    H[np.ix_(from_motion, from_motion)], g[from_motion] = Jw.T @ Jw, Jw.T @ motion.q.ravel()
+    flat = columns.reshape(-1, _SIZE + 1)
+    S = flat.T @ solveh_banded(chain.band(diag, upper), flat, lower=True)
+    return H - S[:_SIZE, :_SIZE], g - S[:_SIZE, _SIZE]
