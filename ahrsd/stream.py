@@ -37,8 +37,7 @@ from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
 
 FACTORY_RATE_HZ = 40.0
-_BLOCK_S = 0.25
-_LEAST_ROWS, _MOST_ROWS = 4, 256
+_BLOCK_S, _LEAST_ROWS, _MOST_ROWS = 0.25, 4, 256
 _ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
@@ -280,8 +279,8 @@ class Stream:
             return []
         steps = deepcopy(self._timeline).extend(extracted.time_s, extracted.usable)
         host_s = self._line(steps.time_s, np.array(self._arrivals))
-        blocks = sample_blocks(extractor, extracted, steps, host_s, self.epochs)
-        return [] if steps.restarts else self._unbridged(blocks)
+        found = sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+        return [] if steps.restarts else self._unbridged(found)
 
     def _unbridged(self, blocks: list[SampleBlock]) -> list[SampleBlock]:
         """Samples that nobody could un-map were left out: what comes next does not follow on."""
@@ -397,5 +396,5 @@ def _rows(rate_hz: float) -> int:
 
 def _better(new: Extractor, old: Extractor) -> bool:
     """Uncompensated before compensated, with device time before without."""
-    new_rank, old_rank = ((not e.mag_compensated, e.has_time) for e in (new, old))
-    return new_rank > old_rank
+    ranks = [(not e.mag_compensated, e.has_time) for e in (new, old)]
+    return ranks[0] > ranks[1]

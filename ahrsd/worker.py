@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from queue import SimpleQueue
 
-SWITCH_S = 0.001
+SWITCH_S = 0.0005
 MOST_WAITING = 40  # pieces, of a quarter of a second each: older verdicts are of no use
 _ASK_S = 0.1
 _STUCK_S = 5.0  # no piece takes so long; the service manager's watchdog then goes hungry

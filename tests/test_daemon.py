@@ -95,7 +95,7 @@ class Operator:
             if self.proposed:
                 green = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
                 core._errands.add(core.writeback.on_verdict(estimate(), green, 1.0, core._host_s))
-                core._judge = lambda: None  # what the gates truly say would end it
+                core._judged = lambda *_: None  # what the gates truly say would end it
         elif isinstance(event, StateChanged) and event.new == State.QUALIFIED:
             self.live.daemon.operate("approve", core.writeback.proposal.id)
         if isinstance(event, StateChanged) and event.new == self.at and not self.acted:
@@ -222,6 +222,39 @@ def test_a_bug_in_a_transaction_leaves_the_output_on(live):
         assert isinstance(daemon.error, TypeError)
         assert streaming(daemon)
         assert daemon.heard.rstrip().split(b"\r\n")[-1].startswith(b"$VNASY,1")
+
+
+def test_a_bug_in_the_estimator_ends_the_run_and_leaves_the_device_as_it_was(live, monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
+        daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
+        daemon.core.calibrator.take = None
+        daemon.ended()
+        assert "the estimate broke off" in str(daemon.error)
+        assert daemon.emulator.memory.ram == daemon.before
+        assert streaming(daemon)
+
+
+def test_samples_go_on_while_the_estimator_is_at_it(live):
+    """Also the end: a search that lasts must hold up neither a reader of the socket nor a stop."""
+    free = threading.Event()
+    with live({"output": "imu"}) as daemon:
+        daemon.flowing()
+        busy = threading.Event()
+
+        def search(_):
+            busy.set()
+            free.wait(20.0)
+
+        daemon.core.calibrator.take = search
+        daemon.until(busy.is_set)
+        seen = [e for e in list(daemon.events) if isinstance(e, SamplesSeen)]
+        daemon.until(
+            lambda: len([e for e in daemon.events if isinstance(e, SamplesSeen)]) > len(seen) + 3
+        )
+        assert not daemon.shell.worker.stuck
+        assert daemon.stop() < LIMIT_S
+        free.set()
 
 
 def test_a_broken_reader_is_a_lost_link(live, monkeypatch):

@@ -21,7 +21,7 @@ from ahrsd.serving.server import SocketServer
 from ahrsd.serving.status import LinkFacts, StatusMaker
 from ahrsd.unmapping import user_compensation
 
-_PACE_S = 0.008  # samples are told so often at most
+_PACE_S = 0.004  # samples are told so often at most
 
 log = logging.getLogger("ahrsd")
 

@@ -1,0 +1,206 @@
+"""Work beside the core: in order, bounded, and told where it breaks off or hangs."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted_calibrator import PlantedCalibrator
+from virtual_run import VirtualRun
+
+from ahrsd import events
+from ahrsd.calibration import Estimate, Observability
+from ahrsd.config import Config
+from ahrsd.core import Core
+from ahrsd.events import Examine
+from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
+from ahrsd.settings import core_settings
+from ahrsd.worker import MOST_WAITING, Worker
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+from drivers.vn100.emulator_scenarios import Setup, build
+
+
+@pytest.fixture
+def worker():
+    made = Worker()
+    yield made
+    made.close(5.0)
+
+
+def wait(condition):
+    for _ in range(1000):
+        if condition():
+            return
+        threading.Event().wait(0.01)
+    raise AssertionError("it did not happen within 10 s")
+
+
+def test_work_is_done_in_order_and_counted_once(worker):
+    done, woken = [], threading.Event()
+    worker.woken = woken.set
+    for k in range(20):
+        worker.put(lambda k=k: done.append(k))
+    counted = 0
+
+    def all_counted():
+        nonlocal counted
+        counted += worker.take_done()
+        return counted == 20
+
+    wait(all_counted)
+    assert done == list(range(20))
+    assert woken.is_set()
+    assert worker.take_done() == 0
+
+
+def test_who_gives_too_much_waits(worker):
+    gate, given = threading.Event(), []
+
+    def give():
+        for k in range(MOST_WAITING + 1):
+            worker.put(gate.wait)
+            given.append(k)
+
+    giver = threading.Thread(target=give)
+    giver.start()
+    wait(lambda: len(given) == MOST_WAITING)
+    giver.join(0.3)
+    assert len(given) == MOST_WAITING
+    gate.set()
+    giver.join(5.0)
+    assert len(given) == MOST_WAITING + 1
+
+
+def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch):
+    monkeypatch.setattr("ahrsd.worker._STUCK_S", 0.05)
+    gate = threading.Event()
+    assert not worker.stuck
+    worker.put(gate.wait)
+    wait(lambda: worker.stuck)
+    for _ in range(2 * MOST_WAITING):  # does not wait: the service manager will end it
+        worker.put(lambda: None)
+    gate.set()
+    wait(lambda: not worker.stuck)
+
+
+def test_work_that_breaks_off_is_told(worker, monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    worker.put(lambda: 1 / 0)
+
+    def told():
+        try:
+            worker.take_done()
+        except RuntimeError as error:
+            return "broke off" in str(error)
+        return False
+
+    wait(told)
+
+
+class BesideRun(VirtualRun):
+    """The calibrator's work is done when `work` is called; `fed` is every input."""
+
+    def __init__(self, mode: Mode = Mode.OBSERVE) -> None:
+        self.fed: list[Input] = []
+        self.waiting: deque[Examine] = deque()
+        policy = WriteBackPolicy(
+            mode=mode, approval="auto", commit_unattended=True, max_change_auto_deg=180.0
+        )
+        settings = replace(core_settings(Config(), policy=policy), beside=True)
+        device = build(Setup("rov", seed=3, output="imu", rate_hz=50))
+        super().__init__(device, settings, step_s=0.1, listen=self._listen)
+
+    def feed(self, item):
+        waiting = [item]
+        while waiting:
+            self.fed.append(waiting.pop(0))
+            for event in self.core.handle(self.fed[-1]):
+                self.listen(event)
+                self._carry_out(event, waiting)
+
+    def _listen(self, event: events.Event) -> None:
+        if isinstance(event, Examine):
+            self.waiting.append(event)
+
+    def work(self) -> None:
+        """All that waits."""
+        done = len(self.waiting)
+        while self.waiting:
+            self.waiting.popleft().work()
+        self.feed(Examined(self.now_ns, done))
+
+
+def estimate() -> Estimate:
+    return Estimate(
+        np.diag([1.1, 1.0, 1 / 1.1]), np.array([0.03, 0.04, -0.02]), np.zeros(3),
+        0.48, False, np.eye(12) * 1e-6, 1e-3, 1e-3, 1.0, 0.1,
+        Observability(np.full(12, 0.01), (), 10.0), 10_000, 300.0, True,
+    )  # fmt: skip
+
+
+def test_the_same_findings_come_at_the_same_place_of_a_replay():
+    run = BesideRun()
+    for wait_s in (3.0, 0.5, 7.0, 1.0, 12.0, 2.0, 30.0):
+        run.run(wait_s)
+        run.work()
+    assert run.core.decisions.count >= 3
+    again = Core(run.core.settings)
+    for item in run.fed:
+        again.handle(item)
+    assert again.decisions.entries == run.core.decisions.entries
+    assert again.decisions.sha256 == run.core.decisions.sha256
+
+
+def test_what_is_told_later_is_what_would_have_been_told_at_once():
+    run = BesideRun()
+    run.run(60.0)
+    run.work()
+    at_once = Core(replace(run.core.settings, beside=False))
+    for item in run.fed:
+        if not isinstance(item, Examined):
+            at_once.handle(item)
+    said, said_at_once = (
+        [e for e in core.decisions.entries if "converged" in e] for core in (run.core, at_once)
+    )
+    assert len(said) >= 2
+    assert said == said_at_once
+
+
+def candidate(run: BesideRun) -> BesideRun:
+    """Observing, with a candidate in what waits to be judged."""
+    assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 10.0), run.notes
+    run.run(2.0)
+    run.work()
+    run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
+    run.run(1.5)
+    assert run.waiting
+    return run
+
+
+def test_a_verdict_that_comes_in_time_leads_to_a_write():
+    run = candidate(BesideRun(Mode.STAGE))
+    run.work()
+    assert run.until(lambda: run.writes > 0, 10.0), run.states
+
+
+def test_a_verdict_on_what_was_before_the_link_was_lost_writes_nothing():
+    run = candidate(BesideRun(Mode.STAGE))
+    run.feed(LinkLost(run.now_ns, "pulled"))
+    run.feed(LinkOpened(run.now_ns, "virtual", 115200))
+    run.work()
+    assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 20.0), run.notes
+    assert run.writes == 0
+    assert "QUALIFIED" not in run.states
+
+
+def test_a_verdict_on_registers_that_are_in_force_no_more_writes_nothing():
+    run = candidate(BesideRun(Mode.STAGE))
+    run.core.in_force(run.core.registers)
+    run.work()
+    run.run(5.0)
+    assert run.writes == 0
+    assert "QUALIFIED" not in run.states
