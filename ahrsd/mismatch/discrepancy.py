@@ -35,7 +35,8 @@ PIECES = 24
 UNIT_GAUSS, UNIT_RAD_S = 1e-3, 1e-4
 SMALLEST, LARGEST = -6.0, 8.0
 #: standing: slower than this for longer than that; it takes a moment to get away from a place
-STILL_RAD_S, STILL_S, LEAVING_S = 0.05, 2.0, 1.0
+STILL_RAD_S, STILL_S = 0.05, 2.0
+LEAVING_S = (1.0, 0.5)  # the way from a place, far and near half
 MOST_RESTS = 24
 ITERATIONS = 40
 
@@ -134,21 +135,23 @@ def _second(x: Array, y: Array, z: Array) -> list[Array]:
 
 
 def places(context: Context) -> locate.Segments:
-    """The stretches in which the vehicle stands, the longest of them."""
+    """The stretches in which the vehicle stands, the longest, and the ways from and to them."""
     track = context.track
     still = np.linalg.norm(context.rate_b_rad_s, axis=1) < STILL_RAD_S
     padded = np.concatenate([[False], still, [False]]).astype(int)
     firsts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
-    lasts = ends - 1
-    length = track.time_s[lasts] - track.time_s[firsts]
-    longest = np.argsort(-length)[:MOST_RESTS]
-    kept = np.sort(longest[length[longest] > STILL_S])
+    begins_s, ends_s = track.time_s[firsts], track.time_s[ends - 1]
+    longest = np.argsort(begins_s - ends_s)[:MOST_RESTS]
     index = np.full(len(track), -1)
-    for number, k in enumerate(kept):
-        near = track.time_s > track.time_s[firsts[k]] - LEAVING_S
-        near &= track.time_s < track.time_s[lasts[k]] + LEAVING_S
-        index[near] = number
-    return locate.Segments(np.arange(len(kept) + 1.0), index)
+    count = 0
+    for k in np.sort(longest[(ends_s - begins_s)[longest] > STILL_S]):
+        for away_s in LEAVING_S:
+            for low, high in ((begins_s[k] - away_s, begins_s[k]), (ends_s[k], ends_s[k] + away_s)):
+                index[(track.time_s >= low) & (track.time_s <= high)] = count
+                count += 1
+        index[(track.time_s >= begins_s[k]) & (track.time_s <= ends_s[k])] = count
+        count += 1
+    return locate.Segments(np.arange(count + 1.0), index)
 
 
 def _projected(basis: Base, columns: Array) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.exam import examined
+from ahrsd.mismatch.exam import examined, paired
 from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
     added_value,
@@ -121,7 +121,7 @@ class _Searched:
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     state, first, last = forward(State(problem, start))
-    slim = examined(pruned(state))
+    slim = examined(paired(pruned(state)))
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = swapped(slim, last)
     state, surveys, left = without_stand_ins(state, surveys)

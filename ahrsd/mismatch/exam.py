@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
-from ahrsd.mismatch.regression import Base
-from ahrsd.mismatch.search import STEPS, State, basis_of, refitted, term_group, without_term
+from ahrsd.mismatch.regression import Base, evidence_of
+from ahrsd.mismatch.search import (
+    COUNTERPART_NATS,
+    STEPS,
+    State,
+    basis_of,
+    counterpart,
+    refitted,
+    term_group,
+    without_term,
+)
 from ahrsd.samples import Array
-
-#: steps that cancel to this share are one thing that was put on and taken off again
-CANCELS = 0.25
 
 
 def examined(state: State) -> State:
@@ -26,10 +34,30 @@ def examined(state: State) -> State:
             break
         worth = [_worth(state, basis, found, k) for k in range(len(state.named))]
         weakest = int(np.argmin(worth))
-        if worth[weakest] > limits.beyond_nats:
+        if worth[weakest] > max(limits.beyond_nats, limits.beyond_share * found.nats):
             break
         kept = tuple(judged for k, judged in enumerate(state.named) if k != weakest)
         state = refitted(state, kept)
+    return state
+
+
+def paired(state: State) -> State:
+    """Steps of about the same size in two frames made one thing, put on and taken off, if they can.
+
+    What comes while the vehicle stands is as good in either frame; what goes while it turns is not.
+    """
+    for k, name in enumerate(state.names):
+        for other in {n for n in state.names if n in STEPS.values()} - {name}:
+            if name not in STEPS.values() or counterpart(state, k) is not None:
+                continue
+            effect = state.problem.library[other]
+            candidate = replace(state.named[k].candidate, effect=effect)
+            left = without_term(state, k)
+            loss = evidence_of(left, state.named[k].candidate) - evidence_of(left, candidate)
+            if loss < COUNTERPART_NATS:
+                judged = replace(state.named[k], candidate=candidate)
+                tried = refitted(state, (*state.named[:k], judged, *state.named[k + 1 :]))
+                state = tried if counterpart(tried, k) is not None else state
     return state
 
 
@@ -47,20 +75,6 @@ def _worth(state: State, basis: Base, found: Discrepancy, number: int) -> float:
         columns = np.concatenate([columns, _columns(basis, other)], axis=2)
         scale = np.concatenate([scale, scale])
     return beyond(found, left, columns, scale)
-
-
-def counterpart(state: State, number: int) -> int | None:
-    """The step that takes back what this one brought, or the other way round."""
-    name = state.names[number]
-    if name not in STEPS.values():
-        return None
-    value = state.fit.terms[number].value
-    for k, other in enumerate(state.names):
-        if k != number and other == name:
-            whole = np.linalg.norm(value) + np.linalg.norm(state.fit.terms[k].value)
-            if 2 * np.linalg.norm(value + state.fit.terms[k].value) < CANCELS * whole:
-                return k
-    return None
 
 
 def _columns(basis: Base, number: int) -> Array:

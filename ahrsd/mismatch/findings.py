@@ -18,7 +18,14 @@ from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.regression import CALIBRATION, Base
-from ahrsd.mismatch.search import State, Survey, in_its_place, term_group
+from ahrsd.mismatch.search import (
+    COUNTERPART_NATS,
+    State,
+    Survey,
+    counterpart,
+    in_its_place,
+    term_group,
+)
 from ahrsd.mismatch.unknown import AXES, innovation_rms
 from ahrsd.mismatch.validate import heading_error_deg
 from ahrsd.mismatch.values import NullModel, Term
@@ -35,7 +42,8 @@ def finding(state: State, basis: Base, number: int, seen: Survey, last: Survey) 
     basis: of the whole model;  seen: the survey without the term;  last: with all terms
     """
     judged, library = state.named[number], state.problem.library
-    shares = _delay_shares(state, basis, number) or _shares(judged, seen, last)
+    lead = COUNTERPART_NATS if counterpart(state, number) is not None else 0.0
+    shares = _delay_shares(state, basis, number) or _shares(judged, seen, last, lead)
     term = whole_term(state, basis, number, next(iter(shares)))
     effect = library[term.identifier]
     alternatives = tuple(
@@ -187,12 +195,15 @@ def cost(basis: Base, number: int, value: Array) -> Cost:
     )
 
 
-def _shares(judged: Judged, seen: Survey, last: Survey) -> dict[str, float]:
-    """Every name's share of the probability of being what the term explains."""
+def _shares(judged: Judged, seen: Survey, last: Survey, lead: float) -> dict[str, float]:
+    """Every name's share of the probability of being what the term explains.
+
+    lead: nats that the term's name has for other reasons
+    """
     mine = judged.candidate.name
     evidence = {c.name: in_its_place(c, last) for c in seen.candidates if c.name != mine}
     own = [c.evidence for c in seen.candidates if c.name == mine]
-    found = posterior({mine: max([judged.evidence, *own]), **evidence}, {})
+    found = posterior({mine: lead + max([judged.evidence, *own]), **evidence}, {})
     rest = {k: v for k, v in sorted(found.items(), key=lambda item: -item[1]) if k != mine}
     return {mine: found[mine], **rest}
 

@@ -24,6 +24,8 @@ class Limits:
     beyond_nats:    what a name must be worth beyond the random effects of what the model leaves
                     (`discrepancy`), where it leaves something: a library of a hundred names and
                     settings against a remainder whose form is only roughly known
+    beyond_share:   and in parts of what the random effects are worth themselves: what is a small
+                    part of the unknown is not known
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
@@ -38,6 +40,7 @@ class Limits:
     coverage: float = 0.9
     most_shaped: int = 3
     beyond_nats: float = 30.0
+    beyond_share: float = 0.05
     unknown_nats: float = 12.0
     unknown_p: float = 1e-6
     most_terms: int = 5

@@ -47,6 +47,10 @@ STEPS: Mapping[Frame, str] = {
     "gyro": "gyro_bias_step",
 }
 STEP_PASSES = 2
+#: steps that cancel to this share are one thing that was put on and taken off again
+CANCELS = 0.25
+#: nats that such a coincidence of three coefficients is worth
+COUNTERPART_NATS = 3 * float(np.log(1 / CANCELS))
 SMALL_LAG_S = 2e-3
 LAG_STEPS = 3
 #: a gyro bias that wanders by 20 deg/h in 400 s is noise of an ordinary gyro and gets no name
@@ -295,12 +299,26 @@ def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
             for j in seen.judged
             if j.accepted and j.candidate.name != name and in_its_place(j.candidate, last) > least
         ]
-        if better and name not in DELAYS:
+        if better and name not in DELAYS and counterpart(state, k) is None:
             state = refitted(state, (*state.named[:k], better[0], *state.named[k + 1 :]))
             last = survey(state)
             seen, _ = _without(state, k)
         surveys.append(seen)
     return state, surveys, last
+
+
+def counterpart(state: State, number: int) -> int | None:
+    """The step that takes back what this one brought, or the other way round."""
+    name = state.names[number]
+    if name not in STEPS.values():
+        return None
+    value = state.fit.terms[number].value
+    for k, other in enumerate(state.names):
+        if k != number and other == name:
+            whole = np.linalg.norm(value) + np.linalg.norm(state.fit.terms[k].value)
+            if 2 * np.linalg.norm(value + state.fit.terms[k].value) < CANCELS * whole:
+                return k
+    return None
 
 
 def in_its_place(candidate: Candidate, last: Survey) -> float:
