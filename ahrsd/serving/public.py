@@ -9,9 +9,7 @@ import logging
 from pathlib import Path
 
 from ahrsd import events
-from ahrsd.calibration import Affine
 from ahrsd.core import Core
-from ahrsd.samples import SampleBlock
 from ahrsd.sdnotify import Notifier
 from ahrsd.serving.client import default_socket_path
 from ahrsd.serving.lines import service_line
@@ -53,29 +51,26 @@ class Public:
 
     def event(self, event: events.Event) -> None:
         """Something happened in the core."""
-        if isinstance(event, events.SamplesSeen):
-            self._samples([event.block], event.present)
-        elif self.socket is not None:
+        if self.socket is None:
+            return
+        if not isinstance(event, events.SamplesSeen):
             self.socket.publish(event)
+        elif (record := self._newest.full(event.block, event.present)) and self._watched:
+            self.socket.samples(record)
 
     def turn(self, core: Core, now_s: float, *, well: bool = True) -> None:
         """The daemon's loop turned once; the watchdog is fed while all is `well`."""
         if well:
             self.notifier.feed()
-        if self._watched and now_s >= self._next_s:  # samples that wait for their block
+        if self.socket is not None and self._watched and now_s >= self._next_s:
             self._next_s = now_s + _PACE_S
-            self._samples(core.stream.peek(), user_compensation(core.registers)[0])
+            present, _ = user_compensation(core.registers)
+            for record in self._newest.waiting(core.stream.peek(), present):
+                self.socket.samples(record)
 
     @property
     def _watched(self) -> bool:
         return self.socket is not None and self.socket.wants("samples")
-
-    def _samples(self, blocks: list[SampleBlock], present: Affine) -> None:
-        if self.socket is None or not self._watched:
-            return
-        for block in blocks:
-            if record := self._newest.of(block, present):
-                self.socket.samples(record)
 
     def look(self, core: Core, link: LinkFacts, now_s: float) -> None:
         """About once a second: the newest status for everybody who asks."""

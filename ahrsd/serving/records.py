@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
 from ahrsd import events
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-
-_ANEW_S = 1.0  # time that falls by more is that of a device that restarted, or of another one
 
 Record = dict[str, object]
 
@@ -70,20 +68,31 @@ def samples_record(block: SampleBlock, present: Affine, first: int = 0) -> Recor
 
 
 class Newest:
-    """Each sample once, though it is told before its block is full; by the device's time."""
+    """Each sample is told once, though before its block is full; known by the device's time."""
 
     def __init__(self) -> None:
-        self._told_s = -np.inf
+        self._ahead: set[float] = set()  # told, and their block is not full yet
+        self._was_full = False
 
-    def of(self, block: SampleBlock, present: Affine) -> Record | None:
-        """What was not told yet."""
-        if block.time_s[-1] < self._told_s - _ANEW_S:
-            self._told_s = -np.inf
-        first = int(np.searchsorted(block.time_s, self._told_s, side="right"))
-        if first == len(block):
-            return None
-        self._told_s = float(block.time_s[-1])
-        return samples_record(block, present, first)
+    def waiting(self, blocks: Sequence[SampleBlock], present: Affine) -> list[Record]:
+        """What waits for its block to be full, and was not told yet."""
+        if self._was_full:
+            self._ahead.clear()
+            self._was_full = False
+        records = [record for block in blocks if (record := self._rest(block, present))]
+        for block in blocks:
+            self._ahead.update(block.time_s.tolist())
+        return records
+
+    def full(self, block: SampleBlock, present: Affine) -> Record | None:
+        """The part of a block that was not told while it waited."""
+        self._was_full = True
+        return self._rest(block, present)
+
+    def _rest(self, block: SampleBlock, present: Affine) -> Record | None:
+        new = (k for k, at_s in enumerate(block.time_s.tolist()) if at_s not in self._ahead)
+        first = next(new, None)
+        return None if first is None else samples_record(block, present, first)
 
 
 def _at(kind: str, at_s: float, host_s: float) -> Record:
