@@ -14,6 +14,7 @@ from ahrsd.samples import Array
 _AXES = ("x", "y", "z")
 _FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
 _PILED = 6.0  # times as many at the limit as in the same width just inside it
+_MARGIN, _NEAR = 3.0, 0.02  # noise levels, and share of the limit, at which it begins to act
 _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
 
 
@@ -29,7 +30,13 @@ def clipping(track: Track) -> list[Fact]:
         if not any(rows.any() for rows, _ in found):
             continue
         limit = max(level for rows, level in found if rows.any())
+        at_limit = np.abs(values) >= limit  # the other axes' few, where the limit is theirs too
+        found = [(rows | at_limit[:, axis], level) for axis, (rows, level) in enumerate(found)]
         rows = np.any([rows for rows, _ in found], axis=0)
+        # of readings at the limit only those that noise made small are left: they are biased
+        near = np.asarray(
+            np.any(np.abs(values) > limit - min(_MARGIN * noise, _NEAR * limit), axis=1)
+        )
         intervals = tuple(
             (float(track.time_s[a]), float(track.time_s[b - 1])) for a, b in spans_of(rows, 5)
         )
@@ -47,7 +54,8 @@ def clipping(track: Track) -> list[Fact]:
                 0.99,
                 (Value("limit", limit, max(noise, 1e-9), unit),),
                 {},
-                rows if unit == "gauss" else None,
+                near if unit == "gauss" else None,
+                None if unit == "gauss" else np.where(near, np.nan, 1.0),
             )
         )
     return out

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch.diagnosis import Value, Where
+from ahrsd.samples import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +21,8 @@ class Fact:
     parameters: as the effect's table row
     setting:    what else the effect needs (axes, signs, onset, ...), JSON-able
     bad:        (N,) rows whose magnetometer reading is not one, None where all are
+    turned:     (N,) how many times as far as the gyro says the sensor turned in the step that ends
+                at the row, nan where nobody knows; None where the gyro is right
     stops:      nothing that is fitted before it is put right means anything
     """
 
@@ -30,6 +33,7 @@ class Fact:
     parameters: tuple[Value, ...] = ()
     setting: dict[str, Any] = field(default_factory=dict)
     bad: NDArray[np.bool] | None = None
+    turned: Array | None = None
     stops: bool = False
 
 

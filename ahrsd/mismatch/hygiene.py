@@ -15,6 +15,7 @@ import numpy as np
 from ahrsd.mismatch.clipping import clipping, quantisation
 from ahrsd.mismatch.coarse import noise_of
 from ahrsd.mismatch.diagnosis import Value, Where
+from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.frames import Frame, ranked, windows
 from ahrsd.mismatch.repeats import repeats
@@ -135,8 +136,8 @@ def _unit_error(
 def put_right(track: Track, facts: Sequence[Fact]) -> Track:
     """The track without what the facts say: frames and units undone, false readings nan.
 
-    Jittering stamps are put on their regular clock, the turn of lost samples is put back.  Rows
-    stay as they are in number and order.
+    Jittering stamps are put on their regular clock, the turn of lost samples is put back, and
+    where the turn is not known a run ends.  Rows stay as they are in number and order.
     """
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     time_s, dt_s = track.time_s, track.dt_s
@@ -152,11 +153,14 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
         elif fact.effect == "timestamp_jitter" and not fact.stops:
             time_s = regular(track)
             dt_s = np.where(np.isnan(dt_s), np.nan, np.diff(time_s, prepend=np.nan))
-        elif fact.setting.get("hidden"):
-            gyro[fact.setting["rows"]] *= 1.0 + np.array(fact.setting["turns"])[:, None]
+        if fact.turned is not None:
+            known = np.isfinite(fact.turned)
+            gyro[known] *= fact.turned[known, None]
+            dt_s = np.where(known, dt_s, np.nan)
         if fact.bad is not None:
             mag[fact.bad] = np.nan
-    return replace(track, time_s=time_s, dt_s=dt_s, mag_b_gauss=mag, gyro_b_rad_s=gyro)
+    runs = track.runs if dt_s is track.dt_s else tuple(series.runs(dt_s))
+    return replace(track, time_s=time_s, dt_s=dt_s, mag_b_gauss=mag, gyro_b_rad_s=gyro, runs=runs)
 
 
 def sensitivity(track: Track) -> tuple[str, ...]:

@@ -7,6 +7,8 @@ Noise does that as often backwards as forwards, which tells how many of the jump
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,10 @@ from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.problem import Problem
+from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
-_MEAN = 3  # samples after the jump that are averaged
+_AVERAGED = (3, 12)  # samples before and after the jump
 _SEEN = 5.0  # deviations of a step's turn that can be told
 _NEAR = 0.3  # of a whole number
 _FEWEST = 5
@@ -29,50 +32,81 @@ def lost_turns(problem: Problem) -> list[Fact]:
 
 
 def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
-    """Where the filter jumps by whole steps.  rate_b_rad_s (N, 3) without bias."""
-    track, A = done.track, done.model.soft_iron
-    if len(track) < 10 * _MEAN:
-        return []
-    dt = np.nan_to_num(track.dt_s, nan=0.0)[:, None]
-    v = np.cross(done.predicted_b, rate_b_rad_s * dt) @ A
+    """Where the filter jumps by whole steps.  rate_b_rad_s (N, 3) without bias.
+
+    Over few samples first, which tells the quick turns, then over more, which tells slower ones.
+    """
+    track = done.track
+    for samples in _AVERAGED:
+        if len(track) < 10 * samples:
+            break
+        found = _jumps(done, rate_b_rad_s, samples)
+        if len(found.forward) >= _FEWEST + 3 * len(found.backward):
+            return [_fact(track, found)]
+    return []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Jumps:
+    """steps (N,) by which the field is ahead;  tell (N,) where that can be said;  rows of jumps."""
+
+    steps: Array
+    tell: NDArray[np.bool]
+    forward: NDArray[np.intp]
+    backward: NDArray[np.intp]
+
+
+def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int) -> _Jumps:
+    dt = np.nan_to_num(done.track.dt_s, nan=0.0)[:, None]
+    v = np.cross(done.predicted_b, rate_b_rad_s * dt) @ done.model.soft_iron
     size = np.linalg.norm(v, axis=1)
-    sigma = float(np.sqrt(np.median(done.gains.innovation_covariance[:, 0, 0]) / _MEAN))
+    sigma = float(np.sqrt(np.median(done.gains.innovation_covariance[:, 0, 0]) / samples))
     ahead = np.zeros_like(v)
     behind = np.zeros_like(v)
-    stop = len(v) - _MEAN
-    for k in range(_MEAN):
-        ahead[:stop] += done.innovation[k : stop + k] / _MEAN
-        behind[_MEAN:] += done.innovation[_MEAN - 1 - k : len(v) - 1 - k] / _MEAN
+    stop = len(v) - samples
+    total = np.concatenate([[0], np.cumsum(done.used)])
+    complete = np.zeros(len(v), dtype=bool)
+    complete[samples:stop] = total[2 * samples : -1] - total[: -2 * samples - 1] == 2 * samples
+    for k in range(samples):
+        ahead[:stop] += done.innovation[k : stop + k] / samples
+        behind[samples:] += done.innovation[samples - 1 - k : len(v) - 1 - k] / samples
     jump = ahead - behind
     steps = np.sum(jump * v, axis=1) / np.maximum(size**2, 1e-300)
     rest = np.linalg.norm(jump - steps[:, None] * v, axis=1)
     fresh = np.sum(behind * v, axis=1) < 0.5 * size**2
-    tell = (size > _SEEN * sigma) & (rest < 5 * sigma) & done.used & fresh
+    tell = (size > _SEEN * sigma) & (rest < 5 * sigma) & complete & fresh
     whole = np.abs(steps - np.round(steps)) < _NEAR
-    forward = _peaks(tell & whole & (steps > 1 - _NEAR), steps)
-    backward = _peaks(tell & whole & (steps < -1 + _NEAR), -steps)
-    if len(forward) < _FEWEST + 3 * len(backward):
-        return []
-    lost = float(np.sum(np.round(steps[forward]))) * len(v) / max(int(np.count_nonzero(tell)), 1)
-    share = lost / (lost + len(v))
-    deviation = share / float(np.sqrt(len(forward)))
-    times = tuple((float(track.time_s[k - 1]), float(track.time_s[k])) for k in forward)
+    return _Jumps(
+        steps,
+        tell,
+        _peaks(tell & whole & (steps > 1 - _NEAR), steps, samples),
+        _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
+    )
+
+
+def _fact(track: Track, found: _Jumps) -> Fact:
+    """The lost samples; where a lost one would not be seen the turn is put right on average."""
+    rows, turns = found.forward, np.round(found.steps[found.forward])
+    per_row = float(turns.sum()) / max(int(np.count_nonzero(found.tell)), 1)
+    share = per_row / (per_row + 1.0)
+    turned = np.where(found.tell, 1.0, 1.0 + per_row)
+    turned[rows] = 1.0 + turns
+    times = tuple((float(track.time_s[k - 1]), float(track.time_s[k])) for k in rows)
     words = (
-        f"at {len(forward)} samples the field is ahead by whole steps of the turn: samples are "
+        f"at {len(rows)} samples the field is ahead by whole steps of the turn: samples are "
         "missing that the time stamps do not show"
     )
     where = Where(times, ("x", "y", "z"), "link")
-    parameters = (Value("part", share, deviation, "1"),)
-    rows, turns = forward.tolist(), np.round(steps[forward]).tolist()
-    setting = {"hidden": True, "rows": rows, "turns": turns}
-    return [Fact("dropped_samples", words, where, 0.9, parameters, setting)]
+    parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
+    setting = {"hidden": True}
+    return Fact("dropped_samples", words, where, 0.9, parameters, setting, turned=turned)
 
 
-def _peaks(rows: NDArray[np.bool], size: Array) -> NDArray[np.intp]:
+def _peaks(rows: NDArray[np.bool], size: Array, samples: int) -> NDArray[np.intp]:
     """Of rows closer than the averaging the one that is largest."""
     out: list[int] = []
     for k in np.flatnonzero(rows).tolist():
-        if out and k - out[-1] < 2 * _MEAN:
+        if out and k - out[-1] < 2 * samples:
             if size[k] > size[out[-1]]:
                 out[-1] = k
         else:

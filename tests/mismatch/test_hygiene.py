@@ -154,10 +154,18 @@ def test_saturation_of_both_sensors(track: Track) -> None:
     assert fact.effect == "mag_saturation"
     assert _value(fact) == 0.3
     assert fact.bad is not None
-    assert np.array_equal(fact.bad, (mag == 0.3).any(axis=1))
+    assert fact.bad[(mag == 0.3).any(axis=1)].all()
+    assert not fact.bad[(np.abs(mag) < 0.29).all(axis=1)].any()
     top = 0.7 * float(np.abs(track.gyro_b_rad_s).max())
     fact = _only(hygiene(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
     assert fact.effect == "gyro_saturation"
+    assert fact.turned is not None
+    clipped = np.max(np.abs(track.gyro_b_rad_s), axis=1) >= top
+    assert np.isnan(fact.turned[clipped]).all()
+    right = put_right(track, (fact,))
+    assert np.isnan(right.dt_s[clipped]).all()
+    assert sum(run.stop - run.start for run in right.runs) == len(track)
+    assert len(right.runs) > 2
     assert _value(fact) == top
 
 
@@ -201,8 +209,21 @@ def test_missing_samples_without_a_gap_in_the_stamps() -> None:
     fact = _only(tuple(facts))
     assert fact.effect == "dropped_samples"
     assert 0.004 < _value(fact) < 0.02
+    right = put_right(cut, (fact,))
+    turned = np.linalg.norm(right.gyro_b_rad_s, axis=1) / np.linalg.norm(cut.gyro_b_rad_s, axis=1)
+    assert np.count_nonzero(turned > 1.9) == len(fact.where.intervals_s)
     rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
     assert missing_turns(run_filter(track, model), rate) == []
+
+
+def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
+    made = experiment("lam", samples=9000, seed=3, sigma_mag=3e-4)
+    track = track_of(made)
+    model = replace(true_model(made), sigma_mag_gauss=3e-4)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.015)
+    cut = _without(track, keep, restamp=True)
+    facts = missing_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    assert abs(_value(_only(tuple(facts))) - 0.015) < 0.008
 
 
 def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
