@@ -19,8 +19,9 @@ from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
-_AVERAGED = (3, 12)  # samples before and after the jump
-_SEEN = 5.0  # deviations of a step's turn that can be told
+#: samples before and after a jump, and how many deviations of a mean a step's turn must have: over
+#: more samples there are fewer jumps by chance
+_AVERAGED = ((3, 7.0), (12, 5.0))
 _NEAR = 0.3  # of a whole number
 _FEWEST = 5
 
@@ -37,10 +38,10 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
     Over few samples first, which tells the quick turns, then over more, which tells slower ones.
     """
     track = done.track
-    for samples in _AVERAGED:
+    for samples, least in _AVERAGED:
         if len(track) < 10 * samples:
             break
-        found = _jumps(done, rate_b_rad_s, samples)
+        found = _jumps(done, rate_b_rad_s, samples, least)
         if len(found.forward) >= _FEWEST + 3 * len(found.backward):
             return [_fact(track, found)]
     return []
@@ -56,7 +57,7 @@ class _Jumps:
     backward: NDArray[np.intp]
 
 
-def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int) -> _Jumps:
+def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _Jumps:
     dt = np.nan_to_num(done.track.dt_s, nan=0.0)[:, None]
     v = np.cross(done.predicted_b, rate_b_rad_s * dt) @ done.model.soft_iron
     size = np.linalg.norm(v, axis=1)
@@ -74,7 +75,7 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int) -> _Jumps:
     steps = np.sum(jump * v, axis=1) / np.maximum(size**2, 1e-300)
     rest = np.linalg.norm(jump - steps[:, None] * v, axis=1)
     fresh = np.sum(behind * v, axis=1) < 0.5 * size**2
-    tell = (size > _SEEN * sigma) & (rest < 5 * sigma) & complete & fresh
+    tell = (size > least * sigma) & (rest < 5 * sigma) & complete & fresh
     whole = np.abs(steps - np.round(steps)) < _NEAR
     return _Jumps(
         steps,
