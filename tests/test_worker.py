@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from ahrsd.config import Config
 from ahrsd.core import Core
 from ahrsd.events import Examine
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
+from ahrsd.serving.public import Public
 from ahrsd.settings import core_settings
 from ahrsd.worker import MOST_WAITING, Worker
 from ahrsd.writeback.permissions import Mode
@@ -99,6 +101,25 @@ def test_work_that_breaks_off_is_told(worker, monkeypatch):
         return False
 
     wait(told)
+
+
+def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch):
+    monkeypatch.setattr("ahrsd.worker._STUCK_S", 0.2)
+    gate, fed = threading.Event(), []
+    with live({"output": "imu"}) as daemon:
+        public = Public(time.monotonic())
+        public.notifier.feed = lambda: fed.append(time.monotonic())
+        daemon.daemon._public = public
+        daemon.until(lambda: len(fed) > 20)
+        daemon.core.calibrator.take = lambda _: gate.wait(30.0)
+        daemon.until(lambda: daemon.shell.worker.stuck)
+        daemon.flowing()  # a turn that had begun before may end
+        count = len(fed)
+        daemon.flowing()
+        daemon.flowing()
+        assert len(fed) == count
+        gate.set()
+        daemon.until(lambda: len(fed) > count)
 
 
 class BesideRun(VirtualRun):
