@@ -107,8 +107,9 @@ class Watch:
         rate = (facts.samples - before) / max(now_s - before_s, 1e-9)
         estimate = core.calibrator.estimate
         sigma = "no estimate" if estimate is None else f"{estimate.heading_sigma_deg:.2f} deg"
-        shut = next((gate for gate in core.calibrator.gates if not gate.ok), None)
-        waits = "" if shut is None else f", waits for {shut.gate}: {shut.advice}"
+        holds = core.writeback.holds() if core.calibrator.gates else []
+        gates = [text.removeprefix("gate ") for text in holds if text.startswith("gate ")]
+        waits = f", waits for {gates[0]}" if gates else "".join(f"; {text}" for text in holds[:1])
         return (
             f"{facts.samples} samples, {rate:.1f} Hz, {core.stream.all_gaps.count} gaps, "
             f"{core.writeback.state.value}, heading sigma {sigma}{waits}"

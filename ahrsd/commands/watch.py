@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ahrsd.commands.running import connected, socket_options
-from ahrsd.serving.explain import explain_json
+from ahrsd.serving.explain import explain_json, holding
 from ahrsd.serving.lines import status_lines
 
 _EVENTS = 8  # lines of what happened
@@ -93,12 +93,11 @@ def screen(status: Mapping[str, Any], happened: deque[str]) -> RenderableType:
 
 
 def _gates(status: Mapping[str, Any]) -> RenderableType:
-    table = Table("gate", "value", "limit", "for", expand=True, title="gates that are shut")
-    shut = [gate for gate in status["gates"] if not gate["ok"]]
-    for gate in shut:
+    table = Table("gate", "value", "limit", "for", expand=True, title="gates that hold a write")
+    for gate in holding(status)[0]:
         table.add_row(gate["gate"], _value(gate, "value"), _value(gate, "limit"), _for(gate))
-    passed = len(status["gates"]) - len(shut)
-    table.caption = f"{passed} of {len(status['gates'])} gates are open"
+    green = sum(gate["ok"] for gate in status["gates"])
+    table.caption = f"{green} of {len(status['gates'])} gates are green"
     return table
 
 

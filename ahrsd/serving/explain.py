@@ -41,8 +41,7 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
     """`ahrsd.explain/1` out of a status: the state, what holds, and what to do next."""
     back = status["write_back"]
     state = str(back["state"])
-    shut = [gate for gate in status["gates"] if not gate["ok"]]
-    said = {f"gate {gate['gate']}: {gate['advice']}" for gate in shut}
+    shut, others = holding(status)
     return {
         "schema": SCHEMA,
         "state": state,
@@ -52,9 +51,25 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "stream": _stream(status),
         "mismatch": _mismatch(status),
         "gates": shut,
-        "others": [text for text in back["holds"] if text not in said],
+        "others": others,
         "next": _next(status, state, shut),
     }
+
+
+def holding(status: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[str]]:
+    """The gates that hold the next step, and what else does.
+
+    A red gate that guards another step (the flash, a write that nobody approves) holds nothing now.
+    """
+    gates = {f"gate {gate['gate']}": gate for gate in status["gates"]}
+    shut, others = [], []
+    for text in status["write_back"]["holds"]:
+        gate = gates.get(text.partition(": ")[0])
+        if gate is None:
+            others.append(text)
+        else:
+            shut.append(gate)
+    return shut, others
 
 
 def _stream(status: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ahrsd.serving.explain import STATES
+from ahrsd.serving.explain import STATES, holding
 
 Status = Mapping[str, Any]
 
@@ -112,7 +112,7 @@ def service_line(status: Status) -> str:
     """One line for `systemctl status`; it changes only when something changes for a person."""
     if not status["link"]["open"]:
         return "waiting for the device"
-    shut = next((gate["gate"] for gate in status["gates"] if not gate["ok"]), "")
-    waits = f", waits for {shut}" if shut else ""
+    shut, _ = holding(status)
+    waits = f", waits for {shut[0]['gate']}" if shut else ""
     flowing = "" if status["stream"]["samples"] else ", no samples yet"
     return f"{status['write_back']['state']}, mode {status['mode']}{waits}{flowing}"

@@ -52,9 +52,18 @@ def test_a_shut_gate_is_shown_with_value_limit_age_and_advice():
     ]
 
 
+def test_a_red_gate_that_guards_another_step_holds_nothing():
+    waiting = {"state": "QUALIFIED", "holds": ["an operator must approve 12ab34cd"]}
+    waiting["proposal"] = {"id": "12ab34cd"}
+    explained = explain_json(status(gates=[GATE | {"gate": "step.auto"}], write_back=waiting))
+    assert explained["gates"] == []
+    assert explained["next"].endswith("ahrsd operator approve 12ab34cd")
+
+
 def test_a_gate_that_was_not_measured_says_so():
     missing = GATE | {"value": None, "for_s": None}
-    lines = explain_lines(explain_json(status(gates=[missing])))
+    held = {"state": "CANDIDATE", "holds": ["gate heldout_heading.rms: turn"], "proposal": None}
+    lines = explain_lines(explain_json(status(gates=[missing], write_back=held)))
     assert "not measured (limit 1.5 deg): turn again elsewhere" in lines[3]
 
 
