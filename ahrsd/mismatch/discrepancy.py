@@ -38,6 +38,7 @@ SMALLEST, LARGEST = -6.0, 8.0
 STILL_RAD_S, STILL_S = 0.05, 2.0
 LEAVING_S = (1.0, 0.5)  # the way from a place, far and near half
 MOST_RESTS = 24
+PLACES = 4  # number of their group
 ITERATIONS = 40
 
 
@@ -50,6 +51,7 @@ class Discrepancy:
     noise:   power of what is left beside everything, at least 1
     sizes:   (groups,) logarithms of the deviations of the whole model
     nats:    log marginal likelihood of the whole model over that without random effects
+    unknown: the same over that with those of places alone, of which one knows what they are
     """
 
     basis: Base
@@ -58,6 +60,18 @@ class Discrepancy:
     noise: float
     sizes: Array
     nats: float
+    unknown: float
+
+    def refined(self, name: str) -> tuple[Array, Array]:
+        """What is left to change in a known group's value (p,) beside them, and its deviation."""
+        X = np.concatenate([self.basis.known, self.columns], axis=2)
+        X = X.reshape(-1, X.shape[2]) / np.sqrt(self.noise)
+        e = self.basis.innovation.ravel() / np.sqrt(self.noise)
+        prior = np.zeros(X.shape[1])
+        prior[-len(self.group) :] = np.exp(-2.0 * self.sizes)[self.group]
+        inverse = solve(X.T @ X + np.diag(prior), np.column_stack([X.T @ e, np.eye(X.shape[1])]))
+        at = self.basis.groups[name]
+        return inverse[at, 0], np.sqrt(np.maximum(np.diag(inverse[:, 1:])[at], 0.0))
 
 
 def discrepancy(basis: Base) -> Discrepancy:
@@ -72,7 +86,12 @@ def discrepancy(basis: Base) -> Discrepancy:
     noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
     G, s = _projected(basis, together)
     nats, sizes = _fitted(G, s, group, noise, np.zeros(len(parts)))
-    return Discrepancy(basis, together, group, noise, sizes, nats)
+    known = group == PLACES
+    by_place = 0.0
+    if known.any():
+        rest = np.zeros(np.count_nonzero(known), dtype=np.intp)
+        by_place, _ = _fitted(G[np.ix_(known, known)], s[known], rest, noise, np.zeros(1))
+    return Discrepancy(basis, together, group, noise, sizes, nats, nats - by_place)
 
 
 def beyond(found: Discrepancy, without: Base, columns: Array, scale: Array) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.mismatch import locate, roles, unknown
+from ahrsd.mismatch import roles, unknown
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
     Baseline,
@@ -25,7 +25,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.exam import examined, paired
+from ahrsd.mismatch.exam import examined, paired, rest_of
 from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
     added_value,
@@ -139,7 +139,10 @@ def _told(
     """Everything that was found, in the contract's form."""
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
-    named = [finding(state, basis, k, seen, done.last) for k, seen in enumerate(done.surveys)]
+    beside = rest_of(state, basis)
+    named = [
+        finding(state, basis, k, seen, done.last, beside) for k, seen in enumerate(done.surveys)
+    ]
     quickly = [
         finding(fast.state, fast.last.basis, k, seen, fast.last)
         for k, seen in enumerate(fast.surveys, start=fast.known)
@@ -152,7 +155,7 @@ def _told(
         *(of_fact(fact, library) for fact in noise),
     )
     something = unknown.detected(done.left, limits)
-    terms = tuple(whole_term(state, basis, k, one.effect) for k, one in enumerate(named))
+    terms = tuple(whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(named))
     quick_terms = tuple(
         whole_term(fast.state, fast.last.basis, k, one.effect)
         for k, one in enumerate(quickly, start=fast.known)
@@ -226,9 +229,8 @@ def without_stand_ins(
     """Names that only stand in for a course in time taken out again, and what is then left.
 
     Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
-    all of what their frame's own coefficients explain, and where a few of them do.  Any other name
-    may stay where it explains something that a free course in the strongest frame does not.  A gyro
-    whose bias wanders as an ordinary one's does is noise.
+    all of what their frame's own coefficients explain, and where a few of them do.  A gyro whose
+    bias wanders as an ordinary one's does is noise.
     """
     limits = state.problem.limits
     left = unknown.remainder(basis_of(state))
@@ -241,10 +243,6 @@ def without_stand_ins(
         if shaped and not doubtful:
             doubtful = shaped if _stand_in(state, frame, shaped, left) else []
         state, surveys, left = _dropped(state, surveys, doubtful, left)
-    if state.named and unknown.detected(left, limits):
-        doubtful = [k for k in range(len(state.named)) if not _survives(state, k, left)]
-        much = _stand_in(state, left.strongest.frame, doubtful, left) if doubtful else False
-        state, surveys, left = _dropped(state, surveys, doubtful if much else [], left)
     return state, surveys, left
 
 
@@ -255,11 +253,10 @@ def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remain
     single one, if the frame's free course is likelier, however many its coefficients.
     """
     limits = state.problem.limits
-    bare = basis_of(state)
-    for k in terms:
-        bare = bare.without(term_group(k), added_value(state, k))
-    before = unknown.remainder(bare, with_bins=False)
+    before = unknown.remainder(_bare(state, terms), with_bins=False)
     free = before.located[frame]
+    if not unknown.detected(before, limits):
+        return False  # there is no course that they could stand in for
     fires = unknown.detected(left, limits)
     if fires and left.located[frame].statistic > (1 - limits.coverage) * free.statistic:
         return True
@@ -269,14 +266,12 @@ def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remain
     return free.evidence > evidence + limits.lead_nats
 
 
-def _survives(state: State, number: int, left: unknown.Remainder) -> bool:
-    """Whether a term still explains something beside the strongest frame's free course."""
-    frame, context = left.strongest.frame, left.basis.context
-    course = locate.frame_columns(context, frame, left.strongest.cut)
-    bare = left.basis.without(term_group(number), added_value(state, number))
-    free = bare.beside(locate.group_name(frame), bare.whitened([course])[0])
-    candidate = state.named[number].candidate
-    return evidence_of(free, candidate) > state.problem.limits.evidence_nats
+def _bare(state: State, terms: list[int]) -> Base:
+    """The basis without these terms, what they explain put back."""
+    bare = basis_of(state)
+    for k in terms:
+        bare = bare.without(term_group(k), added_value(state, k))
+    return bare
 
 
 def _dropped(
@@ -285,8 +280,12 @@ def _dropped(
     if not terms:
         return state, surveys, left
     kept = [k for k in range(len(state.named)) if k not in terms]
+    before = unknown.remainder(_bare(state, terms))
     state = refitted(state, tuple(state.named[k] for k in kept))
-    return state, [surveys[k] for k in kept], unknown.remainder(basis_of(state))
+    after = unknown.remainder(basis_of(state))
+    # without the names, what they stood for may have become noise
+    left = after if unknown.detected(after, state.problem.limits) else before
+    return state, [surveys[k] for k in kept], left
 
 
 def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:

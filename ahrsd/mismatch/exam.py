@@ -29,16 +29,24 @@ def examined(state: State) -> State:
     limits = state.problem.limits
     while state.named:
         basis = basis_of(state)
-        found = discrepancy(basis)
-        if found.nats < limits.unknown_nats:
+        found = rest_of(state, basis)
+        if found is None:
             break
         worth = [_worth(state, basis, found, k) for k in range(len(state.named))]
         weakest = int(np.argmin(worth))
-        if worth[weakest] > max(limits.beyond_nats, limits.beyond_share * found.nats):
+        if worth[weakest] > max(limits.beyond_nats, limits.beyond_share * found.unknown):
             break
         kept = tuple(judged for k, judged in enumerate(state.named) if k != weakest)
         state = refitted(state, kept)
     return state
+
+
+def rest_of(state: State, basis: Base) -> Discrepancy | None:
+    """What the model leaves, None where that is no more than noise."""
+    if not state.named:
+        return None
+    found = discrepancy(basis)
+    return found if found.nats > state.problem.limits.unknown_nats else None
 
 
 def paired(state: State) -> State:

@@ -9,6 +9,7 @@ import numpy as np
 from ahrsd.mismatch.confound import separating_manoeuvre
 from ahrsd.mismatch.delays import DELAYS, weighed
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
+from ahrsd.mismatch.discrepancy import Discrepancy
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import posterior
 from ahrsd.mismatch.facts import Fact
@@ -33,18 +34,25 @@ from ahrsd.samples import Array
 
 #: shares below this are not worth a line
 SMALLEST_SHARE = 0.005
-FRAMES: Mapping[str, str] = {"sensor": "sensor", "world": "world", "gyro": "gyro", "link": "link"}
 
 
-def finding(state: State, basis: Base, number: int, seen: Survey, last: Survey) -> Finding:
+def finding(
+    state: State,
+    basis: Base,
+    number: int,
+    seen: Survey,
+    last: Survey,
+    beside: Discrepancy | None = None,
+) -> Finding:
     """The finding of term `number`.
 
     basis: of the whole model;  seen: the survey without the term;  last: with all terms
+    beside: what the whole model leaves, if it is more than noise
     """
     judged, library = state.named[number], state.problem.library
     lead = COUNTERPART_NATS if counterpart(state, number) is not None else 0.0
-    shares = _delay_shares(state, basis, number) or _shares(judged, seen, last, lead)
-    term = whole_term(state, basis, number, next(iter(shares)))
+    shares = _delay_shares(state, basis, number, beside) or _shares(judged, seen, last, lead)
+    term = whole_term(state, basis, number, next(iter(shares)), beside)
     effect = library[term.identifier]
     alternatives = tuple(
         Share(name, share) for name, share in shares.items() if name != effect.identifier
@@ -94,13 +102,19 @@ def added_value(state: State, number: int) -> Array:
     return np.array([state.lag_s(number)]) if _is_delay(state, number) else value
 
 
-def whole_term(state: State, basis: Base, number: int, name: str | None = None) -> Term:
+def whole_term(
+    state: State,
+    basis: Base,
+    number: int,
+    name: str | None = None,
+    beside: Discrepancy | None = None,
+) -> Term:
     """A fitted term as it is told: whole value, deviations for the noise as coloured as it is.
 
     name: what a delay is called in the end
     """
     term = state.fit.terms[number]
-    change, deviation = refined(basis, number)
+    change, deviation = refined(basis, number, term.identifier, beside)
     value = added_value(state, number) + change
     setting = {k: v for k, v in term.setting.items() if k != "searched"}
     if not _is_delay(state, number):
@@ -114,8 +128,14 @@ def whole_term(state: State, basis: Base, number: int, name: str | None = None) 
     return Term(name, value, deviation, setting)
 
 
-def refined(basis: Base, number: int) -> tuple[Array, Array]:
-    """What is left to change in a term's value (p,), and its deviation (p,) in coloured noise."""
+def refined(basis: Base, number: int, name: str, beside: Discrepancy | None) -> tuple[Array, Array]:
+    """What is left to change in a term's value (p,), and its deviation (p,) in coloured noise.
+
+    A delay shows in the turns, whatever else is the matter: it is taken beside what is left.  What
+    shows in the level of the field would give half of itself away to it.
+    """
+    if beside is not None and name in DELAYS:
+        return beside.refined(term_group(number))
     Z = basis.known.reshape(-1, basis.known.shape[2])
     where = basis.groups[term_group(number)]
     inverse = solve(Z.T @ Z, np.column_stack([Z.T @ basis.innovation.ravel(), np.eye(len(Z.T))]))
@@ -127,11 +147,13 @@ def _is_delay(state: State, number: int) -> bool:
     return state.named[number].candidate.name in DELAYS
 
 
-def _delay_shares(state: State, basis: Base, number: int) -> dict[str, float] | None:
+def _delay_shares(
+    state: State, basis: Base, number: int, beside: Discrepancy | None
+) -> dict[str, float] | None:
     if not _is_delay(state, number):
         return None
     term = state.fit.terms[number]
-    change, deviation = (float(part[0]) for part in refined(basis, number))
+    change, deviation = (float(part[0]) for part in refined(basis, number, term.identifier, beside))
     recorded = float(np.nanmedian(state.problem.recorded.dt_s))
     lag_s = DELAYS[term.identifier] * (state.lag_s(number) + change)
     return weighed(basis, state.problem.library, lag_s, deviation, recorded)
@@ -171,7 +193,7 @@ def where(judged: Judged, value: Array, basis: Base) -> Where:
     return Where(
         tuple(found),
         axes,
-        FRAMES[judged.candidate.effect.family],
+        judged.candidate.effect.frame or judged.candidate.effect.family,
         _regime(judged, basis, added),
         None if frequency is None else (float(frequency) - width, float(frequency) + width),
     )
@@ -223,7 +245,7 @@ def _regime(judged: Judged, basis: Base, added: Array) -> str | None:
     if values is None or not np.isfinite(values).any():
         return None
     size = np.linalg.norm(added, axis=1)
-    strong = values[size > np.median(size)]
+    strong = values[size >= np.median(size)]
     low, high = float(np.min(strong)), float(np.max(strong))
     if low > float(np.median(values)) * 0.9:
         return f"{name} > {low:.3g}"
