@@ -237,7 +237,7 @@ class Gates(Section):
     )
     """Change of scale where no position is known: the motion does not determine it. [%]"""
     max_step_auto_deg: float = Field(default=_LIMITS.max_step_auto_deg, ge=0.0, le=180.0)
-    """Worst heading change without a person, and of a first calibration. [deg]"""
+    """Worst heading change without a person, whatever `write_back.approval` says. [deg]"""
     max_step_operator_deg: float = Field(default=_LIMITS.max_step_operator_deg, ge=0.0, le=180.0)
     """Worst heading change against an earlier calibration, with a person's approval. [deg]"""
     max_field_change_gauss: float = Field(default=_LIMITS.max_field_change_gauss, ge=0.0, le=2.5)
@@ -309,7 +309,8 @@ class WriteBack(Section):
     """Who says yes to a write, and what is worth one."""
 
     approval: Literal["operator", "auto"] = _POLICY.approval
-    """operator: a person approves each candidate by its id; auto: small changes need nobody."""
+    """operator: a person approves each candidate by its id; auto: a change within
+    `gates.max_step_auto_deg` needs nobody."""
     commit_unattended: bool = _POLICY.commit_unattended
     """Save to flash without an operator's yes (mode commit, approval auto)."""
     keep_on_stop: bool = _POLICY.keep_on_stop
@@ -318,8 +319,6 @@ class WriteBack(Section):
     """A change of heading below this is not worth a write. [deg]"""
     min_gyro_change_rad_s: float = Field(default=_POLICY.min_gyro_change_rad_s, ge=0.0, le=1.0)
     """And a change of the gyro bias below this neither. [rad/s]"""
-    max_change_auto_deg: float = Field(default=_POLICY.max_change_auto_deg, gt=0.0, le=180.0)
-    """A larger change of heading needs an operator whatever `approval` says. [deg]"""
     margin_after_rollback: float = Field(default=_POLICY.margin_after_rollback, ge=1.0, le=100.0)
     """After a rollback only changes so many times as large are worth a write. [1]"""
 

@@ -181,6 +181,7 @@ def test_the_write_backs_defaults_have_one_source():
             "interlock": {"max_age_s": 0.5},
             "write_back": {"approval": "auto", "keep_on_stop": True, "min_change_deg": 0.25},
             "budget": {"ram_writes_per_day": 2},
+            "gates": {"max_step_auto_deg": 3.0},
             "trial": {"turns": 3.0, "interlock": False},
             "still": {"duration_s": 4.0},
         },
@@ -190,6 +191,7 @@ def test_the_write_backs_defaults_have_one_source():
     assert (policy.mode, policy.serial, policy.configure_stream) == (Mode.COMMIT, 7, True)
     assert (policy.approval, policy.keep_on_stop) == ("auto", True)
     assert (policy.interlock_max_age_s, policy.min_change_deg) == (0.5, 0.25)
+    assert policy.max_change_auto_deg == 3.0
     assert (policy.ram_writes_per_day, policy.still.duration_s) == (2, 4.0)
     assert (policy.trial.turns, policy.trial.interlock) == (3.0, False)
 

@@ -7,6 +7,7 @@ from ahrsd.gates.row import Level, least, most, no
 _MOVE = "drive at least two full circles in calm surroundings"
 _TILT = "pitch and roll by 30 deg if the vehicle can"
 _HELD = "keep turning: held-out data must show full circles too"
+_PERSON = 'a person must approve that: write_back.approval = "operator"'
 _REST = "stand still for 5 s with the motors idle"
 
 PROOF = (
@@ -186,7 +187,7 @@ CHANGE = (
         "max_condition_auto",
         Level.UNATTENDED,
         meaning="the same, without a person",
-        advice="the soft iron is {v:.1f} to 1 (limit {l:.0f}): an operator must approve",
+        advice=f"the soft iron is {{v:.1f}} to 1 (limit {{l:.0f}}): {_PERSON}",
     ),
     most(
         "bounds.offset",
@@ -206,7 +207,7 @@ CHANGE = (
         "max_offset_auto_gauss",
         Level.UNATTENDED,
         meaning="the same, without a person",
-        advice="the hard iron is {v:.2f} gauss (limit {l:.2f}): an operator must approve",
+        advice=f"the hard iron is {{v:.2f}} gauss (limit {{l:.2f}}): {_PERSON}",
     ),
     most(
         "bounds.scale",
@@ -240,7 +241,7 @@ CHANGE = (
         "max_step_auto_deg",
         Level.UNATTENDED,
         meaning="the same, without a person (and for a first calibration)",
-        advice="heading would change by {v:.1f} deg (limit {l:.0f}): an operator must approve",
+        advice=f"heading would change by {{v:.1f}} deg (limit {{l:.0f}}): {_PERSON}",
         missing="the heading change is not known yet: field and tilt are not measured",
     ),
 )

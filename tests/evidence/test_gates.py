@@ -165,7 +165,7 @@ def test_a_large_step_is_for_a_person_and_a_larger_one_for_nobody(world) -> None
     results = judge(first, LIMITS, 0.0)
     assert holds(results, Level.RAM)
     assert not holds(results, Level.UNATTENDED)
-    assert "operator must approve" in red(first)["step.auto"]
+    assert "a person must approve" in red(first)["step.auto"]
     again = world.evidence(world.Scene(), present=moved(world, 0.15, 0.0, 0.0))
     assert not holds(judge(again, LIMITS, 0.0), Level.CANDIDATE)
     assert "something else is wrong" in red(again)["step.operator"]
