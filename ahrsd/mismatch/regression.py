@@ -28,6 +28,10 @@ BATCH_COLUMNS = 96
 ONE_SIDED = ("mag_time_lag", "gyro_time_lag", "mag_low_pass", "mag_sample_hold")
 ONSET_STEPS = 12
 ONSET_PASSES = 2
+#: settings that are a size, sought between the values of their grid, and what that choice costs
+SCALES = ("time_constant_s", "radius_gauss", "length_s")
+SCALE_CHOICES = 3
+WORTH_NATS = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +151,11 @@ def best_settings(
         if not options:
             continue
         best = max(_scan(basis, effect, options), key=lambda candidate: candidate.evidence)
-        found.append(_with_onset(basis, best, options) if "onset_s" in best.setting else best)
+        if "onset_s" in best.setting:
+            best = _with_onset(basis, best, options)
+        if best.evidence > WORTH_NATS:
+            best = _with_scale(basis, best, options)
+        found.append(best)
     return sorted(found, key=lambda candidate: -candidate.evidence)
 
 
@@ -219,6 +227,29 @@ def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
     if paid <= best.evidence:
         return best
     return replace(finer, tried=len(options) * 4, evidence=paid)
+
+
+def _with_scale(basis: Base, best: Candidate, options: Sequence[Setting]) -> Candidate:
+    """The candidate with its time constant, radius or length sought between those of the grid.
+
+    A grid of factors of three leaves coefficients off by many of their deviations.
+    """
+    for key in SCALES:
+        values = {float(option[key]) for option in options if key in option}
+        if len(values) < 2 or key not in best.setting or best.name in ONE_SIDED:
+            continue
+        wide = (max(values) / min(values)) ** (1.0 / (len(values) - 1))
+        finer = best
+        for share in (1 / 3, 1 / 9, 1 / 27):
+            middle = float(finer.setting[key])
+            steps = [{**finer.setting, key: middle * wide ** (k * share)} for k in (-1, 0, 1)]
+            finer = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
+        cost = np.log(len(options) * SCALE_CHOICES)
+        paid = evidence_of(basis, finer) - float(cost)
+        if paid > best.evidence:
+            tried = len(options) * SCALE_CHOICES
+            best = replace(finer, tried=tried, evidence=paid)
+    return best
 
 
 def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:

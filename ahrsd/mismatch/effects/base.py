@@ -65,6 +65,7 @@ class Effect(ABC):
     size:        what is seen on real vehicles;  source: where that and the equation come from
     kind:        "variance" and "discrete" effects have no columns and no settings
     after_noise: it acts on the finished reading, noise included
+    frame:       in which it is told, where that is not the family's name
     """
 
     identifier: str
@@ -82,6 +83,7 @@ class Effect(ABC):
     source: str
     kind: Kind = "mean"
     after_noise: bool = False
+    frame: str | None = None
 
     @abstractmethod
     def settings(self, context: Context) -> tuple[Setting, ...]:

@@ -7,12 +7,22 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch.effects import series, shapes
-from ahrsd.mismatch.effects.base import Discrete, Linear, Parameter, Readings, Scatter, Setting
-from ahrsd.mismatch.values import Columns
+from ahrsd.mismatch.effects.base import (
+    Discrete,
+    Effect,
+    Linear,
+    Parameter,
+    Readings,
+    Scatter,
+    Setting,
+    readings_of,
+)
+from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
 _DEG = np.pi / 180
+_CONVERGED_S = (20.0, 60.0, 180.0)  # time constants of a compensation on board
 
 
 class ClockRate(Linear):
@@ -265,16 +275,17 @@ class UnitError(Discrete):
         return float(bool(strength)) * np.array(self.typical), {}
 
 
-class OnboardCalibrationActive(Discrete):
+class OnboardCalibrationActive(Effect):
     """F1: the reading creeps from raw to the device's own correction C (m - b)."""
 
     identifier = "onboard_calibration_active"
     code = "F1"
     family = "link"
     words = "the device's own hard and soft iron compensation is running and applied"
-    equation = "m += s(t) (A^-1 (m - b) - m), s = k (1 - exp(-(t - t0)/tau)) from t0 on"
+    equation = "m += s(t) (A^-1 (m - b) - m), s ~ 1 - exp(-(t - t0)/tau) from t0 on, k at the end"
     parameters = (Parameter("part", "1", 1.0, 2.0),)
     typical = (0.8,)
+    frame = "sensor"
     signature = "hard and soft iron creep or jump with no cause outside"
     confusers = (
         ("hard_iron_drift", "read register 44"),
@@ -284,14 +295,26 @@ class OnboardCalibrationActive(Discrete):
     size = "the whole of the hard iron within a minute"
     source = "VN-100 registers 44 and 47 (dossier F1)"
 
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """From the first sample on, slowly or quickly, or from a later time."""
+        readings = readings_of(context)
+        first = float(readings.time_s[0])
+        return tuple(
+            {**onset, "time_constant_s": tau}
+            for onset in ({"onset_s": first}, *shapes.onsets(readings)[::2])
+            for tau in _CONVERGED_S
+        )
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """From the raw reading to the corrected one."""
+        readings = readings_of(context)
+        change = _converged(readings, setting)[:, None] * _correction(readings)
+        return Columns(mag=change[:, :, None])
+
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """A convergence with a time constant, as of a filter that sees more and more attitudes."""
-        induced = readings.field_b @ readings.soft_iron.T
-        hard_iron = np.mean(readings.mag_b_gauss - induced, axis=0)
-        corrected = np.linalg.solve(readings.soft_iron, (readings.mag_b_gauss - hard_iron).T).T
-        since = np.maximum(readings.time_s - setting["onset_s"], 0.0)
-        part = float(value[0]) * (1 - np.exp(-since / setting["time_constant_s"]))
-        change = part[:, None] * (corrected - readings.mag_b_gauss)
+        part = float(value[0]) * _converged(readings, setting)
+        change = part[:, None] * _correction(readings)
         return replace(readings, mag_b_gauss=readings.mag_b_gauss + change)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -300,6 +323,20 @@ class OnboardCalibrationActive(Discrete):
         onset = round(first + 0.25 * (last - first), 3)
         value = np.minimum(strength * np.array(self.typical), 1.0)
         return value, {"onset_s": onset, "time_constant_s": 60.0}
+
+
+def _converged(readings: Readings, setting: Setting) -> Array:
+    """How far a filter that began at the onset has come, 1 at the last sample, (N,)."""
+    since = np.maximum(readings.time_s - setting["onset_s"], 0.0) / setting["time_constant_s"]
+    return np.asarray(np.expm1(-since) / min(np.expm1(-since[-1]), -1e-6))
+
+
+def _correction(readings: Readings) -> Array:
+    """(N, 3) gauss that the whole of hard and soft iron compensation changes in a reading."""
+    induced = readings.field_b @ readings.soft_iron.T
+    hard_iron = np.mean(readings.mag_b_gauss - induced, axis=0)
+    corrected = np.linalg.solve(readings.soft_iron, (readings.mag_b_gauss - hard_iron).T).T
+    return np.asarray(corrected - readings.mag_b_gauss)
 
 
 def _within(time_s: Array, setting: Setting) -> Array:
