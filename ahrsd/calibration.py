@@ -103,6 +103,8 @@ class Estimate:
     heading_sigma_deg: worst 1-sigma heading error over the headings and tilts that were driven
     mag_lag_s:       how late the field's readings are against the gyro's, taken into account;
                      0 where the data do not ask for it
+    gyro_misscaled:  share of themselves by which the gyro's angles are too small against the turns
+                     of the field; 0 where they may be right
     """
 
     soft_iron: Array
@@ -121,6 +123,7 @@ class Estimate:
     converged: bool
     warnings: tuple[str, ...] = field(default=())
     mag_lag_s: float = 0.0
+    gyro_misscaled: float = 0.0
 
     @property
     def correction(self) -> Affine:

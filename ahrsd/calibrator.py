@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
+from ahrsd.estimator import change
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.events import GateResult, Noted
@@ -114,9 +115,10 @@ class Calibrator:
 
     def _heed(self, estimate: Estimate | None) -> None:
         """Whether the estimator began anew by itself since the last call."""
-        if estimate is not None and self.estimator.restarted_s != self._heeded_s:
-            self._heeded_s = self.estimator.restarted_s
-            self._begin_anew(list(estimate.warnings))
+        at_s = self.estimator.restarted_s
+        if estimate is not None and at_s is not None and at_s != self._heeded_s:
+            self._heeded_s = at_s
+            self._begin_anew([change.spoken(at_s)])
 
     def _begin_anew(self, notes: list[str]) -> None:
         """The estimate forgot what was before a change: evidence from then proves nothing now."""

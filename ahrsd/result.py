@@ -98,6 +98,11 @@ def why_not_converged(estimate: Estimate | None) -> list[str]:
         return ["too few samples for an estimate"]
     if estimate.converged:
         return []
+    if wrong := estimate.gyro_misscaled:
+        return [
+            f"not converged: the field turns {abs(wrong):.0%} {'more' if wrong > 0 else 'less'} "
+            "than the gyro says: the rate in Hz, the times of samples or the gyro's unit are wrong"
+        ]
     if blind := estimate.observability.unobservable:
         return [f"this motion does not determine: {'; '.join(blind)}"]
     if estimate.heading_sigma_deg >= _HOPELESS_DEG:

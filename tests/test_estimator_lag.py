@@ -16,8 +16,10 @@ from ahrsd.config import Config
 from ahrsd.estimator import chain
 from ahrsd.estimator.lag import delayed, rates
 from ahrsd.estimator.online import Estimator
+from ahrsd.result import why_not_converged
 
 BROAD = Path(__file__).parents[2] / "shared" / "recordings" / "broad"
+WALK = BROAD.parent / "vn100" / "walk_square_2024_sazgar.vnraw.gz"
 UPPER = np.triu_indices(3)
 
 
@@ -61,6 +63,27 @@ def test_where_there_is_no_lag_none_is_found(bench):
         for seed in range(3)
     ]
     assert lags == [0.0] * 6
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.1])
+def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
+    run = bench.simulate("mam", "rov", 2, samples=5000)
+    gyro = run.block.gyro_b_rad_s * factor
+    found = answer(bench, replace(run, block=replace(run.block, gyro_b_rad_s=gyro)))
+    assert found.gyro_misscaled == pytest.approx(1 / factor - 1, abs=0.06)
+    assert not found.converged
+    (reason,) = why_not_converged(found)
+    assert f"{abs(found.gyro_misscaled):.0%} {'more' if factor < 1 else 'less'} than" in reason
+    right = answer(bench, run)
+    assert right.converged and right.gyro_misscaled == 0.0
+
+
+@pytest.mark.skipif(not WALK.exists(), reason="the real recordings are not here")
+def test_a_rate_that_lost_messages_made_wrong_is_no_answer():
+    assert calibrate(WALK, Config(), rate_hz=40.0).estimate.gyro_misscaled == 0.0
+    found = calibrate(WALK, Config(), rate_hz=30.0).estimate
+    assert not found.converged
+    assert found.gyro_misscaled == pytest.approx(30 / 40 - 1, abs=0.08)
 
 
 def test_delay_turns_what_the_field_is_the_image_of():

@@ -17,6 +17,11 @@ _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must 
 _FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
 
 
+def spoken(at_s: float) -> str:
+    """What is said of a change at that time."""
+    return f"the iron changed at about {at_s:.0f} s: calibrated anew from there"
+
+
 def contradicts(
     epoch: Epoch, c: Array, covariance: Array, usual: chain.Noise, limit_sigma: float
 ) -> bool:

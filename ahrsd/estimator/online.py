@@ -13,10 +13,10 @@ from copy import copy
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.estimator import chain, intake, noise, summary
+from ahrsd.estimator import chain, change, intake, noise, summary
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
-from ahrsd.estimator.instrument import LAG, instrument
+from ahrsd.estimator.instrument import LAG, Instrument, instrument
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.misalignment import Misalignment, misalignment
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
@@ -65,8 +65,8 @@ class Estimator:
         self._next_search = _FIRST_SEARCH
         self._strange = 0
         self._lag_spread: Array = np.zeros(12)  # what a lag that is one sigma off does
+        self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
-        self._warnings: tuple[str, ...] = ()
 
     def add(self, block: SampleBlock) -> bool:
         """Take samples; true where they completed an epoch, so that `estimate` says something new.
@@ -96,7 +96,7 @@ class Estimator:
             if self._searching and self._moving_epochs > _FRESH * self._last_search:
                 self._search(self._window)
             self._window.track(everything=True)
-            if self._delay(self._window) and self._searching:
+            if self._examine(self._window) and self._searching:
                 self._search(self._window)
                 self._window.track(everything=True)
         return self._answer()
@@ -119,7 +119,7 @@ class Estimator:
                 self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
                 if self._searching:
                     self._search(window)
-                self._delay(window)
+                self._examine(window)
         window.fold()
 
     def _contradicted(self, window: Window) -> bool:
@@ -130,10 +130,7 @@ class Estimator:
         sure = not self._searching and window.step_sigmas < _SETTLED
         self._strange = self._strange + 1 if sure and window.contradicted() else 0
         if self._strange == _CHANGED:
-            at_s = self.restarted_s = float(window.epochs[-_CHANGED].data.time_s[0])
-            self._warnings = (
-                f"the iron changed at about {at_s:.0f} s: calibrated anew from there",
-            )
+            self.restarted_s = float(window.epochs[-_CHANGED].data.time_s[0])
             self._window = window.anew(_CHANGED)
             self._searching, self._agreed, self._strange = True, False, 0
             self._moving_epochs = self._last_search = 1
@@ -173,25 +170,31 @@ class Estimator:
         settled = window.step_sigmas < _SETTLED
         self._searching = not (found.agreed and settled and self._sure(window))
 
-    def _delay(self, window: Window) -> bool:
-        """Take a lag of the field out where the epochs ask for one; whether they did."""
+    def _examine(self, window: Window) -> bool:
+        """See whether the gyro's angles are the field's, and take out a lag where the epochs ask
+        for one; whether they did.
+        """
         least, changed = _LAG_SIGMAS if window.lag_s == 0.0 else 1.0, False
         for _ in range(_LAG_PASSES):
-            try:
-                found = instrument(
-                    window.epochs, window.graph, self.parameters.prior_gyro_bias_rad_s
-                )
-            except np.linalg.LinAlgError:
-                return changed
-            more, sigma = float(found.step[LAG]), float(np.sqrt(found.covariance[LAG, LAG]))
+            found = self._instrument(window)
+            if found is None:
+                break
+            self._misscaled = found.misscaled
+            more, sigma = found.lag_s
             if changed:
                 self._lag_spread = found.covariance[:12, LAG] / sigma
             if abs(more) < least * sigma:
-                return changed
+                break
             window.delay(float(np.clip(window.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)))
             window.track(everything=True)
             least, changed = _LAG_SAME, True
         return changed
+
+    def _instrument(self, window: Window) -> Instrument | None:
+        try:
+            return instrument(window.epochs, window.graph, self.parameters.prior_gyro_bias_rad_s)
+        except np.linalg.LinAlgError:
+            return None
 
     @staticmethod
     def _sure(window: Window) -> bool:
@@ -264,8 +267,12 @@ class Estimator:
             samples=self._intake.samples,
             duration_s=self._intake.duration_s,
             converged=bool(
-                self._agreed and window.step_sigmas < _SETTLED and heading < _HOPELESS_DEG
+                self._agreed
+                and window.step_sigmas < _SETTLED
+                and heading < _HOPELESS_DEG
+                and self._misscaled == 0.0
             ),
-            warnings=self._warnings,
+            warnings=() if self.restarted_s is None else (change.spoken(self.restarted_s),),
             mag_lag_s=window.lag_s,
+            gyro_misscaled=self._misscaled,
         )
