@@ -39,6 +39,12 @@ _AMENDS_S = 2.0
 _INTERLOCK_S = 0.2
 _WATCH_S = 1.0
 _WALL_STEP_S = 1.0
+_SUSPENDED_S = 0.5
+
+
+def _asleep_s() -> float:
+    """How long the host has been suspended since it booted."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
 class Vehicle(Protocol):
@@ -95,6 +101,7 @@ class Daemon:
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
         self._next_interlock_ns = 0
         self._wall_offset_s = float("nan")
+        self._asleep_s = _asleep_s()
         self._watch = Watch(time.monotonic())
         self._next_watch_s = self._retry_s = 0.0
         self._messages_before = 0
@@ -137,6 +144,8 @@ class Daemon:
         if not self._link.is_open:
             self._reopen()
         item = self._inbox.get(self._patience_s(longest_s))
+        if self._slept():
+            return
         self._around()
         if isinstance(item, Bytes):
             self._feed(inputs.Received(item.host_ns, item.data))
@@ -158,6 +167,20 @@ class Daemon:
         worker = self.shell.worker
         if worker is not None and (pieces := worker.take_done()):
             self._feed(inputs.Examined(now_ns, pieces))
+
+    def _slept(self) -> bool:
+        """Whether the host was suspended; then the link begins anew, with the device's registers.
+
+        Its clock stood still and the device's did not: nothing that is at hand may be joined over
+        that, nor is it known whether the device kept its power.
+        """
+        asleep_s = _asleep_s()
+        slept_s, self._asleep_s = asleep_s - self._asleep_s, asleep_s
+        if slept_s < _SUSPENDED_S or not self._link.is_open:
+            return False
+        reason = f"the host was suspended for {slept_s:.1f} s"
+        self._lost(self.clock.now_ns(), reason, heard=False)
+        return True
 
     def _tick(self, now_ns: int) -> None:
         deadline = self.shell.core.deadline_ns
@@ -252,9 +275,10 @@ class Daemon:
     def _messages(self) -> int:
         return self.shell.core.conversation.session.deframer.counters.valid
 
-    def _lost(self, host_ns: int, reason: str) -> None:
-        for item in self._link.close():  # it was heard before the link went
-            self._feed(inputs.Received(item.host_ns, item.data))
+    def _lost(self, host_ns: int, reason: str, *, heard: bool = True) -> None:
+        for item in self._link.close():
+            if heard:  # before the link went
+                self._feed(inputs.Received(item.host_ns, item.data))
         if self._stop_reason:  # the mark that `stop` left went with them
             self._inbox.wake()
         if self._messages > self._messages_before:  # it was a device: it may be back at once

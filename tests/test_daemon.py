@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import re
 import threading
+import time
 
 import numpy as np
 import pytest
 
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.events import GateResult, SamplesSeen, StateChanged
-from ahrsd.inputs import LinkLost
+from ahrsd.inputs import LinkLost, WallClock
 from ahrsd.recording.capture import CaptureReader
 from ahrsd.shell import FoldedLog
 from ahrsd.writeback.states import State
@@ -295,3 +296,44 @@ def test_the_log_counts_what_comes_again():
     assert len(folded._open) == 64
     folded.finish()
     assert len(lines) == 203
+
+
+def test_a_host_that_was_suspended_begins_the_link_anew(live, monkeypatch):
+    """Its clock stood still: what a stream without time of its own missed would show nowhere."""
+    real, slept = time.clock_gettime, [0.0]
+
+    def clock(which):
+        return real(which) + slept[0] * (which == time.CLOCK_BOOTTIME)
+
+    monkeypatch.setattr(time, "clock_gettime", clock)
+    with live({"output": "ascii"}) as daemon:  # VNYMR: no time in it
+        daemon.until(lambda: daemon.samples > 60)
+        slept[0] = 3600.0
+        daemon.until(lambda: daemon.noted("the host was suspended for 3600.0 s"))
+        daemon.events.clear()
+        daemon.until(lambda: any(isinstance(e, SamplesSeen) for e in list(daemon.events)))
+        daemon.stop()
+        first = next(e.block for e in daemon.events if isinstance(e, SamplesSeen))
+        assert first.gap_before
+        assert np.isnan(first.dt_s[0])
+        assert daemon.error is None
+    lost = [i for i in CaptureReader(daemon.capture) if isinstance(i, LinkLost)]
+    assert [item.reason for item in lost] == ["the host was suspended for 3600.0 s"]
+
+
+def test_a_host_clock_that_is_set_moves_no_sample(live, monkeypatch):
+    real, step = time.time, [0.0]
+    monkeypatch.setattr(time, "time", lambda: real() + step[0])
+    with live({"output": "binary"}) as daemon:
+        daemon.flowing()
+        rollcall = daemon.core._rollcall
+        for days in (-1, 7):
+            was_s, step[0] = rollcall.wall_offset_s, 86400.0 * days
+            daemon.until(lambda was_s=was_s: abs(rollcall.wall_offset_s - was_s) > 80_000.0)
+            daemon.flowing()
+        daemon.stop()
+        facts = daemon.core.stream.facts
+        assert daemon.core.stream.gaps == []
+        assert facts.samples == facts.expected
+    told = [i.wall_s for i in CaptureReader(daemon.capture) if isinstance(i, WallClock)]
+    assert np.round(np.diff(told) / 86400.0, 2).tolist() == [-1.0, 8.0]
