@@ -18,7 +18,7 @@ from ahrsd.mismatch.innovation import TRACELESS
 from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
-from ahrsd.mismatch.regression import CALIBRATION, Base
+from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
     State,
@@ -34,6 +34,7 @@ from ahrsd.samples import Array
 
 #: shares below this are not worth a line
 SMALLEST_SHARE = 0.005
+_SCALE_STEP = 0.05
 
 
 def finding(
@@ -68,7 +69,7 @@ def finding(
         alternatives=tuple(a for a in alternatives if a.confidence > SMALLEST_SHARE),
         where=where(judged, added_value(state, number), basis),
         parameters=parameters,
-        heldout=_heldout(judged, basis),
+        heldout=_heldout(judged, basis, state.problem.thin),
         cost_if_left_out=cost(basis, number, added_value(state, number)),
         separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
@@ -114,7 +115,8 @@ def whole_term(
     name: what a delay is called in the end
     """
     term = state.fit.terms[number]
-    change, deviation = refined(basis, number, term.identifier, beside)
+    scale = _by_scale(state, basis, number)
+    change, deviation = refined(basis, number, term.identifier, beside, scale)
     value = added_value(state, number) + change
     setting = {k: v for k, v in term.setting.items() if k != "searched"}
     if not _is_delay(state, number):
@@ -128,15 +130,40 @@ def whole_term(
     return Term(name, value, deviation, setting)
 
 
-def refined(basis: Base, number: int, name: str, beside: Discrepancy | None) -> tuple[Array, Array]:
+def _by_scale(state: State, basis: Base, number: int) -> Array | None:
+    """(N, 3) whitened change of the term with its scale's logarithm; None where it has none."""
+    candidate, value = state.named[number].candidate, state.fit.terms[number].value
+    key = scale_of(candidate)
+    if key is None:
+        return None
+    effect, setting = candidate.effect, candidate.setting
+    sides = [
+        effect.columns(basis.context, {**setting, key: setting[key] * factor})
+        for factor in (1 - _SCALE_STEP, 1 + _SCALE_STEP)
+    ]
+    low, high = (part @ value for part in basis.whitened(sides))
+    return np.asarray((high - low) / (2 * _SCALE_STEP))
+
+
+def refined(
+    basis: Base,
+    number: int,
+    name: str,
+    beside: Discrepancy | None,
+    scale: Array | None = None,
+) -> tuple[Array, Array]:
     """What is left to change in a term's value (p,), and its deviation (p,) in coloured noise.
 
+    scale (N, 3): how the whitened readings move with the term's time constant or radius, which was
+    fitted too.
     A delay shows in the turns, whatever else is the matter: it is taken beside what is left.  What
     shows in the level of the field would give half of itself away to it.
     """
     if beside is not None and name in DELAYS:
         return beside.refined(term_group(number))
     Z = basis.known.reshape(-1, basis.known.shape[2])
+    if scale is not None:
+        Z = np.column_stack([Z, scale.ravel()])
     where = basis.groups[term_group(number)]
     inverse = solve(Z.T @ Z, np.column_stack([Z.T @ basis.innovation.ravel(), np.eye(len(Z.T))]))
     variance = np.diag(inverse[:, 1:])[where]
@@ -230,11 +257,15 @@ def _shares(judged: Judged, seen: Survey, last: Survey, lead: float) -> dict[str
     return {mine: found[mine], **rest}
 
 
-def _heldout(judged: Judged, basis: Base) -> Heldout:
+def _heldout(judged: Judged, basis: Base, thin: int) -> Heldout:
+    """Gains per recorded sample, of which `thin` are one of the search's."""
     rms = innovation_rms(basis)
     ratio = judged.gain.before / max(judged.gain.after, 1e-12)
     return Heldout(
-        rms * float(np.sqrt(max(ratio, 0.0))), rms, judged.gain.nats_per_sample, judged.placebo_gain
+        rms * float(np.sqrt(max(ratio, 0.0))),
+        rms,
+        judged.gain.nats_per_sample / thin,
+        judged.placebo_gain / thin,
     )
 
 

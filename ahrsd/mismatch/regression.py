@@ -234,21 +234,35 @@ def _with_scale(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
 
     A grid of factors of three leaves coefficients off by many of their deviations.
     """
-    for key in SCALES:
-        values = {float(option[key]) for option in options if key in option}
-        if len(values) < 2 or key not in best.setting or best.name in ONE_SIDED:
-            continue
-        wide = (max(values) / min(values)) ** (1.0 / (len(values) - 1))
-        finer = best
-        for share in (1 / 3, 1 / 9, 1 / 27):
-            middle = float(finer.setting[key])
-            steps = [{**finer.setting, key: middle * wide ** (k * share)} for k in (-1, 0, 1)]
-            finer = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
-        cost = np.log(len(options) * SCALE_CHOICES)
-        paid = evidence_of(basis, finer) - float(cost)
-        if paid > best.evidence:
-            tried = len(options) * SCALE_CHOICES
-            best = replace(finer, tried=tried, evidence=paid)
+    key = scale_of(best)
+    values = {float(option[key]) for option in options if key in option} if key else set()
+    if len(values) < 2:
+        return best
+    wide = (max(values) / min(values)) ** (1.0 / (len(values) - 1))
+    finer = closest_scale(basis, best, wide ** (1 / 3))
+    paid = finer.evidence - float(np.log(len(options) * SCALE_CHOICES))
+    if paid <= best.evidence:
+        return best
+    return replace(finer, tried=len(options) * SCALE_CHOICES, evidence=paid)
+
+
+def scale_of(candidate: Candidate) -> str | None:
+    """The setting of a candidate that is a size and goes with its value, None where none is."""
+    if candidate.name in ONE_SIDED:
+        return None
+    return next((key for key in SCALES if key in candidate.setting), None)
+
+
+def closest_scale(basis: Base, start: Candidate, factor: float) -> Candidate:
+    """The best scale within about `factor`, to a small part of it; the choice is not paid for."""
+    key, best = scale_of(start), start
+    if key is None:
+        return start
+    for share in (1.0, 1 / 3, 1 / 9):
+        middle = float(best.setting[key])
+        steps = [{**best.setting, key: middle * factor ** (k * share)} for k in (-1, 0, 1)]
+        found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
+        best = replace(found, tried=start.tried, evidence=found.evidence + np.log(len(steps)))
     return best
 
 

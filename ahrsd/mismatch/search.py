@@ -25,7 +25,9 @@ from ahrsd.mismatch.regression import (
     best_settings,
     candidate_gram,
     closest_onset,
+    closest_scale,
     columns_of,
+    scale_of,
 )
 from ahrsd.mismatch.score import Score
 from ahrsd.mismatch.unknown import course, detected, remainder
@@ -47,6 +49,8 @@ STEPS: Mapping[Frame, str] = {
     "gyro": "gyro_bias_step",
 }
 STEP_PASSES = 2
+#: within what factor a time constant may still change in the joint fit
+SCALE_AGAIN = 1.5
 #: steps that cancel to this share are one thing that was put on and taken off again
 CANCELS = 0.25
 #: nats that such a coincidence of three coefficients is worth
@@ -207,13 +211,27 @@ def added(state: State, judged: Judged) -> State:
     """The state with one more term, everything fitted together."""
     name = judged.candidate.name
     if name not in DELAYS:
-        return refitted(state, (*state.named, judged))
+        return _scaled_again(refitted(state, (*state.named, judged)))
     step_s = float(np.nanmedian(state.problem.track.dt_s)) / 2
     lag_s = DELAYS[name] * float(judged.what.value[0])
     lag_s *= step_s if name == "gyro_integration" else 1.0
     effect = state.problem.library[plain(lag_s)]
     lag = replace(judged, candidate=replace(judged.candidate, effect=effect, setting={}))
     return _lag_taken_out(state, lag, lag_s)
+
+
+def _scaled_again(state: State) -> State:
+    """The newest term's time constant or radius sought once more, beside the fit with it."""
+    last = len(state.named) - 1
+    judged = state.named[last]
+    if scale_of(judged.candidate) is None:
+        return state
+    left = basis_of(state).without(term_group(last), state.fit.terms[last].value)
+    closer = closest_scale(left, judged.candidate, SCALE_AGAIN)
+    if closer.setting == judged.candidate.setting:
+        return state
+    candidate = replace(judged.candidate, setting=closer.setting)
+    return refitted(state, (*state.named[:last], replace(judged, candidate=candidate)))
 
 
 def refitted(state: State, named: tuple[Judged, ...]) -> State:
