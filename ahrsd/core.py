@@ -71,13 +71,12 @@ class Core:
         self.calibrator = Calibrator(*self._from_scratch)
         self._desk = Desk()
         self._proposed: Affine | None = None
-        self.at_s = 0.0
+        self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
         self.faults = self.strays = self.undecodable = 0
-        self._host_s = 0.0
         self._stopping = ""
         self._closing = self._uptime_due = self._unread = False
-        self._links = self._restarts = 0
+        self._breaks = self._restarts = 0
         self._serial: int | None = None
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
@@ -85,14 +84,14 @@ class Core:
         self._out: list[events.Event] = []
         if settings.policy.mode is Mode.PASSIVE:
             self._no_device()
-        talk = self.conversation
+        talk, back, add = self.conversation, self.writeback, self._errands.add
         self._handlers: dict[type, Callable[..., None]] = {
             inputs.Received: lambda it: self.take(talk.received(it.data, self._host_s)),
             inputs.Tick: lambda _: self.take(talk.tick(self._host_s)),
             inputs.WallClock: self._wall_clock,
             inputs.LinkOpened: self._link_opened,
             inputs.LinkLost: self._link_lost,
-            inputs.Interlock: self._interlock,
+            inputs.Interlock: lambda it: add(back.on_interlock(it.safe, self._host_s)),
             inputs.Operator: self._operator,
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
@@ -139,15 +138,12 @@ class Core:
 
     def _link_lost(self, item: inputs.LinkLost) -> None:
         self._flush()
-        self._links += 1
+        self._breaks += 1
         self._note("warning", f"link lost: {item.reason}")
         self.take(self.conversation.lost(self._host_s))
         self.stream.forget()
         self._errands.forget_procedure()
         self._errands.add(self.writeback.on_link_lost(self._host_s))
-
-    def _interlock(self, item: inputs.Interlock) -> None:
-        self._errands.add(self.writeback.on_interlock(item.safe, self._host_s))
 
     def _operator(self, item: inputs.Operator) -> None:
         self._note("info", f"operator: {item.verb} {item.argument}".strip())
@@ -206,6 +202,7 @@ class Core:
 
     def _device_reset(self, why: str) -> None:
         self._note("warning", f"the device restarted ({why})")
+        self._breaks += 1
         if self.conversation.identity is None:
             return
         self.epochs.begin(self._host_s, None)
@@ -241,8 +238,8 @@ class Core:
     def _digest(self, said: Said) -> None:
         match said:
             case Identified(identity):
-                text = f"{identity.model} serial {identity.serial} firmware {identity.firmware}"
-                self._note("info", text)
+                name = f"{identity.model} serial {identity.serial}"
+                self._note("info", f"{name} firmware {identity.firmware}")
                 self._rollcall.identified()
                 if self._serial not in (None, identity.serial):
                     self._note("warning", "another device: its calibration begins anew")
@@ -251,10 +248,14 @@ class Core:
                 self._out.append(events.OpenJournal(identity.serial))
             case ConfigurationRead(values):
                 self._flush()
-                if self._unread:  # what was taken as it came does not mix with what is un-mapped
+                believed = {} if self.writeback.history.open else self.registers
+                if others := self._rollcall.registers(values, believed, self._breaks):
+                    self._note("warning", f"somebody changed registers {others}: calibrated anew")
+                if (
+                    self._unread or others
+                ):  # what was taken as it came does not mix with what is un-mapped
                     self.calibrator, self._unread = Calibrator(*self._from_scratch), False
                 self._in_force(values)
-                self._rollcall.registers(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
             case StreamChanged(text, level):
@@ -329,8 +330,7 @@ class Core:
 
     def _block(self, block: SampleBlock) -> None:
         self.at_s = float(block.time_s[-1])
-        if np.isnan(self.first_s):
-            self.first_s = float(block.time_s[0])
+        self.first_s = float(block.time_s[0]) if np.isnan(self.first_s) else self.first_s
         if self._uptime_due and self.stream.facts.rate_source == "device time":
             self._uptime_due = False  # the first one since the device was read: did it restart?
             self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
@@ -383,14 +383,14 @@ class Core:
         )
 
     def _era(self) -> tuple[int, int]:
-        return self.epochs.now.number, self._links
+        return self.epochs.now.number, self._breaks
 
     def _basis(self) -> BasisFacts:
         """What is known of where the samples come from."""
         identity, applied = self.conversation.identity, self.epochs.now.compensation
         return BasisFacts(
             registers_read=bool(self.registers),
-            changed=False,
+            changed=applied is None,
             hsi_applied=applied is not None and applied.hsi is not None,
             compensated_only=self.stream.compensated_mag,
             firmware_known=identity is not None and identity.profile.writable,

@@ -10,7 +10,9 @@ from ahrsd.conversation import Conversation
 from ahrsd.inputs import JournalOpened
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
+
+COMPENSATING = (23, 25, 26, 44, 84)  # what a sample went through depends on them
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,7 @@ class Rollcall:
     _values: dict[int, Values] | None = None
     _journal: Sequence[RecordRead] | None = field(default=None)
     _journal_known: bool = False
+    _breaks: int = -1
 
     def identified(self) -> None:
         """A device said who it is: its journal is not open yet."""
@@ -44,9 +47,18 @@ class Rollcall:
         self._journal = None if item.error else [RecordRead.of(r) for r in item.records]
         self._journal_known = True
 
-    def registers(self, values: dict[int, Values]) -> None:
-        """Its registers."""
-        self._values = values
+    def registers(
+        self, values: dict[int, Values], believed: Mapping[int, Values], breaks: int
+    ) -> list[int]:
+        """Its registers; those that somebody else changed, at a time that nobody knows.
+
+        believed: what was held for true until now; breaks: how often link or device began anew,
+        which explains a change
+        """
+        explained = breaks != self._breaks
+        self._values, self._breaks = values, breaks
+        read = [n for n in COMPENSATING if n in believed and n in values]
+        return [] if explained else [n for n in read if not same(n, believed[n], values[n])]
 
     def told(
         self,
