@@ -11,6 +11,7 @@ from copy import copy
 
 import numpy as np
 
+from ahrsd import so3
 from ahrsd.estimator import chain
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.estimator.steps import StepAverager, Steps, join, samples_per_step, split
@@ -19,7 +20,6 @@ from ahrsd.samples import Array, SampleBlock
 _RATE_ROWS = 33
 _LONGEST_GAP_S = 60.0  # after a longer one the gyro's bias may have moved
 _SPARE = 2  # steps by which the count of what waits may be wrong
-_SMOOTHED = 33  # steps over which the specific force is averaged to tell where down is
 
 
 def check(block: SampleBlock) -> None:
@@ -175,24 +175,34 @@ class Intake:
         self._pending_count = len(rest)
         fresh, self._fresh = self._fresh, False
         cut = steps.linked == 0
+        angle = np.where(cut[:, None], 0.0, steps.angle_b_rad)
         return chain.Data(
             steps.field_b_gauss,
-            np.where(cut[:, None], 0.0, steps.angle_b_rad),
+            angle,
             np.where(cut, np.median(steps.dt_s[~cut]), steps.dt_s),
-            _down(steps.accel_b_m_s2),
+            _down(steps.accel_b_m_s2, angle),
             steps.time_s,
             measures_first=fresh,
             linked=steps.linked if cut[1:].any() else None,
         )
 
 
-def _down(accel: Array) -> Array:
-    """Unit vectors towards the earth from specific force (it points up at rest), smoothed."""
+def _down(accel: Array, angle: Array) -> Array:
+    """Unit vectors towards the earth (n, 3) from specific force, which points up at rest.
+
+    The force is averaged over the epoch in one frame, that of its middle, to which the gyro's
+    angles (n, 3) turn it: what a vehicle does to get round a bend averages out there, and so does a
+    gyro's bias to first order.
+    """
     if not np.isfinite(accel).all():
         return np.full_like(accel, np.nan)
-    kernel = np.ones(min(len(accel), _SMOOTHED))
-    smooth = np.column_stack([np.convolve(accel[:, i], kernel, "same") for i in range(3)])
-    return np.asarray(-smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-9))
+    R = so3.exp(angle)
+    step = 1
+    while step < len(R):  # products of all rotations up to each row
+        R[step:] = R[:-step] @ R[step:]
+        step *= 2
+    up = R.transpose(0, 2, 1) @ (R @ accel[:, :, None]).mean(axis=0)
+    return np.asarray(-up[:, :, 0] / np.maximum(np.linalg.norm(up, axis=1), 1e-9))
 
 
 def with_border(data: chain.Data, before: chain.Data) -> chain.Data:
