@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ahrsd.mismatch.score import Score
 from ahrsd.samples import Array
@@ -31,7 +30,7 @@ def log_bayes(what: Score, colour: float = 1.0, sizes: Sequence[float] = SIZES) 
     l, s = what.information / colour, what.score / colour  # noqa: E741
     k2 = np.square(np.asarray(sizes, float))[:, None]
     terms = 0.5 * np.sum(s**2 / (l + 1.0 / k2), axis=1) - 0.5 * np.sum(np.log1p(k2 * l), axis=1)
-    return float(logsumexp(terms) - np.log(len(sizes)))
+    return float(np.logaddexp.reduce(terms) - np.log(len(sizes)))
 
 
 def log_bayes_walk(G: Array, s: Array, axes: int, deviations: Array, colour: float = 1.0) -> float:
@@ -55,7 +54,7 @@ def log_bayes_walk(G: Array, s: Array, axes: int, deviations: Array, colour: flo
         - 0.5 * float(np.sum(np.log1p(d**2 * information)))
         for d in deviations
     ]
-    return float(logsumexp(terms) - np.log(len(terms)))
+    return float(np.logaddexp.reduce(terms) - np.log(len(terms)))
 
 
 def posterior(
@@ -64,7 +63,7 @@ def posterior(
     """Probabilities of the hypotheses; they sum to 1.  A missing prior is log 1."""
     names = list(log_evidence)
     values = np.array([log_evidence[name] + log_prior.get(name, 0.0) for name in names])
-    share = np.exp(values - logsumexp(values))
+    share = np.exp(values - np.max(values, initial=-np.inf))
     return dict(zip(names, (share / share.sum()).tolist(), strict=True))
 
 

@@ -32,6 +32,8 @@ ONSET_PASSES = 2
 SCALES = ("time_constant_s", "radius_gauss", "length_s")
 SCALE_CHOICES = 3
 WORTH_NATS = 4.0
+#: an onset of the coarse grid that says less than this against its effect is sought more closely
+NEAR_NATS = -3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +153,7 @@ def best_settings(
         if not options:
             continue
         best = max(_scan(basis, effect, options), key=lambda candidate: candidate.evidence)
-        if "onset_s" in best.setting:
+        if "onset_s" in best.setting and best.evidence > NEAR_NATS:
             best = _with_onset(basis, best, options)
         if best.evidence > WORTH_NATS:
             best = _with_scale(basis, best, options)
