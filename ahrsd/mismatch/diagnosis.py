@@ -79,15 +79,18 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One named effect."""
+    """One named effect.
+
+    heldout, cost_if_left_out: None, and no key in the answer, for what was counted and not fitted
+    """
 
     effect: str
     confidence: float
     alternatives: tuple[Share, ...]
     where: Where
     parameters: tuple[Value, ...]
-    heldout: Heldout
-    cost_if_left_out: Cost
+    heldout: Heldout | None
+    cost_if_left_out: Cost | None
     separate_from: str | None
     words: str = ""
     equation: str = ""
@@ -126,6 +129,18 @@ class Check:
     band: tuple[float, float]
     inside_before: bool
     inside_after: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Whiteness:
+    """A test of the innovations that needs no idea of what may be wrong.
+
+    p_before, p_after: its probability if nothing were left out, for the null and the repaired model
+    """
+
+    words: str
+    p_before: float
+    p_after: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,24 +186,33 @@ class Diagnosis:
     model: NullModel | None = None
     terms: tuple[Term, ...] = ()
     drawn: Drawn | None = None
+    omnibus: dict[str, Whiteness] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """The contract's object, plus notes, sensitivity and the repaired model."""
+        """The contract's object, plus omnibus tests, sensitivity, notes and the repaired model."""
         out: dict[str, Any] = {
             "schema": SCHEMA,
             "recording": self.recording,
             "baseline": _plain(self.baseline),
             "mismatch": self.mismatch,
             "p_value": self.p_value,
-            "findings": [_plain(finding) for finding in self.findings],
+            "findings": [_told(finding) for finding in self.findings],
             "unexplained": _plain(self.unexplained),
             "posterior_predictive": {k: _plain(v) for k, v in self.posterior_predictive.items()},
+            "omnibus": {k: _plain(v) for k, v in self.omnibus.items()},
             "sensitivity": [_plain(limit) for limit in self.sensitivity],
             "notes": list(self.notes),
         }
         if self.model is not None:
             out["model"] = {**_plain(self.model), "terms": [_plain(term) for term in self.terms]}
         return out
+
+
+def _told(finding: Finding) -> dict[str, Any]:
+    """A finding without the keys of what was not measured."""
+    out: dict[str, Any] = _plain(finding)
+    unmeasured = [key for key in ("heldout", "cost_if_left_out") if out[key] is None]
+    return {key: value for key, value in out.items() if key not in unmeasured}
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - any of the records above

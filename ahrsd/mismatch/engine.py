@@ -151,7 +151,7 @@ def _told(
     noise = level_facts(filtered, spec_given=problem.spec.sigma_mag_gauss is not None)
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
-        *sorted((*named, *quickly), key=lambda one: -one.heldout.nll_gain_per_sample),
+        *sorted((*named, *quickly), key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
     )
     something = unknown.detected(done.left, limits)
@@ -179,6 +179,10 @@ def _told(
         terms=(*terms, *quick_terms),
         drawn=_drawn(done, basis),
     )
+
+
+def _least_gain(one: Finding) -> float:
+    return 0.0 if one.heldout is None else -one.heldout.nll_gain_per_sample
 
 
 def _limits(problem: Problem, basis: Base, first: Survey, fast: Quick) -> tuple[Limit, ...]:

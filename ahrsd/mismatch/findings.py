@@ -80,7 +80,7 @@ def finding(
 
 
 def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
-    """A fact that was counted, not fitted, as a finding; nothing is held out from counting."""
+    """A fact that was counted, not fitted, as a finding; nothing is held out, nothing moves."""
     effect = library.get(fact.effect)
     return Finding(
         effect=fact.effect,
@@ -88,8 +88,8 @@ def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
         alternatives=(),
         where=fact.where,
         parameters=fact.parameters,
-        heldout=Heldout(0.0, 0.0, 0.0, 0.0),
-        cost_if_left_out=Cost(0.0, 0.0),
+        heldout=None,
+        cost_if_left_out=None,
         separate_from=None,
         words=fact.words,
         equation="" if effect is None else effect.equation,

@@ -47,6 +47,11 @@ class Segments:
         return len(self.edges_s) - 1
 
     @property
+    def length_s(self) -> float:
+        """Mean length of a stretch."""
+        return float(self.edges_s[-1] - self.edges_s[0]) / max(len(self), 1)
+
+    @property
     def middle_s(self) -> Array:
         """(J,) middle times."""
         return np.asarray((self.edges_s[1:] + self.edges_s[:-1]) / 2)
@@ -164,19 +169,6 @@ def _single_source(course: Array, deviation: Array) -> tuple[Array, float]:
     along = course @ axes[0]
     direction = axes[0] * np.copysign(1.0, along[np.argmax(np.abs(along))])
     return np.asarray(direction), float(power[0] / max(power.sum(), 1e-300))
-
-
-def pooled_steps(G: Array, s: Array, axes: int) -> tuple[Array, Array]:
-    """Information and score of "everything from segment j on", j = 1 ... J - 1, without a new pass.
-
-    A step that begins with segment j is the sum of the columns of the segments j ... J - 1.
-    Returns G (J - 1, axes, axes) and s (J - 1, axes).
-    """
-    J = len(s) // axes
-    cube = G.reshape(J, axes, J, axes)
-    tail = np.cumsum(np.cumsum(cube[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
-    diagonal = np.stack([tail[j, :, j, :] for j in range(1, J)])
-    return diagonal, np.cumsum(s.reshape(J, axes)[::-1], axis=0)[::-1][1:]
 
 
 def course_of(track: Track, covariate: Array, cut: Segments) -> Array:

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.start import linear_start
@@ -47,6 +46,7 @@ from ahrsd.samples import Array
 
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _FEWEST = 15  # steps that a fit needs
+_SHORTEST_RUN = 8  # samples of a run that the linear start can use
 _DONE = 0.05  # largest step in standard deviations
 _STEPS = 6
 _HALVINGS = 3
@@ -78,7 +78,7 @@ class NullFit:
     """A fitted model.
 
     covariance: (11 + p, 11 + p) of [soft iron (TRACELESS), hard iron, gyro bias, terms in order],
-                for noise as estimated;  informed: (11,) false where the prior decided
+                for noise as estimated
     terms:      with their values and deviations
     terms_mag, terms_gyro: (N, 3) what the terms contribute to the readings, None without terms;
                 the Earth's rotation, where it is known, is in the second
@@ -89,7 +89,6 @@ class NullFit:
     filtered: Filtered
     converged: bool
     covariance: Array
-    informed: NDArray[np.bool]
     terms: tuple[FittedTerm, ...] = ()
     terms_mag: Array | None = None
     terms_gyro: Array | None = None
@@ -225,6 +224,7 @@ def _epochs(track: Track) -> list[chain.Data]:
             measures_first=True,
         )
         for run in track.runs
+        if run.stop - run.start > _SHORTEST_RUN
     ]
 
 
@@ -265,11 +265,9 @@ def _descended(problem: _Problem, model: NullModel, steps: int) -> NullFit:
     converged = False
     count = 0
     covariance: Array = np.zeros((11 + len(values), 11 + len(values)))
-    information = np.zeros(11)
     while count < steps and not converged:
         count += 1
         gradient, data, prior = _normal(problem, point)
-        information = np.diag(data)[:11]
         covariance = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
         step = covariance @ gradient
         new = _taken(problem, point, step, cost)
@@ -286,7 +284,6 @@ def _descended(problem: _Problem, model: NullModel, steps: int) -> NullFit:
         filtered=point.filtered,
         converged=converged,
         covariance=covariance,
-        informed=(np.diag(covariance)[:11] < 0.25 * problem.prior.deviation**2) & (information > 0),
         terms=_named(problem, point, covariance),
         terms_mag=point.terms_mag,
         terms_gyro=point.terms_gyro,

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from ahrsd.mismatch.delays import DELAYS, plain
+from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
@@ -117,7 +118,7 @@ def survey(state: State, basis: Base | None = None) -> Survey:
         library = {name: effect for name, effect in library.items() if effect.family == "gyro"}
     if any(name in DELAYS for name in state.names):
         library = {name: effect for name, effect in library.items() if name not in DELAYS}
-    candidates = tuple(best_settings(basis, library, taken))
+    candidates = tuple(in_time(basis, c) for c in best_settings(basis, library, taken))
     near = [c for c in candidates if c.evidence > problem.limits.evidence_nats][:LOOKED_AT]
     if not near:
         return Survey(basis, candidates, ())

@@ -60,11 +60,17 @@ def _finding_lines(finding: Finding) -> list[str]:
             for k, v in enumerate(finding.parameters)
         ),
         f"   left out   {finding.equation}" if finding.equation else "",
-        f"   without it hard iron off by {cost.hard_iron_shift_gauss * _MG:.2f} mG, heading by "
-        f"{cost.heading_error_deg:.2f} deg",
-        f"   held out   {held.nll_gain_per_sample:+.4f} nats/sample (moved in time: at most "
-        f"{held.placebo_gain:+.4f})",
     ]
+    if cost is not None:
+        out.append(
+            f"   without it hard iron off by {cost.hard_iron_shift_gauss * _MG:.2f} mG, heading by "
+            f"{cost.heading_error_deg:.2f} deg"
+        )
+    if held is not None:
+        out.append(
+            f"   held out   {held.nll_gain_per_sample:+.4f} nats/sample (moved in time: at most "
+            f"{held.placebo_gain:+.4f})"
+        )
     if finding.alternatives:
         rest = ", ".join(f"{a.effect} {a.confidence:.1%}" for a in finding.alternatives)
         out.append(f"   or else    {rest}")

@@ -8,24 +8,25 @@ nonparametric repair.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ahrsd.mismatch import intervals, locate, regime
 from ahrsd.mismatch.diagnosis import Heldout, Suspect, Unexplained, Where
 from ahrsd.mismatch.evidence import log_bayes
-from ahrsd.mismatch.gram import Gram
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import FRAMES, Frame, Located
 from ahrsd.mismatch.regime import Regime
 from ahrsd.mismatch.regression import Base, group_gram, quieter
 from ahrsd.mismatch.score import chi2_p, score
-from ahrsd.mismatch.validate import heldout
+from ahrsd.mismatch.validate import Gain, alternating, heldout
 from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
 
 FINE = 80
+#: shifts of the placebo
+SHIFTS = 3
 AXES = ("x", "y", "z")
 
 
@@ -86,19 +87,18 @@ class Course:
     """
 
     fine: Located
-    gram: Gram
     changes_s: tuple[float, ...]
     covered: float
     level: Array
     spans: tuple[tuple[float, float], ...]
 
 
-def course(left: Remainder, block_s: float | None = None) -> Course:
+def course(left: Remainder) -> Course:
     """The strongest frame's course in segments of an eightieth of the recording."""
     basis, frame = left.basis, left.strongest.frame
     name = locate.group_name(frame)
     cut = locate.segments(basis.context.track.time_s, FINE)
-    gram = group_gram(basis, {name: locate.frame_columns(basis.context, frame, cut)}, block_s)
+    gram = group_gram(basis, {name: locate.frame_columns(basis.context, frame, cut)})
     where = gram.groups[name]
     total = gram.total / basis.colour
     G, s = total[where, where], total[where, -1]
@@ -109,7 +109,6 @@ def course(left: Remainder, block_s: float | None = None) -> Course:
     whole = [(float(cut.edges_s[0]), float(cut.edges_s[-1]))]
     return Course(
         fine,
-        gram,
         tuple(float(cut.edges_s[k]) for k in changes),
         intervals.explained(G, s, changes) / max(left.strongest.statistic / basis.colour, 1e-300),
         level,
@@ -130,7 +129,7 @@ def detected(left: Remainder, limits: Limits) -> bool:
 def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
     """The address of what is left."""
     best, basis = left.strongest, left.basis
-    seen = course(left, block_s)
+    seen = course(left)
     words = None
     if left.bins and left.bins[0][1] > limits.unknown_nats:
         words = _bin_words(left.bins[0][0], basis)
@@ -154,7 +153,7 @@ def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
             None,
             (x, y, z),
         ),
-        heldout=None if by_bin else _heldout(seen, basis),
+        heldout=None if by_bin else _heldout(left, block_s),
         size=float(np.ptp(best.source)),
         unit="rad/s" if best.frame == "gyro" else "gauss",
         single_source_share=best.single_share,
@@ -173,14 +172,31 @@ def _bin_words(one: Regime, basis: Base) -> str:
     return one.words(size > 0.5 * size.max())
 
 
-def _heldout(seen: Course, basis: Base) -> Heldout:
-    frame = seen.fine.frame
-    name = locate.group_name(frame)
-    width = seen.gram.groups[name].stop - seen.gram.groups[name].start
-    gain = heldout(seen.gram, [], name, np.full(width, 10.0 * locate.UNITS[frame]))
+def _heldout(left: Remainder, block_s: float) -> Heldout:
+    """What the frame's course says of every second block, known from the others alone.
+
+    Placebo: the same course held against the innovations of another time.
+    """
+    best, basis = left.strongest, left.basis
+    gain = _course_gain(best, basis, block_s)
+    count = len(basis.innovation)
+    moved = [
+        replace(basis, innovation=np.roll(basis.innovation, count * k // (SHIFTS + 1), axis=0))
+        for k in range(1, SHIFTS + 1)
+    ]
+    usual = max(_course_gain(best, other, block_s).nats_per_sample for other in moved)
     rms = innovation_rms(basis)
     after = rms * float(np.sqrt(max(gain.after, 0.0) / max(gain.before, 1e-12)))
-    return Heldout(rms, after, gain.nats_per_sample, 0.0)
+    return Heldout(rms, after, gain.nats_per_sample, usual)
+
+
+def _course_gain(best: Located, basis: Base, block_s: float) -> Gain:
+    name = locate.group_name(best.frame)
+    columns = locate.frame_columns(basis.context, best.frame, best.cut)
+    gram = group_gram(basis, {name: columns}, min(block_s, best.cut.length_s / 4))
+    width = gram.groups[name].stop - gram.groups[name].start
+    scale = np.full(width, max(float(np.std(best.course)), 1e-3 * locate.UNITS[best.frame]))
+    return heldout(gram, [], name, scale, alternating)
 
 
 def innovation_rms(basis: Base) -> float:

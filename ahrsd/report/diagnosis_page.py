@@ -44,17 +44,19 @@ def _finding(found: Diagnosis, number_: int, one: Finding) -> str:
         ("where", escape(place(one.where))),
         ("size", "<br>".join(escape(value_text(value)) for value in one.parameters)),
         ("left out", f"<code>{escape(one.equation)}</code>"),
-        (
-            "without it",
-            f"hard iron off by {number(cost.hard_iron_shift_gauss * _MG, 'mG')}, heading by "
-            f"{number(cost.heading_error_deg, 'deg')}",
-        ),
-        (
-            "on data not fitted",
-            f"{held.nll_gain_per_sample:+.4f} nats per sample; the same effect moved in time gains "
-            f"at most {held.placebo_gain:+.4f}",
-        ),
     ]
+    if cost is not None:
+        off = (
+            f"hard iron off by {number(cost.hard_iron_shift_gauss * _MG, 'mG')}, heading by "
+            f"{number(cost.heading_error_deg, 'deg')}"
+        )
+        rows.append(("without it", off))
+    if held is not None:
+        gain = (
+            f"{held.nll_gain_per_sample:+.4f} nats per sample; the same effect moved in time gains "
+            f"at most {held.placebo_gain:+.4f}"
+        )
+        rows.append(("on data not fitted", gain))
     if one.alternatives:
         rest = ", ".join(f"{a.effect} ({a.confidence:.1%})" for a in one.alternatives)
         rows.append(("or else", escape(rest)))

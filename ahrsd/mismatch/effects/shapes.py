@@ -80,8 +80,11 @@ def per_covariate(readings: Readings, role: str, **more: object) -> tuple[Settin
 
 
 def course_of(readings: Readings, setting: Setting) -> Array:
-    """The setting's covariate minus its reference, (N, 1)."""
-    return np.asarray(readings.covariates[setting["covariate"]] - setting["reference"])[:, None]
+    """The setting's covariate minus its reference, (N, 1); `late_s`: how late it is logged."""
+    values = readings.covariates[setting["covariate"]]
+    if late_s := setting.get("late_s", 0.0):
+        values = np.interp(readings.time_s + late_s, readings.time_s, values)
+    return np.asarray(values - setting["reference"])[:, None]
 
 
 def onsets(readings: Readings) -> tuple[Setting, ...]:
