@@ -36,7 +36,7 @@ from drivers.serial_port import BaudFound, PortError
 
 log = logging.getLogger("ahrsd")
 
-_CLOSE_S = 3.0
+_CLOSE_S = 8.0  # where nobody waits for the end
 _EXIT_S = 2.6  # from a signal to the end of everything that is waited for
 _LEAST_S = 0.2
 _SEARCH_AGAIN_S = 0.5
@@ -131,7 +131,7 @@ def close_shell(shell: Shell, until_s: float | None = None) -> None:
     if shell.worker is not None:
         shell.worker.close(left_s() / 4)
     if shell.capture is not None:
-        status = shell.capture.close(left_s() / 2)
+        status = shell.capture.close(left_s())  # before the viewer: it can be replayed
         if not status.complete:
             log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
     if isinstance(shell.viewer, RerunSink):

@@ -10,6 +10,7 @@ import numpy as np
 from ahrsd.calibration import Estimate
 from ahrsd.core import Core
 from ahrsd.events import GateResult
+from ahrsd.gates import Level, for_level
 from ahrsd.result import HeadingErrors, calibration_json, why_not_converged
 from ahrsd.unmapping import Compensation
 
@@ -104,7 +105,7 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
             f"{_count(stream.restarts, 'restart')} of the device"
         )
     lines += estimate_lines(core.calibrator.estimate)
-    lines += _gate_lines(core.calibrator.gates)
+    lines += _gate_lines(_guarding(core.calibrator.gates, core.settings.level))
     lines += [f"  warning: {text}" for text in said_of(core, warnings)]
     lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
     return lines
@@ -112,6 +113,12 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
 
 def _count(number: int, thing: str) -> str:
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def _guarding(gates: Sequence[GateResult], level: Level) -> list[GateResult]:
+    """Gates of the write and of the save; those of a write without a person only where one is."""
+    guards = {g.gate for guarded in (level, Level.FLASH) for g in for_level(gates, guarded)}
+    return [gate for gate in gates if gate.gate in guards]
 
 
 def _gate_lines(gates: Sequence[GateResult]) -> list[str]:

@@ -41,6 +41,17 @@ def test_alarms_are_states_or_words_that_the_program_says():
         assert alarm in STATES or said, alarm
 
 
+def test_what_it_says_when_it_does_not_work_is_what_it_says():
+    table = PAGE[PAGE.index("## When it does not work") :]
+    cells = re.findall(r"^\| ([^|]*`[^|]*) \|", table, re.MULTILINE)
+    said = [text for cell in cells for text in re.findall(r"`([^`]+)`", cell)]
+    assert len(said) >= 10
+    sources = re.sub(r'"\s*f?"', "", SOURCES)  # texts that go over two lines
+    for text in said:
+        for part in re.split(r"\d+", text):  # what stands for a number
+            assert part.strip() in sources, (text, part)
+
+
 def test_the_states_that_need_a_person_are_explained():
     table = PAGE[PAGE.index("## What it says") : PAGE.index("## Allowing a write")]
     for state in ("OBSERVING", "CANDIDATE", "QUALIFIED", "TRIAL", "PROVEN", "COMMITTED", "FAULT"):
