@@ -189,6 +189,24 @@ def test_a_journal_that_cannot_be_written_writes_nothing(live, tmp_path):
         assert daemon.emulator.memory.ram == daemon.before
 
 
+def test_a_full_disk_of_the_journal_writes_nothing_to_the_device(live, small_disk, tmp_path):
+    captures = {"directory": str(tmp_path / "captures")}
+    (tmp_path / "captures").mkdir()
+    setup = {"mode": "stage", "state_directory": str(small_disk), "capture": captures}
+    with live({"output": "imu"}, **setup) as daemon:
+        daemon.until(lambda: "OBSERVING" in daemon.states)
+        free = os.statvfs(small_disk)
+        (small_disk / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize))
+        operator = importer("test_daemon").Operator(daemon, "TRIAL", lambda: None)
+        daemon.until(lambda: daemon.noted("No space left on device"))
+        daemon.flowing()
+        daemon.stop()
+        assert operator.proposed
+        assert not operator.acted
+        assert b"VNWRG" not in daemon.heard
+        assert daemon.emulator.memory.ram == daemon.before
+
+
 def importer(name):
     import importlib.util
 
