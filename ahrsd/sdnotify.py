@@ -1,7 +1,7 @@
 """Telling systemd how the service stands (sd_notify(3)): one datagram a word, never an error.
 
-The main loop feeds the watchdog after each turn, so a loop that is stuck in the estimator is killed
-and restarted, while one that waits for an unplugged device turns on and is left alone.
+The main loop feeds the watchdog after each turn, but not while the estimator is stuck: then it is
+killed and restarted, while one that waits for an unplugged device turns on and is left alone.
 """
 
 from __future__ import annotations
