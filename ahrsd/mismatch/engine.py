@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch import roles, unknown
+from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
     Baseline,
@@ -22,6 +23,7 @@ from ahrsd.mismatch.diagnosis import (
     Finding,
     Limit,
     Unexplained,
+    Whiteness,
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
@@ -34,13 +36,14 @@ from ahrsd.mismatch.findings import (
     of_fact,
     whole_term,
 )
-from ahrsd.mismatch.hygiene import hygiene, put_right
+from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null, unusable
+from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.problem import Problem, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, model_at_rate, quick, without_quick
@@ -154,7 +157,12 @@ def _told(
         *sorted((*named, *quickly), key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
     )
-    something = unknown.detected(done.left, limits)
+    left = (
+        unknown.described(done.left, problem.block_s, limits)
+        if unknown.detected(done.left, limits)
+        else bursts(basis) or Unexplained(False)
+    )
+    something = left.detected
     terms = tuple(whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(named))
     quick_terms = tuple(
         whole_term(fast.state, fast.last.basis, k, one.effect)
@@ -167,18 +175,28 @@ def _told(
         mismatch=bool(found) or something,
         p_value=_p_value(seen, found, done.left),
         findings=found,
-        unexplained=(
-            unknown.described(done.left, problem.block_s, limits)
-            if something
-            else Unexplained(False)
-        ),
+        unexplained=left,
         posterior_predictive=_checked(done, fast, (*terms, *quick_terms), library),
         sensitivity=() if found or something else _limits(problem, basis, done.first, fast),
-        notes=(*notes, *(fact.words for fact in facts if not matters(fact))),
+        notes=(
+            *notes,
+            *(fact.words for fact in facts if not matters(fact)),
+            *(() if found or something else would_have_shown(problem.recorded)),
+        ),
         model=model_at_rate(state.fit.model, problem.thin),
         terms=(*terms, *quick_terms),
         drawn=_drawn(done, basis),
+        omnibus=_whiteness(done),
     )
+
+
+def _whiteness(done: _Searched) -> dict[str, Whiteness]:
+    """The omnibus tests of the null and of the repaired model."""
+    before, after = (omnibus(fit.filtered, fit.context()) for fit in (done.start, done.state.fit))
+    later = {test.name: test.p_value for test in after}
+    return {
+        test.name: Whiteness(test.words, test.p_value, later.get(test.name, 1.0)) for test in before
+    }
 
 
 def _least_gain(one: Finding) -> float:

@@ -163,7 +163,7 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
     return replace(track, time_s=time_s, dt_s=dt_s, mag_b_gauss=mag, gyro_b_rad_s=gyro, runs=runs)
 
 
-def sensitivity(track: Track) -> tuple[str, ...]:
+def would_have_shown(track: Track) -> tuple[str, ...]:
     """What the checks would have shown here, one line each."""
     mag, gyro = noise_of(track)
     step = track.step_s

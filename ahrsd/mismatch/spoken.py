@@ -13,6 +13,7 @@ _FRAMES = {
 }
 _MG = 1e3
 _LIMITS_SHOWN = 6
+_FAILED = 1e-4
 
 
 def lines(found: Diagnosis) -> list[str]:
@@ -29,7 +30,19 @@ def lines(found: Diagnosis) -> list[str]:
         count = len(found.posterior_predictive)
         state = f"fails {', '.join(failed)}" if failed else "passes all of them"
         out += ["", f"checks: {count} statistics; the repaired model {state}"]
+    if found.omnibus:
+        out.append(f"innovations: {_whiteness(found)}")
     return out + [f"note: {note}" for note in found.notes]
+
+
+def _whiteness(found: Diagnosis) -> str:
+    """Which of the omnibus tests the model failed, and which the repaired one still fails."""
+    before = [name for name, test in found.omnibus.items() if test.p_before < _FAILED]
+    after = [name for name, test in found.omnibus.items() if test.p_after < _FAILED]
+    if not before and not after:
+        return "white, Gaussian and even"
+    left = f"still {', '.join(after)}" if after else "nothing with the repaired model"
+    return f"fail {', '.join(before) or 'nothing'} before; {left}"
 
 
 def verdict(found: Diagnosis) -> str:

@@ -10,7 +10,7 @@ from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd.mismatch.facts import Fact, spans_of
 from ahrsd.mismatch.frames import ranked, windows
-from ahrsd.mismatch.hygiene import hygiene, put_right, sensitivity
+from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.missing import missing_turns
 from ahrsd.mismatch.stamps import regular
@@ -109,8 +109,8 @@ def test_a_quiet_motion_does_not_tell_the_frame() -> None:
         gyro_b_rad_s=1e-3 * rng.standard_normal((2000, 3)),
     )
     assert hygiene(at_rest) == ()
-    assert "hardly turned" in sensitivity(at_rest)[-1]
-    assert "left-handed" in sensitivity(track_of(made))[-1]
+    assert "hardly turned" in would_have_shown(at_rest)[-1]
+    assert "left-handed" in would_have_shown(track_of(made))[-1]
 
 
 def test_a_stuck_magnetometer(track: Track) -> None:

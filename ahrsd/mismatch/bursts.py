@@ -1,0 +1,94 @@
+"""Bursts of a second or so that come and go: too short for the segments of the agnostic frames.
+
+The mean of what is left over a second is held against its own scatter there, so that noise that is
+louder for a while is no burst.  Two bursts at least: beside a step whose time is a little off there
+is one.  Their frame is the one in which a constant per burst explains most.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.mismatch import locate
+from ahrsd.mismatch.diagnosis import Unexplained, Where
+from ahrsd.mismatch.facts import spans_of
+from ahrsd.mismatch.locate import FRAMES, Located, Segments
+from ahrsd.mismatch.regression import Base, group_gram, residual
+from ahrsd.samples import Array
+
+_WINDOW_S = 1.0
+_LOUD = 44.0  # chi-squared of three: 1 in 1e9 windows by chance
+_FEWEST = 2
+_MOST_SHARE = 0.3  # of the recording; beyond, it is no burst
+_AXES = ("x", "y", "z")
+
+
+def bursts(basis: Base) -> Unexplained | None:
+    """What the names leave, if it is bursts; None where there are fewer than two."""
+    time_s = basis.context.track.time_s
+    rows = loud_rows(residual(basis.known, basis.innovation), basis.rate_hz, basis.colour)
+    gap = round(_WINDOW_S * basis.rate_hz)
+    spans = spans_of(rows, gap)
+    if len(spans) < _FEWEST or np.mean(rows) > _MOST_SHARE:
+        return None
+    cut = _cut(time_s, spans)
+    columns = {
+        locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
+        for frame in FRAMES
+    }
+    gram = group_gram(basis, columns)
+    best = max(
+        (locate.locate(gram, frame, cut, basis.colour) for frame in FRAMES),
+        key=lambda one: one.evidence,
+    )
+    return _described(best, [(float(time_s[a]), float(time_s[b - 1])) for a, b in spans])
+
+
+def loud_rows(left: Array, rate_hz: float, colour: float) -> NDArray[np.bool]:
+    """(N,) rows of windows in which the mean of (N, 3) is away from zero beyond all doubt."""
+    width = max(4, round(_WINDOW_S * rate_hz))
+    if len(left) < 4 * width:
+        return np.zeros(len(left), dtype=bool)
+    sums = _moving_sum(left, width)
+    scatter = np.sum(_moving_sum(left**2, width) - sums**2 / width, axis=1) / (3 * (width - 1))
+    statistic = np.sum(sums**2, axis=1) / width / np.maximum(scatter, colour)
+    rows = np.zeros(len(left), dtype=bool)
+    for first in np.flatnonzero(statistic > _LOUD):
+        rows[first : first + width] = True
+    return rows
+
+
+def _moving_sum(values: Array, width: int) -> Array:
+    """(N - width + 1, k) of (N, k)."""
+    total = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
+    return np.asarray(total[width:] - total[:-width])
+
+
+def _cut(time_s: Array, spans: list[tuple[int, int]]) -> Segments:
+    """A segment per burst, and between them segments that no row belongs to."""
+    edges = [edge for a, b in spans for edge in (time_s[a], time_s[b - 1])]
+    index = np.full(len(time_s), -1, dtype=np.intp)
+    for number, (a, b) in enumerate(spans):
+        index[a:b] = 2 * number
+    return Segments(np.asarray(edges, float), index)
+
+
+def _described(best: Located, spans: list[tuple[float, float]]) -> Unexplained:
+    spread = np.sqrt(np.mean(best.course[::2] ** 2, axis=0))
+    x, y, z = (float(part) for part in best.direction)
+    return Unexplained(
+        detected=True,
+        where=Where(
+            tuple(spans),
+            tuple(_AXES[k] for k in range(3) if spread[k] > 0.3 * spread.max()),
+            best.frame,
+            f"{len(spans)} bursts",
+            None,
+            (x, y, z),
+        ),
+        size=float(np.max(np.abs(best.course))),
+        unit="rad/s" if best.frame == "gyro" else "gauss",
+        single_source_share=best.single_share,
+        evidence_nats=best.evidence,
+    )
