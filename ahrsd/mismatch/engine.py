@@ -48,6 +48,7 @@ from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.problem import Problem, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, model_at_rate, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
+from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     State,
@@ -156,6 +157,7 @@ def _told(
         *(of_fact(fact, library) for fact in facts if matters(fact)),
         *sorted((*named, *quickly), key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
+        *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
     left = (
         unknown.described(done.left, problem.block_s, limits)

@@ -212,7 +212,7 @@ def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candi
         M = solve(inner, cross)
         G = X.T @ X - cross.T @ M
         s = X.T @ basis.innovation.ravel() - M.T @ known_e
-        what = _total_score(G, s, np.einsum("ij,ij->j", X, X), scale)
+        what = total_score(G, s, np.einsum("ij,ij->j", X, X), scale)
         cost = np.log(len(options)) + np.log(float(option.get("searched", 1)))
         evidence = log_bayes(what, basis.colour) - cost if _possible(effect, what) else -np.inf
         out.append(Candidate(effect, option, len(options), evidence))
@@ -291,7 +291,8 @@ def _possible(effect: Effect, what: Score) -> bool:
     return bool(np.all(what.value > -2.0 * np.sqrt(np.diag(what.covariance))))
 
 
-def _total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
+def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
+    """The score of one group from its projected information (p, p) and score (p,)."""
     whole = np.zeros((1, len(s) + 1, len(s) + 1))
     whole[0, :-1, :-1], whole[0, :-1, -1], whole[0, -1, :-1] = G, s, s
     one = Gram({"x": slice(0, len(s))}, whole, np.ones(1), np.zeros((1, 2)), information)
