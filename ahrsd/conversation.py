@@ -1,9 +1,13 @@
 """What the core says to the device, and when: identify, read, set up the stream, put it back.
 
 ```
- CLOSED -> IDENTIFYING -> READING -> [SETTING_UP] -> READY -> RESTORING -> DONE
-                                                     READY <-> RUNNING (the write-back)
+ CLOSED -> IDENTIFYING -> READING -> [KEEPING -> SETTING_UP] -> READY -> RESTORING -> DONE
+                                                                READY <-> RUNNING (the write-back)
 ```
+Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_outputs`).
+A device that falls silent though it may be told to talk is asked for its output (`silence`), and
+a stop ends within `STOP_S`, whatever the device does.
+
 In mode `passive` the port goes from CLOSED to READY at once and no byte is ever sent. A device that
 answers nothing is listened to and asked again now and then: it stays IDENTIFYING, without an
 identity, so nothing can be written to it.
@@ -11,89 +15,36 @@ identity, so nothing can be written to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
+from collections.abc import Callable, Mapping, Sequence
 
-from ahrsd.writeback.permissions import Mode, Purpose, permitted
-from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
-from drivers.vn100.commands import Command, LinkGone, Pause, Procedure
-from drivers.vn100.decode import Measurement
-from drivers.vn100.procedures import (
-    SESSION_SETTINGS,
-    Identity,
-    identify,
-    quiet,
-    read_configuration,
-    restore,
-    resume,
+from ahrsd import closing
+from ahrsd.closing import OutOfTime, StopLimit, WrongDevice
+from ahrsd.kept_outputs import KeptOutputs
+from ahrsd.said import (
+    Closed,
+    Completed,
+    ConfigurationRead,
+    Identified,
+    Phase,
+    Said,
+    StreamChanged,
+    Unanswered,
 )
+from ahrsd.silence import Silence
+from ahrsd.writeback.journal_history import JournalRecord
+from ahrsd.writeback.permissions import Mode, Purpose, permitted
+from ahrsd.writeback.reconcile import Kind
+from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
+from drivers.vn100.commands import RESUME, Command, LinkGone, Procedure
+from drivers.vn100.decode import Measurement
+from drivers.vn100.procedures import SESSION_SETTINGS, Identity, identify, quiet, restore, resume
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
 
 ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
+RESTORE_AGAIN_S = 0.1
 _FOREIGN = 20  # messages without one of the session's own output: it is gone
-
-
-class Phase(Enum):
-    """Where the conversation stands."""
-
-    CLOSED = "closed"
-    IDENTIFYING = "identifying"
-    READING = "reading registers"
-    SETTING_UP = "setting up the stream"
-    READY = "ready"
-    RUNNING = "running a procedure"
-    RESTORING = "restoring"
-    DONE = "done"
-
-
-@dataclass(frozen=True, slots=True)
-class Identified:
-    """The device said who it is."""
-
-    identity: Identity
-
-
-@dataclass(frozen=True, slots=True)
-class ConfigurationRead:
-    """All registers; `first` where this reading is what must be put back at the end."""
-
-    values: dict[int, Values]
-
-
-@dataclass(frozen=True, slots=True)
-class StreamChanged:
-    """Outputs were set up or put back: samples before and after do not follow each other."""
-
-    text: str
-    level: str = "info"
-
-
-@dataclass(frozen=True, slots=True)
-class Unanswered:
-    """The device does not say who it is; it is only listened to, and asked again now and then."""
-
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Completed:
-    """A procedure that was asked for with `run` ended: `error` None where it did what it should."""
-
-    name: str
-    result: object
-    error: Exception | None
-
-
-@dataclass(frozen=True, slots=True)
-class Closed:
-    """Everything is put back; `error` says what is not."""
-
-    error: Exception | None
-
-
-Said = Identified | ConfigurationRead | StreamChanged | Unanswered | Completed | Closed
+_ENDING = (Phase.RESTORING, Phase.CLOSING, Phase.DONE)
 
 
 class Conversation:
@@ -105,21 +56,26 @@ class Conversation:
         *,
         change_stream: bool = False,
         rate_hz: float = 100.0,
-        reply_timeout_s: float = 0.4,
+        reply_timeout_s: float = closing.USUAL_REPLY_S,
     ) -> None:
         self.mode = mode
         self.change_stream = change_stream and mode is not Mode.PASSIVE
         self.rate_hz = rate_hz
+        self._may_ask = self.change_stream or mode >= Mode.STAGE  # may send VNASY,1, as what:
+        self._asking = Purpose.STREAM if self.change_stream else Purpose.ROLL_BACK
         self.phase = Phase.CLOSED
         self.identity: Identity | None = None
-        self.saved: dict[int, Values] = {}
+        self.outputs = KeptOutputs()
+        scale = max(1.0, reply_timeout_s / closing.USUAL_REPLY_S)
+        self.silence, self.limit = Silence(scale), StopLimit(scale)
         self.session = Session(self._allowed, reply_timeout_s=reply_timeout_s)
         self._purpose = Purpose.READ
         self._extra_gate: Callable[[Command], bool] | None = None
         self._serial: int | None = None
         self._name = ""
         self._baud = 115200
-        self._touched = self._unanswered = False
+        self._touched = self._unanswered = self._unkept = False
+        self._failure = "no answer in time"  # why something was not put back
         self._ask_again_s = ASK_AGAIN_S[0]
         self._own, self._foreign = "", 0  # layout of the session's output; others without it
         self._said: list[Said] = []
@@ -137,20 +93,26 @@ class Conversation:
     @property
     def may_close(self) -> bool:
         """Nothing is under way that must end before the port may be given back."""
-        only_reads = self.phase in (Phase.IDENTIFYING, Phase.READING) and not self._must_restore
-        return self.phase is Phase.CLOSED or self.idle or only_reads
+        return self.phase not in (Phase.RUNNING, Phase.RESTORING)
+
+    @property
+    def deadline_s(self) -> float | None:
+        """When `tick` wants to be called if nothing arrives before."""
+        due = [self.session.deadline_s, self.limit.due_s]
+        if self.idle and self._may_ask:
+            due.append(self.silence.due_s)
+        return min((d for d in due if d is not None), default=None)
 
     @property
     def session_keys(self) -> frozenset[int]:
-        """Registers that this session changes and puts back."""
-        return frozenset(SESSION_SETTINGS) if self.change_stream else frozenset()
+        """Registers that this session, or one before it that was killed, changed."""
+        theirs = bool(self.outputs.left)
+        return frozenset(SESSION_SETTINGS) if self.change_stream or theirs else frozenset()
 
     def take_said(self) -> list[Said]:
         """What happened since the last call."""
         said, self._said = self._said, []
         return said
-
-    # -- inputs ----------------------------------------------------------------------------------
 
     def opened(self, baud: int, now_s: float) -> list[Event]:
         """The port is open."""
@@ -160,9 +122,36 @@ class Conversation:
             return []
         return self.identify_again(now_s)
 
+    def known(
+        self, registers: Mapping[int, Values], journal: Sequence[JournalRecord] | None
+    ) -> dict[int, Values]:
+        """Registers and journal of the device are there; returns them as the user has them.
+
+        With `change_stream`, the session's outputs follow as soon as the journal has the user's.
+        """
+        if self._serial is None or self.mode is Mode.PASSIVE:
+            return dict(registers)
+        self.outputs.read(self._serial, registers, journal)
+        if self.outputs.left and not self._touched:
+            self._warn(self.outputs.describe_left(put_back=self.change_stream))
+        if self.phase is Phase.KEEPING:
+            self.outputs.keep()
+        return {**registers, **self.outputs.users}
+
+    def journalled(self, kind: Kind, error: str, now_s: float) -> None:
+        """A record of the user's outputs is on the disk, or is not."""
+        kept = self.outputs.journalled(kind, error)
+        if self.phase is Phase.CLOSING and kind is Kind.OUTPUTS_BACK:
+            self._done(None)
+        elif self.phase is Phase.KEEPING and not kept:
+            if not self._unkept:
+                self._warn("the user's outputs cannot be journalled, so no others are set up")
+            self.phase, self._unkept = Phase.READY, True
+            self.silence.owe(now_s, *closing.KEEP_AGAIN_S)
+
     def identify_again(self, now_s: float) -> list[Event]:
         """The device may be another one, or itself after a reset: ask it everything again."""
-        if self.mode is Mode.PASSIVE or self.phase is Phase.DONE:
+        if self.mode is Mode.PASSIVE or self.phase in _ENDING:
             return []
         events = self._abandon(now_s)
         self.phase = Phase.IDENTIFYING
@@ -172,14 +161,15 @@ class Conversation:
         """Bytes came; returns measurements, faults and strays, in order."""
         events = self._digest(self.session.receive(data, now_s), now_s)
         if self._own and self._own_is_gone(events) and self.idle:
-            text = "the session's output is gone: the device restarted, or somebody changed it"
-            self._said.append(StreamChanged(text, "warning"))
+            self._warn("the session's output is gone: the device restarted, or somebody changed it")
             events += self.identify_again(now_s)
-        return events
+        if any(isinstance(event, Measurement) for event in events):
+            self.silence.heard(now_s)
+        return events + self._on_time(now_s)
 
     def tick(self, now_s: float) -> list[Event]:
         """Time passed."""
-        return self._digest(self.session.tick(now_s), now_s)
+        return self._digest(self.session.tick(now_s), now_s) + self._on_time(now_s)
 
     def lost(self, now_s: float) -> list[Event]:
         """The port went away."""
@@ -216,21 +206,24 @@ class Conversation:
 
     def set_up_again(self, now_s: float) -> list[Event]:
         """The user's own outputs are back for a save: set the session's up again."""
-        if not (self.change_stream and self.idle):
+        if not (self.change_stream and (self.idle or self.phase is Phase.KEEPING)):
             return []
-        return self._digest(self._set_up(now_s), now_s)
+        self.phase = Phase.SETTING_UP
+        self._unkept = False
+        self._touched = True  # from the first byte on, also where it breaks off half way
+        procedure = configure_stream(self.rate_hz, self._baud, self.outputs.users)
+        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
 
     def restore_and_close(self, now_s: float) -> list[Event]:
-        """Put back what was changed for the session, then say Closed. Ends mere reading."""
-        known = self.phase is not Phase.CLOSED and self.identity is not None
+        """Put back what was changed for the session, then say Closed. Ends what is under way."""
+        linked, self.limit.closing = self.phase is not Phase.CLOSED, True
+        if self.phase is Phase.RUNNING and not self._must_restore:
+            return self._give_up(now_s)
         events = [] if self.idle else self._abandon(now_s)
-        if not (self._must_restore and known):
-            self.phase = Phase.DONE
-            self._said.append(Closed(LinkGone() if self._must_restore else None))
+        if not (self._must_restore and linked):
+            self._done(LinkGone() if self._must_restore else None)
             return events
-        self.phase = Phase.RESTORING
-        procedure = quiet(restore(self.saved, SESSION_SETTINGS))
-        return events + self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
+        return events + self._restore(0.0, now_s)
 
     def amends(self) -> Procedure[object] | None:
         """What puts the device's output back after this program broke down; None: nothing need be.
@@ -238,31 +231,71 @@ class Conversation:
         Not for `run`: whoever calls this trusts no state of the conversation but what was saved.
         """
         if self._must_restore and self.identity is not None:
-            return quiet(restore(self.saved, SESSION_SETTINGS))
+            return quiet(restore(self.outputs.users, SESSION_SETTINGS))
         paused = self.phase in (Phase.RUNNING, Phase.RESTORING) and self.mode >= Mode.STAGE
         return resume() if paused else None
 
     def allows_amends(self, command: Command) -> bool:
         """The gate of `amends`."""
-        purpose = Purpose.STREAM if self.change_stream else Purpose.ROLL_BACK
-        return permitted(command, self.mode, self.change_stream, purpose)
-
-    # -- inside ----------------------------------------------------------------------------------
+        return permitted(command, self.mode, self.change_stream, self._asking)
 
     @property
     def _must_restore(self) -> bool:
         """The device that was read, and no other, may hold settings of this session."""
-        return self._touched and bool(self.saved)
+        left = self.change_stream and bool(self.outputs.left)
+        return (self._touched or left) and bool(self.outputs.users)
+
+    def _on_time(self, now_s: float) -> list[Event]:
+        """What is due without a word from the device: the end of a stop, a silence to be ended."""
+        if self.limit.over(now_s):
+            return [] if self.phase is Phase.DONE else self._give_up(now_s)
+        if not (self.idle and self._may_ask):
+            return []
+        if self.silence.pays(now_s):
+            if not self._unkept:
+                return self.identify_again(now_s)
+            self.phase = Phase.KEEPING
+            self.outputs.keep()
+            return []
+        if not self.silence.breaks(now_s):
+            return []
+        if self.silence.asked == 1:
+            self._warn("the device is silent: it is asked for its output, again and again")
+        if self.silence.asked > 1 and self.change_stream:
+            return self.identify_again(now_s)
+        self._resume_blindly()  # costs nothing, should the device only be slow
+        return []
+
+    def _resume_blindly(self) -> None:
+        """VNASY,1, and nobody waits for the reply."""
+        self._purpose, self._extra_gate = self._asking, None
+        self.session.last_word(RESUME)
+
+    def _give_up(self, now_s: float) -> list[Event]:
+        """What takes too long ends here; a last VNASY,1 goes out, its reply is not waited for."""
+        linked, self.phase = self.phase is not Phase.CLOSED, Phase.CLOSED
+        events = self._abandon(now_s)
+        if linked and self._may_ask:
+            self._resume_blindly()
+        self._done(OutOfTime(self._failure) if self._must_restore else None)
+        return events
+
+    def _warn(self, text: str) -> None:
+        self._said.append(StreamChanged(text, "warning"))
+
+    def _done(self, error: Exception | None) -> None:
+        self.phase = Phase.DONE
+        self._said.append(Closed(error))
+
+    def _restore(self, wait_s: float, now_s: float) -> list[Event]:
+        self.phase = Phase.RESTORING
+        procedure = closing.put_back_to(self._serial, self.outputs.users, wait_s)
+        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
 
     def _own_is_gone(self, events: list[Event]) -> bool:
         names = [event.layout.name for event in events if isinstance(event, Measurement)]
         self._foreign = 0 if self._own in names else self._foreign + len(names)
         return self._foreign >= _FOREIGN
-
-    def _set_up(self, now_s: float) -> list[Event]:
-        self.phase = Phase.SETTING_UP
-        self._touched = True  # from the first byte on, also where it breaks off half way
-        return self._start(configure_stream(self.rate_hz, self._baud), Purpose.STREAM, now_s)
 
     def _start(self, procedure: Procedure[object], purpose: Purpose, now_s: float) -> list[Event]:
         self._purpose = purpose
@@ -285,29 +318,49 @@ class Conversation:
     def _advance(self, result: object, error: Exception | None, now_s: float) -> list[Event]:
         phase = self.phase
         if phase is Phase.RUNNING:
-            self.phase, self._extra_gate = Phase.READY, None
+            self._extra_gate = None
+            self._ready(now_s)
             self._said.append(Completed(self._name, result, error))
-            return []
-        if phase is Phase.RESTORING:
-            self.phase = Phase.DONE
-            if error is None:
-                self._touched = False
-                self._said.append(StreamChanged("outputs put back as they were"))
-            self._said.append(Closed(error))
             return []
         if phase is Phase.CLOSED:
             return []
+        if phase is Phase.RESTORING:
+            return self._restored(error, now_s)
         if phase is Phase.SETTING_UP and error is not None:
-            self.phase = Phase.READY
-            text = f"the session's output cannot be set up, the device's own stays: {error}"
-            self._said.append(StreamChanged(text, "warning"))
-            return []
+            return self._not_set_up(error, now_s)
         if error is not None:
             self._say_unanswered(f"{phase.value}: {error}")
             self.phase = Phase.IDENTIFYING
             later, self._ask_again_s = self._ask_again_s, min(2 * self._ask_again_s, ASK_AGAIN_S[1])
-            return self._start(_identify_in(later), Purpose.READ, now_s)
+            return self._start(closing.identify_in(later), Purpose.READ, now_s)
         return self._next(phase, result, now_s)
+
+    def _restored(self, error: Exception | None, now_s: float) -> list[Event]:
+        """Once more where it failed: a stop has a limit of its own."""
+        if isinstance(error, LinkGone | WrongDevice):
+            self._done(error)
+        elif error is not None:
+            self._failure = str(error)
+            return self._restore(RESTORE_AGAIN_S, now_s)
+        else:
+            self._touched, self.phase = False, Phase.CLOSING
+            self._said.append(StreamChanged("outputs put back as they were"))
+            self.outputs.give_back()
+        return []
+
+    def _not_set_up(self, error: Exception, now_s: float) -> list[Event]:
+        again = closing.again_after(error)
+        own = "" if again is closing.PUT_BACK_AGAIN_S else ", the device's own stays"
+        if not self.silence.owed:
+            self._warn(f"the session's output cannot be set up{own}: {error}")
+        if again is not None:
+            self.silence.owe(now_s, *again)
+        self._ready(now_s)
+        return []
+
+    def _ready(self, now_s: float) -> None:
+        self.phase = Phase.READY
+        self.silence.begin(now_s)
 
     def _say_unanswered(self, text: str) -> None:
         """Once. What a device that was known sends now is not used: its registers will be read."""
@@ -319,26 +372,21 @@ class Conversation:
     def _next(self, phase: Phase, result: object, now_s: float) -> list[Event]:
         if phase is Phase.IDENTIFYING and isinstance(result, Identity):
             if result.serial != self._serial:
-                self.saved = {}  # another device: nothing of the first one's is put back to it
-                self._touched = False
+                self._touched = False  # nothing of another device's is put back to this one
             self.identity, self._serial = result, result.serial
             self._said.append(Identified(result))
             self.phase = Phase.READING
-            return self._start(read_configuration(result.profile), Purpose.READ, now_s)
+            twice = SESSION_SETTINGS if self.change_stream else ()
+            return self._start(closing.read_surely(result.profile, twice), Purpose.READ, now_s)
         if phase is Phase.READING and isinstance(result, dict):
-            if not self.saved:
-                self.saved = dict(result)
             self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]
             self._said.append(ConfigurationRead(result))
             if self.change_stream:
-                return self._set_up(now_s)
+                self.phase = Phase.KEEPING
+                return []
         if isinstance(result, CalibrationStream):
             self._own, self._foreign = result.layout, 0
+            self.silence.settle()
             self._said.append(StreamChanged(f"output set up for the session: {result}"))
-        self.phase = Phase.READY
+        self._ready(now_s)
         return []
-
-
-def _identify_in(seconds: float) -> Procedure[Identity]:
-    yield Pause(seconds)
-    return (yield from identify())

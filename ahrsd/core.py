@@ -16,16 +16,7 @@ import numpy as np
 from ahrsd import events, inputs
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.calibrator import Calibrator
-from ahrsd.conversation import (
-    Closed,
-    Completed,
-    ConfigurationRead,
-    Conversation,
-    Identified,
-    Said,
-    StreamChanged,
-    Unanswered,
-)
+from ahrsd.conversation import Conversation
 from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
 from ahrsd.errands import Errands
@@ -34,6 +25,15 @@ from ahrsd.examination import Circumstances, Desk, Finding, Piece
 from ahrsd.gates import Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.rollcall import Rollcall
+from ahrsd.said import (
+    Closed,
+    Completed,
+    ConfigurationRead,
+    Identified,
+    Said,
+    StreamChanged,
+    Unanswered,
+)
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream import Stream
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
@@ -117,7 +117,7 @@ class Core:
     @property
     def deadline_ns(self) -> int | None:
         """When a `Tick` is wanted if nothing else arrives before, on the host's clock."""
-        due = [self.conversation.session.deadline_s, self.writeback.deadline_s]
+        due = [self.conversation.deadline_s, self.writeback.deadline_s]
         known = [d for d in due if d is not None]
         return int(min(known) * 1e9) + 1 if known else None
 
@@ -168,7 +168,7 @@ class Core:
     def _stop(self, item: inputs.Stop) -> None:
         self._flush()
         self._stopping = item.reason
-        self._errands.add(self.writeback.on_stop(self._host_s))
+        self._errands.stop(self._host_s)
 
     # -- the device --------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from ahrsd.writeback.actions import (
     SetUpStream,
 )
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import OF_OUTPUTS, Kind
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event as SessionEvent
 
@@ -53,6 +53,7 @@ class Errands:
         self._todo: deque[Action] = deque()
         self._procedure: RunProcedure | None = None
         self._awaiting_journal = False
+        self._now_s = 0.0
 
     @property
     def at_rest(self) -> bool:
@@ -63,11 +64,16 @@ class Errands:
             and not self._awaiting_journal
             and self._writeback.idle
             and self._conversation.may_close
-        )
+        ) or not self._conversation.limit.patient(self._now_s)
 
     def add(self, actions: Iterable[Action]) -> None:
         """To the end of the line."""
         self._todo.extend(actions)
+
+    def stop(self, host_s: float) -> None:
+        """The run is to end: what is only in RAM is undone, within a limit."""
+        self._conversation.limit.begin(host_s)
+        self.add(self._writeback.on_stop(host_s))
 
     def forget_procedure(self) -> None:
         """The link or the device went away before it could start; the write-back knows."""
@@ -77,6 +83,8 @@ class Errands:
         """The record that the line waits for is on the disk, or is not."""
         self._awaiting_journal = False
         kind = Kind(item.kind)
+        if kind in OF_OUTPUTS:
+            self._conversation.journalled(kind, item.error, host_s)
         if item.error:
             first = self._writeback.on_journal_failed(kind, item.error, host_s)
         else:
@@ -94,7 +102,8 @@ class Errands:
 
     def work(self, office: Office, host_s: float) -> bool:
         """As far as it goes now; whether anything was done."""
-        done = False
+        done, self._now_s = False, host_s
+        self._todo.extend(self._conversation.outputs.take_actions())
         while self._todo and not self._awaiting_journal:
             self._act(self._todo.popleft(), office, host_s)
             done = True

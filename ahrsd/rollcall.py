@@ -37,6 +37,7 @@ class Rollcall:
     _journal: Sequence[RecordRead] | None = field(default=None)
     _journal_known: bool = False
     _breaks: int = -1
+    _read_from_s: float = float("inf")
 
     def identified(self) -> None:
         """A device said who it is: its journal is not open yet."""
@@ -45,7 +46,7 @@ class Rollcall:
     def journal(self, item: JournalOpened) -> None:
         """Its journal, or why there is none that can be trusted."""
         self._journal = None if item.error else [RecordRead.of(r) for r in item.records]
-        self._journal_known = True
+        self._journal_known, self._read_from_s = True, item.host_ns * 1e-9
 
     def registers(
         self, values: dict[int, Values], believed: Mapping[int, Values], breaks: int
@@ -74,12 +75,13 @@ class Rollcall:
         if identity is None or values is None or not self._journal_known:
             return []
         self._values = None
-        keys, saved = conversation.session_keys, conversation.saved
+        users = conversation.known(values, self._journal)
         return writeback.on_device(
             identity,
-            {n: saved[n] if n in keys and n in saved else v for n, v in values.items()},
+            users,
             self._journal,
             host_s,
             host_s + self.wall_offset_s,
-            session_keys=keys,
+            session_keys=conversation.session_keys,
+            read_from_s=self._read_from_s,
         )

@@ -6,18 +6,21 @@ import re
 
 import pytest
 
-from ahrsd.conversation import (
-    ASK_AGAIN_S,
+from ahrsd.closing import STOP_S, WrongDevice
+from ahrsd.conversation import ASK_AGAIN_S, Conversation
+from ahrsd.rollcall import RecordRead as Record
+from ahrsd.said import (
     Closed,
     Completed,
     ConfigurationRead,
-    Conversation,
     Identified,
     Phase,
     StreamChanged,
     Unanswered,
 )
+from ahrsd.writeback.actions import SetUpStream
 from ahrsd.writeback.permissions import Mode, Purpose
+from ahrsd.writeback.reconcile import Kind
 from drivers.vn100.commands import LinkGone, Read, Word, Write
 from drivers.vn100.emulator_scenarios import Setup, build
 from drivers.vn100.procedures import SESSION_SETTINGS, quiet, read, write_verified
@@ -35,6 +38,7 @@ class Talk:
         self.now_s = 1.0
         self.device.advance(self.now_s)
         self.said, self.sent, self.events = [], b"", []
+        self.journal, self.disk_full = [], False
         self.conversation.opened(115200, self.now_s)
 
     def step(self):
@@ -45,10 +49,29 @@ class Talk:
         data = self.device.advance(self.now_s)
         if data:
             self.events += self.conversation.received(data, self.now_s)
-        due = self.conversation.session.deadline_s
+        due = self.conversation.deadline_s
         if due is not None and self.now_s >= due:
-            self.conversation.tick(self.now_s)
-        self.said += self.conversation.take_said()
+            self.events += self.conversation.tick(self.now_s)
+        self.hear()
+
+    def hear(self):
+        """What the core does with what was said; the journal answers at once."""
+        said = self.conversation.take_said()
+        self.said += said
+        for one in said:
+            if isinstance(one, ConfigurationRead):
+                self.conversation.known(one.values, self.journal)
+        actions = self.conversation.outputs.take_actions()
+        while actions:
+            action = actions.pop(0)
+            if isinstance(action, SetUpStream):
+                self.conversation.set_up_again(self.now_s)
+                continue
+            if not self.disk_full:
+                self.journal.append(Record(action.kind.value, dict(action.facts)))
+            error = "no space left" if self.disk_full else ""
+            self.conversation.journalled(action.kind, error, self.now_s)
+            actions += self.conversation.outputs.take_actions()
 
     def until(self, condition, seconds=20.0):
         end_s = self.now_s + seconds
@@ -61,9 +84,10 @@ class Talk:
         return self.until(lambda: self.conversation.phase is phase)
 
     def close(self, seconds=3.0):
+        self.conversation.limit.begin(self.now_s)
         self.conversation.restore_and_close(self.now_s)
         self.until(lambda: self.conversation.phase is Phase.DONE, seconds)
-        self.said += self.conversation.take_said()
+        self.hear()
         return next(one for one in self.said if isinstance(one, Closed))
 
     def kinds(self):
@@ -92,7 +116,12 @@ def test_passive_says_nothing():
     )
 
 
-@pytest.mark.parametrize("phase", [p for p in Phase if p not in (Phase.RUNNING, Phase.DONE)])
+AT_ONCE = (Phase.KEEPING, Phase.CLOSING)  # the journal answers before time passes
+
+
+@pytest.mark.parametrize(
+    "phase", [p for p in Phase if p not in (Phase.RUNNING, Phase.DONE, *AT_ONCE)]
+)
 def test_closed_in_any_phase_the_device_is_as_it_was(phase):
     talk = Talk(change_stream=True)
     if phase is Phase.RESTORING:
@@ -160,11 +189,20 @@ def test_a_device_that_cannot_be_asked_is_not_written_to_at_the_end():
     talk = Talk(change_stream=True).in_phase(Phase.READY)
     talk.conversation.lost(talk.now_s)
     talk.conversation.opened(115200, talk.now_s)
-    assert not talk.conversation.may_close
     talk.conversation.lost(talk.now_s)
     sent = len(talk.sent)
     assert isinstance(talk.close().error, LinkGone)
     assert b"VNWRG" not in talk.sent[sent:]
+
+
+def test_what_is_put_back_is_put_back_to_the_same_device_only():
+    """Behind an adapter that stays, another device answers: the serial number is read first."""
+    talk = Talk(change_stream=True).in_phase(Phase.READY)
+    talk.device.replace_unit(7)
+    before = dict(talk.device.memory.ram)
+    talk.conversation.identify_again(talk.now_s)
+    assert isinstance(talk.close().error, WrongDevice)
+    assert talk.device.memory.ram == before
 
 
 def test_an_output_that_vanished_is_set_up_again():
@@ -181,8 +219,10 @@ def test_an_output_that_vanished_is_set_up_again():
 def test_what_cannot_be_put_back_is_said():
     talk = Talk(change_stream=True, faults=("refused_write@3",)).in_phase(Phase.READY)
     talk.until(lambda: talk.now_s > 3.1)
-    closed = talk.close(10.0)
+    closed = talk.close(STOP_S + 0.1)
     assert "settings not put back" in str(closed.error)
+    assert "the next run" in str(closed.error)
+    assert Kind.OUTPUTS_BACK not in [record.kind for record in talk.journal]
     assert not any("put back as they were" in getattr(one, "text", "") for one in talk.said)
 
 

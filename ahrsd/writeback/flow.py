@@ -244,8 +244,7 @@ class Flow:
         self.desk.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
 
     def _enter_checking(self, reason: str) -> None:
-        make = partial(check, self.transaction(), self.session_keys)
-        self.desk.run("check", Purpose.STAGE, make)
+        self.desk.run("check", Purpose.STAGE, partial(check, self.transaction(), self.session_keys))
 
     def _enter_staging(self, reason: str) -> None:
         self._cause = "device"
@@ -315,6 +314,8 @@ class Flow:
         else:
             self.desk.note("warning", f"not saved: {outcome}")
             self.signal(Signal.NOT_SENT, str(outcome))
+            if outcome.differing:
+                self.desk.ask(IdentifyAgain())
         self._set_up_stream()
 
     def on_failure(self, reason: str) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
-from ahrsd.writeback.reconcile import OPEN, Kind
+from ahrsd.writeback.reconcile import OF_OUTPUTS, OPEN, Kind
 from ahrsd.writeback.transaction import Transaction
 from drivers.vn100.registers import Values
 
@@ -67,6 +67,8 @@ class History:
 
     def with_record(self, kind: Kind, facts: Mapping[str, Any]) -> History:
         """The history after one more record."""
+        if kind in OF_OUTPUTS:
+            return self
         wall_s = float(facts.get("wall_s", 0.0))
         if kind is Kind.LOCKED:
             return replace(self, locked=str(facts.get("reason", "no reason given")))

@@ -40,6 +40,8 @@ from ahrsd.writeback.trial import Finding, TrialMetrics
 from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values
 
+UPTIME_MARGIN_S = 0.5  # what a message may take to get here
+
 _AWAITED = {
     State.PREPARING: Kind.PREPARED,
     State.STAGED: Kind.RAM_VERIFIED,
@@ -57,6 +59,7 @@ class WriteBack:
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._saw_reset = False
+        self._read_from_s = float("inf")  # since when the registers were being read; inf: told
 
     # -- what others ask ---------------------------------------------------------------------------
 
@@ -127,11 +130,13 @@ class WriteBack:
         *,
         uptime_s: float | None = None,
         session_keys: frozenset[int] = frozenset(),
+        read_from_s: float = float("inf"),
     ) -> list[Action]:
         """The device was identified and read: at the start, after a reset, after a lost link.
 
         registers:    all that were read; `session_keys` (which the daemon changes for its session)
                       with the values that the user had
+        read_from_s:  when the reading of them began; see `on_uptime`
         journal:      this device's records, oldest first; None where they cannot be trusted
         wall_s:       the wall clock at `host_s`; only for budgets that span restarts
         uptime_s:     the device's own time since its start-up, where its stream says it
@@ -143,6 +148,7 @@ class WriteBack:
         self._desk.in_force(registers)
         age_s = wall_s - self.history.last_wall_s
         restarted = self._saw_reset or (uptime_s is not None and 0.0 <= uptime_s < age_s)
+        self._read_from_s = float("inf") if self._saw_reset else read_from_s
         self._saw_reset = False
         if self.state is not State.RECONCILING:
             flow.enter(State.RECONCILING, "the device was read again")
@@ -173,9 +179,15 @@ class WriteBack:
     def on_uptime(self, uptime_s: float, host_s: float) -> list[Action]:
         """The device's time since its start-up, once its stream tells: a restart nobody saw.
 
-        Only a restart shows what a save left in flash, so it is asked again then.
+        One since the registers were read (the output of before had no device time) makes that
+        reading void. And only a restart shows what a save left in flash, so it is asked again then.
         """
         self._desk.host_s = host_s
+        if uptime_s < host_s - self._read_from_s - UPTIME_MARGIN_S:
+            self._saw_reset = True
+            self._flow.signal(Signal.DEVICE_RESET, "the device restarted since it was read")
+            self._desk.ask(IdentifyAgain())
+            return self._answer()
         age_s = self._desk.wall_s - self.history.last_wall_s
         open_save = self.history.last in (Kind.FLASH_SENT, Kind.FLASH_ACKED)
         resting = self.state in (State.FAULT, State.COMMITTED)

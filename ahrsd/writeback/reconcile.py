@@ -41,6 +41,8 @@ class Kind(StrEnum):
 
     LOCKED = "LOCKED"  # not part of a transaction
     UNLOCKED = "UNLOCKED"
+    OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
+    OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
 
 
 OPEN: Final = (
@@ -52,6 +54,7 @@ OPEN: Final = (
     Kind.FLASH_SENT,
     Kind.FLASH_ACKED,
 )
+OF_OUTPUTS: Final = (Kind.OUTPUTS_KEPT, Kind.OUTPUTS_BACK)
 
 
 class Found(Enum):

@@ -13,12 +13,14 @@ there, unchanged.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.vn100.commands import NoReply, Pause, Procedure, SessionError
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
+    differences,
     quiet,
     read,
     read_registers,
@@ -30,6 +32,7 @@ from drivers.vn100.registers import (
     BINARY_OUTPUTS,
     SAMPLE_RATE_HZ,
     Values,
+    same,
 )
 
 GROUPS, TIME_WORD = 0x06, 0x0001
@@ -42,6 +45,10 @@ _OTHER_PORT = {1: 2, 2: 1}  # the values are bits of AsyncMode
 
 class DoesNotFit(ValueError):
     """The stream that was asked for is impossible; the text says what would be possible."""
+
+
+class NotPutBack(SessionError):
+    """The set-up failed, and so did putting back what it had changed: the device has neither."""
 
 
 class NoStream(SessionError):
@@ -82,15 +89,24 @@ def rate_divisor(rate_hz: float, baud: int) -> int:
     return divisor
 
 
-def configure_stream(rate_hz: float, baud: int) -> Procedure[CalibrationStream]:
+def configure_stream(
+    rate_hz: float, baud: int, users: Mapping[int, Values] | None = None
+) -> Procedure[CalibrationStream]:
     """Stream the calibration packet at `rate_hz` on the port in use, in RAM; ASCII output off.
 
     Changes registers 6 and 75 to 77, all of `procedures.SESSION_SETTINGS`; puts them back itself
-    where it fails. Raises DoesNotFit before anything is sent, NoStream, DeviceRefused.
+    where it fails. Raises DoesNotFit before anything is sent, NoStream, DeviceRefused, NoReply, and
+    NotPutBack.
+
+    users: the outputs as the user has them, where an earlier session may have left others in the
+           device; these are put back first. Without, what the device holds is the user's.
     """
     divisor = rate_divisor(rate_hz, baud)
-    saved = yield from quiet(read_registers((6, *BINARY_OUTPUTS)))
+    present = yield from quiet(read_registers((6, *BINARY_OUTPUTS)))
+    saved = {**present, **(users or {})}
     try:
+        if differences({n: saved[n] for n in present}, present):
+            yield from quiet(restore(saved, SESSION_SETTINGS))
         port = yield from quiet(_silence_and_find_port())
         for candidate in (port,) if port else (1, 2):
             stream = yield from quiet(_set_up(saved, candidate, divisor))
@@ -98,11 +114,41 @@ def configure_stream(rate_hz: float, baud: int) -> Procedure[CalibrationStream]:
             if stream.layout in heard.tokens:
                 return stream
             yield from quiet(restore(saved, BINARY_OUTPUTS))
-    except (DeviceRefused, SessionError):
-        yield from quiet(restore(saved, SESSION_SETTINGS))
+    except (DeviceRefused, SessionError) as error:
+        yield from _put_back(saved, error)
         raise
-    yield from quiet(restore(saved, SESSION_SETTINGS))
-    raise NoStream("the calibration packets were set up on the port, but none arrived")
+    nothing = NoStream("the calibration packets were set up on the port, but none arrived")
+    yield from _put_back(saved, nothing)
+    raise nothing
+
+
+def left_by_session(register: int, users: Values, present: Values) -> bool:
+    """Whether `present` is what `configure_stream` leaves in a register of a user with `users`.
+
+    At its end, or where it was broken off half way. The user's own value is none of its.
+    """
+    if same(register, users, present):
+        return False
+    if register == 6:
+        return int(present[0]) == 0 or (int(present[0]) == 1 and int(users[0]) == 0)
+    if register not in BINARY_OUTPUTS:
+        return False
+    if same(register, BINARY_OUTPUT_OFF, present):
+        return True
+    mode, other = int(present[0]), int(users[0]) & ~int(present[0])
+    if mode in _OTHER_PORT and other and same(register, (mode, *users[1:]), present):
+        return True  # taken off one port, kept on the other
+    words = tuple(int(value) for value in present[2:])
+    packets = [(GROUPS, TIME_WORD, word) for word in (IMU_WORD, IMU_WORD_WITHOUT_SATURATION)]
+    return mode in _OTHER_PORT and words in packets
+
+
+def _put_back(saved: Mapping[int, Values], cause: Exception) -> Procedure[None]:
+    """The settings as they were; NotPutBack where that is refused or gets no answer either."""
+    try:
+        yield from quiet(restore(saved, SESSION_SETTINGS))
+    except (DeviceRefused, SessionError) as error:
+        raise NotPutBack(f"{cause}; {error}") from cause
 
 
 def _silence_and_find_port() -> Procedure[int | None]:

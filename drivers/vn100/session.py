@@ -203,6 +203,11 @@ class Session:
             self._unanswered(self._flight, now_s, events)
         return events
 
+    def last_word(self, command: Speech) -> None:
+        """Send a command whose reply nobody waits for, where the gate lets it out."""
+        if self._allow(command):
+            self._output += encode(command.body)
+
     def _take(self, chunk: bytes, now_s: float, events: list[Event]) -> None:
         for frame in self.deframer.feed(chunk):
             event = decode(frame)

@@ -68,7 +68,11 @@ class Part:
 PARTS = {
     "cuts": Part(240, cuts_chunk, ("unrecoverable", "disagreements", "flash_after")),
     "histories": Part(1000, histories_chunk, ("wrong",)),
-    "cycles": Part(200, cycles_chunk, ("exceptions", "hangs", "leaked_threads", "leaked_files")),
+    "cycles": Part(
+        200,
+        cycles_chunk,
+        ("exceptions", "hangs", "differs", "outputs_changed", "leaked_threads", "leaked_files"),
+    ),
 }
 
 

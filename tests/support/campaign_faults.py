@@ -8,7 +8,10 @@ follows, in which samples must flow, the state must not wait, and a stop must en
 hang:      no sample within `FLOW_S` after the last fault, or no end within `STOP_S` after a stop,
            in virtual time; or one step of the world that takes longer than `STEP_WALL_S`
 differs:   the state says what the registers hold and they hold something else, without an alarm
-           (not counted where a third party wrote, the unit was exchanged, or replies were altered)
+outputs:   after the stop the device has other outputs than the user's (registers 5 to 7 and 75 to
+           77, both ports), or its flash has; the program was killed in some of the schedules
+           (differs and outputs are not counted where a third party wrote, the unit was exchanged,
+           or replies were altered; the flash not where it was torn)
 """
 
 from __future__ import annotations
@@ -32,6 +35,7 @@ from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
 from drivers.vn100.emulator_faults import FAULTS
 from drivers.vn100.emulator_physics import draw_truth
 from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.registers import Values
 
 PER_SCHEDULE = 40
 BEGIN_S, FAULTS_S, CALM_S = 3.0, 30.0, 12.0
@@ -43,7 +47,9 @@ POLICY = WriteBackPolicy(
     trial=TrialPolicy(duration_s=3.0, max_spread_percent=100.0, worse_percent=1e6),
 )  # fmt: skip
 OTHERS = ("third_party", "replug_other", "altered_reply")  # in a quarter of the schedules
+Registers = dict[tuple[int, int], Values]
 ALARMS = ("FAULT", "LOCKED", "FLASH_TORN")
+OUTPUTS = (5, 6, 7, 75, 76, 77)
 AGREE = {"TRIAL": "new", "PROVEN": "new", "COMMITTED": "new", "CONFIRMED": "new"}
 
 
@@ -63,6 +69,8 @@ class FaultTally:
     exceptions: list[str] = field(default_factory=list)
     hangs: list[str] = field(default_factory=list)
     differs: list[str] = field(default_factory=list)
+    outputs_changed: list[str] = field(default_factory=list)
+    outputs_compared: int = 0
     leaked_threads: int = 0
     leaked_files: int = 0
 
@@ -109,6 +117,7 @@ class Schedule:
         )  # fmt: skip
         settings = core_settings(Config(), policy=POLICY)
         self.run_ = VirtualRun(build(setup), settings, step_s=0.05)
+        self.users = outputs_of(self.run_.emulator.memory.ram)
 
     def step(self) -> None:
         """One step of the world, and what a program under test may not do in it."""
@@ -161,11 +170,32 @@ class Schedule:
             self.step()
         if not run.finished:
             self.tally.hangs.append(f"{self.where}no end after a stop, {run.describe()}")
+        self.compare_outputs()
+
+    @property
+    def others(self) -> bool:
+        """Whether somebody else meddled."""
+        return any(fault.startswith(OTHERS) for fault in self.faults)
+
+    def compare_outputs(self) -> None:
+        """Are the outputs the user's, after everything?"""
+        if self.others:
+            return
+        self.tally.outputs_compared += 1
+        memory = self.run_.emulator.memory
+        places = {"RAM": memory.ram, "flash": memory.flash}
+        if any(fault.startswith("torn_flash") for fault in self.faults):
+            del places["flash"]
+        for place, values in places.items():
+            held = outputs_of(values)
+            if other := {key: row for key, row in held.items() if row != self.users[key]}:
+                where = f"{self.where}{place} {other}, {self.run_.describe()}"
+                self.tally.outputs_changed.append(where)
 
     def compare(self) -> None:
         """State and registers, where nobody else meddled."""
         run = self.run_
-        if any(fault.startswith(OTHERS) for fault in self.faults):
+        if self.others:
             return
         state, history = run.core.writeback.state.value, run.core.writeback.history
         wanted = history.open.new if AGREE.get(state) and history.open else history.holds
@@ -174,6 +204,11 @@ class Schedule:
             not np.allclose(held[n], values, atol=1e-5) for n, values in (wanted or {}).items()
         ):
             self.tally.differs.append(f"{self.where}{run.describe()}")
+
+
+def outputs_of(memory: Registers) -> Registers:
+    """The registers that say what the device sends, of both ports."""
+    return {key: values for key, values in memory.items() if key[0] in OUTPUTS}
 
 
 def run_one(number: int, seed: int, tally: FaultTally) -> None:
