@@ -15,12 +15,15 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from ahrsd.mismatch.diagnosis import Value, Where
-from ahrsd.mismatch.facts import Fact
+from ahrsd.mismatch.facts import Fact, spans_of
 from ahrsd.mismatch.innovation import Filtered
 from ahrsd.samples import Array
 
 _MOST = 12  # order of the autoregression
 _BLOCK_S = 2.0
+_FINE_S, _PASSES = 1.0, 4  # in which bursts are told apart
+_SURE_NATS = 3.0  # by which a burst is one
+_FILLED = 0.7  # of a stretch that is loud throughout
 _NATS = 15.0  # by which a change of level must be more likely than none
 _RATIO = 1.3  # of the levels, at least
 _BURST_SHARE = 0.4  # of the recording that a burst may last
@@ -109,14 +112,19 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
     loud = float(np.average(variance[inside], weights=weight[inside])) if inside.any() else 1.0
     quiet = float(np.average(variance[~inside], weights=weight[~inside])) if not inside.all() else 1
     changed = gain > _NATS and loud > _RATIO * quiet and _is_noise(done, middle[inside])
-    if changed and last < len(middle) and last - first <= _BURST_SHARE * len(middle):
-        return [_fact(done, "noise_burst", middle[first], middle[last - 1], loud, quiet)]
     if changed:
-        return [_fact(done, "noise_level", middle[first], middle[last - 1], loud, quiet)]
+        stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
+        spans, loud, quiet = _loud_spans(done, loud, quiet)
+        filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
+        short = last < len(middle) and last - first <= _BURST_SHARE * len(middle)
+        if short or (len(spans) > 1 and filled < _FILLED):
+            return [_burst(done, spans or [stretch], loud, quiet)]
+        return [_level(done, stretch, loud, quiet)]
     overall = float(np.average(variance, weights=weight))
     spec_given = spec_given and _is_noise(done, middle)
     if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 / weight.sum()):
-        return [_fact(done, "noise_level", middle[0], middle[-1], overall, 1.0)]
+        whole = (float(middle[0] - _BLOCK_S / 2), float(middle[-1] + _BLOCK_S / 2))
+        return [_level(done, whole, overall, 1.0)]
     return []
 
 
@@ -150,22 +158,51 @@ def _loudest(variance: Array, weight: Array) -> tuple[int, int, float]:
     return int(a[best]), int(b[best]), float(gain[best])
 
 
-def _fact(
-    done: Filtered, effect: str, first: float, last: float, loud: float, quiet: float
-) -> Fact:
-    begin, end = float(first - _BLOCK_S / 2), float(last + _BLOCK_S / 2)
-    end = min(end, float(done.track.time_s[-1]))
+def _loud_spans(
+    done: Filtered, loud: float, quiet: float
+) -> tuple[list[tuple[float, float]], float, float]:
+    """Where the noise is at the louder of two levels rather than the other; the levels."""
+    middle, variance, size = levels(done, _FINE_S)
+    weight = size / 1.5
+    on = np.zeros(len(middle), dtype=bool)
+    for _ in range(_PASSES):
+        nats = 0.5 * weight * (np.log(quiet / loud) + variance * (1 / quiet - 1 / loud))
+        on = nats > 0
+        if on.all() or not on.any():
+            break
+        loud = float(np.average(variance[on], weights=weight[on]))
+        quiet = float(np.average(variance[~on], weights=weight[~on]))
+    found = [
+        (float(middle[a] - _FINE_S / 2), float(middle[b - 1] + _FINE_S / 2))
+        for a, b in spans_of(on, 1)
+        if float(np.sum(nats[a:b])) > _SURE_NATS
+    ]
+    return found, loud, quiet
+
+
+def _burst(done: Filtered, spans: list[tuple[float, float]], loud: float, quiet: float) -> Fact:
+    sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
+    times = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in spans)
+    words = f"from {times} s the noise is {np.sqrt(loud / quiet):.2g} times its usual level"
+    begin, end = spans[0]
+    return Fact(
+        "noise_burst",
+        words,
+        Where(tuple(spans), ("x", "y", "z"), "noise"),
+        0.95,
+        (Value("burst", sigma, sigma * 0.1, "gauss"),),
+        {"onset_s": begin, "length_s": end - begin},
+    )
+
+
+def _level(done: Filtered, stretch: tuple[float, float], loud: float, quiet: float) -> Fact:
+    begin, end = stretch[0], min(stretch[1], float(done.track.time_s[-1]))
     sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
     ratio = float(np.sqrt(loud / quiet))
     words = f"from {begin:.0f} to {end:.0f} s the noise is {ratio:.2g} times its usual level"
     where = Where(((begin, end),), ("x", "y", "z"), "noise")
-    if effect == "noise_burst":
-        parameters = (Value("burst", sigma, sigma * 0.1, "gauss"),)
-        return Fact(
-            effect, words, where, 0.95, parameters, {"onset_s": begin, "length_s": end - begin}
-        )
     parameters = (Value("mag", sigma, sigma * 0.1, "gauss"),)
-    return Fact(effect, words, where, 0.95, parameters, {"onset_s": begin})
+    return Fact("noise_level", words, where, 0.95, parameters, {"onset_s": begin})
 
 
 def _centred(done: Filtered) -> Array:

@@ -78,6 +78,20 @@ def test_a_burst_is_found_with_its_time_and_size() -> None:
     assert abs(fact.parameters[0].value / 3e-3 - 1) < 0.25
 
 
+def test_several_bursts_are_told_apart() -> None:
+    rng = np.random.default_rng(6)
+    extra = np.zeros((4000, 3))
+    spans = [(400, 560), (1700, 1850), (3700, 3880)]
+    for a, b in spans:
+        extra[a:b] = 2e-3 * rng.standard_normal((b - a, 3))
+    (fact,) = level_facts(_filtered(1, extra))
+    assert fact.effect == "noise_burst"
+    assert len(fact.where.intervals_s) == 3
+    for (a, b), (begin, end) in zip(spans, fact.where.intervals_s, strict=True):
+        assert abs(begin - 0.04 * a) < 1.5
+        assert abs(end - 0.04 * b) < 1.5
+
+
 @pytest.mark.parametrize("onset", [0, 1800])
 def test_a_higher_level(onset: int) -> None:
     rng = np.random.default_rng(7)
