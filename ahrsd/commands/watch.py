@@ -18,7 +18,8 @@ from ahrsd.commands.running import connected, socket_options
 from ahrsd.serving.explain import explain_json, holding
 from ahrsd.serving.lines import status_lines
 
-_EVENTS = 8  # lines of what happened
+_EVENTS = 6  # lines of what happened
+_BESIDE = 28  # lines of everything but the gates
 
 
 @click.command()
@@ -66,7 +67,7 @@ def _show(records: Iterator[Mapping[str, Any]]) -> None:
             elif line := event_line(record):
                 happened.append(line)
             if status is not None:
-                live.update(screen(status, happened))
+                live.update(screen(status, happened, console.height - _BESIDE))
 
 
 def event_line(record: Mapping[str, Any]) -> str:
@@ -83,21 +84,23 @@ def event_line(record: Mapping[str, Any]) -> str:
     return ""
 
 
-def screen(status: Mapping[str, Any], happened: deque[str]) -> RenderableType:
-    """Status on top, the gates, what happened last."""
+def screen(status: Mapping[str, Any], happened: deque[str], most: int = 99) -> RenderableType:
+    """Status on top, what happened last, and `most` of the gates, nearest to the cause first."""
     explained = explain_json(status)
     head = Panel("\n".join(status_lines(status)), title="ahrsd")
     todo = Panel(Text(str(explained["next"]), style="bold"), title="what to do next")
     log = Panel("\n".join(happened) or "nothing yet", title="what happened")
-    return Group(head, todo, _gates(status), log)
+    return Group(head, todo, log, _gates(status, max(most, 3)))
 
 
-def _gates(status: Mapping[str, Any]) -> RenderableType:
+def _gates(status: Mapping[str, Any], most: int) -> RenderableType:
     table = Table("gate", "value", "limit", "for", expand=True, title="gates that hold a write")
-    for gate in holding(status)[0]:
+    holds = holding(status)[0]
+    for gate in holds[:most]:
         table.add_row(gate["gate"], _value(gate, "value"), _value(gate, "limit"), _for(gate))
     green = sum(gate["ok"] for gate in status["gates"])
-    table.caption = f"{green} of {len(status['gates'])} gates are green"
+    more = f"and {len(holds) - most} more; " if len(holds) > most else ""
+    table.caption = f"{more}{green} of {len(status['gates'])} gates are green"
     return table
 
 

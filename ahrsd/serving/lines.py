@@ -57,7 +57,7 @@ def motion_line(status: Status) -> str:
     shown = [_number(motion["heading_deg"], "{:.0f} of 360 deg of heading", "")]
     shown += [_number(motion[axis], name + " +-{:.0f}", "") for axis, name in _TILTS]
     next_ = f"; next: {motion['next']}" if motion["next"] else ""
-    return "motion: " + ", ".join(text for text in shown if text) + next_
+    return "motion: " + (", ".join(text for text in shown if text) or "none yet") + next_
 
 
 _TILTS = (("roll_deg", "roll"), ("pitch_deg", "pitch"))
