@@ -9,7 +9,8 @@ hang:      no sample within `FLOW_S` after the last fault, or no end within `STO
            in virtual time; or one step of the world that takes longer than `STEP_WALL_S`
 differs:   the state says what the registers hold and they hold something else, without an alarm
 outputs:   after the stop the device has other outputs than the user's (registers 5 to 7 and 75 to
-           77, both ports), or its flash has; the program was killed in some of the schedules
+           77, both ports), or its flash has; the program was killed in some of the schedules; where
+           the program said that it could not put them back, after the next run
            (differs and outputs are not counted where a third party wrote, the unit was exchanged,
            or replies were altered; the flash not where it was torn)
 """
@@ -71,6 +72,7 @@ class FaultTally:
     differs: list[str] = field(default_factory=list)
     outputs_changed: list[str] = field(default_factory=list)
     outputs_compared: int = 0
+    left_to_the_next_run: int = 0  # stops in which the device was away
     leaked_threads: int = 0
     leaked_files: int = 0
 
@@ -164,13 +166,24 @@ class Schedule:
         self.until(run.now_s + CALM_S)
         self.compare()
         self.tally.ends[run.core.writeback.state.value] += 1
+        self.stop()
+        if any("not everything was put back" in text for _, text in run.notes):
+            self.tally.left_to_the_next_run += 1
+            run.restart()
+            self.until(run.now_s + CALM_S)
+            self.stop()
+        self.compare_outputs()
+
+    def stop(self) -> None:
+        """A stop, which must end."""
+        run = self.run_
+        run.finished = False
         run.stop()
         end_s = run.now_s + STOP_S
         while not run.finished and run.now_s < end_s:
             self.step()
         if not run.finished:
             self.tally.hangs.append(f"{self.where}no end after a stop, {run.describe()}")
-        self.compare_outputs()
 
     @property
     def others(self) -> bool:
