@@ -1,19 +1,29 @@
-"""Whether an epoch contradicts a calibration as a whole: the iron has changed.
+"""Whether the iron has changed: an epoch contradicts a sure calibration, or two parts of all do.
 
 A magnet that passes disturbs some rows; one that stays with the sensor disturbs them all, and
 another hard iron explains what it does. A field that differs from place to place does neither.
+
+A change before the answer was sure leaves a mixture that no epoch agrees with. There, a second hard
+iron from some epoch on must take most of the disagreement away.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.graph import Graph
+from ahrsd.estimator.instrument import disagreement, information
 from ahrsd.samples import Array
 
 _MOST_ROWS = 0.6
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
+_HARD = slice(6, 9)
+_CHI2, _CALMED = 100.0, 3.0  # of a second hard iron; times by which the disagreement must fall
+_LEAST = 0.03  # of the field: a smaller change may be a place
 _FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
 
 
@@ -41,3 +51,42 @@ def contradicts(
     H, g = q.H[np.ix_(_FREE, _FREE)], q.g[_FREE]
     explained = 0.5 * g @ np.linalg.lstsq(H, g, rcond=1e-12)[0]
     return bool(explained > _EXPLAINED * q.cost)
+
+
+def divides(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float, sigma_b: float) -> int | None:
+    """The epoch from which on another hard iron explains what one cannot; None if none does.
+
+    At a settled calibration: linear around it. sigma_bias (rad/s) and sigma_b (gauss): what is
+    believed of gyro bias and of a change without data.
+    """
+    turned = [k for k, epoch in enumerate(epochs) if epoch.turned]
+    own = []
+    if len(turned) < 2:
+        return None
+    for k in turned:
+        H, g = information(epochs[k], graph.c, graph.nodes[epochs[k].a].bias)
+        own.append((H[:12, :12], g[:12]))
+    pull = np.zeros((12, 12))
+    pull[:9, :9] = graph.temper * graph.anchor[1] + graph.hold
+    pull[9:, 9:] = np.eye(3) * graph.temper / sigma_bias**2
+    away = np.r_[graph.c - graph.anchor[0], np.zeros(3)]
+    Hs, gs = np.array([h for h, _ in own]), np.array([k for _, k in own])
+    H, g = pull + Hs.sum(axis=0), pull @ away + gs.sum(axis=0)
+    second = np.eye(3) * graph.temper / sigma_b**2
+    best: tuple[float, int, Array, Array] | None = None
+    for first in range(1, len(own)):
+        late_H, late_g = Hs[first:].sum(axis=0), gs[first:].sum(axis=0)
+        both = np.block([[H, late_H[:, _HARD]], [late_H[_HARD], late_H[_HARD, _HARD] + second]])
+        covariance = np.linalg.inv(both)
+        step = -covariance @ np.r_[g, late_g[_HARD]]
+        chi2 = float(step[12:] @ np.linalg.solve(covariance[12:, 12:], step[12:]))
+        if best is None or chi2 > best[0]:
+            best = (chi2, first, step[:12], step[12:])
+    assert best is not None
+    chi2, first, step, change = best
+    after = step + np.r_[np.zeros(6), change, np.zeros(3)]
+    one = disagreement(own, [-np.linalg.solve(H, g)] * len(own))
+    two = max(1.0, disagreement(own, [step] * first + [after] * (len(own) - first)))
+    size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
+    told = chi2 > _CHI2 * two and one > _CALMED * two
+    return turned[first] if told and np.linalg.norm(change) > _LEAST * size else None

@@ -67,37 +67,37 @@ class Instrument:
 def instrument(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Instrument:
     """From the epochs of a settled window.  LinAlgError where the motion does not tell."""
     own = [
-        _information(epoch, graph.c, graph.nodes[epoch.a].bias) for epoch in epochs if epoch.turned
+        information(epoch, graph.c, graph.nodes[epoch.a].bias) for epoch in epochs if epoch.turned
     ]
     if not own:
         raise np.linalg.LinAlgError("no epoch with motion")
     H, g = np.sum([h for h, _ in own], axis=0), np.sum([k for _, k in own], axis=0)
-    mean, information = graph.anchor
-    H[:9, :9] += graph.temper * information + graph.hold
-    g[:9] += (graph.temper * information + graph.hold) @ (graph.c - mean)
+    pull, mean = graph.temper * graph.anchor[1] + graph.hold, graph.anchor[0]
+    H[:9, :9] += pull
+    g[:9] += pull @ (graph.c - mean)
     prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
     H[9:, 9:] += np.diag(graph.temper / np.square(prior))
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
     covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
     step = -covariance @ g
-    misfit = max(1.0, _disagreement(own, step))
+    misfit = max(1.0, disagreement(own, [step] * len(own)))
     return Instrument(step, misfit * covariance, misfit)
 
 
-def _disagreement(own: Sequence[tuple[Array, Array]], step: Array) -> float:
-    """Mean square per degree of freedom of what each epoch still asks for after the step."""
+def disagreement(own: Sequence[tuple[Array, Array]], steps: Sequence[Array]) -> float:
+    """Mean square per degree of freedom of what each epoch (H, g) still asks for after its step."""
     total, count = 0.0, 0
-    for H, g in own:
+    for (H, g), step in zip(own, steps, strict=True):
         scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
         values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
         good = values > _WEAKEST
         asked = (vectors.T @ (scale * (g + H @ step)))[good]
         total += float(np.sum(asked**2 / values[good]))
         count += int(np.count_nonzero(good))
-    return total / max(count - _SIZE, 0.2 * count)
+    return total / max(count - len(steps[0]), 0.2 * count)
 
 
-def _information(epoch: Epoch, c: Array, bias: Array) -> tuple[Array, Array]:
+def information(epoch: Epoch, c: Array, bias: Array) -> tuple[Array, Array]:
     """H (17, 17) and gradient, all directions eliminated."""
     data, u = epoch.data, epoch.u
     field, motion = chain.parts(data, u, c, bias, epoch.used, epoch.weights)

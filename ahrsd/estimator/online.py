@@ -96,6 +96,7 @@ class Estimator:
             if self._searching and self._moving_epochs > _FRESH * self._last_search:
                 self._search(self._window)
             self._window.track(everything=True)
+            self._window = self._undivided(self._window)
             if self._examine(self._window) and self._searching:
                 self._search(self._window)
                 self._window.track(everything=True)
@@ -119,6 +120,7 @@ class Estimator:
                 self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
                 if self._searching:
                     self._search(window)
+                window = self._window = self._undivided(window)
                 self._examine(window)
         window.fold()
 
@@ -130,12 +132,35 @@ class Estimator:
         sure = not self._searching and window.step_sigmas < _SETTLED
         self._strange = self._strange + 1 if sure and window.contradicted() else 0
         if self._strange == _CHANGED:
-            self.restarted_s = float(window.epochs[-_CHANGED].data.time_s[0])
-            self._window = window.anew(_CHANGED)
-            self._searching, self._agreed, self._strange = True, False, 0
-            self._moving_epochs = self._last_search = 1
-            self._next_search = _FIRST_SEARCH
+            self._window = self._anew(window, _CHANGED)
         return self._strange > 0
+
+    def _anew(self, window: Window, count: int) -> Window:
+        """The iron changed before the last `count` epochs: what was before is forgotten."""
+        self.restarted_s = float(window.epochs[-count].data.time_s[0])
+        self._searching, self._agreed, self._strange = True, False, 0
+        self._moving_epochs = self._last_search = 1
+        self._next_search = _FIRST_SEARCH
+        return window.anew(count)
+
+    def _undivided(self, window: Window) -> Window:
+        """The window, or a new one from where the iron changed before the answer was sure."""
+        if not window.step_sigmas < _SETTLED:
+            return window
+        p = self.parameters
+        try:
+            first = change.divides(
+                window.epochs, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
+            )
+        except np.linalg.LinAlgError:
+            return window
+        if first is None:
+            return window
+        window = self._anew(window, len(window.epochs) - first)
+        window.track(everything=True)
+        self._search(window)
+        window.track(everything=True)
+        return window
 
     def _begin(self, data: chain.Data) -> Window:
         A0 = np.linalg.inv(self._present.matrix)
