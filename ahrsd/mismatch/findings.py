@@ -18,7 +18,7 @@ from ahrsd.mismatch.innovation import TRACELESS
 from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
-from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of
+from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of, scaled
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
     State,
@@ -138,8 +138,8 @@ def _by_scale(state: State, basis: Base, number: int) -> Array | None:
         return None
     effect, setting = candidate.effect, candidate.setting
     sides = [
-        effect.columns(basis.context, {**setting, key: setting[key] * factor})
-        for factor in (1 - _SCALE_STEP, 1 + _SCALE_STEP)
+        effect.columns(basis.context, scaled(setting, key, change))
+        for change in (-_SCALE_STEP, _SCALE_STEP)
     ]
     low, high = (part @ value for part in basis.whitened(sides))
     return np.asarray((high - low) / (2 * _SCALE_STEP))

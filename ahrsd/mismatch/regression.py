@@ -30,6 +30,7 @@ ONSET_STEPS = 12
 ONSET_PASSES = 2
 #: settings that are a size, sought between the values of their grid, and what that choice costs
 SCALES = ("time_constant_s", "radius_gauss", "length_s")
+ANGLES = ("turn_deg",)
 SCALE_CHOICES = 3
 WORTH_NATS = 4.0
 #: an onset of the coarse grid that says less than this against its effect is sought more closely
@@ -240,8 +241,8 @@ def _with_scale(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
     values = {float(option[key]) for option in options if key in option} if key else set()
     if len(values) < 2:
         return best
-    wide = (max(values) / min(values)) ** (1.0 / (len(values) - 1))
-    finer = closest_scale(basis, best, wide ** (1 / 3))
+    ends = [np.radians(v) if key in ANGLES else np.log(v) for v in (min(values), max(values))]
+    finer = closest_scale(basis, best, float(ends[1] - ends[0]) / (len(values) - 1) / 3)
     paid = finer.evidence - float(np.log(len(options) * SCALE_CHOICES))
     if paid <= best.evidence:
         return best
@@ -252,17 +253,25 @@ def scale_of(candidate: Candidate) -> str | None:
     """The setting of a candidate that is a size and goes with its value, None where none is."""
     if candidate.name in ONE_SIDED:
         return None
-    return next((key for key in SCALES if key in candidate.setting), None)
+    return next((key for key in (*SCALES, *ANGLES) if key in candidate.setting), None)
 
 
-def closest_scale(basis: Base, start: Candidate, factor: float) -> Candidate:
-    """The best scale within about `factor`, to a small part of it; the choice is not paid for."""
+def scaled(setting: Setting, key: str, change: float) -> Setting:
+    """The setting with its scale exp(change) times as large, or turned by `change` radians."""
+    value = float(setting[key])
+    return {
+        **setting,
+        key: value + np.degrees(change) if key in ANGLES else value * float(np.exp(change)),
+    }
+
+
+def closest_scale(basis: Base, start: Candidate, reach: float) -> Candidate:
+    """The best scale within about `reach` (`scaled`), to a small part; the choice is not paid."""
     key, best = scale_of(start), start
     if key is None:
         return start
     for share in (1.0, 1 / 3, 1 / 9):
-        middle = float(best.setting[key])
-        steps = [{**best.setting, key: middle * factor ** (k * share)} for k in (-1, 0, 1)]
+        steps = [scaled(best.setting, key, k * share * reach) for k in (-1, 0, 1)]
         found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
         best = replace(found, tried=start.tried, evidence=found.evidence + np.log(len(steps)))
     return best

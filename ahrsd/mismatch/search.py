@@ -50,8 +50,8 @@ STEPS: Mapping[Frame, str] = {
     "gyro": "gyro_bias_step",
 }
 STEP_PASSES = 2
-#: within what factor a time constant may still change in the joint fit
-SCALE_AGAIN = 1.5
+#: by how much a time constant's logarithm may still change in the joint fit
+SCALE_AGAIN = 0.3
 #: steps that cancel to this share are one thing that was put on and taken off again
 CANCELS = 0.25
 #: nats that such a coincidence of three coefficients is worth
