@@ -22,6 +22,7 @@ from mcap.reader import make_reader
 
 from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import (
+    Examined,
     Input,
     Interlock,
     Journalled,
@@ -53,6 +54,7 @@ EVERY_INPUT: list[Input] = [
     LinkLost(15, "unplugged"),
     JournalOpened(15, 100012345, [{"seq": 1, "old": {"23": [1.0, 1e-7]}}], "line 2 is damaged"),
     Journalled(15, "PREPARED"),
+    Examined(15, 3),
     Stop(16, "SIGTERM"),
 ]
 
