@@ -74,7 +74,9 @@ def test_nothing_grows_and_nothing_gets_slower(soak, tmp_path, short_histories):
     print(growth)
     assert abs(growth.heap_kb) < HEAP_KB
     assert abs(growth.blocks) < BLOCKS
-    assert found.last_to_first("estimator_s", 150.0) < 2.0
+    assert found.by_reference("estimator_s", 150.0) < 2.0
+    assert found.column("slices")[-1] == pytest.approx(8 * 60 / 15, abs=2)
+    assert found.column("reference_s")[-1] < 0.2 * found.column("cpu_s")[-1]
     assert len(set(found.column("descriptors")[1:])) == 1
     assert len(set(found.column("threads")[1:])) == 1
     assert found.column("updates")[-1] > 150

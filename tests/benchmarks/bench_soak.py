@@ -11,16 +11,18 @@ every `DAMAGE_S` a byte is damaged: registers are read again, gaps and restarts 
 
 One row per ten minutes of device time: RSS, the bytes that are live in the C heap (numpy's arrays
 are in it) and the blocks that are live in Python's, descriptors, threads, processor time, and the
-processor time of the estimator per update. Writes soak.json and soak.png.
+processor time of the estimator per update. Other programs on the machine make the same work take
+half as long again, so a slice of fixed work (`reference_work`) is done every `SLICE_S` of device
+time, some 40 ms of it per row, and times are also given in units of it. Writes soak.json, soak.png.
 """
 
 from __future__ import annotations
 
 import argparse
-import ctypes
 import gc
 import json
 import logging
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -46,10 +48,15 @@ from ahrsd.shell import JournalKeeper, Shell, journal_in
 from drivers.vn100.checksum import crc16
 from drivers.vn100.emulator_scenarios import Setup, build
 
+sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
+from live_heap import heap_bytes
+from reference_work import ReferenceWork
+
 CHUNK_S = 0.25
 AWAY_S = 2.0  # unplugged between two rounds
 RESTART_ROUNDS = 8
 DAMAGE_S = 60.0
+SLICE_S = 15.0
 ROW_S = 600.0
 HOUR_S, DAY_S = 3600.0, 86400.0
 SETTLED_S = 4500.0  # the histories, of an hour at most, are full
@@ -67,27 +74,9 @@ COLUMNS = (
     "updates",
     "samples",
     "gaps",
+    "reference_s",
+    "slices",
 )
-
-
-class _Mallinfo(ctypes.Structure):
-    """struct mallinfo2 of <malloc.h>."""
-
-    _fields_ = [
-        *[(name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd")],
-        *[(name, ctypes.c_size_t) for name in ("usmblks", "fsmblks", "uordblks", "fordblks")],
-        ("keepcost", ctypes.c_size_t),
-    ]
-
-
-def heap_bytes() -> int:
-    """Bytes of the C heap that are in use; 0 where the C library does not say."""
-    libc = ctypes.CDLL(None)
-    if not hasattr(libc, "mallinfo2"):
-        return 0
-    libc.mallinfo2.restype = _Mallinfo
-    found = libc.mallinfo2()
-    return int(found.uordblks + found.hblkhd)
 
 
 class Device:
@@ -161,13 +150,18 @@ class Figures:
         t = self.column("device_s")
         a, b = np.searchsorted(t, [from_s, to_s])
         row = self.rows[min(b, len(t) - 1)] - self.rows[a]
-        return float(1e3 * row[COLUMNS.index(name)] / row[COLUMNS.index("updates")])
+        per = "slices" if name == "reference_s" else "updates"
+        return float(1e3 * row[COLUMNS.index(name)] / row[COLUMNS.index(per)])
 
     def last_to_first(self, name: str, stretch_s: float = HOUR_S) -> float:
         """Time per update in the last stretch over that in the first one."""
         end_s = float(self.column("device_s")[-1])
         first = self.per_update_ms(name, 0.0, stretch_s)
         return self.per_update_ms(name, end_s - stretch_s, end_s) / first
+
+    def by_reference(self, name: str, stretch_s: float = HOUR_S) -> float:
+        """`last_to_first` in slices of the fixed work: the load of the machine is not in it."""
+        return self.last_to_first(name, stretch_s) / self.last_to_first("reference_s", stretch_s)
 
     def __str__(self) -> str:
         t = self.column("device_s")
@@ -187,7 +181,11 @@ class Figures:
             f"  estimator {self.per_update_ms('estimator_s', 0.0, hour):.1f} ms per update in the "
             f"first hour, last over first {self.last_to_first('estimator_s', hour):.3f}; "
             f"everything {self.per_update_ms('cpu_s', 0.0, hour):.0f} ms, "
-            f"{self.last_to_first('cpu_s', hour):.3f}"
+            f"{self.last_to_first('cpu_s', hour):.3f}\n"
+            f"  fixed work {self.per_update_ms('reference_s', 0.0, hour):.2f} ms a slice, "
+            f"{self.last_to_first('reference_s', hour):.3f}; by it, the estimator "
+            f"{self.by_reference('estimator_s', hour):.3f}, everything "
+            f"{self.by_reference('cpu_s', hour):.3f}"
         )
 
 
@@ -229,6 +227,7 @@ class Soak:
         keeper = JournalKeeper(journal_in(folder), lambda: int(self._now_s * 1e9))
         self.shell = Shell(core, capture, keeper, None, [self._count])
         self._updates = 0
+        self._work, self._reference_s, self._slices = ReferenceWork(), 0.0, 0
         self._process = psutil.Process()
 
     def _count(self, event: Event) -> None:
@@ -241,9 +240,13 @@ class Soak:
         count = 0
         with _estimator_time() as spent:
             for _ in self._inputs():
+                if self._now_s >= self._slices * SLICE_S:
+                    self._reference_s += self._work.timed()
+                    self._slices += 1
                 if self._now_s < count * row_s:
                     continue
-                rows[count] = self._row(time.process_time() - cpu_s, spent[0])
+                own_s = time.process_time() - cpu_s - self._reference_s
+                rows[count] = self._row(own_s, spent[0])
                 count += 1
                 if self._now_s >= days * DAY_S or time.monotonic() - began > wall_s:
                     break
@@ -265,6 +268,8 @@ class Soak:
             self._updates,
             core.stream.facts.samples,
             core.stream.all_gaps.count,
+            self._reference_s,
+            self._slices,
         )
 
     def _inputs(self) -> Iterator[None]:
@@ -326,21 +331,25 @@ def plot(found: Figures, path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 9), layout="constrained")
-    memory, speed, counts = figure.subplots(3, 1, sharex=True)
+    figure = Figure(figsize=(9, 11), layout="constrained")
+    memory, speed, ratio, counts = figure.subplots(4, 1, sharex=True)
     hours = found.column("device_s") / HOUR_S
     memory.plot(hours, found.column("rss_mb"), label="resident")
     memory.plot(hours, found.column("heap_mb"), label="live in the C heap")
     title = f"{found.days:.2f} device-days at {found.rate_hz} Hz in {found.wall_s / 60:.0f} minutes"
     memory.set(ylabel="MB", ylim=(0, None), title=title)
     updates = np.maximum(np.diff(found.column("updates")), 1)
+    slices = 1e3 * np.diff(found.column("reference_s")) / np.diff(found.column("slices"))
     for name, label in (("cpu_s", "everything"), ("estimator_s", "estimator alone")):
-        speed.plot(hours[1:], 1e3 * np.diff(found.column(name)) / updates, label=label)
+        each = 1e3 * np.diff(found.column(name)) / updates
+        speed.plot(hours[1:], each, label=label)
+        ratio.plot(hours[1:], each / slices, label=label)
     speed.set(ylabel="processor ms per update", ylim=(0, None))
+    ratio.set(ylabel="the same, in slices\nof the fixed work", ylim=(0, None))
     for name in ("descriptors", "threads"):
         counts.plot(hours, found.column(name), label=name)
     counts.set(ylabel="count", ylim=(0, None), xlabel="device time, hours")
-    for axes in (memory, speed, counts):
+    for axes in (memory, speed, ratio, counts):
         axes.legend(loc="lower right")
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=90)
@@ -356,6 +365,9 @@ def save(found: Figures, folder: Path) -> None:
         "heap_mb_per_day": found.slope_per_day("heap_mb"),
         "estimator_last_to_first_hour": found.last_to_first("estimator_s"),
         "everything_last_to_first_hour": found.last_to_first("cpu_s"),
+        "reference_last_to_first_hour": found.last_to_first("reference_s"),
+        "estimator_by_reference": found.by_reference("estimator_s"),
+        "everything_by_reference": found.by_reference("cpu_s"),
     }
     rows = [json.dumps([round(value, 3) for value in row]) for row in found.rows.tolist()]
     text = json.dumps(facts, indent=1).replace('"rows": []', f'"rows": [\n{_LINES.join(rows)}\n]')
