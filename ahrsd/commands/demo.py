@@ -23,6 +23,7 @@ def _program(name: str) -> str:
 
 @click.command()
 @click.option(
+    "-o",
     "--output",
     "directory",
     type=click.Path(path_type=Path, file_okay=False),
