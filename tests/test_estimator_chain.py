@@ -105,22 +105,19 @@ def case(request):
 
 def test_derivatives_of_the_residuals(case):
     data, u, x, bias = case
-    T = so3.tangent_basis(u)
-    w = np.ones(len(u))
-    w[0] = float(data.measures_first)
-    field = chain._field(data, u, T, x, np.sqrt(w) / NOISE.mag_gauss)
-    motion = chain._motion(data, u, T, bias, NOISE)
+    rows = chain.Rows.of([chain.Chain(data, u, bias, NOISE)])
+    field, motion = chain.parts(rows, x)
     n = len(u)
     J = np.zeros((5 * n - 2, 12 + 2 * n))
-    r = np.concatenate([field.r.ravel(), motion.q.ravel()])
+    r = np.concatenate([field.r.ravel(), motion.q[1:].ravel()])
     for k in range(n):
         own = slice(12 + 2 * k, 14 + 2 * k)
-        J[3 * k : 3 * k + 3, :9], J[3 * k : 3 * k + 3, own] = field.J_x[k], field.J_own[k]
+        J[3 * k : 3 * k + 3, :9], J[3 * k : 3 * k + 3, own] = field.by_x[k], field.own[k]
     for k in range(1, n):
-        rows = slice(3 * n + 2 * k - 2, 3 * n + 2 * k)
-        J[rows, 9:12] = motion.J_bias[k - 1]
-        J[rows, 10 + 2 * k : 12 + 2 * k] = motion.J_prev[k - 1]
-        J[rows, 12 + 2 * k : 14 + 2 * k] = -motion.scale[k - 1] * np.eye(2)
+        at = slice(3 * n + 2 * k - 2, 3 * n + 2 * k)
+        J[at, 9:12] = motion.by_bias[k]
+        J[at, 10 + 2 * k : 12 + 2 * k] = motion.prev[k]
+        J[at, 12 + 2 * k : 14 + 2 * k] = -motion.scale[k] * np.eye(2)
     r_numeric, J_numeric = dense(data, u, x, bias)
     np.testing.assert_allclose(r, r_numeric, atol=1e-9)
     np.testing.assert_allclose(J, J_numeric, atol=1e-6 * np.abs(J_numeric).max())
@@ -178,6 +175,39 @@ def test_gauss_newton_finds_the_minimum():
     error = np.r_[x[6:] - [0.1, -0.2, 0.05], bias - [0.01, -0.02, 0.03]]
     assert np.abs(np.linalg.solve(q.H, q.g)).max() < 1e-8
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(covariance)[6:12]))
+
+
+def test_several_epochs_at_once_are_each_as_by_itself():
+    """Of different lengths, biases, noises and weights, grouped and with a cut."""
+    chains = []
+    for seed, count in enumerate((12, 40, 7)):
+        data, u, x, bias = epoch(count, seed, measures_first=seed != 1)
+        weights = np.linspace(0.2, 1.0, count) if seed else None
+        chains.append(chain.Chain(data, u, bias, chain.Noise(2e-3 + 1e-3 * seed, 5e-3), weights))
+    P = np.tile(0.99 * np.eye(3), (40, 1, 1))
+    own = chain.Averaging(np.full(40, 3.0), P, np.full(40, 0.1), np.zeros((40, 3)))
+    chains[1] = replace(chains[1], data=replace(chains[1].data, averaging=own))
+    linked = np.r_[0.0, 1.0, 1.0, 0.0, np.ones(3)]
+    chains[2] = replace(chains[2], data=replace(chains[2].data, linked=linked))
+    z = np.random.default_rng(3).normal(size=16) * 1e-3
+    for at, q in zip(chains, chain.linearise_all(chains, x), strict=True):
+        alone = chain.linearise(at.data, at.u, x, at.bias, at.noise, weights=at.weights)
+        np.testing.assert_allclose(q.H, alone.H, rtol=1e-9, atol=1e-9 * np.abs(alone.H).max())
+        np.testing.assert_allclose(q.g, alone.g, rtol=1e-9, atol=1e-9 * np.abs(alone.g).max())
+        np.testing.assert_allclose(chain.move(at.u, q, z), chain.move(at.u, alone, z), atol=1e-12)
+        for name in ("cost", "sum_mag", "sum_gyro", "count_mag", "count_gyro"):
+            assert getattr(q, name) == pytest.approx(getattr(alone, name), rel=1e-9)
+
+
+def test_weights_of_outliers_are_those_of_the_residuals_there():
+    data, u, x, bias = epoch()
+    data.field_b_gauss[5] += 0.1
+    q = chain.linearise_all([chain.Chain(data, u, bias, NOISE)], x, outlier_sigma=4.6)[0]
+    expected = chain.robust_weights(data.field_error(u, x), 4.6 * NOISE.mag_gauss)
+    np.testing.assert_allclose(q.weights, expected)
+    assert expected[5] < 0.02
+    given = chain.linearise(data, u, x, bias, NOISE, weights=expected)
+    np.testing.assert_allclose(q.H, given.H, rtol=1e-12)
 
 
 def test_symmetric_and_its_columns():

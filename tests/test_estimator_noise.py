@@ -41,7 +41,8 @@ def residuals_at(data, used):
         z = np.zeros(16)
         z[12:] = -np.linalg.solve(q.H[12:, 12:], q.g[12:])
         u = chain.move(u, q, z)
-    return noise.residuals(chain.linearise(data, u, x, np.zeros(3), used), data, used, M)
+    q = chain.linearise(data, u, x, np.zeros(3), used)
+    return noise.residuals(q, data, used, noise.Typical.of(data))
 
 
 @pytest.mark.parametrize("wrong", [(1.0, 1.0), (2.0, 0.7), (0.6, 1.6)])

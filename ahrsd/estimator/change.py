@@ -16,7 +16,7 @@ import numpy as np
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.graph import Graph
-from ahrsd.estimator.instrument import disagreement, information
+from ahrsd.estimator.instrument import disagreement, informations
 from ahrsd.samples import Array
 
 _MOST_ROWS = 0.6
@@ -60,33 +60,37 @@ def divides(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float, sigma_b: f
     believed of gyro bias and of a change without data.
     """
     turned = [k for k, epoch in enumerate(epochs) if epoch.turned]
-    own = []
     if len(turned) < 2:
         return None
-    for k in turned:
-        H, g = information(epochs[k], graph.c, graph.nodes[epochs[k].a].bias)
-        own.append((H[:12, :12], g[:12]))
+    whole = informations([epochs[k] for k in turned], graph)
+    Hs, gs = whole[0][:, :12, :12], whole[1][:, :12]
     pull = np.zeros((12, 12))
     pull[:9, :9] = graph.temper * graph.anchor[1] + graph.hold
     pull[9:, 9:] = np.eye(3) * graph.temper / sigma_bias**2
     away = np.r_[graph.c - graph.anchor[0], np.zeros(3)]
-    Hs, gs = np.array([h for h, _ in own]), np.array([k for _, k in own])
     H, g = pull + Hs.sum(axis=0), pull @ away + gs.sum(axis=0)
-    second = np.eye(3) * graph.temper / sigma_b**2
-    best: tuple[float, int, Array, Array] | None = None
-    for first in range(1, len(own)):
-        late_H, late_g = Hs[first:].sum(axis=0), gs[first:].sum(axis=0)
-        both = np.block([[H, late_H[:, _HARD]], [late_H[_HARD], late_H[_HARD, _HARD] + second]])
-        covariance = np.linalg.inv(both)
-        step = -covariance @ np.r_[g, late_g[_HARD]]
-        chi2 = float(step[12:] @ np.linalg.solve(covariance[12:, 12:], step[12:]))
-        if best is None or chi2 > best[0]:
-            best = (chi2, first, step[:12], step[12:])
-    assert best is not None
-    chi2, first, step, change = best
-    after = step + np.r_[np.zeros(6), change, np.zeros(3)]
-    one = disagreement(own, [-np.linalg.solve(H, g)] * len(own))
-    two = max(1.0, disagreement(own, [step] * first + [after] * (len(own) - first)))
+    steps, chi2 = _seconds(H, g, Hs, gs, np.eye(3) * graph.temper / sigma_b**2)
+    first = int(np.argmax(chi2)) + 1
+    step, change = steps[first - 1, :12], steps[first - 1, 12:]
+    own = np.tile(step, (len(turned), 1))
+    own[first:, _HARD] += change
+    one = disagreement(Hs, gs, -np.linalg.solve(H, g))
+    two = max(1.0, disagreement(Hs, gs, own))
     size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
-    told = chi2 > _CHI2 * two and one > _CALMED * two
+    told = chi2[first - 1] > _CHI2 * two and one > _CALMED * two
     return turned[first] if told and np.linalg.norm(change) > _LEAST * size else None
+
+
+def _seconds(H: Array, g: Array, Hs: Array, gs: Array, prior: Array) -> tuple[Array, Array]:
+    """Steps (N - 1, 15) and chi squared (N - 1,) of a second hard iron from each epoch on."""
+    late_H = np.cumsum(Hs[:0:-1], axis=0)[::-1]
+    late_g = np.cumsum(gs[:0:-1], axis=0)[::-1]
+    both = np.empty((len(late_H), 15, 15))
+    both[:, :12, :12] = H
+    both[:, :12, 12:], both[:, 12:, :12] = late_H[:, :, _HARD], late_H[:, _HARD]
+    both[:, 12:, 12:] = late_H[:, _HARD, _HARD] + prior
+    gradient = np.column_stack([np.broadcast_to(g, (len(late_g), 12)), late_g[:, _HARD]])
+    covariance = np.linalg.inv(both)
+    steps = -(covariance @ gradient[:, :, None])[:, :, 0]
+    change = steps[:, 12:, None]
+    return steps, np.sum(change * np.linalg.solve(covariance[:, 12:, 12:], change), axis=(1, 2))

@@ -2,29 +2,76 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.factors import Factor, Node
+from ahrsd.estimator.misfit import Score, scores
 from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
 
 
-@dataclass(slots=True, eq=False)
-class Epoch:
-    """One epoch in the window: its data, directions, noise, and its factor's nodes a -> b."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """What an epoch is, wherever it is linearised: from node a to the next.
+
+    walk: information of the gyro bias's random walk over it; turned: whether it calibrates.
+    """
 
     data: chain.Data
+    a: int
+    walk: float
+    turned: bool
+    typical: noise.Typical
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where one is to be linearised: directions, noise, weights of the fields (None for 1)."""
+
+    piece: Piece
     u: Array
     used: chain.Noise
-    weights: Array | None
-    a: int
-    b: int
+    weights: Array | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Epoch:
+    """One epoch in the window: what it is, directions, noise, and its factor.
+
+    used: the noise that it was linearised with; usual: that of the window then.
+    """
+
+    piece: Piece
+    u: Array
+    used: chain.Noise
+    usual: chain.Noise
     quadratic: chain.Quadratic
     factor: Factor
-    turned: bool
+    score: Score | None = None
     _residuals: noise.Residuals | None = None
     _cells: Cells | None = None
+
+    @property
+    def data(self) -> chain.Data:
+        """What it measured."""
+        return self.piece.data
+
+    @property
+    def a(self) -> int:
+        """The node at its beginning; the next one is at its end."""
+        return self.piece.a
+
+    @property
+    def turned(self) -> bool:
+        """Whether it calibrates."""
+        return self.piece.turned
+
+    @property
+    def weights(self) -> Array:
+        """Of its fields."""
+        return self.quadratic.weights
 
     @property
     def cells(self) -> Cells:
@@ -37,14 +84,23 @@ class Epoch:
     def residuals(self) -> noise.Residuals:
         """What it says about the noise, at its linearisation point."""
         if self._residuals is None:
-            M = chain.symmetric(self.factor.point.c[:6])
-            self._residuals = noise.residuals(self.quadratic, self.data, self.used, M)
+            self._residuals = noise.residuals(
+                self.quadratic, self.data, self.used, self.piece.typical
+            )
         return self._residuals
 
     @property
     def cost(self) -> float:
         """Half the sum of squares with the interior directions at their best."""
         return self.quadratic.cost
+
+
+def scores_of(epochs: Sequence[Epoch]) -> list[Score]:
+    """What epochs ask for, found once where each was linearised."""
+    new = [e for e in epochs if e.score is None]
+    for epoch, score in zip(new, scores([e.factor for e in new]) if new else [], strict=True):
+        epoch.score = score
+    return [e.score for e in epochs if e.score is not None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

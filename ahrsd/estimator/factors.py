@@ -28,11 +28,15 @@ _BORDERS = np.r_[12:14, 17:19]
 _TOKEN = 1.0  # information on a direction, 1/rad^2
 # where chain.Quadratic's 16 numbers go among the factor's 19
 _FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
+_AMONG = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """Border between two epochs: the gyro bias from here on (rad/s) and the field's direction."""
+    """Border between two epochs: the gyro bias from here on (rad/s) and the field's direction.
+
+    Its arrays are never written to: nodes are replaced, and shared until then.
+    """
 
     bias: Array
     direction: Array
@@ -43,14 +47,18 @@ class Node:
         """A node with a tangent basis of its direction."""
         return Node(bias.copy(), direction.copy(), so3.tangent_basis(direction[None])[0])
 
-    def copy(self) -> Node:
-        """An independent copy."""
-        return Node(self.bias.copy(), self.direction.copy(), self.tangent.copy())
-
     def moved(self, step: Array) -> Node:
         """The node after a step (5,), on the sphere."""
-        direction = self.direction + self.tangent @ step[3:]
-        return Node.at(self.bias + step[:3], direction / np.linalg.norm(direction))
+        return moved_all([self], step[None])[0]
+
+
+def moved_all(nodes: Sequence[Node], steps: Array) -> list[Node]:
+    """Nodes after their steps (N, 5), all at once."""
+    bias = np.array([n.bias for n in nodes]) + steps[:, :3]
+    T = np.array([n.tangent for n in nodes])
+    direction = np.array([n.direction for n in nodes]) + (T @ steps[:, 3:, None])[:, :, 0]
+    direction /= np.sqrt(np.sum(direction * direction, axis=1, keepdims=True))
+    return [Node(*each) for each in zip(bias, direction, so3.tangent_basis(direction), strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,21 +117,20 @@ class Stack:
         walks = 0.5 * self._walk * np.sum(self._walked**2, axis=1)
         return np.asarray(np.sum((self._g + 0.5 * pulled) * self.z, axis=1) + walks)
 
-    def here(self, *, walk: bool = True) -> tuple[Array, Array]:
+    def here(self) -> tuple[Array, Array]:
         """H (F, 19, 19) and gradients (F, 19) around the present values."""
         J = np.tile(np.eye(SIZE), (len(self.z), 1, 1))
         J[:, 12:14, 12:14], J[:, 17:19, 17:19] = self._tilt
         Jt = np.swapaxes(J, 1, 2)
         H = Jt @ self._H @ J
         g = (Jt @ (self._g[:, :, None] + self._H @ self.z[:, :, None]))[:, :, 0]
-        if walk:
-            i, j = np.arange(9, 12), np.arange(14, 17)
-            H[:, i, i] += self._walk[:, None]
-            H[:, j, j] += self._walk[:, None]
-            H[:, i, j] -= self._walk[:, None]
-            H[:, j, i] -= self._walk[:, None]
-            g[:, i] -= self._walk[:, None] * self._walked
-            g[:, j] += self._walk[:, None] * self._walked
+        i, j = np.arange(9, 12), np.arange(14, 17)
+        H[:, i, i] += self._walk[:, None]
+        H[:, j, j] += self._walk[:, None]
+        H[:, i, j] -= self._walk[:, None]
+        H[:, j, i] -= self._walk[:, None]
+        g[:, i] -= self._walk[:, None] * self._walked
+        g[:, j] += self._walk[:, None] * self._walked
         return H, g
 
 
@@ -138,7 +145,7 @@ def epoch_factor(
     of information, to stay determined.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-    H[np.ix_(_FROM_CHAIN, _FROM_CHAIN)] = q.H
+    H[_AMONG] = q.H
     g[_FROM_CHAIN] = q.g
     if rest is not None:
         gain = np.linalg.solve(H[_BORDERS][:, _BORDERS], np.c_[H[_BORDERS][:, _BIAS], g[_BORDERS]])
@@ -161,7 +168,7 @@ def chain_step(z: Array, *, calibrates: bool = True) -> Array:
 
 def gap_factor(a: int, c: Array, node_a: Node, node_b: Node, walk: float) -> Factor:
     """Across a gap, between nodes a and a + 1, only the gyro bias is linked."""
-    point = Point(c.copy(), node_a.copy(), node_b.copy())
+    point = Point(c.copy(), node_a, node_b)
     return Factor(a, a + 1, np.zeros((SIZE, SIZE)), np.zeros(SIZE), point, walk)
 
 
@@ -169,4 +176,4 @@ def bias_prior(node: int, c: Array, at: Node, sigma_bias: float) -> Factor:
     """Prior on the first node's gyro bias (rad/s)."""
     H = np.zeros((SIZE, SIZE))
     H[9:12, 9:12] = np.eye(3) / sigma_bias**2
-    return Factor(node, node, H, np.zeros(SIZE), Point(c.copy(), at.copy(), at.copy()))
+    return Factor(node, node, H, np.zeros(SIZE), Point(c.copy(), at, at))

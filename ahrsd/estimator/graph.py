@@ -20,7 +20,7 @@ from operator import is_not
 import gtsam
 import numpy as np
 
-from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point, Stack
+from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point, Stack, moved_all
 from ahrsd.estimator.retraction import Moments, moved
 from ahrsd.samples import Array
 
@@ -35,8 +35,11 @@ _UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.
 _HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
+_FIRST_Y = gtsam.symbol("y", 0)
+
+
 def _y(j: int) -> int:
-    return int(gtsam.symbol("y", j))
+    return int(_FIRST_Y + j)
 
 
 def _hessian(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
@@ -159,7 +162,8 @@ class Graph:
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
         """Move all values by a step, the calibration along its valley (`retraction.py`)."""
         self.c = moved(self.c, dc, self.moments)
-        self.nodes = {j: node.moved(dy[j]) for j, node in self.nodes.items()}
+        steps = np.array([dy[j] for j in self.nodes])
+        self.nodes = dict(zip(self.nodes, moved_all(list(self.nodes.values()), steps), strict=True))
 
     def covariance(self) -> Array:
         """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed.
@@ -216,7 +220,7 @@ class Graph:
         ordering.push_back(_y(old))
         H, g = _information(_eliminated(self._linear(factors), ordering)[1])
         node = self.nodes[new]
-        self.prior = Factor(new, new, H, g, Point(self.c.copy(), node.copy(), node.copy()))
+        self.prior = Factor(new, new, H, g, Point(self.c.copy(), node, node))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]
         del self.nodes[old]
 

@@ -21,10 +21,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from ahrsd import so3
 from ahrsd.estimator import chain
+from ahrsd.estimator.elimination import halfway
 from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.lag import rates
@@ -33,6 +33,8 @@ from ahrsd.samples import Array
 TURN, LAG, SCALE = slice(12, 15), 15, 16
 _SIZE = 17
 _OF_ANGLE = np.r_[12:15, 16]
+_FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
+_MOTION = np.ix_(np.r_[9:15, SCALE, _SIZE], np.r_[9:15, SCALE, _SIZE])
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
@@ -66,12 +68,11 @@ class Instrument:
 
 def instrument(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Instrument:
     """From the epochs of a settled window.  LinAlgError where the motion does not tell."""
-    own = [
-        information(epoch, graph.c, graph.nodes[epoch.a].bias) for epoch in epochs if epoch.turned
-    ]
-    if not own:
+    moving = [epoch for epoch in epochs if epoch.turned]
+    if not moving:
         raise np.linalg.LinAlgError("no epoch with motion")
-    H, g = np.sum([h for h, _ in own], axis=0), np.sum([k for _, k in own], axis=0)
+    own = informations(moving, graph)
+    H, g = own[0].sum(axis=0), own[1].sum(axis=0)
     pull, mean = graph.temper * graph.anchor[1] + graph.hold, graph.anchor[0]
     H[:9, :9] += pull
     g[:9] += pull @ (graph.c - mean)
@@ -80,45 +81,49 @@ def instrument(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Inst
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
     covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
     step = -covariance @ g
-    misfit = max(1.0, disagreement(own, [step] * len(own)))
+    misfit = max(1.0, disagreement(*own, step))
     return Instrument(step, misfit * covariance, misfit)
 
 
-def disagreement(own: Sequence[tuple[Array, Array]], steps: Sequence[Array]) -> float:
-    """Mean square per degree of freedom of what each epoch (H, g) still asks for after its step."""
-    total, count = 0.0, 0
-    for (H, g), step in zip(own, steps, strict=True):
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
-        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-        good = values > _WEAKEST
-        asked = (vectors.T @ (scale * (g + H @ step)))[good]
-        total += float(np.sum(asked**2 / values[good]))
-        count += int(np.count_nonzero(good))
-    return total / max(count - len(steps[0]), 0.2 * count)
+def disagreement(H: Array, g: Array, steps: Array) -> float:
+    """Mean square per degree of freedom of what epochs (N, n, n), (N, n) still ask for after steps.
+
+    steps (n,), or (N, n) where each takes its own.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
+    values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
+    good = values > _WEAKEST
+    left = scale * (g + (H @ np.broadcast_to(steps, g.shape)[:, :, None])[:, :, 0])
+    asked = (np.swapaxes(vectors, 1, 2) @ left[:, :, None])[:, :, 0]
+    count = int(np.count_nonzero(good))
+    return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def information(epoch: Epoch, c: Array, bias: Array) -> tuple[Array, Array]:
-    """H (17, 17) and gradient, all directions eliminated."""
-    data, u = epoch.data, epoch.u
-    field, motion = chain.parts(data, u, c, bias, epoch.used, epoch.weights)
-    dt = data.dt_s[1:, None, None]
-    by_angle = motion.J_bias / dt
-    angle = data.angle_b_rad[1:]
+def informations(epochs: Sequence[Epoch], graph: Graph) -> tuple[Array, Array]:
+    """H (N, 17, 17) and gradient (N, 17) of each epoch, all directions eliminated."""
+    rows = chain.Rows.of(
+        [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
+    )
+    field, motion = chain.parts(rows, graph.c)
+    by_angle, angle = motion.by_bias / rows.dt_s[:, None, None], rows.angle_b_rad
     turn = np.concatenate([by_angle @ so3.skew(angle), -by_angle @ angle[:, :, None]], axis=2)
-    swept = np.cross(rates(data), data.seen(u)) @ chain.symmetric(c[:6])
-    late = field.J_x[:, 0, 6, None] * swept  # J_x holds - sqrt(weight) / s_m in that place
+    seen = np.concatenate([e.data.seen(e.u) for e in epochs])
+    rate = np.concatenate([rates(e.data) for e in epochs])
+    swept = np.cross(rate, seen) @ chain.symmetric(graph.c[:6])
+    late = field.by_x[:, 0, 6, None] * swept  # by_x holds - sqrt(weight) / s_m in that place
     diag, upper, border = chain.interior(field, motion)
-    columns = np.zeros((len(u), 2, _SIZE + 1))
+    columns = np.zeros((len(rate), 2, _SIZE + 1))
     columns[:, :, :12], columns[:, :, _SIZE] = border[:, :, :12], border[:, :, 12]
-    columns[1:, :, _OF_ANGLE] -= motion.scale[:, None, None] * turn
-    columns[:-1, :, _OF_ANGLE] += np.swapaxes(motion.J_prev, 1, 2) @ turn
-    columns[:, :, LAG] = (late[:, None, :] @ field.J_own)[:, 0]
-    H, g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
-    from_field, from_motion = np.r_[0:9, LAG], np.r_[9:15, SCALE]
-    Jx = np.concatenate([field.J_x, late[:, :, None]], axis=2).reshape(-1, len(from_field))
-    Jw = np.concatenate([motion.J_bias, turn], axis=2).reshape(-1, len(from_motion))
-    H[np.ix_(from_field, from_field)], g[from_field] = Jx.T @ Jx, Jx.T @ field.r.ravel()
-    H[np.ix_(from_motion, from_motion)], g[from_motion] = Jw.T @ Jw, Jw.T @ motion.q.ravel()
-    flat = columns.reshape(-1, _SIZE + 1)
-    S = flat.T @ solveh_banded(chain.band(diag, upper), flat, lower=True)
-    return H - S[:_SIZE, :_SIZE], g - S[:_SIZE, _SIZE]
+    columns[:, :, _OF_ANGLE] = -motion.scale[:, None, None] * turn
+    columns[:-1, :, _OF_ANGLE] += np.swapaxes(motion.prev[1:], 1, 2) @ turn[1:]
+    columns[:, :, LAG] = (late[:, None, :] @ field.own)[:, 0]
+    _, half = halfway(diag, upper, columns.transpose(2, 0, 1))
+    J = np.concatenate([field.by_x, late[:, :, None], field.r[:, :, None]], axis=2)
+    K = np.concatenate([motion.by_bias, turn, motion.q[:, :, None]], axis=2)
+    H = np.zeros((len(epochs), _SIZE + 1, _SIZE + 1))
+    for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
+        Jk, Kk, Y = J[a:b].reshape(-1, 11), K[a:b].reshape(-1, 8), half[2 * a : 2 * b]
+        H[k] = -(Y.T @ Y)
+        H[k][_FIELD] += Jk.T @ Jk
+        H[k][_MOTION] += Kk.T @ Kk
+    return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]

@@ -7,8 +7,11 @@ In the steady chain a tangent direction with field information a and motion info
 has the hat value h = 1 / sqrt(1 + 4 b / a) on its field residual and 1 - h on its motion residual
 (inverse of the tridiagonal matrix -b, a + 2 b, -b). So the field residuals of an epoch have
 3 n - sum h degrees of freedom, the motion residuals sum h (1 less in a chain that stands alone:
-half a mode per tangent direction is free at its ends): both noise levels follow from one pass
-(restricted maximum likelihood at fixed calibration; tests/test_estimator_noise.py).
+half a mode per tangent direction is free at its ends): both noise levels follow from such passes
+(restricted maximum likelihood at fixed calibration; tests/test_estimator_noise.py). The gyro's
+level found where another was assumed goes the way only in part: over the chain's modes, whose gains
+have the mean h and the mean square h (1 + h^2) / 2, the variance found follows the one assumed with
+the exponent (1 - h^2) / 2. So the step is taken 2 / (1 + h^2) times as far.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from ahrsd.samples import Array
 
 _MAD = 1.4826
 _GYRO_LIMIT = 1.5
+_FAR = 1.7  # beyond this ratio of the gyro's variance to the one assumed it is something else
 # Degrees of freedom by which an epoch's noise is drawn to the usual one. The gyro has so few per
 # epoch that its noise per epoch would be mostly chance, and weighting by chance is biased.
 _STRENGTH_MAG, _STRENGTH_GYRO = 100.0, 3000.0
@@ -31,7 +35,10 @@ _STRENGTH_MAG, _STRENGTH_GYRO = 100.0, 3000.0
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
-    """Sums of squares of an epoch's residuals in units of the sensors, and their freedom."""
+    """Sums of squares of an epoch's residuals in units of the sensors, and their freedom.
+
+    The gyro's is what it will be once the level assumed is the level found.
+    """
 
     mag_gauss2: float
     mag_freedom: float
@@ -51,21 +58,42 @@ def first_guess(data: chain.Data, parameters: EstimatorParameters) -> chain.Nois
     return _floored(from_differences(data.field_b_gauss), from_differences(rate), parameters)
 
 
-def residuals(q: chain.Quadratic, data: chain.Data, used: chain.Noise, M: Array) -> Residuals:
+@dataclass(frozen=True, slots=True)
+class Typical:
+    """Of an epoch's rows: steps in a state, spread of the gyro's noise in s (`chain.Averaging`)."""
+
+    count: float
+    spread_s: float
+
+    @staticmethod
+    def of(data: chain.Data) -> Typical:
+        """Medians."""
+        if data.averaging is None:
+            return Typical(1.0, float(np.median(data.dt_s[1:])))
+        own = data.averaging
+        return Typical(float(np.median(own.count)), float(np.median(own.spread_s[1:])))
+
+
+def residuals(
+    q: chain.Quadratic, data: chain.Data, used: chain.Noise, typical: Typical
+) -> Residuals:
     """What an epoch linearised with the noise levels `used` says about them."""
-    spread = data.dt_s if data.averaging is None else data.averaging.spread_s
-    seen = np.sum(np.square(M @ data.seen(q.tangents)), axis=1)
-    a = float(np.median(np.asarray(data.count))) * seen / used.mag_gauss**2
-    b = 1.0 / (used.gyro_rad_s * float(np.median(spread[1:]))) ** 2
+    a = typical.count * q.seen / used.mag_gauss**2
+    b = 1.0 / (used.gyro_rad_s * typical.spread_s) ** 2
     hat = float(np.sum(1.0 / np.sqrt(1.0 + 4.0 * b / np.maximum(a, 1e-12))))
     hat -= float(data.measures_first)
     if data.linked is not None:
         hat -= float(np.count_nonzero(data.linked[1:] == 0))
+    hat = max(hat, 1.0)
+    further = 2.0 / (1.0 + min(hat / max(q.count_gyro, 1.0), 1.0) ** 2)
+    found = q.sum_gyro / hat  # over the variance assumed
+    if 1.0 / _FAR < found < _FAR:
+        found += (further - 1.0) * (found - 1.0)
     return Residuals(
         q.sum_mag * used.mag_gauss**2,
         max(q.count_mag - hat, 1.0),
-        q.sum_gyro * used.gyro_rad_s**2,
-        max(hat, 1.0),
+        found * hat * used.gyro_rad_s**2,
+        hat,
     )
 
 

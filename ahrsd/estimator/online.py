@@ -95,11 +95,11 @@ class Estimator:
         if self._window is not None:
             if self._searching and self._moving_epochs > _FRESH * self._last_search:
                 self._search(self._window)
-            self._window.track(everything=True)
+            self._window.track(everything=True, exactly=True)
             self._window = self._undivided(self._window)
             if self._examine(self._window) and self._searching:
                 self._search(self._window)
-                self._window.track(everything=True)
+                self._window.track(everything=True, exactly=True)
         return self._answer()
 
     def _append(self, data: chain.Data) -> None:

@@ -1,7 +1,7 @@
 """The window: epochs that can still be linearised again, and the graph that joins them.
 
-Two ways to move the estimate. `track` is a plain Gauss-Newton step in which only what has moved by
-more than a third of a sigma is linearised again: the steady state, whose cost does not depend on
+Two ways to move the estimate. `track` is a plain Gauss-Newton step after which only what it pays to
+linearise again is (`staleness.py`): the steady state, whose cost does not depend on
 how long the run has been. `optimise` linearises everything and takes a step only if the true cost
 falls (Levenberg-Marquardt): for searching, and whenever a tracking step would be large. `track`
 spends at most _WORK linearisations per epoch on average; what is left over waits.
@@ -13,6 +13,7 @@ noise and model errors cannot make them wander (`Graph.hold_blind`).
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Epoch, Snapshot
+from ahrsd.estimator.epoch import Epoch, Piece, Place, Snapshot, scores_of
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
     Node,
@@ -36,12 +37,12 @@ from ahrsd.estimator.grouping import group_size, grouped
 from ahrsd.estimator.lag import delayed
 from ahrsd.estimator.misfit import Misfit
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.staleness import bends, outdated
 from ahrsd.estimator.systematic import Cells, excess
 from ahrsd.samples import Array
 
-_STALE = 0.3  # sigmas of movement after which an epoch is linearised again
 _SETTLED = 0.05  # sigmas of movement at which iterating stops
-_LARGE = 1.0  # sigmas: a larger tracking step is taken with care instead
+_LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
 _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
@@ -132,7 +133,8 @@ class Window:
         u[0] = graph.nodes[a].direction
         graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
         info = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-        self.epochs.append(self._linearised(data, u, self.usual, None, a, info, turned=moving))
+        piece = Piece(data, a, info, moving, noise.Typical.of(data))
+        self.epochs += self._linearised([Place(piece, u, self.usual)])
         graph.factors.append(self.epochs[-1].factor)
 
     def fold(self) -> None:
@@ -145,31 +147,30 @@ class Window:
             self.folded |= old.turned
             if old.turned:
                 self._folded_cells += old.cells
-            self.misfit.remember(old.factor, self.graph)
+            self.misfit.remember(old.factor, scores_of([old])[0], self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
 
     # -- linearisation ---------------------------------------------------------------------------
 
     def _linearised(
-        self,
-        data: chain.Data,
-        u: Array,
-        used: chain.Noise,
-        weights: Array | None,
-        a: int,
-        walk: float,
-        *,
-        turned: bool,
-    ) -> Epoch:
-        self._work -= 1
-        graph = self.graph
-        first, last = graph.nodes[a], graph.nodes[a + 1]
-        u[0], u[-1] = first.direction, last.direction
-        q = chain.linearise(data, u, graph.c, first.bias, used, weights=weights)
-        point = Point(graph.c.copy(), first.copy(), last.copy())
-        factor = epoch_factor(q, a, point, walk, rest=None if turned else self._resting(u))
-        return Epoch(data, u, used, weights, a, a + 1, q, factor, turned)
+        self, places: Sequence[Place], outlier_sigma: float | None = None
+    ) -> list[Epoch]:
+        """Epochs at the present values; with `outlier_sigma` at weights of their own."""
+        self._work -= len(places)
+        graph, chains = self.graph, []
+        for at in places:
+            first, last = graph.nodes[at.piece.a], graph.nodes[at.piece.a + 1]
+            at.u[0], at.u[-1] = first.direction, last.direction
+            chains.append(chain.Chain(at.piece.data, at.u, first.bias, at.used, at.weights))
+        found = chain.linearise_all(chains, graph.c, outlier_sigma=outlier_sigma)
+        out = []
+        for at, q in zip(places, found, strict=True):
+            a, rest = at.piece.a, None if at.piece.turned else self._resting(at.u)
+            point = Point(graph.c, graph.nodes[a], graph.nodes[a + 1])
+            factor = epoch_factor(q, a, point, at.piece.walk, rest=rest)
+            out.append(Epoch(at.piece, at.u, at.used, self.usual, q, factor))
+        return out
 
     def contradicted(self) -> bool:
         """Whether the newest epoch contradicts the calibration; ask before it is tracked."""
@@ -202,15 +203,16 @@ class Window:
             self._rest = mean
         return self._rest
 
-    def _replace(self, k: int, u: Array, used: chain.Noise, weights: Array | None) -> None:
-        old = self.epochs[k]
-        new = self._linearised(
-            old.data, u, used, weights, old.a, old.factor.walk, turned=old.turned
-        )
-        self.graph.factors[self.graph.factors.index(old.factor)] = new.factor
-        self.epochs[k] = new
+    def _replace(self, which: Sequence[int], places: Sequence[Place], **weighing: float) -> None:
+        if not which:
+            return
+        factors = self.graph.factors
+        where = {id(factor): i for i, factor in enumerate(factors)}
+        for k, new in zip(which, self._linearised(places, **weighing), strict=True):
+            factors[where[id(self.epochs[k].factor)]] = new.factor
+            self.epochs[k] = new
 
-    def _moved_directions(self, which: list[int]) -> list[Array]:
+    def _moved_directions(self, which: Sequence[int]) -> list[Array]:
         """Directions of these epochs where the present values put them."""
         graph, epochs = self.graph, [self.epochs[k] for k in which]
         if not epochs:
@@ -221,16 +223,14 @@ class Window:
             for e, own in zip(epochs, z, strict=True)
         ]
 
-    def refresh(self, which: list[int]) -> None:
+    def refresh(self, which: Sequence[int]) -> None:
         """Linearise epochs again at the present values, with fresh noise and outlier weights."""
-        for k, u in zip(which, self._moved_directions(which), strict=True):
-            epoch = self.epochs[k]
-            used = noise.shrunk(epoch.residuals, self.usual, self.parameters)
-            weights = chain.robust_weights(
-                epoch.data.field_error(u, self.graph.c),
-                used.mag_gauss * self.parameters.outlier_sigma / np.sqrt(epoch.data.count),
-            )
-            self._replace(k, u, used, weights)
+        epochs, p = [self.epochs[k] for k in which], self.parameters
+        places = [
+            Place(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
+            for e, u in zip(epochs, self._moved_directions(which), strict=True)
+        ]
+        self._replace(which, places, outlier_sigma=p.outlier_sigma)
         found = [e.residuals for e in self.epochs]
         guess = noise.median(self._guesses)
         self.usual = noise.at_least(
@@ -239,11 +239,12 @@ class Window:
 
     def delay(self, lag_s: float) -> None:
         """Take the field to be `lag_s` late in every epoch of the window, and in those to come."""
-        everyone = list(range(len(self.epochs)))
-        for k, u in zip(everyone, self._moved_directions(everyone), strict=True):
-            epoch = self.epochs[k]
-            self.epochs[k] = replace(epoch, data=delayed(epoch.data, lag_s - self.lag_s))
-            self._replace(k, u, epoch.used, epoch.weights)
+        everyone = range(len(self.epochs))
+        places = []
+        for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):
+            data = delayed(epoch.data, lag_s - self.lag_s)
+            places.append(Place(replace(epoch.piece, data=data), u, epoch.used, epoch.weights))
+        self._replace(everyone, places)
         self.lag_s = lag_s
 
     # -- moving ----------------------------------------------------------------------------------
@@ -257,12 +258,14 @@ class Window:
         self.usual = self._start_noise()
         self._damping = _DAMPING_FAR
         graph.c = c.copy()
+        places = []
         for k, epoch in enumerate(self.epochs):
             u = chain.start_directions(chain.symmetric(c[:6]), c[6:], epoch.data.field_b_gauss)
             if epoch.data.measures_first or k == 0:
                 graph.nodes[epoch.a] = Node.at(bias, u[0])
-            graph.nodes[epoch.b] = Node.at(bias, u[-1])
-            self._replace(k, u, self.usual, None)
+            graph.nodes[epoch.a + 1] = Node.at(bias, u[-1])
+            places.append(Place(epoch.piece, u, self.usual))
+        self._replace(range(len(self.epochs)), places)
         self._work = max(self._work, _RESTART_WORK * len(self.epochs))
 
     def _start_noise(self) -> chain.Noise:
@@ -320,33 +323,46 @@ class Window:
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
             return float(np.inf)
         which = [k for k, e in enumerate(self.epochs) if e.turned]  # others do not depend on c
-        for k, u in zip(which, self._moved_directions(which), strict=True):
-            self._replace(k, u, self.epochs[k].used, self.epochs[k].weights)
+        epochs = [self.epochs[k] for k in which]
+        places = zip(epochs, self._moved_directions(which), strict=True)
+        self._replace(which, [Place(e.piece, u, e.used, e.weights) for e, u in places])
         return self.cost()
 
-    def track(self, *, everything: bool = False) -> None:
-        """Follow the newest epoch, or iterate to the end over `everything`."""
-        everyone = list(range(len(self.epochs)))
-        stale = everyone if everything else everyone[-1:]
+    def track(self, *, everything: bool = False, exactly: bool = False) -> None:
+        """Follow the newest epoch; with `everything`, all are linearised anew first.
+
+        Ends where linearising again would hardly move the answer: by what the step was curved, or,
+        `exactly`, by what another pass over everything did.
+        """
+        graph, everyone = self.graph, range(len(self.epochs))
+        stale: Sequence[int] = everyone if everything else everyone[-1:]
         if everything:
             self._work = max(self._work, _FINISH_WORK * len(everyone))
         for _ in range(_MAX_TRACKS):
             self.refresh(stale)
             try:
                 information = self._weigh()
-                dc, dy = self.graph.step()
+                dc, dy = graph.step()
             except (SingularError, np.linalg.LinAlgError):
                 self.step_sigmas = float(np.inf)
                 return
-            self.step_sigmas = sigmas(dc, information)
-            if self.step_sigmas > _LARGE:
+            step, bent = (
+                sigmas(dc, information),
+                bends(self.epochs, graph.c + dc, graph.moments, information),
+            )
+            self.step_sigmas = step if exactly else min(step, float(bent.max()))
+            if step > _LARGE and bent.max() > _CURVED:
+                self.step_sigmas = step
                 if not self._careful():
                     return
                 stale = everyone
                 continue
-            self.graph.move(dc, dy)
-            stale = everyone if everything else self._stale(information)
-            if self.step_sigmas < _SETTLED or (len(stale) > self._work and not everything):
+            graph.move(dc, dy)
+            stale = outdated(self.epochs, bent, self.usual, exactly=exactly)
+            if not stale and self.step_sigmas < _SETTLED:
+                return
+            stale = everyone if exactly else stale or everyone[-1:]
+            if len(stale) > self._work and not everything:
                 return
 
     def _careful(self) -> bool:
@@ -361,25 +377,14 @@ class Window:
         self.optimise(steps)
         return self._work >= 2 * n
 
-    def _stale(self, information: Array) -> list[int]:
-        """Epochs far from where they were linearised, or else the newest one."""
-        c = self.graph.c
-        moved = [
-            k
-            for k, e in enumerate(self.epochs)
-            if e.turned and sigmas(c - e.factor.point.c, information) > _STALE
-        ]
-        return moved or [len(self.epochs) - 1]
-
     def _weigh(self) -> Array:
         """Prior against data, and what is held; returns the tempered information of c (9, 9).
 
         What is believed without data keeps its weight against data that disagree among themselves.
         """
-        graph = self.graph
+        graph, factors, asked = self.graph, [e.factor for e in self.epochs], scores_of(self.epochs)
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
-        factors = [e.factor for e in self.epochs]
-        self.found_misfit = self.misfit.value(factors, graph, graph.step())
+        self.found_misfit = self.misfit.value(factors, asked, graph, graph.step())
         graph.temper = max(1.0, self.found_misfit, self._repeating())
         covariance = self._covariance = graph.covariance()[:9, :9] * graph.temper
         graph.hold_blind(BLIND, covariance)
