@@ -23,7 +23,8 @@ _MODELS = ("wmm", "igrf")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), required=True,
               help="calibration.json of `ahrsd calibrate --json`.")  # fmt: skip
-@click.option("--method", help="Which one, where that file holds several.")
+@click.option("--method", help="Which one, where that file holds several; all: each, in one "
+              "table.")  # fmt: skip
 @click.option("--reference", "reference_path", type=click.Path(path_type=Path),
               help="GPS fixes, or a table with attitude or heading; else NAME.gps.csv.gz beside "
               "RECORDING, and what its columns hold.")  # fmt: skip
@@ -61,17 +62,25 @@ def command(
     if folder is not None:
         json_path, figure_path = _into(folder, json_path, figure_path)
     with byte_progress(recording) as progress:
-        found = evaluate(recording, calibration_path, progress=progress, **options)  # type: ignore[arg-type]
-    from ahrsd.evaluation.spoken import evaluation_json, evaluation_lines
+        found, without = evaluate(recording, calibration_path, progress=progress, **options)  # type: ignore[arg-type]
+    from ahrsd.evaluation import spoken
 
+    several = options["method"] == "all"
     if json_path is not None:
-        write_json(json_path, evaluation_json(found))
+        write_json(
+            json_path,
+            spoken.comparison_json(found, without) if several else spoken.evaluation_json(found[0]),
+        )
     if figure_path is not None:
-        _draw(figure_path, found)
+        _draw(figure_path, found[0])
     if json_path != "-":
-        for line in evaluation_lines(found):
-            click.echo(line)
-    raise SystemExit(EXIT_DONE if found.better else EXIT_NO)
+        lines = (
+            spoken.comparison_lines(found, without)
+            if several
+            else spoken.evaluation_lines(found[0])
+        )
+        click.echo("\n".join(lines))
+    raise SystemExit(EXIT_DONE if found[0].better else EXIT_NO)
 
 
 def evaluate(
@@ -88,8 +97,11 @@ def evaluate(
     least_speed_m_s: float = 4.0,
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
-) -> Evaluation:
-    """The evaluation that the command prints.  Raises AhrsdError."""
+) -> tuple[list[Evaluation], dict[str, str]]:
+    """The evaluations that the command prints, and by method why one is none.  Raises AhrsdError.
+
+    One evaluation, or with method "all" one for each calibration in the file, in its order.
+    """
     from dataclasses import replace
 
     from ahrsd.commands import evaluate_sources as sources
@@ -97,7 +109,7 @@ def evaluate(
     from ahrsd.evaluation import judge
     from ahrsd.evaluation.references import fixes_of_track
 
-    calibration = sources.read_calibration(calibration_path, method)
+    calibrations, without = sources.read_calibrations(calibration_path, method)
     world = sources.place_and_date(position, date, model)  # type: ignore[arg-type]
     track, said = sources.read_track(recording, Config(), rate_hz, progress)
     fixes = None
@@ -112,16 +124,19 @@ def evaluate(
         track = sources.with_columns_of(track, gps)
     fixes = fixes or fixes_of_track(track)
     references, more = _references(track, fixes, heading_column, least_speed_m_s)
-    calibration = replace(calibration, remarks=(*said, *more, *calibration.remarks))
-    return judge(
-        recording.name,
-        track,
-        calibration,
-        references,
-        fixes=fixes,
-        world=world,
-        tilt_source=tilt,  # type: ignore[arg-type]
-    )
+    found = [
+        judge(
+            recording.name,
+            track,
+            replace(calibration, remarks=(*said, *more, *calibration.remarks)),
+            references,
+            fixes=fixes,
+            world=world,
+            tilt_source=tilt,  # type: ignore[arg-type]
+        )
+        for calibration in calibrations
+    ]
+    return found, without
 
 
 def _references(

@@ -15,7 +15,14 @@ import numpy as np
 from ahrsd.calibration import Affine
 from ahrsd.config import Config
 from ahrsd.errors import RecordingError
-from ahrsd.evaluation import EvaluationError, StoredCalibration, Track, parse_calibration, tracked
+from ahrsd.evaluation import (
+    EvaluationError,
+    StoredCalibration,
+    Track,
+    parse_calibration,
+    parse_calibrations,
+    tracked,
+)
 from ahrsd.evaluation.references import Fixes, fixes_from_degrees
 from ahrsd.events import SamplesSeen
 from ahrsd.recording.opening import open_recording
@@ -59,10 +66,22 @@ def read_track(
     return tracked([(event.block, event.present) for event in seen]), said
 
 
-def read_calibration(path: Path, method: str | None) -> StoredCalibration:
-    """calibration.json.  CalibrationFileError, AhrsdError where it cannot be read."""
+def read_calibrations(
+    path: Path, method: str | None
+) -> tuple[list[StoredCalibration], dict[str, str]]:
+    """The one in calibration.json, or with the method "all" each, and why others have no answer.
+
+    CalibrationFileError, EvaluationError where it cannot be read.
+    """
+    body = _json(path)
+    if method == "all":
+        return parse_calibrations(body, path.name)
+    return [parse_calibration(body, path.name, method)], {}
+
+
+def _json(path: Path) -> object:
     try:
-        body = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise EvaluationError(
             f"{path}: cannot be read: {error.strerror}; check the path"
@@ -71,7 +90,6 @@ def read_calibration(path: Path, method: str | None) -> StoredCalibration:
         raise EvaluationError(
             f"{path}: is no JSON: {error}; write it with `ahrsd calibrate RECORDING --json FILE`"
         ) from error
-    return parse_calibration(body, path.name, method)
 
 
 def gps_beside(recording: Path) -> Path | None:

@@ -9,7 +9,7 @@ Sources: [R] 2.1-2.4 and 4.4, [L]; docs/evaluate.md has the definitions.
 
 from ahrsd.evaluation.judging import Evaluation, judge
 from ahrsd.evaluation.references import Fixes, Reference
-from ahrsd.evaluation.stored import StoredCalibration, parse_calibration
+from ahrsd.evaluation.stored import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.track import EvaluationError, Track, tracked
 
 __all__ = [
@@ -21,5 +21,6 @@ __all__ = [
     "Track",
     "judge",
     "parse_calibration",
+    "parse_calibrations",
     "tracked",
 ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.field import FieldFigures
@@ -10,6 +11,7 @@ from ahrsd.evaluation.heading import HeadingFigures
 from ahrsd.evaluation.judging import Evaluation, HeadingJudged, Reckoned
 
 SCHEMA = "ahrsd.evaluation/1"
+SCHEMA_OF_MANY = "ahrsd.evaluations/1"
 
 
 def evaluation_json(found: Evaluation) -> dict[str, object]:
@@ -136,6 +138,61 @@ def evaluation_lines(found: Evaluation) -> list[str]:
     if found.reckoned is not None:
         lines += _reckoned_lines(found.reckoned)
     return lines + [f"  warning: {text}" for text in found.warnings]
+
+
+def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) -> list[str]:
+    """One row per calibration, least heading error first; without: method to why it has none."""
+    first = found[0]
+    duration_s = first.track.time_s[-1] - first.track.time_s[0]
+    lines = [f"{first.recording}: {len(first.track)} samples, {duration_s:.0f} s"]
+    if first.headings:
+        against = first.headings[0]
+        lines.append(
+            f"heading against {against.reference}, RMS, one constant removed; tilt: {against.tilt}"
+        )
+    if first.reckoned is not None:
+        lines.append(f"dead reckoning by {first.reckoned.velocity}, XY error RMS over distance")
+    lines += [
+        f"{'method':20}{'heading [deg]':>14}{'worst [deg]':>13}{'XY error [%]':>14}"
+        f"{'spread [%]':>12}",
+        _row("(before)", *_figures(first, "before")),
+    ]
+    by_heading = sorted(found, key=lambda one: _figures(one, "after")[0])
+    for one in by_heading if first.headings else found:
+        row = _row(one.calibration.method, *_figures(one, "after"))
+        lines.append(row + ("" if one.calibration.converged else "  not converged"))
+    lines += [f"{name:20}no answer: {why}" for name, why in without.items()]
+    common = set.intersection(*(set(one.warnings) for one in found))
+    return lines + [f"  warning: {text}" for text in first.warnings if text in common]
+
+
+def comparison_json(found: Sequence[Evaluation], without: Mapping[str, str]) -> dict[str, object]:
+    """The evaluations of several calibrations on one recording."""
+    return {
+        "schema": SCHEMA_OF_MANY,
+        "recording": found[0].recording,
+        "evaluations": [evaluation_json(one) for one in found],
+        "without": dict(without),
+    }
+
+
+def _figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:
+    """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN where there is none."""
+    nan = float("nan")
+    heading = getattr(found.headings[0].figures, which) if found.headings else None
+    reckoned = None if found.reckoned is None else getattr(found.reckoned.figures, which)
+    return (
+        nan if heading is None else heading.rms_deg,
+        nan if heading is None else heading.worst_deg,
+        nan if reckoned is None else reckoned.rms_percent,
+        100 * getattr(found.field, which).spread,
+    )
+
+
+def _row(name: str, heading: float, worst: float, reckoned: float, spread: float) -> str:
+    return f"{name:20}{heading:14.2f}{worst:13.2f}{reckoned:14.2f}{spread:12.2f}".replace(
+        "nan", "  -"
+    )
 
 
 def _reckoned_lines(reckoned: Reckoned) -> list[str]:

@@ -27,6 +27,7 @@ class CalibrationFileError(AhrsdError):
 
     def __init__(self, source: str, what: str, remedy: str) -> None:
         super().__init__(f"{source}: {what}; {remedy}")
+        self.what = what
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +86,28 @@ def parse_calibration(body: object, source: str, method: str | None = None) -> S
         field_known=entry.get("field_known") is True,
         remarks=tuple(remarks),
     )
+
+
+def parse_calibrations(body: object, source: str) -> tuple[list[StoredCalibration], dict[str, str]]:
+    """Every calibration of a file of several, and by method why one has no answer.
+
+    Raises CalibrationFileError where the file holds none at all, or one alone.
+    """
+    entries = body.get("calibrations") if isinstance(body, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise CalibrationFileError(
+            source, "holds no list of calibrations", "leave `--method all` out"
+        )
+    found: list[StoredCalibration] = []
+    without: dict[str, str] = {}
+    for name in (str(entry.get("method")) for entry in entries if isinstance(entry, dict)):
+        try:
+            found.append(parse_calibration(body, source, name))
+        except CalibrationFileError as error:
+            without[name] = error.what.removeprefix(f"holds no answer of {name}: ")
+    if not found:
+        raise CalibrationFileError(source, "no method has an answer", "use another recording")
+    return found, without
 
 
 def _chosen(body: object, source: str, method: str | None) -> Mapping[str, object]:

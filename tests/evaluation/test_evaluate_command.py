@@ -191,3 +191,38 @@ def test_a_file_that_is_no_json(files, run, capsys, tmp_path):
     assert "is no JSON" in capsys.readouterr().err
     assert run("evaluate", files / "drive.csv", "--calibration", tmp_path / "none.json") == 2
     assert "none.json: cannot be read: No such file" in capsys.readouterr().err
+
+
+def test_every_calibration_of_a_file_in_one_table(files, run, capsys, tmp_path):
+    worse = {**GOOD, "method": "ellipsoid", "converged": False,
+             "hard_iron_gauss": (HARD_IRON + 0.03).tolist()}  # fmt: skip
+    none = {"method": "tls", "hard_iron_gauss": None, "warnings": ["needs the field's magnitude"]}
+    many = {"schema": "ahrsd.calibrations/1", "calibrations": [GOOD, worse, none]}
+    (tmp_path / "all.json").write_text(json.dumps(many))
+    code = run(
+        "evaluate", files / "drive.csv", "--calibration", tmp_path / "all.json",
+        "--method", "all", "--json", tmp_path / "e.json",
+    )  # fmt: skip
+    lines = capsys.readouterr().out.splitlines()
+    assert code == 0
+    first = next(k for k, line in enumerate(lines) if line.startswith("(before)"))
+    assert [line.split()[0] for line in lines[first : first + 4]] == [
+        "(before)", "magyc", "ellipsoid", "tls",
+    ]  # fmt: skip
+    assert lines[first + 2].endswith("not converged")
+    assert "no answer" in lines[first + 3] and "needs the field's magnitude" in lines[first + 3]
+    body = json.loads((tmp_path / "e.json").read_text())
+    assert body["schema"] == "ahrsd.evaluations/1"
+    rms = [one["heading"][0]["after"]["rms_deg"] for one in body["evaluations"]]
+    printed = [float(line.split()[1]) for line in lines[first + 1 : first + 3]]
+    assert printed == pytest.approx(rms, abs=0.006)
+    assert rms[0] < 1.0 < rms[1]
+    assert set(body["without"]) == {"tls"}
+
+
+def test_a_file_of_one_calibration_has_no_table(files, run, capsys):
+    code = run(
+        "evaluate", files / "drive.csv", "--calibration", files / "c.json", "--method", "all"
+    )
+    assert code == 2
+    assert "leave `--method all` out" in capsys.readouterr().err
