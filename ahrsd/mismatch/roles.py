@@ -21,7 +21,8 @@ _LONG_ON_ROWS = 4  # a 0/1 column that stays on longer is a switch, else a train
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
 # what the sensor itself makes of the same readings: it moves with every error and causes none
 _OWN_OUTPUT = re.compile(
-    r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|yaw|pitch|roll|mag_|gyro_|accel_|uncomp|delta_|lin_?acc)"
+    r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|uncomp|delta_|lin_?acc|(mag|gyro|accel)_(?!temp)"
+    r"|(yaw|pitch|roll)(_?(angle|rate|std|sigma|uncertainty))?(_(deg|rad)(_s)?)?$)"
 )
 
 

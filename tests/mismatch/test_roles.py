@@ -125,8 +125,16 @@ def test_columns_without_a_role_are_kept():
 
 def test_what_the_sensor_makes_of_its_own_readings_is_no_cause():
     own = {"vn_yaw_deg": RAMP, "dcm_01": RAMP, "mag_n_d_gauss": RAMP, "pitch_rad": RAMP}
+    own |= {"yaw": RAMP, "roll_rate_rad_s": RAMP, "yaw_angle_deg": RAMP}
     found, notes = roles.prepared(track(**own, linkage_m=RAMP))
     assert list(found.covariates) == ["linkage_m"]
+    assert notes == ()
+
+
+@pytest.mark.parametrize("name", ["yaw_motor_current_a", "pitch_servo_a", "gyro_temperature_c"])
+def test_a_cause_may_be_named_after_what_it_turns_or_warms(name):
+    found, notes = roles.prepared(track(**{name: RAMP}))
+    assert list(found.covariates) == [name]
     assert notes == ()
 
 
