@@ -205,8 +205,12 @@ class Conversation:
         return self._digest(self.session.cancel(now_s), now_s)
 
     def set_up_again(self, now_s: float) -> list[Event]:
-        """The user's own outputs are back for a save: set the session's up again."""
+        """The user's own outputs are back for a save, or kept: set the session's up (again)."""
         if not (self.change_stream and (self.idle or self.phase is Phase.KEEPING)):
+            return []
+        if not self.outputs.kept:  # the disk was full until now: the journal first
+            self.phase = Phase.KEEPING
+            self.outputs.keep()
             return []
         self.phase = Phase.SETTING_UP
         self._unkept = False
@@ -353,6 +357,8 @@ class Conversation:
         own = "" if again is closing.PUT_BACK_AGAIN_S else ", the device's own stays"
         if not self.silence.owed:
             self._warn(f"the session's output cannot be set up{own}: {error}")
+        else:
+            self._said.append(StreamChanged(""))
         if again is not None:
             self.silence.owe(now_s, *again)
         self._ready(now_s)

@@ -251,9 +251,7 @@ class Core:
                 believed = {} if self.writeback.history.open else self.registers
                 if others := self._rollcall.registers(values, believed, self._breaks):
                     self._note("warning", f"somebody changed registers {others}: calibrated anew")
-                if (
-                    self._unread or others
-                ):  # what was taken as it came does not mix with what is un-mapped
+                if self._unread or others:  # as it came does not mix with what is un-mapped
                     self.calibrator, self._unread = Calibrator(*self._from_scratch), False
                 self._in_force(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
@@ -261,7 +259,8 @@ class Core:
             case StreamChanged(text, level):
                 self._flush()
                 self.stream.forget()
-                self._note(level, text)
+                if text:
+                    self._note(level, text)
             case Unanswered(text):
                 self._unread = True
                 self._note("warning", f"{text}; listening only, nothing can be written")

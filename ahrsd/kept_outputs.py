@@ -37,6 +37,11 @@ class KeptOutputs:
         self._kept: dict[int, Values] | None = None  # as the open record has them
         self._actions: list[Action] = []
 
+    @property
+    def kept(self) -> bool:
+        """Whether the journal has the user's outputs as they are."""
+        return self._kept == self.users
+
     def read(
         self, serial: int, registers: Mapping[int, Values], journal: Sequence[JournalRecord] | None
     ) -> None:
@@ -57,7 +62,7 @@ class KeptOutputs:
 
     def keep(self) -> None:
         """Set up the session's outputs, behind a record of the user's where there is none yet."""
-        if self._kept == self.users:
+        if self.kept:
             self._actions.append(SetUpStream())
         else:
             self._actions.append(JournalAppend(Kind.OUTPUTS_KEPT, self._facts()))

@@ -42,6 +42,7 @@ _ARRIVALS = 100  # messages whose arrival times give the rate of a stream withou
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
 OTHERS = "others"
+_GONE = 400  # messages of other layouts without one of the stream's own
 _FEW_PLACES = 3  # a jump of the device's own attitude now and then is not worth a warning
 
 
@@ -78,7 +79,7 @@ class Stream:
         self._rows: list[tuple[float, ...]] = []
         self._arrivals: list[float] = []
         self._lost: list[int] = []
-        self._lost_next = 0
+        self._lost_next = self._others = 0
         self._want = 1
         self._forgiven = False
         self._replaced = self._left_out = False
@@ -149,6 +150,7 @@ class Stream:
         extractor = self._extractor
         if extractor is not None and layout is extractor.layout:
             self.by_layout[layout.name] += 1
+            self._others = 0
         else:
             self._count(layout.name)
             extractor = self._accept(measurement)
@@ -169,7 +171,10 @@ class Stream:
         self.by_layout[name if known else OTHERS] += 1
 
     def _accept(self, measurement: Measurement) -> Extractor | None:
-        """The first layout that has what is needed is the stream; a better one replaces it."""
+        """The first layout that has what is needed is the stream.
+
+        A better one replaces it, and any other one where it is gone: somebody changed the output.
+        """
         layout = measurement.layout
         if layout.name in self.refused:
             return None
@@ -181,10 +186,11 @@ class Stream:
             return None
         old = self._extractor
         if old is not None:
-            if not _better(new, old):
+            self._others += 1
+            if not (new.better_than(old) or self._others >= _GONE):
                 return None
             self._replace(old, new)
-        self._extractor = new
+        self._extractor, self._others = new, 0
         if new.has_time:
             self._steps = None  # the rate of what came before says nothing
         self._clear()
@@ -196,7 +202,7 @@ class Stream:
 
     def _replace(self, old: Extractor, new: Extractor) -> None:
         """Other quantities begin: what the old message gave must not mix with them."""
-        if _quantities(old) == _quantities(new):
+        if old.quantities == new.quantities:
             return
         for text in [text for text in self.warnings if text.startswith(old.layout.name)]:
             del self.warnings[text]
@@ -385,16 +391,6 @@ class Stream:
             raise NoSamplesError(reasons)
 
 
-def _quantities(extractor: Extractor) -> tuple[bool, bool]:
-    return extractor.mag_compensated, extractor.gyro_compensated
-
-
 def _rows(rate_hz: float) -> int:
     """Rows of a block."""
     return max(_LEAST_ROWS, min(_MOST_ROWS, int(_BLOCK_S * rate_hz)))
-
-
-def _better(new: Extractor, old: Extractor) -> bool:
-    """Uncompensated before compensated, with device time before without."""
-    ranks = [(not e.mag_compensated, e.has_time) for e in (new, old)]
-    return ranks[0] > ranks[1]

@@ -256,6 +256,16 @@ class Extractor:
         return self._time is not None
 
     @property
+    def quantities(self) -> tuple[bool, bool]:
+        """Samples of two layouts that differ in this must not be mixed."""
+        return self.mag_compensated, self.gyro_compensated
+
+    def better_than(self, other: Extractor) -> bool:
+        """Uncompensated before compensated, with device time before without."""
+        own, others = ((not e.mag_compensated, e.has_time) for e in (self, other))
+        return own > others
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of results from this layout must know."""
         name, texts = self.layout.name, []

@@ -69,6 +69,15 @@ def test_random_faults_end_in_samples_and_in_a_stop():
     assert tally.samples > 500
 
 
+@pytest.mark.parametrize("number", [506, 1079, 1499, 2375])
+def test_schedules_that_once_ended_badly_end_well(number):
+    """Two went on without a sample, two with outputs in the device that nobody had kept."""
+    tally = campaign_faults.FaultTally()
+    campaign_faults.run_one(number, 1, tally)
+    assert tally.hangs + tally.outputs_changed + tally.exceptions + tally.differs == []
+    assert tally.samples > 100
+
+
 @pytest.mark.parametrize("part", ["cuts", "histories", "cycles"])
 def test_the_published_result_is_of_this_campaign(part):
     found = json.loads(RESULT.read_text())["parts"][part]

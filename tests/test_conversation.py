@@ -216,6 +216,15 @@ def test_an_output_that_vanished_is_set_up_again():
     assert talk.device.memory.ram == talk.before
 
 
+def test_each_set_up_that_fails_cuts_the_stream_and_the_first_one_is_told():
+    """A device that restarted meanwhile sends its own message, also the second time."""
+    talk = Talk(change_stream=True, faults=("refused_write",)).in_phase(Phase.READY)
+    talk.until(lambda: talk.kinds().count(StreamChanged) == 3, 60.0)
+    texts = [one.text for one in talk.said if isinstance(one, StreamChanged)]
+    assert "cannot be set up" in texts[0]
+    assert texts[1:] == ["", ""]
+
+
 def test_what_cannot_be_put_back_is_said():
     talk = Talk(change_stream=True, faults=("refused_write@3",)).in_phase(Phase.READY)
     talk.until(lambda: talk.now_s > 3.1)

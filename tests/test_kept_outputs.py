@@ -184,6 +184,34 @@ def test_with_a_full_disk_the_device_keeps_its_outputs_until_there_is_room():
     assert run.until(lambda: run.emulator.memory.get(75)[0] == 1, 20.0)
 
 
+def test_a_save_that_fails_sets_up_nothing_that_is_not_kept():
+    """The disk was full at the start and is not any more when the outputs would be set up again."""
+    run = world(
+        Mode.COMMIT, motion=(("static", 1000.0),), faults=("power_cut_wnv@1",),
+        output="ascii", rate_hz=20,
+    )  # fmt: skip
+    users = outputs(run.emulator.memory.ram)
+    run.disk_full = True
+    run.run(4.0)
+    run.disk_full = False
+    for verb in ("lock", "unlock"):  # written, so the write-back need not wait for the disk
+        run.operate(verb, "test")
+    planted(run)
+    assert run.until(lambda: "FLASH_SENT" in kinds(run), 15.0)
+    assert "OUTPUTS_KEPT" not in kinds(run)
+    before = []
+
+    def listen(event):
+        if b"VNWRG,06" in getattr(event, "data", b""):
+            before.append(kinds(run))
+
+    run.listen = listen
+    assert run.until(lambda: run.emulator.memory.get(75)[0] == 1, 8.0)
+    assert "OUTPUTS_KEPT" in before[0]
+    end(run)
+    assert outputs(run.emulator.memory.ram) == users
+
+
 def planted(run):
     truth = run.emulator.truth
     values = estimate(

@@ -251,6 +251,18 @@ class TestWhichMessage:
         assert stream.by_layout == {BINARY.name: 40, "VNYMR": 40}
         assert stream.facts.layout == BINARY.name
 
+    def test_a_worse_one_takes_over_where_the_better_one_is_gone(self):
+        stream = Stream(RegisterEpochs())
+        feed(stream, BINARY, range(40))
+        for k in range(0, 1000, 200):  # both in turn: the better one stays
+            assert feed(stream, VNYMR, range(200)) == []
+            feed(stream, BINARY, range(40 + k, 41 + k))
+        assert feed(stream, VNYMR, range(399)) == []
+        assert feed(stream, VNYMR, range(399, 440)) != []
+        assert stream.facts.layout == "VNYMR"
+        assert stream.take_replaced()
+        assert f"{BINARY.name} was left out when VNYMR began" in stream.warnings
+
     def test_without_a_magnetometer_it_says_what_to_do(self):
         stream = Stream(RegisterEpochs())
         assert feed(stream, MESSAGES["VNYPR"], range(5)) == []

@@ -128,6 +128,7 @@ class Events:
     def _replug(self, fault: Fault, now_s: float) -> None:
         self._device.plug(True, now_s)
         if fault.name == "replug_other_serial":
+            self._device.lose_power(now_s)  # another fault may have started the unit that goes
             self._device.replace_unit(self._device.serial + 1)
         if not self._device.powered:
             self._device.restart(now_s)

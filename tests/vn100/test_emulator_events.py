@@ -64,6 +64,15 @@ def test_replug_brings_another_unit_in_factory_state():
     assert say(made, b"$VNRRG,23*72\r\n", 9.0) == b"$VNRRG,23,1,0,0,0,1,0,0,0,1,0,0,0*73\r\n"
 
 
+def test_another_unit_starts_also_where_the_first_one_was_started_meanwhile():
+    """It had sent the first one's last message over and over, because a reset had started that."""
+    made = device("replug_other_serial@2+1", "reset@2.2", presets=TIMES)
+    assert len(set(times(made.advance(1.9)))) > 100
+    made.advance(3.5)
+    assert b"\xfa" not in made.advance(5.0)  # in factory state: its own ASCII message
+    assert say(made, b"$VNRRG,03*70\r\n", 5.1).count(b"$VNRRG,03,0100130609*") == 1
+
+
 def test_power_cut_after_the_nth_write():
     made = device("power_cut_wrg=2@1+1")
     assert say(made, b"$VNWRG,07,50*58\r\n", 2.0) == b"$VNWRG,07,50*58\r\n"
