@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.evidence import colour, log_bayes
@@ -58,12 +59,40 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Sums:
+    """What a fit with all its terms has in common with columns that were held against it.
+
+    known (3 N, q), innovation (3 N,): of the fit;  inner (q, q), seen (q,): their products
+    found: by effect and setting (p, p) X^T X, (q, p) Z^T X, (p,) X^T e
+    """
+
+    known: Array
+    innovation: Array
+    inner: Array
+    seen: Array
+    found: dict[tuple[str, str], tuple[Array, Array, Array]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(known: Array, innovation: Array) -> Sums:
+        """Nothing held against it yet; (N, 3, q), (N, 3)."""
+        Z, e = known.reshape(-1, known.shape[2]), innovation.ravel()
+        return Sums(Z, e, Z.T @ Z, Z.T @ e)
+
+    def add(self, key: tuple[str, str], columns: Array) -> None:
+        """Whitened columns (N, 3, p)."""
+        X = columns.reshape(-1, columns.shape[2])
+        self.found[key] = X.T @ X, self.known.T @ X, X.T @ self.innovation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Base:
     """What every candidate is measured against: innovations with calibration and terms taken out.
 
     known (N, 3, q): whitened columns of the calibration and of the named terms, in `groups` order;
     innovation (N, 3): whitened;  rate_hz: rows per second;
-    colour: power of the innovation at low frequency over white.
+    colour: power of the innovation at low frequency over white;
+    sums: of the fit with all its terms, of whose columns `kept` (q,) are known here and of which
+    `back` (all of them,) was put back into the innovation.
     """
 
     context: Context
@@ -73,6 +102,9 @@ class Base:
     innovation: Array
     rate_hz: float
     colour: float
+    sums: Sums
+    kept: NDArray[np.intp]
+    back: Array
 
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
         """The columns (N, 3, p) as the innovation sees them, several at a time."""
@@ -95,22 +127,28 @@ class Base:
     def beside(self, name: str, columns: Array) -> Base:
         """The same with a further group of whitened columns (N, 3, p) known."""
         widths = [(k, where.stop - where.start) for k, where in self.groups.items()]
-        return replace(
-            self,
-            groups=slices([*widths, (name, columns.shape[2])]),
-            known=np.concatenate([self.known, columns], axis=2),
-        )
+        groups = slices([*widths, (name, columns.shape[2])])
+        known = np.concatenate([self.known, columns], axis=2)
+        return _based(self, groups, known, self.innovation)
 
     def without(self, name: str, value: Array) -> Base:
         """The same with one named term left out, what it explains put back; value (p,)."""
         where = self.groups[name]
         kept = [k for k in self.groups if k != name]
+        back = self.back.copy()
+        back[self.kept[where]] += value
         return replace(
             self,
             groups=slices([(k, self.groups[k].stop - self.groups[k].start) for k in kept]),
-            known=np.concatenate([self.known[:, :, self.groups[k]] for k in kept], axis=2),
+            known=np.delete(self.known, where, axis=2),
             innovation=self.innovation + self.known[:, :, where] @ value,
+            kept=np.delete(self.kept, where),
+            back=back,
         )
+
+    def moved(self, rows: int) -> Base:
+        """The same with the innovations of another time, `rows` later."""
+        return _based(self, self.groups, self.known, np.roll(self.innovation, rows, axis=0))
 
 
 def base(
@@ -119,14 +157,31 @@ def base(
     """Whiten the columns of calibration and named terms (group name, columns)."""
     parts = [(CALIBRATION, sensitivities(filtered, nuisance_columns(filtered)))]
     parts += [(name, sensitivities(filtered, columns)) for name, columns in terms]
+    known = np.concatenate([part for _, part in parts], axis=2)
     return Base(
         context,
         filtered,
         slices([(name, part.shape[2]) for name, part in parts]),
-        np.concatenate([part for _, part in parts], axis=2),
+        known,
         filtered.whitened,
         rate_hz,
         colour(filtered.whitened, rate_hz),
+        Sums.of(known, filtered.whitened),
+        np.arange(known.shape[2]),
+        np.zeros(known.shape[2]),
+    )
+
+
+def _based(basis: Base, groups: Mapping[str, slice], known: Array, innovation: Array) -> Base:
+    """A base with other columns or innovations, against which nothing was held yet."""
+    return replace(
+        basis,
+        groups=groups,
+        known=known,
+        innovation=innovation,
+        sums=Sums.of(known, innovation),
+        kept=np.arange(known.shape[2]),
+        back=np.zeros(known.shape[2]),
     )
 
 
@@ -200,20 +255,23 @@ def without_known(basis: Base, columns: Array) -> tuple[Array, Array]:
 
 def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candidate]:
     """Evidence of each setting, its choice paid for."""
-    columns = [effect.columns(basis.context, option) for option in options]
-    whitened = basis.whitened(columns)
-    Z = basis.known.reshape(-1, basis.known.shape[2])
-    inner = Z.T @ Z
-    known_e = Z.T @ basis.innovation.ravel()
+    sums, kept = basis.sums, basis.kept
+    keys = [(effect.identifier, repr(option)) for option in options]
+    new = [k for k, key in enumerate(keys) if key not in sums.found]
+    columns = [effect.columns(basis.context, options[k]) for k in new]
+    for k, part in zip(new, basis.whitened(columns), strict=True):
+        sums.add(keys[k], part)
+    inverse = solve(sums.inner[np.ix_(kept, kept)], np.eye(len(kept)))
+    known_e = (sums.seen + sums.inner @ basis.back)[kept]
     scale = np.array([parameter.scale for parameter in effect.parameters])
     out = []
-    for option, part in zip(options, whitened, strict=True):
-        X = part.reshape(-1, part.shape[2])
-        cross = Z.T @ X
-        M = solve(inner, cross)
-        G = X.T @ X - cross.T @ M
-        s = X.T @ basis.innovation.ravel() - M.T @ known_e
-        what = total_score(G, s, np.einsum("ij,ij->j", X, X), scale)
+    for option, key in zip(options, keys, strict=True):
+        XX, whole, Xe = sums.found[key]
+        cross = whole[kept]
+        M = inverse @ cross
+        G = XX - cross.T @ M
+        s = Xe + whole.T @ basis.back - M.T @ known_e
+        what = total_score(G, s, np.diag(XX), scale)
         cost = np.log(len(options)) + np.log(float(option.get("searched", 1)))
         evidence = log_bayes(what, basis.colour) - cost if _possible(effect, what) else -np.inf
         out.append(Candidate(effect, option, len(options), evidence))

@@ -43,6 +43,8 @@ FEWEST, SCATTER, AWAY_RAD_S = 60, 3.0, 0.01
 #: a change below this many deviations of an ordinary walk is one
 LARGE = 3.0
 SMALLEST_SHARE = 0.005
+#: share of the gyro's integral that the field follows, beyond which the vehicle does turn
+TURNS = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +65,7 @@ class _Rest:
 def resting(context: Context, library: Mapping[str, Effect], limits: Limits) -> tuple[Finding, ...]:
     """The name for what moves the bias of a gyro that stands, with what is as likely; or none."""
     rest = _rest(context)
-    if rest is None:
+    if rest is None or _turning(rest, context) > TURNS:
         return ()
     best: dict[str, tuple[float, Setting]] = {}
     roots = [_roots(rest, walk) for walk in WALKS]
@@ -140,6 +142,22 @@ def _rest(context: Context) -> _Rest | None:
     noise = np.sqrt(np.mean(np.diff(mean, axis=0) ** 2, axis=0) / 2)
     chosen = known[still]
     return _Rest(chosen + 0.5 + track.time_s[0], mean, np.maximum(noise, 1e-9), second, chosen)
+
+
+def _turning(rest: _Rest, context: Context) -> float:
+    """Share of the gyro's integral by which the field turns in the sensor; constant rates aside.
+
+    0 for a bias that changes, 1 for a slow turn: a vehicle on a straight course is not at rest.
+    """
+    readings = context.track.mag_b_gauss - context.model.hard_iron_gauss
+    field = rest.means(np.nan_to_num(readings, nan=0.0))
+    unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
+    steps_s = np.diff(rest.time_s, prepend=rest.time_s[0])
+    angle = np.cumsum((rest.mean - rest.mean.mean(axis=0)) * steps_s[:, None], axis=0)
+    line = np.column_stack([np.ones(len(unit)), rest.time_s - rest.time_s[0]])
+    both = np.column_stack([np.cross(unit.mean(axis=0), angle), unit])
+    expected, seen = np.hsplit(both - line @ np.linalg.lstsq(line, both)[0], 2)
+    return float(np.sum(expected * seen) / max(float(np.sum(expected**2)), 1e-300))
 
 
 def _roots(rest: _Rest, walk: float) -> list[Array]:

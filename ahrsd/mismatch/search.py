@@ -311,7 +311,7 @@ def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
     surveys: list[Survey] = []
     for k in range(len(state.named)):
         name = state.named[k].candidate.name
-        seen, mine = _without(state, k)
+        seen, mine = _without(state, k, last.basis)
         least = mine + state.problem.limits.lead_nats
         better = [
             j
@@ -321,7 +321,7 @@ def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
         if better and name not in DELAYS and counterpart(state, k) is None:
             state = refitted(state, (*state.named[:k], better[0], *state.named[k + 1 :]))
             last = survey(state)
-            seen, _ = _without(state, k)
+            seen, _ = _without(state, k, last.basis)
         surveys.append(seen)
     return state, surveys, last
 
@@ -355,9 +355,9 @@ def without_term(state: State, number: int, basis: Base | None = None) -> Base:
     return basis.without(term_group(number), value)
 
 
-def _without(state: State, number: int) -> tuple[Survey, float]:
-    """The survey without one term, and the term's own evidence in it."""
-    left = without_term(state, number)
+def _without(state: State, number: int, basis: Base) -> tuple[Survey, float]:
+    """The survey without one term of the state's basis, and the term's own evidence in it."""
+    left = without_term(state, number, basis)
     others = tuple(j for i, j in enumerate(state.named) if i != number)
     seen = survey(replace(state, named=others), left)
     name = state.named[number].candidate.name

@@ -8,7 +8,7 @@ nonparametric repair.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -180,10 +180,7 @@ def _heldout(left: Remainder, block_s: float) -> Heldout:
     best, basis = left.strongest, left.basis
     gain = _course_gain(best, basis, block_s)
     count = len(basis.innovation)
-    moved = [
-        replace(basis, innovation=np.roll(basis.innovation, count * k // (SHIFTS + 1), axis=0))
-        for k in range(1, SHIFTS + 1)
-    ]
+    moved = [basis.moved(count * k // (SHIFTS + 1)) for k in range(1, SHIFTS + 1)]
     usual = max(_course_gain(best, other, block_s).nats_per_sample for other in moved)
     rms = innovation_rms(basis)
     after = rms * float(np.sqrt(max(gain.after, 0.0) / max(gain.before, 1e-12)))

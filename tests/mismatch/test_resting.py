@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,3 +63,13 @@ def test_without_a_thermometer_the_same_bias_drifts():
     assert found.confidence + sum(s.confidence for s in found.alternatives) == pytest.approx(
         1, abs=0.02
     )
+
+
+def test_a_vehicle_that_turns_a_little_on_its_straight_course_does_not_stand():
+    passed = np.arange(COUNT) / RATE_HZ
+    rate = 1e-3 * np.cos(2 * np.pi * passed / 290.0)[:, None] * np.array([1.0, -0.6, 0.8])
+    track = standing(1e-3 + rate)
+    assert told(track), "the same readings at rest are a bias that moves"
+    angle = np.cumsum(rate, axis=0) / RATE_HZ
+    field = track.mag_b_gauss + np.cross(np.array([0.2, 0.05, 0.4]), angle)
+    assert told(replace(track, mag_b_gauss=field)) == ()
