@@ -17,9 +17,11 @@ from ahrsd.calibration import Estimate
 from ahrsd.calibrator import Calibrator
 from ahrsd.config import Config
 from ahrsd.core import Core
+from ahrsd.diagnosing import track_of
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.misalignment import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
+from ahrsd.mismatch.hygiene import as_recorded
 from ahrsd.replay import Replayed, replay
 from ahrsd.result import calibration_json, why_not_converged
 from ahrsd.summary import said_of
@@ -27,7 +29,10 @@ from ahrsd.summary import said_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchResult:
-    """What `ahrsd calibrate` says."""
+    """What `ahrsd calibrate` says.
+
+    wrong: units, axes and signs that cannot be as recorded, in words
+    """
 
     name: str
     core: Core
@@ -35,6 +40,7 @@ class BatchResult:
     events: tuple[Event, ...]
     warnings: tuple[str, ...]
     misalignment: Misalignment | None = None
+    wrong: tuple[str, ...] = ()
 
     @property
     def samples(self) -> int:
@@ -50,6 +56,7 @@ class BatchResult:
         """Warnings of recording and stream."""
         turned = self.misalignment
         return [
+            *(f"{words}: put this right and calibrate again" for words in self.wrong),
             *said_of(self.core, self.warnings),
             *(self.estimate.warnings if self.estimate is not None else ()),
             *([] if turned is None or not turned.significant else [_spoken(turned)]),
@@ -108,7 +115,11 @@ def calibrate(
     if estimate is not None:
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
     turned = calibrator.estimator.misalignment()
-    return BatchResult(path.name, done.core, estimate, tuple(seen), tuple(done.warnings), turned)
+    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
+    wrong = tuple(fact.words for fact in as_recorded(track_of(blocks))) if blocks else ()
+    return BatchResult(
+        path.name, done.core, estimate, tuple(seen), tuple(done.warnings), turned, wrong
+    )
 
 
 def _spoken(turned: Misalignment) -> str:

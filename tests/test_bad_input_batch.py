@@ -222,3 +222,21 @@ def test_a_sigma_that_cannot_be(value):
     for name in ("sigma_mag_gauss", "sigma_field_gauss"):
         with pytest.raises(MethodError, match=f"{name} is .*: it must be a positive number"):
             Settings(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("gyro", "words"),
+    [
+        (np.diag([1e-3] * 3), "they are divided by 1000 once too often"),
+        (np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), "the gyro's x y z are the magnetometer's"),
+    ],
+)
+def test_a_gyro_that_is_not_what_it_says_is_named(tmp_path, gyro, words):
+    rows = tumbling(4)
+    assert not any(words in said for said in tried(tmp_path, rows).said())
+    rows[:, 4:] = rows[:, 4:] @ gyro.T
+    result = tried(tmp_path, rows)
+    refused_by_ours(result)
+    assert any(
+        words in said and "put this right" in said for said in result.json("magyc")["warnings"]
+    )

@@ -38,12 +38,16 @@ GYRO_UNITS = (("deg/s", np.pi / 180), ("mrad/s", 1e-3), ("rpm", 2 * np.pi / 60))
 
 def hygiene(track: Track) -> tuple[Fact, ...]:
     """Everything that is found, what stops first."""
-    unit = mag_unit(track)
-    frame = _gyro(track)
+    wrong = as_recorded(track)
     limits = clipping(track)
     clipped = next((fact.bad for fact in limits if fact.bad is not None), None)
     rest = repeats(track, clipped) + limits + quantisation(track) + stamps(track)
-    return tuple(sorted(unit + frame + rest, key=lambda fact: not fact.stops))
+    return tuple(sorted(wrong + rest, key=lambda fact: not fact.stops))
+
+
+def as_recorded(track: Track) -> list[Fact]:
+    """Units, axes and signs that are wrong: nothing fitted before they are right means anything."""
+    return mag_unit(track) + _gyro(track)
 
 
 def mag_unit(track: Track) -> list[Fact]:
