@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ahrsd.mismatch import roles, unknown
 from ahrsd.mismatch.bursts import bursts
+from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
     Baseline,
@@ -30,7 +31,6 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import examined, paired, rest_of
 from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
-    added_value,
     contribution,
     finding,
     of_fact,
@@ -38,16 +38,15 @@ from ahrsd.mismatch.findings import (
 )
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
-from ahrsd.mismatch.locate import Frame
-from ahrsd.mismatch.missing import lost_turns
+from ahrsd.mismatch.missing import lost_turns, missing_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
-from ahrsd.mismatch.null import NullFit, fit_null, unusable
+from ahrsd.mismatch.null import NullFit, at_model, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.problem import Problem, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, model_at_rate, quick, without_quick
-from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
+from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
@@ -57,21 +56,14 @@ from ahrsd.mismatch.search import (
     basis_of,
     forward,
     pruned,
-    refitted,
     survey,
     swapped,
-    term_group,
 )
+from ahrsd.mismatch.stand_ins import without_stand_ins
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import Array
 
-#: names that are a course in time and nothing else, by the frame that they act in
-TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
-    "sensor": ("hard_iron_step", "hard_iron_drift", "switched_device", "soft_iron_step"),
-    "world": ("field_step", "geomagnetic_drift", "field_anomaly"),
-    "gyro": ("gyro_bias_step", "gyro_startup", "gyro_bias_drift"),
-}
 #: a detection limit is this many standard deviations: what the gate would pass 9 times in 10
 DETECTED_AT = 6.5
 
@@ -96,18 +88,40 @@ def diagnose(
     if any(fact.stops for fact in facts):
         return _stopped(recording, [fact for fact in facts if fact.stops], notes)
     problem, cold = problem_of(put_right(track, facts), spec, library, limits)
-    lost = lost_turns(problem)
+    whole, lost = problem, lost_turns(problem.recorded, problem.cold)
     if lost:
-        facts = (*facts, *lost)
-        problem, cold = problem_of(put_right(track, facts), spec, library, limits)
+        problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
+    done, fast = _named(problem, cold)
+    beside = _lost_beside(whole, fast)
+    if bool(beside) != bool(lost):
+        lost = beside
+        problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
+        done, fast = _named(problem, cold)
+    facts = (*facts, *lost)
+    if at_rest(done.start):
+        notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
+    return _told(recording, problem, done, fast, facts, notes)
+
+
+def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:
+    """The search, and what only the recorded rate shows; with that taken out the search anew."""
     done = _searched(without_quick(problem), cold)
     fast = quick(done.state, problem)
     if fast:
         done = _searched(cleaned(fast, problem), done.start.model)
         fast = quick(done.state, problem)
-    if at_rest(done.start):
-        notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
-    return _told(recording, problem, done, fast, facts, notes)
+    return done, fast
+
+
+def _lost_beside(whole: Problem, fast: Quick) -> list[Fact]:
+    """Lost turns of the recording as it came, beside everything that was named.
+
+    A field that jumps looks like lost turns now and then, and hides those that are.
+    """
+    state = fast.state
+    track = delayed_gyro(whole.recorded, state.problem.lag_s)
+    fit = at_model(track, state.fit.model, state.fit.terms)
+    return missing_turns(fit.filtered, track.gyro_b_rad_s - fit.model.gyro_bias_rad_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,71 +259,6 @@ def _checked(
         for term, fitted in zip(terms, state.fit.terms, strict=True)
     ]
     return checks(null, state.fit, kept, library=library)
-
-
-def without_stand_ins(
-    state: State, surveys: list[Survey]
-) -> tuple[State, list[Survey], unknown.Remainder]:
-    """Names that only stand in for a course in time taken out again, and what is then left.
-
-    Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
-    all of what their frame's own coefficients explain, and where a few of them do.  A gyro whose
-    bias wanders as an ordinary one's does is noise.
-    """
-    limits = state.problem.limits
-    left = unknown.remainder(basis_of(state))
-    if not state.walk and left.strongest.frame == "gyro" and unknown.detected(left, limits):
-        state = refitted(replace(state, walk=True), state.named)
-        left = unknown.remainder(basis_of(state))
-    for frame, names in TIME_SHAPED.items():
-        shaped = [k for k, name in enumerate(state.names) if name in names]
-        doubtful = shaped if len(shaped) > limits.most_shaped else []
-        if shaped and not doubtful:
-            doubtful = shaped if _stand_in(state, frame, shaped, left) else []
-        state, surveys, left = _dropped(state, surveys, doubtful, left)
-    return state, surveys, left
-
-
-def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remainder) -> bool:
-    """Whether the terms explain less than true names would.
-
-    They do if what they leave fires and is more than the part that a true name may leave, or, a
-    single one, if the frame's free course is likelier, however many its coefficients.
-    """
-    limits = state.problem.limits
-    before = unknown.remainder(_bare(state, terms), with_bins=False)
-    free = before.located[frame]
-    if not unknown.detected(before, limits):
-        return False  # there is no course that they could stand in for
-    fires = unknown.detected(left, limits)
-    if fires and left.located[frame].statistic > (1 - limits.coverage) * free.statistic:
-        return True
-    if len(terms) > 1:  # on and off again: neither proves much without the other
-        return False
-    evidence = evidence_of(before.basis, state.named[terms[0]].candidate)
-    return free.evidence > evidence + limits.lead_nats
-
-
-def _bare(state: State, terms: list[int]) -> Base:
-    """The basis without these terms, what they explain put back."""
-    bare = basis_of(state)
-    for k in terms:
-        bare = bare.without(term_group(k), added_value(state, k))
-    return bare
-
-
-def _dropped(
-    state: State, surveys: list[Survey], terms: list[int], left: unknown.Remainder
-) -> tuple[State, list[Survey], unknown.Remainder]:
-    if not terms:
-        return state, surveys, left
-    kept = [k for k in range(len(state.named)) if k not in terms]
-    before = unknown.remainder(_bare(state, terms))
-    state = refitted(state, tuple(state.named[k] for k in kept))
-    after = unknown.remainder(basis_of(state))
-    # without the names, what they stood for may have become noise
-    left = after if unknown.detected(after, state.problem.limits) else before
-    return state, [surveys[k] for k in kept], left
 
 
 def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.innovation import Filtered, run_filter
-from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
 #: samples before and after a jump, and how many deviations of a mean a step's turn must have: over
@@ -24,12 +24,15 @@ from ahrsd.samples import Array
 _AVERAGED = ((3, 7.0), (12, 5.0))
 _NEAR = 0.3  # of a whole number
 _FEWEST = 5
+#: deviations of a mean that no noise jumps by, and the part of such a jump that is across the turn,
+#: more than a lost one has
+_CLEAR, _ACROSS = 8.0, 0.5
 
 
-def lost_turns(problem: Problem) -> list[Fact]:
+def lost_turns(track: Track, model: NullModel) -> list[Fact]:
     """`missing_turns` of a recording at its own rate, with the calibration that it starts from."""
-    done = run_filter(problem.recorded, problem.cold, sensitive=False)
-    return missing_turns(done, problem.recorded.gyro_b_rad_s - problem.cold.gyro_bias_rad_s)
+    done = run_filter(track, model, sensitive=False)
+    return missing_turns(done, track.gyro_b_rad_s - model.gyro_bias_rad_s)
 
 
 def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
@@ -42,19 +45,23 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
         if len(track) < 10 * samples:
             break
         found = _jumps(done, rate_b_rad_s, samples, least)
-        if len(found.forward) >= _FEWEST + 3 * len(found.backward):
+        if len(found.forward) >= _FEWEST + 3 * len(found.backward) + found.others:
             return [_fact(track, found)]
     return []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Jumps:
-    """steps (N,) by which the field is ahead;  tell (N,) where that can be said;  rows of jumps."""
+    """steps (N,) by which the field is ahead;  tell (N,) where that can be said;  rows of jumps.
+
+    others: how many jumps there are that no lost turn makes
+    """
 
     steps: Array
     tell: NDArray[np.bool]
     forward: NDArray[np.intp]
     backward: NDArray[np.intp]
+    others: int
 
 
 def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _Jumps:
@@ -77,11 +84,18 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
     fresh = np.sum(behind * v, axis=1) < 0.5 * size**2
     tell = (size > least * sigma) & (rest < 5 * sigma) & complete & fresh
     whole = np.abs(steps - np.round(steps)) < _NEAR
+    far = np.linalg.norm(jump, axis=1)
+    forward = _peaks(tell & whole & (steps > 1 - _NEAR), steps, samples)
+    far = np.linalg.norm(jump, axis=1)
+    across = complete & (far > _CLEAR * sigma) & ((rest > _ACROSS * far) | (steps < 0))
+    for k in forward.tolist():  # before and behind a jump its mean is not along the turn
+        across[max(0, k - 2 * samples) : k + 2 * samples] = False
     return _Jumps(
         steps,
         tell,
-        _peaks(tell & whole & (steps > 1 - _NEAR), steps, samples),
+        forward,
         _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
+        len(_peaks(across, far, samples)),
     )
 
 

@@ -1,0 +1,68 @@
+"""Currents of many shapes: named where they are logged, never taken for lost samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+
+#: gauss per ampere
+K = np.array([2e-3, -1e-3, 1.5e-3])
+#: amperes at the times (N,)
+SHAPES = {
+    "square": lambda t: 5 + 4 * np.sign(np.sin(t / 3)) + np.sin(0.7 * t),
+    "quick square": lambda t: 5 + 5 * np.sign(np.sin(1.5 * t)),
+    "ramps": lambda t: 10 * np.abs((t / 12) % 2 - 1),
+    "pulses": lambda t: 8.0 * (t % 9 < 0.7),
+    "levels": lambda t: np.random.default_rng(7).uniform(0, 10, 100)[(t / 8).astype(int)],
+}
+
+
+def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
+    covariates = {"motor_current_a": current} if logged else {}
+    return replace(
+        track, mag_b_gauss=track.mag_b_gauss + np.outer(current, K), covariates=covariates
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("seed", [6, 11])
+def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
+    track = track_of(experiment("wam", seed=seed, samples=2500))
+    found = diagnose(_disturbed(track, SHAPES[shape](track.time_s), logged=True))
+    assert [one.effect for one in found.findings] == ["motor_current_field"]
+    assert not found.unexplained.detected
+    for parameter, truth in zip(found.findings[0].parameters, K, strict=True):
+        assert parameter.value == pytest.approx(truth, abs=4 * parameter.std + 2e-5)
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None:
+    track = track_of(experiment("wam", seed=seed, samples=3000))
+    found = diagnose(_disturbed(track, SHAPES["square"](track.time_s), logged=False))
+    assert "dropped_samples" not in [one.effect for one in found.findings]
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
+    track = track_of(experiment("wam", seed=seed, samples=3000))
+    track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
+    cut = Track(
+        track.time_s[: len(keep)],
+        track.dt_s[: len(keep)],
+        track.mag_b_gauss[keep],
+        track.gyro_b_rad_s[keep],
+        None,
+        {name: values[keep] for name, values in track.covariates.items()},
+        (slice(0, len(keep)),),
+    )
+    found = {one.effect: one for one in diagnose(cut).findings}
+    assert found.keys() == {"motor_current_field", "dropped_samples"}
+    assert found["dropped_samples"].parameters[0].value == pytest.approx(0.01, abs=0.005)
