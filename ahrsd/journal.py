@@ -18,14 +18,14 @@ from __future__ import annotations
 import json
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ahrsd.errors import JournalError
-from drivers.vn100.registers import REGISTERS, as_stored, format_command
+from drivers.vn100.registers import REGISTERS, Values, as_stored, format_command
 from drivers.vn100.sentences import encode
 
 _OWN_KEYS = ("seq", "time", "kind", "crc")
@@ -186,8 +186,13 @@ def register_values(record: Record, which: str = "old") -> dict[int, tuple[float
 
 def wrg_lines(record: Record, which: str = "old") -> list[str]:
     """`$VNWRG,23,...*CS` for each register of the record that a person may send from a terminal."""
+    return typed_lines(register_values(record, which))
+
+
+def typed_lines(registers: Mapping[int, Values]) -> list[str]:
+    """`$VNWRG,...*CS` for each register that can be written, in the order of their numbers."""
     return [
         encode(f"VNWRG,{format_command(number, as_stored(number, values))}").decode().strip()
-        for number, values in sorted(register_values(record, which).items())
+        for number, values in sorted(registers.items())
         if REGISTERS[number].writable
     ]

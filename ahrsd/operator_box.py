@@ -39,6 +39,19 @@ class OperatorBox:
         draft.rename(word)  # whole or not at all
         return word
 
+    def heard(self, verb: str, argument: str, wait_s: float) -> bool:
+        """Say a word and wait; False where nobody took it, then it is gone. Raises OSError."""
+        word, until_s = self.put(verb, argument), time.monotonic() + wait_s
+        while word.exists():
+            if time.monotonic() > until_s:
+                try:
+                    word.unlink()
+                except FileNotFoundError:  # taken in this moment
+                    return True
+                return False
+            time.sleep(0.05)
+        return True
+
     def take(self) -> list[tuple[str, str]]:
         """The words (verb, argument) since the last time, oldest first. Never raises."""
         try:

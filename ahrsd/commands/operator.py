@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import click
@@ -38,15 +37,11 @@ def command(verb: str, text: str, directory: Path | None) -> None:
         raise click.UsageError("approve needs the candidate's ID; the daemon's log names it")
     box = OperatorBox(directory or default_state_directory())
     try:
-        file = box.put(verb, text)
+        heard = box.heard(verb, text, _WAIT_S)
     except FileNotFoundError:
         raise DeviceError(f"no daemon has been here: {box.folder} is missing", EXIT_BUSY) from None
     except OSError as error:
         raise DeviceError(f"{box.folder}: {error.strerror}", EXIT_USAGE) from None
-    until = time.monotonic() + _WAIT_S
-    while file.exists():
-        if time.monotonic() > until:
-            file.unlink(missing_ok=True)
-            raise DeviceError(f"no daemon took the word within {_WAIT_S:.0f} s", EXIT_BUSY)
-        time.sleep(0.05)
+    if not heard:
+        raise DeviceError(f"no daemon took the word within {_WAIT_S:.0f} s", EXIT_BUSY)
     click.echo(f"the daemon heard: {verb} {text}".rstrip() + "; its log says what follows")

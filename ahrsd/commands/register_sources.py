@@ -11,6 +11,7 @@ from ahrsd.commands.device_access import open_device, read_all
 from ahrsd.commands.register_changes import Changes, to_write
 from ahrsd.errors import AhrsdError, JournalError
 from ahrsd.journal import Journal, Record, journal_path, register_values
+from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import REGISTERS
 
 
@@ -58,7 +59,7 @@ def newest_in_force(journal: Journal, read: Callable[[Iterable[int]], Changes]) 
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Reads what `diff` is given. A journal's number means the journal of the device beside it."""
+    """Reads a set by its name. A journal's number means the journal of the device beside it."""
 
     state: Path
     journal_file: Path | None
@@ -70,14 +71,24 @@ class Sources:
         sets: dict[str, Changes] = {}
         for name in (first, second):
             if _is_port(name):
-                with open_device(Path(name), self.baud) as device:
-                    identity, sets[name] = read_all(device)
+                identity, sets[name] = self._device(name)
                 serial = identity.serial
         for name in (first, second):
             if name not in sets:
-                is_number = name.partition(":")[0].isdecimal()
-                sets[name] = self._record(name, serial) if is_number else _read_json(Path(name))
+                sets[name] = self._stored(name, serial)
         return sets[first], sets[second]
+
+    def read(self, name: str) -> tuple[Identity | None, Changes]:
+        """One set, and the device where it is one.  Raises the same."""
+        return self._device(name) if _is_port(name) else (None, self._stored(name, None))
+
+    def _device(self, name: str) -> tuple[Identity, Changes]:
+        with open_device(Path(name), self.baud) as device:
+            return read_all(device)
+
+    def _stored(self, name: str, serial: int | None) -> Changes:
+        is_number = name.partition(":")[0].isdecimal()
+        return self._record(name, serial) if is_number else _read_json(Path(name))
 
     def _record(self, name: str, serial: int | None) -> Changes:
         number, _, which = name.partition(":")

@@ -1,4 +1,4 @@
-"""`ahrsd registers read|diff|write|history|rollback`: the device's registers and their journal."""
+"""`ahrsd registers`: the device's registers and their journal."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import TypeVar
 
 import click
 
+from ahrsd.commands import register_locks
 from ahrsd.commands.device_access import describe, open_device
 from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
 from ahrsd.config import default_state_directory
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
-from ahrsd.journal import Journal, Record, journal_path, register_values, wrg_lines
+from ahrsd.journal import Journal, Record, journal_path, register_values, typed_lines, wrg_lines
 from drivers.vn100.device import Device
 from drivers.vn100.procedures import Identity, identify, read_configuration, read_registers
 from drivers.vn100.registers import (
@@ -40,6 +41,7 @@ _SAVE = click.option("--save", is_flag=True, help="Also save all of RAM to flash
 
 
 Ids = TypeVar("Ids", int, tuple[int, ...])
+_BAUD_RATE = 5  # a line that changes it cuts off the lines behind it
 _SHOWN = ("txn", "reason", "undoes", "error", "restored")  # facts of a record besides its registers
 
 
@@ -60,6 +62,10 @@ def command() -> None:
     """
 
 
+command.add_command(register_locks.lock)
+command.add_command(register_locks.unlock)
+
+
 @command.command()
 @click.argument("port", type=click.Path(path_type=Path))
 @click.argument("ids", nargs=-1, type=int, callback=_known)
@@ -75,14 +81,10 @@ def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | No
         click.echo(f"{identity.model}, serial {identity.serial}, firmware {identity.firmware}")
         for number, row in values.items():
             click.echo(f"{number:3}  {REGISTERS[number].name:36.36}  {_text(number, row)}")
-    if json_path:
-        registers = {str(number): list(row) for number, row in values.items()}
-        body = {"schema": "ahrsd.registers/1", "device": describe(identity), "registers": registers}
-        text = json.dumps(body, indent=1) + "\n"
-        if json_path == "-":
-            click.echo(text, nl=False)
-        else:
-            Path(json_path).write_text(text, encoding="utf-8")
+    if json_path == "-":
+        click.echo(_json(values, identity), nl=False)
+    elif json_path:
+        Path(json_path).write_text(_json(values, identity), encoding="utf-8")
 
 
 @command.command()
@@ -165,6 +167,40 @@ def history(state_directory: Path | None, journal_file: Path | None, serial: int
 
 
 @command.command()
+@click.argument("source")
+@click.argument("ids", nargs=-1, type=int, callback=_known)
+@click.option("--json", "as_json", is_flag=True, help="JSON, which `diff` reads, not lines.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="A file, not stdout.")
+@_STATE
+@_JOURNAL
+@_BAUD
+def export(
+    *,
+    source: str,
+    ids: tuple[int, ...],
+    as_json: bool,
+    output: Path | None,
+    state_directory: Path | None,
+    journal_file: Path | None,
+    baud: int | None,
+) -> None:
+    """Print registers as $VNWRG lines, which a person can type or send without ahrsd.
+
+    SOURCE is what `diff` takes: a port, a JSON file, or a number of the journal. Without IDS all
+    that it has and that can be written, save the baud rate. In RAM until $VNWNV*57 is sent.
+    """
+    identity, values = Sources(_state(state_directory), journal_file, baud).read(source)
+    if missing := [number for number in ids if number not in values]:
+        raise AhrsdError(f"{source} has no register {missing[0]}")
+    chosen = {n: row for n, row in values.items() if (n in ids if ids else n != _BAUD_RATE)}
+    text = _json(chosen, identity) if as_json else "\n".join(typed_lines(chosen)) + "\n"
+    if output is None:
+        click.echo(text, nl=False)
+    else:
+        output.write_text(text, encoding="ascii")
+
+
+@command.command()
 @click.argument("port", type=click.Path(path_type=Path))
 @click.argument("number", metavar="[ID]", type=int, required=False)
 @_YES
@@ -213,6 +249,8 @@ def _change(
         identity = device.run(identify())
         journal = Journal.open(journal_file or journal_path(state, identity.serial))
         changes, why = wanted(device, journal)
+        if "undoes" not in why:  # what goes back to where it was is not locked out
+            register_locks.refuse_locked(journal)
         present = device.run(read_registers(changes))
         changes = to_write(present, changes)
         _show(identity, present, changes)
@@ -231,6 +269,14 @@ def _change(
         if save:
             save_to_flash(device, journal, record)
             click.echo("saved to flash")
+
+
+def _json(values: Changes, identity: Identity | None) -> str:
+    """What `diff` and `export` read again."""
+    registers = {str(number): list(row) for number, row in values.items()}
+    device = {} if identity is None else {"device": describe(identity)}
+    body = {"schema": "ahrsd.registers/1", **device, "registers": registers}
+    return json.dumps(body, indent=1) + "\n"
 
 
 def _show(identity: Identity, present: Changes, changes: Changes) -> None:

@@ -1,0 +1,95 @@
+"""`ahrsd registers lock|unlock`: nothing is written to a device until somebody has looked at it.
+
+Where a daemon runs it is told, as by `ahrsd operator`; it alone writes into its journal. Where none
+does, the record goes into the journal, and the next daemon begins with it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ahrsd.commands.register_sources import journals
+from ahrsd.config import default_state_directory
+from ahrsd.errors import JournalError
+from ahrsd.journal import Journal, journal_path
+from ahrsd.operator_box import OperatorBox
+from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.reconcile import Kind
+
+_WAIT_S = 5.0
+_OPTIONS = (
+    click.argument("reason"),
+    click.option("--serial", type=int, help="The device, where several have a journal."),
+    click.option(
+        "--state-directory", type=click.Path(path_type=Path), default=None,
+        help="Where the journals are; default: that of the daemon.",
+    ),
+)  # fmt: skip
+
+
+def _with_options(function: Callable[..., None]) -> Callable[..., Any]:
+    for option in reversed(_OPTIONS):
+        function = option(function)
+    return function
+
+
+@click.command()
+@_with_options
+def lock(reason: str, serial: int | None, state_directory: Path | None) -> None:
+    """Forbid every write, but for going back to old values; REASON is for those who come later."""
+    _say(Kind.LOCKED, reason, serial, state_directory or default_state_directory())
+
+
+@click.command()
+@_with_options
+def unlock(reason: str, serial: int | None, state_directory: Path | None) -> None:
+    """Allow writes again: REASON says what was found. Also ends FAULT and FLASH_TORN."""
+    _say(Kind.UNLOCKED, reason, serial, state_directory or default_state_directory())
+
+
+def refuse_locked(journal: Journal) -> None:
+    """Raise JournalError where the newest word in the journal is a lock."""
+    reason = History.of(journal.records()).locked
+    if reason is not None:
+        raise JournalError(
+            f"{journal.path}: locked: {reason}; nothing is written until "
+            "`ahrsd registers unlock REASON`"
+        )
+
+
+def _say(kind: Kind, reason: str, serial: int | None, state: Path) -> None:
+    if _daemon_heard("lock" if kind is Kind.LOCKED else "unlock", reason, state):
+        click.echo(f"the daemon heard it; {state} has its journal")
+        return
+    journal = Journal.open(_journal_of(kind, serial, state))
+    history = History.of(journal.records())
+    if kind is Kind.UNLOCKED and history.locked is None and not history.torn:
+        click.echo(f"{journal.path}: it is not locked")
+        return
+    record = journal.append(kind, reason=reason, by="registers", wall_s=time.time())
+    click.echo(f"{journal.path}: record {record.seq}, {kind}: {reason}")
+
+
+def _daemon_heard(verb: str, reason: str, state: Path) -> bool:
+    """Whether a daemon runs and took the word. A folder that may not be written: JournalError."""
+    box = OperatorBox(state)
+    try:
+        return box.folder.is_dir() and box.heard(verb, reason, _WAIT_S)
+    except OSError as error:
+        raise JournalError(f"{box.folder}: {error.strerror}; try as root") from None
+
+
+def _journal_of(kind: Kind, serial: int | None, state: Path) -> Path:
+    """The one journal that is meant; a device may be locked before it was ever written."""
+    if serial is not None and kind is Kind.LOCKED:
+        return journal_path(state, serial)
+    found = journals(state, None, serial)
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise JournalError(f"{state}: several journals ({names}); say which by --serial")
+    return found[0]
