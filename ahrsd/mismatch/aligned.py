@@ -1,8 +1,9 @@
 """A recording beside a simulation that somebody brought: the common time, and what only one has.
 
 The two are the same motion if their rates agree, so the rates align them: the shift at which the
-magnitudes of the two gyros correlate most.  A simulation contains what its author put in; an effect
-that both have to the same size is no difference, one that only the recording has was left out.
+two gyros correlate most, or where their axes differ the magnitudes.  A simulation contains what its
+author put in; an effect that both have to the same size is no difference, one that only the
+recording has was left out.
 """
 
 from __future__ import annotations
@@ -67,22 +68,35 @@ def _shift(real: Track, simulated: Track) -> tuple[float, float]:
     if end - begin < LEAST_OVERLAP_S:
         return 0.0, 1.0  # said by the caller
     grid = np.arange(begin, end, step)
-    a, b = (_speed(track, grid) for track in (real, simulated))
+    a, b = (_rates(track, grid) for track in (real, simulated))
     reach = min(reach, len(grid) // 4)
+    found = _best(a, b, reach)
+    if found[1] < LEAST_CORRELATION:  # perhaps one has its axes swapped
+        found = max(found, _best(_size(a), _size(b), reach), key=lambda one: one[1])
+    return found[0] * step, found[1]
+
+
+def _best(a: Array, b: Array, reach: int) -> tuple[int, float]:
+    """Lag in rows of b (N, k) behind a, within reach, and the correlation of the two there."""
     best = (0, -1.0)
     for lag in range(-reach, reach + 1):
         x = a[max(0, -lag) : len(a) - max(0, lag)]
         y = b[max(0, lag) : len(b) - max(0, -lag)]
-        if np.std(x) > 0.0 and np.std(y) > 0.0:
-            found = float(np.corrcoef(x, y)[0, 1])
-            best = max(best, (lag, found), key=lambda one: one[1])
-    return best[0] * step, best[1]
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+        power = float(np.sum(x * x) * np.sum(y * y))
+        if power > 0.0:
+            best = max(best, (lag, float(np.sum(x * y)) / power**0.5), key=lambda one: one[1])
+    return best
 
 
-def _speed(track: Track, grid_s: Array) -> Array:
-    bias = np.median(track.gyro_b_rad_s, axis=0)
-    speed = np.linalg.norm(track.gyro_b_rad_s - bias, axis=1)
-    return np.asarray(np.interp(grid_s, track.time_s, speed))
+def _rates(track: Track, grid_s: Array) -> Array:
+    axes = [np.interp(grid_s, track.time_s, values) for values in track.gyro_b_rad_s.T]
+    return np.stack(axes, axis=1)
+
+
+def _size(rates: Array) -> Array:
+    """(N, 1) magnitudes, the bias taken off as the median."""
+    return np.asarray(np.linalg.norm(rates - np.median(rates, axis=0), axis=1))[:, None]
 
 
 def _cut(track: Track, begin_s: float, end_s: float) -> Track:

@@ -172,17 +172,19 @@ def would_have_shown(track: Track) -> tuple[str, ...]:
     mag, gyro = noise_of(track)
     step = track.step_s
     found = windows(track)
-    lines = [
+    shown = [
         f"a magnetometer stuck for 1 s while turning by {1e3 * 8 * mag:.2g} mG",
         f"readings in steps above {1e3 * 2 * mag:.2g} mG (noise {1e3 * mag:.2g} mG, "
         f"{1e3 * gyro:.2g} mrad/s)",
-        f"time stamps that jitter by {1e3 * 0.03 * step:.2g} ms; 1 sample in 1000 missing",
+        f"time stamps that jitter by {1e3 * 0.03 * step:.2g} ms",
+        "1 sample in 1000 missing",
     ]
-    if found is not None and ranked(found) and ranked(found)[0].cost < _EXPLAINED:
-        lines.append("swapped, negated or left-handed axes, and wrong units of the gyro")
-    else:
-        lines.append("no wrong axes or units of the gyro: the sensor hardly turned")
-    return tuple(lines)
+    axes = "swapped, negated or left-handed axes, wrong units of the gyro"
+    turned = found is not None and ranked(found) and ranked(found)[0].cost < _EXPLAINED
+    if turned:
+        shown.append(axes)
+    said = f"would also have been seen: {'; '.join(shown)}"
+    return (said,) if turned else (said, f"would not have been seen, it hardly turned: {axes}")
 
 
 def _whole(track: Track) -> tuple[tuple[float, float], ...]:

@@ -143,6 +143,29 @@ def test_a_simulation_with_the_same_effect_leaves_nothing_to_name(saved, clean):
     assert any("moved by +1.2" in note for note in overlap.notes)
 
 
+@pytest.mark.parametrize("shift_s", [0.0, 1.2])
+def test_a_simulation_of_a_part_is_laid_where_it_belongs(saved, clean, shift_s):
+    """A part has another mean rate than the whole; that must not move it."""
+    real, _ = load_track(saved(clean))
+    part = {name: values[400:1150] for name, values in clean.items()}
+    part["time_s"] = part["time_s"] + shift_s
+    part["gyro_x_rad_s"] = part["gyro_x_rad_s"] + 0.02
+    simulated, _ = load_track(saved(part, "part.csv"))
+    overlap = align(real, simulated)
+    first, last = clean["time_s"][[400, 1149]]
+    assert overlap.simulated.time_s[[0, -1]] == pytest.approx([first, last], abs=0.021)
+    assert any("was moved" in note for note in overlap.notes) == (shift_s > 0)
+
+
+def test_a_simulation_in_other_axes_is_laid_by_its_speed(saved, clean):
+    real, _ = load_track(saved(clean))
+    turned = {**clean, "time_s": clean["time_s"] + 0.8}
+    turned["gyro_x_rad_s"], turned["gyro_y_rad_s"] = clean["gyro_y_rad_s"], -clean["gyro_x_rad_s"]
+    simulated, _ = load_track(saved(turned, "turned.csv"))
+    overlap = align(real, simulated)
+    assert overlap.simulated.time_s[0] == pytest.approx(clean["time_s"][0], abs=0.021)
+
+
 def test_simulations_that_are_something_else_are_refused(run, saved, clean, capsys):
     real = saved(clean)
     far = saved({**clean, "time_s": clean["time_s"] + 1000.0}, "far.csv")
