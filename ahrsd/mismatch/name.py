@@ -22,6 +22,9 @@ from ahrsd.samples import Array
 
 #: shifts shorter than this are the effect itself a moment later
 MINIMUM_SHIFT_SHARE = 0.05
+#: what fewer blocks than this show cannot be known from the others: a jump of the outside field,
+#: which the filter follows within seconds; then nats beyond all doubt take the held-out gain's place
+LONELY_BLOCKS, LONELY_NATS = 2.5, 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,12 +81,13 @@ def judge(
         *without_known(basis, columns), round(MINIMUM_SHIFT_SHARE * len(columns))
     )
     beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
+    lonely = what.effective_blocks < LONELY_BLOCKS and evidence > LONELY_NATS
     bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
     checks = (
         ("family-wise probability", family < limits.family_p),
         ("block-robust probability", robust < limits.robust_family_p),
         ("evidence", evidence > limits.evidence_nats),
-        ("held-out gain", gain.nats_per_sample > limits.cv_gain),
+        ("held-out gain", gain.nats_per_sample > limits.cv_gain or lonely),
         ("time-shifted copies", beaten >= limits.placebo_beaten),
         ("physical bounds", bool(np.all(np.abs(what.value) <= bounds))),
     )

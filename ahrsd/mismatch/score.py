@@ -52,6 +52,17 @@ class Score:
         return len(self.information)
 
     @property
+    def leverage(self) -> Array:
+        """(B,) each block's part of the information, the mean of the observable directions."""
+        H = np.einsum("bii->bi", self.block_information) / self.information
+        return np.asarray(H.mean(axis=1)) if self.rank else np.zeros(len(self.block_s))
+
+    @property
+    def effective_blocks(self) -> float:
+        """How many blocks carry the information: 1 where a single one does."""
+        return 1.0 / max(float(np.sum(self.leverage**2)), 1e-300)
+
+    @property
     def statistic(self) -> float:
         """The score statistic, chi2 of `rank` under white noise."""
         return float(np.sum(self.score**2 / self.information))
@@ -111,8 +122,7 @@ def robust_p(what: Score, colour: float = 1.0) -> float:
     root = 1.0 / np.sqrt(what.information)
     H = what.block_information * root[:, None] * root
     s = what.block_s * root
-    leverage = np.einsum("bii->b", H) / r
-    blocks = min(float(len(s)), 1.0 / float(np.sum(leverage**2)))
+    blocks = min(float(len(s)), what.effective_blocks)
     whole = s.sum(axis=0)
     if blocks <= r + FEW_BLOCKS:
         power = np.maximum(what.block_power, 1.0)

@@ -108,7 +108,7 @@ def test_a_passed_object_is_looked_for_where_the_field_s_size_departs():
 def test_positions_need_a_level_world():
     context, _ = moving(5)
     adrift = replace(context, world_levelled=False)
-    assert len(EFFECTS["field_gradient"].settings(context)) == 3
+    assert len(EFFECTS["field_gradient"].settings(context)) == 8
     assert EFFECTS["field_gradient"].settings(adrift) == ()
     assert all("onset_s" in s for s in EFFECTS["field_anomaly"].settings(adrift))
 

@@ -21,7 +21,7 @@ _STARTS_M = (
     (1.5, 1.5, 0.5),
     (-1.5, -1.5, 0.5),
 )
-_MOST_TURN_RAD = 0.4
+_TURNS_RAD = (-np.pi / 2, np.pi / 2, np.pi)  # of a frame of positions that is not north's
 _NEAREST_M = 0.2
 
 
@@ -60,11 +60,12 @@ def found_place(
         right = columns.T @ size
         ridge = columns.T @ columns + 1e-9 * np.eye(4)
         outside = max(_NEAREST_M - float(np.linalg.norm(way - place, axis=1).min()), 0.0)
-        outside += 4 * max(abs(turn) - _MOST_TURN_RAD, 0.0)
         return float(size @ size - right @ np.linalg.solve(ridge, right)) * (1 + outside)
 
     starts = [np.append(place_m[row] + np.array(start), 0.0) for start in _STARTS_M]
     best = min((_lowest(left, start, 90) for start in starts), key=lambda one: one[0])
+    turned = [_lowest(left, np.append(best[1][:3], best[1][3] + turn), 90) for turn in _TURNS_RAD]
+    best = min((best, *turned), key=lambda one: one[0])
     found = _lowest(left, best[1], 250)[1]
     return found[:3], float(found[3])
 

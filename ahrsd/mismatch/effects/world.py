@@ -20,7 +20,7 @@ _MG = 1e-3
 _NED = ("position_north_m", "position_east_m", "position_down_m")
 #: the world's x axis is magnetic north where the field made it, true north where positions come
 #: from: their difference in degrees, coarsely
-_DECLINATIONS_DEG = (-16.0, 0.0, 16.0)
+_DECLINATIONS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
 _BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
 _BUMPS = 2
 _DISTANCES_M = (0.7, 2.0)
