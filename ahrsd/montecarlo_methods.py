@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ahrsd.accuracy import Answer
-from ahrsd.estimator.online import Estimator
+from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.methods import METHODS, MethodError, Settings, calibrate_with
 from ahrsd.simulation import Experiment
 
@@ -43,7 +43,7 @@ def batch_method(name: str) -> Batch:
 
 
 def _ours(experiment: Experiment) -> Answer:
-    estimator = Estimator()
+    estimator = Estimator(at_once=WHOLE)
     for block in experiment.blocks(_BLOCK):
         estimator.add(block)
     estimate = estimator.finish()

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ahrsd.batch import BatchResult
-from ahrsd.estimator.online import Estimator
+from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import SamplesSeen
 from ahrsd.methods import METHODS, MethodResult, calibrate_with
 from ahrsd.methods.checks import stuck
@@ -191,7 +191,10 @@ def _theirs_on(result: BatchResult, method: str, blocks: list[SampleBlock]) -> A
 def _ours_on(result: BatchResult, blocks: list[SampleBlock]) -> Answer | None:
     calibrator = result.core.calibrator
     estimator = Estimator(
-        calibrator.settings.estimator, calibrator.present, calibrator.present_gyro_bias_rad_s
+        calibrator.settings.estimator,
+        calibrator.present,
+        calibrator.present_gyro_bias_rad_s,
+        at_once=WHOLE,
     )
     for block in blocks:
         estimator.add(block)

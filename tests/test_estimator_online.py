@@ -14,7 +14,7 @@ import pytest
 from scipy.stats import chi2
 
 from ahrsd.calibration import Affine
-from ahrsd.estimator.online import Estimator
+from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.recording.table import read_table
 
@@ -37,6 +37,13 @@ def calibrated(run, estimator=None, size=50):
     estimator = estimator or Estimator()
     history = bench.feed(estimator, run.block, size)
     return estimator.finish(), history
+
+
+def unasked(estimator, block, size=1000):
+    """What it says at the end, when nobody asked before."""
+    for start in range(0, len(block), size):
+        estimator.add(bench.piece(block, start, start + size))
+    return estimator.finish()
 
 
 def same(a, b):
@@ -219,6 +226,35 @@ def test_blocks_of_any_size_give_bit_identical_estimates():
         assert same(whole, other)
 
 
+@pytest.mark.parametrize(("kind", "motion"), [("mam", "rov"), ("lam", "slow")])
+def test_many_epochs_at_once_give_the_answer_of_a_stream(kind, motion):
+    """Whether all fit into the window or not, and whatever the size of the blocks."""
+    run = bench.simulate(kind, motion, 1)
+    small = EstimatorParameters(window_steps=4096)
+    for parameters, far in ((EstimatorParameters(), 0.2), (small, 0.3)):
+        one = unasked(Estimator(parameters), run.block)
+        whole, other = (
+            unasked(Estimator(parameters, at_once=8), run.block, size) for size in (1000, 333)
+        )
+        assert same(whole, other)
+        assert one.converged
+        assert whole.converged
+        assert whole.samples == one.samples
+        moved = np.abs(run.errors(whole) - run.errors(one)) / one.sigma
+        assert moved.max() < far
+        np.testing.assert_allclose(whole.sigma, one.sigma, rtol=0.1)
+
+
+def test_what_waits_for_others_counts_when_asked():
+    run = bench.simulate("mam", "rov", 1, samples=1300)
+    estimator = Estimator(SMALL, at_once=8)
+    assert estimator.add(bench.piece(run.block, 0, 700))
+    early = estimator.estimate()
+    assert early.samples == 700
+    estimator.add(bench.piece(run.block, 700, 1300))
+    assert same(estimator.finish(), unasked(Estimator(SMALL, at_once=8), run.block))
+
+
 def test_averaged_streams_too():
     run = bench.simulate("mam", "rov", 1, samples=9000, rate_hz=100.0)
     estimates = [calibrated(run, Estimator(SMALL), size=size)[0] for size in (9000, 61)]
@@ -297,18 +333,22 @@ def test_single_wild_samples_do_not_move_the_answer():
     assert moved.max() < 3.0
 
 
+@pytest.mark.parametrize("at_once", [1, 5, WHOLE])
 @pytest.mark.parametrize("step_gauss", [0.02, 0.1, 0.5])
-def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss):
+def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
     """Body-fixed from 200 s on: what follows is as good as if nothing had been before."""
     run = bench.simulate("wam", "rov", 4)
     change = step_gauss * np.array([0.6, -0.48, 0.64])
     late = run.block.time_s > 200.0
     raw = run.block.raw_b_gauss + late[:, None] * change
     after = replace(run, hard_iron_gauss=run.hard_iron_gauss + change)
-    estimator = Estimator()
-    history = bench.feed(estimator, replace(run.block, raw_b_gauss=raw))
-    estimate = estimator.finish()
-    assert not any(e.warnings for t, e in history if t < 205.0)
+    estimator, block = Estimator(at_once=at_once), replace(run.block, raw_b_gauss=raw)
+    if at_once == 1:
+        history = bench.feed(estimator, block)
+        assert not any(e.warnings for t, e in history if t < 205.0)
+        estimate = estimator.finish()
+    else:
+        estimate = unasked(estimator, block)
     assert len(estimate.warnings) == 1
     said_s = float(estimate.warnings[0].split(" s:")[0].split()[-1])
     assert 175.0 < said_s < 225.0

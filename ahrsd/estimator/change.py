@@ -9,14 +9,12 @@ iron from some epoch on must take most of the disagreement away.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.graph import Graph
-from ahrsd.estimator.instrument import disagreement, informations
+from ahrsd.estimator.instrument import Said, disagreement
 from ahrsd.samples import Array
 
 _MOST_ROWS = 0.6
@@ -53,17 +51,16 @@ def contradicts(
     return bool(explained > _EXPLAINED * q.cost)
 
 
-def divides(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float, sigma_b: float) -> int | None:
-    """The epoch from which on another hard iron explains what one cannot; None if none does.
+def divides(said: Said, graph: Graph, sigma_bias: float, sigma_b: float) -> int | None:
+    """Which of the epochs is the first of those that another hard iron explains; None if none is.
 
-    At a settled calibration: linear around it. sigma_bias (rad/s) and sigma_b (gauss): what is
-    believed of gyro bias and of a change without data.
+    said: what they say (`instrument.py`) at a settled calibration: linear around it.
+    sigma_bias (rad/s) and sigma_b (gauss): what is believed of gyro bias and of a change
+    without data.
     """
-    turned = [k for k, epoch in enumerate(epochs) if epoch.turned]
-    if len(turned) < 2:
+    Hs, gs = said[0][:, :12, :12], said[1][:, :12]
+    if len(Hs) < 2:
         return None
-    whole = informations([epochs[k] for k in turned], graph)
-    Hs, gs = whole[0][:, :12, :12], whole[1][:, :12]
     pull = np.zeros((12, 12))
     pull[:9, :9] = graph.temper * graph.anchor[1] + graph.hold
     pull[9:, 9:] = np.eye(3) * graph.temper / sigma_bias**2
@@ -72,13 +69,13 @@ def divides(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float, sigma_b: f
     steps, chi2 = _seconds(H, g, Hs, gs, np.eye(3) * graph.temper / sigma_b**2)
     first = int(np.argmax(chi2)) + 1
     step, change = steps[first - 1, :12], steps[first - 1, 12:]
-    own = np.tile(step, (len(turned), 1))
+    own = np.tile(step, (len(Hs), 1))
     own[first:, _HARD] += change
     one = disagreement(Hs, gs, -np.linalg.solve(H, g))
     two = max(1.0, disagreement(Hs, gs, own))
     size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
     told = chi2[first - 1] > _CHI2 * two and one > _CALMED * two
-    return turned[first] if told and np.linalg.norm(change) > _LEAST * size else None
+    return first if told and np.linalg.norm(change) > _LEAST * size else None
 
 
 def _seconds(H: Array, g: Array, Hs: Array, gs: Array, prior: Array) -> tuple[Array, Array]:

@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ahrsd.estimator import chain, noise
-from ahrsd.estimator.factors import Factor, Node
+from ahrsd.estimator.factors import Factor, Node, gap_factor
+from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.misfit import Score, scores
 from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
+
+_SHORTEST_GAP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +106,26 @@ def scores_of(epochs: Sequence[Epoch]) -> list[Score]:
     for epoch, score in zip(new, scores([e.factor for e in new]) if new else [], strict=True):
         epoch.score = score
     return [e.score for e in epochs if e.score is not None]
+
+
+def grown(graph: Graph, data: chain.Data, walk: float, *, moving: bool) -> tuple[Piece, Array]:
+    """A new epoch, with the nodes that it needs in the graph, and directions to start from.
+
+    walk: of the gyro's bias, rad/s/sqrt(s).
+    """
+    a = graph.last
+    u = chain.start_directions(chain.symmetric(graph.c[:6]), graph.c[6:], data.field_b_gauss)
+    if data.measures_first and graph.until_s is not None:
+        gap_s = max(float(data.time_s[0]) - graph.until_s, _SHORTEST_GAP_S)
+        node = graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[0])
+        graph.factors.append(gap_factor(a, graph.c, graph.nodes[a], node, 1 / (walk**2 * gap_s)))
+        a += 1
+    elif data.measures_first:
+        graph.nodes[a] = Node.at(graph.nodes[a].bias, u[0])
+    graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
+    graph.until_s = float(data.time_s[-1])
+    information = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
+    return Piece(data, a, information, moving, noise.Typical.of(data)), u
 
 
 @dataclass(frozen=True, slots=True, eq=False)

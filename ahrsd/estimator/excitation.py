@@ -20,7 +20,8 @@ _SMOOTHED = 16  # steps
 
 def spread(field: Array) -> float:
     """Standard deviation of (N, 3) along the direction in which it varied most."""
-    return float(np.sqrt(np.linalg.eigvalsh(np.cov(field.T))[-1]))
+    away = field - field.mean(axis=0)
+    return float(np.sqrt(np.linalg.eigvalsh(away.T @ away)[-1] / (len(field) - 1)))
 
 
 def turned(data: chain.Data) -> bool:

@@ -93,6 +93,7 @@ class Graph:
         self.moments = Moments()
         self.nodes: dict[int, Node] = {prior.a: first}
         self.prior = prior
+        self.until_s: float | None = None  # when the newest node is
         self.factors: list[Factor] = []
         self._kept: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
 

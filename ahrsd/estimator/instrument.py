@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import is_not
 
 import numpy as np
 
@@ -66,13 +67,31 @@ class Instrument:
         return float(self.step[row]), float(np.sqrt(self.covariance[row, row]))
 
 
-def instrument(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Instrument:
-    """From the epochs of a settled window.  LinAlgError where the motion does not tell."""
-    moving = [epoch for epoch in epochs if epoch.turned]
-    if not moving:
-        raise np.linalg.LinAlgError("no epoch with motion")
-    own = informations(moving, graph)
-    H, g = own[0].sum(axis=0), own[1].sum(axis=0)
+Said = tuple[Array, Array]
+"""H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
+
+
+class Informations:
+    """What the epochs with motion say around the present answer; found once where they are."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[list[object], Said] | None = None
+
+    def of(self, epochs: Sequence[Epoch], graph: Graph) -> Said:
+        """LinAlgError where none has motion, or its directions are not determined."""
+        at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
+        kept = self._kept
+        if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
+            moving = [epoch for epoch in epochs if epoch.turned]
+            if not moving:
+                raise np.linalg.LinAlgError("no epoch with motion")
+            kept = self._kept = (at, _informations(moving, graph))
+        return kept[1]
+
+
+def instrument(said: Said, graph: Graph, sigma_bias: float) -> Instrument:
+    """From what the epochs of a settled window say.  LinAlgError where the motion does not tell."""
+    H, g = said[0].sum(axis=0), said[1].sum(axis=0)
     pull, mean = graph.temper * graph.anchor[1] + graph.hold, graph.anchor[0]
     H[:9, :9] += pull
     g[:9] += pull @ (graph.c - mean)
@@ -81,7 +100,7 @@ def instrument(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Inst
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
     covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
     step = -covariance @ g
-    misfit = max(1.0, disagreement(*own, step))
+    misfit = max(1.0, disagreement(*said, step))
     return Instrument(step, misfit * covariance, misfit)
 
 
@@ -99,8 +118,7 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
     return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def informations(epochs: Sequence[Epoch], graph: Graph) -> tuple[Array, Array]:
-    """H (N, 17, 17) and gradient (N, 17) of each epoch, all directions eliminated."""
+def _informations(epochs: Sequence[Epoch], graph: Graph) -> Said:
     rows = chain.Rows.of(
         [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
     )

@@ -6,7 +6,6 @@ ask for beyond that (`instrument.py`), in sigmas, is the evidence.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +13,8 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.estimator import chain
-from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.graph import Graph
-from ahrsd.estimator.instrument import TURN, instrument
+from ahrsd.estimator.instrument import TURN, Said, instrument
 from ahrsd.estimator.retraction import moved
 from ahrsd.samples import Array
 
@@ -47,9 +45,9 @@ class Misalignment:
         return worth and self.chi2 > _EVIDENCE and self.misfit < _MISFIT
 
 
-def misalignment(epochs: Sequence[Epoch], graph: Graph, sigma_bias: float) -> Misalignment:
-    """From the epochs of a settled window.  LinAlgError where the motion does not tell."""
-    found = instrument(epochs, graph, sigma_bias)
+def misalignment(said: Said, graph: Graph, sigma_bias: float) -> Misalignment:
+    """From what the epochs of a settled window say.  LinAlgError where the motion does not tell."""
+    found = instrument(said, graph, sigma_bias)
     theta, spread = found.step[TURN], found.covariance[TURN, TURN]
     c = moved(graph.c, found.step[:9], graph.moments)
     C = so3.exp(-theta[None])[0] @ np.linalg.inv(chain.symmetric(c[:6]))

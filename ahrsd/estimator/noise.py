@@ -11,7 +11,7 @@ half a mode per tangent direction is free at its ends): both noise levels follow
 (restricted maximum likelihood at fixed calibration; tests/test_estimator_noise.py). The gyro's
 level found where another was assumed goes the way only in part: over the chain's modes, whose gains
 have the mean h and the mean square h (1 + h^2) / 2, the variance found follows the one assumed with
-the exponent (1 - h^2) / 2. So the step is taken 2 / (1 + h^2) times as far.
+the exponent (1 - h^2) / 2. So the step is taken 2 / (1 + h^2) times as far (of logarithms).
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def residuals(
     further = 2.0 / (1.0 + min(hat / max(q.count_gyro, 1.0), 1.0) ** 2)
     found = q.sum_gyro / hat  # over the variance assumed
     if 1.0 / _FAR < found < _FAR:
-        found += (further - 1.0) * (found - 1.0)
+        found **= further
     return Residuals(
         q.sum_mag * used.mag_gauss**2,
         max(q.count_mag - hat, 1.0),

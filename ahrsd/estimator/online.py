@@ -16,7 +16,7 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, change, intake, noise, summary
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
-from ahrsd.estimator.instrument import LAG, Instrument, instrument
+from ahrsd.estimator.instrument import LAG, Informations, Instrument, instrument
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.misalignment import Misalignment, misalignment
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
@@ -41,6 +41,9 @@ _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
+WHOLE = 32  # `at_once` for a recording that is there as a whole: what a window holds
+
+
 class Estimator:
     """Streaming MAGYC.  Not thread-safe; deterministic: the same samples give the same numbers."""
 
@@ -49,13 +52,22 @@ class Estimator:
         parameters: EstimatorParameters | None = None,
         present: Affine | None = None,
         present_gyro_bias_rad_s: Array | None = None,
+        *,
+        at_once: int = 1,
     ) -> None:
-        """`present` is the device's calibration (registers 23 and 84): the prior's centre."""
+        """`present` is the device's calibration (registers 23 and 84): the prior's centre.
+
+        at_once: epochs that are collected before the answer follows them; where nobody asks in
+        between, more are faster.
+        """
         self.parameters = parameters or EstimatorParameters()
         self._present = present or Affine.identity()
         self._present_bias = (
             np.zeros(3) if present_gyro_bias_rad_s is None else present_gyro_bias_rad_s.copy()
         )
+        self._at_once = at_once
+        self._new: list[chain.Data] = []  # epochs that are not in the window yet
+        self._last: chain.Data | None = None  # the newest one
         self._intake = Intake(self.parameters)
         self._window: Window | None = None
         self._whitening = np.eye(12)
@@ -64,6 +76,7 @@ class Estimator:
         self._moving_epochs, self._last_search = 0, 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
+        self._said = Informations()
         self._lag_spread: Array = np.zeros(12)  # what a lag that is one sigma off does
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
@@ -92,55 +105,70 @@ class Estimator:
     def finish(self) -> Estimate | None:
         """End of the recording: use what is pending and iterate to the end."""
         self.interrupt()
+        if self._new:
+            self._grow()
         if self._window is not None:
             if self._searching and self._moving_epochs > _FRESH * self._last_search:
-                self._search(self._window)
-            self._window.track(everything=True, exactly=True)
+                self._search(self._window, exactly=True)
+            else:
+                self._window.track(everything=True, exactly=True)
             self._window = self._undivided(self._window)
             if self._examine(self._window) and self._searching:
-                self._search(self._window)
-                self._window.track(everything=True, exactly=True)
+                self._search(self._window, exactly=True)
         return self._answer()
 
     def _append(self, data: chain.Data) -> None:
-        window = self._window
-        if window is None:
-            window = self._window = self._begin(data)
-        elif not data.measures_first:
-            data = intake.with_border(data, window.epochs[-1].data)
+        if self._last is not None and not data.measures_first:
+            data = intake.with_border(data, self._last)
+        self._last = data
         self._down.append(data.down_b[len(data) // 2])
-        window.append(data)
-        if self._contradicted(window):
+        self._new.append(data)
+        if len(self._new) >= self._at_once:
+            self._follow(*self._grow())
+
+    def _grow(self) -> tuple[Window, int]:
+        """The window with the new epochs in it, and how many they were."""
+        new, self._new = self._new, []
+        window = self._window = self._window or self._begin(new[0])
+        window.append(new)
+        self._moving_epochs += sum(epoch.turned for epoch in window.epochs[-len(new) :])
+        return self._unchanged(window, len(new)), len(new)
+
+    def _follow(self, window: Window, new: int) -> None:
+        """Let the answer follow the new epochs, unless the last one waits for the next."""
+        if self._strange > 0:
             return
-        window = self._window or window
-        window.track(everything=self._searching and len(window.epochs) <= _FEW)
-        if window.epochs[-1].turned:
-            self._moving_epochs += 1
-            if self._moving_epochs >= self._next_search:
-                self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
-                if self._searching:
-                    self._search(window)
-                window = self._window = self._undivided(window)
-                self._examine(window)
+        due = self._moving_epochs >= self._next_search
+        if not (due and window.untried):  # else there is nothing yet to go on from
+            window.track(new, everything=self._searching and len(window.epochs) <= _FEW)
+        if due:
+            self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
+            if self._searching:
+                self._search(window)
+            window = self._window = self._undivided(window)
+            self._examine(window)
         window.fold()
 
-    def _contradicted(self, window: Window) -> bool:
-        """Whether the newest epoch waits for the next one, because it contradicts a sure answer.
+    def _unchanged(self, window: Window, new: int) -> Window:
+        """The window, or a new one where two epochs one after the other contradict a sure answer.
 
-        If that does too, the iron has changed: everything before them is forgotten.
+        Then the iron has changed: everything before them is forgotten. One that does waits for the
+        next to do so too.
         """
         sure = not self._searching and window.step_sigmas < _SETTLED
-        self._strange = self._strange + 1 if sure and window.contradicted() else 0
-        if self._strange == _CHANGED:
-            self._window = self._anew(window, _CHANGED)
-        return self._strange > 0
+        for k in range(-new, 0):
+            self._strange = self._strange + 1 if sure and window.contradicted(k) else 0
+            if self._strange == _CHANGED:
+                window = self._window = self._anew(window, _CHANGED - 1 - k)
+                break
+        return window
 
     def _anew(self, window: Window, count: int) -> Window:
         """The iron changed before the last `count` epochs: what was before is forgotten."""
         self.restarted_s = float(window.epochs[-count].data.time_s[0])
         self._searching, self._agreed, self._strange = True, False, 0
-        self._moving_epochs = self._last_search = 1
-        self._next_search = _FIRST_SEARCH
+        self._moving_epochs = sum(epoch.turned for epoch in window.epochs[-count:])
+        self._last_search, self._next_search = 0, _FIRST_SEARCH
         return window.anew(count)
 
     def _undivided(self, window: Window) -> Window:
@@ -149,17 +177,18 @@ class Estimator:
             return window
         p = self.parameters
         try:
+            said = self._said.of(window.epochs, window.graph)
             first = change.divides(
-                window.epochs, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
+                said, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
             )
         except np.linalg.LinAlgError:
             return window
         if first is None:
             return window
-        window = self._anew(window, len(window.epochs) - first)
+        turned = [k for k, epoch in enumerate(window.epochs) if epoch.turned]
+        window = self._anew(window, len(window.epochs) - turned[first])
         window.track(everything=True)
-        self._search(window)
-        window.track(everything=True)
+        self._search(window, exactly=True)
         return window
 
     def _begin(self, data: chain.Data) -> Window:
@@ -178,8 +207,11 @@ class Estimator:
         first = Node.at(self._present_bias, direction)
         return Window(p, c, belief, first, noise.first_guess(data, p))
 
-    def _search(self, window: Window) -> None:
-        """Other starts compete with the present answer, until they agree on good data."""
+    def _search(self, window: Window, *, exactly: bool = False) -> None:
+        """Other starts compete with the present answer, until they agree on good data.
+
+        With `exactly` the answer is then iterated to the end over all.
+        """
         found = search(self.parameters, window, self._present_bias, [e.data for e in window.epochs])
         window.loud = found.loud
         unsettled = window.step_sigmas > _SETTLED
@@ -190,7 +222,10 @@ class Estimator:
             or (not window.folded and found.away > _AWAY)
         ):
             window.restart_at(found.c, found.bias)
-            window.track()
+            window.track(everything=exactly, exactly=exactly)
+        elif exactly or window.untried:
+            window.track(everything=True, exactly=exactly)
+        self._last_search = self._moving_epochs
         self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
         settled = window.step_sigmas < _SETTLED
         self._searching = not (found.agreed and settled and self._sure(window))
@@ -217,7 +252,8 @@ class Estimator:
 
     def _instrument(self, window: Window) -> Instrument | None:
         try:
-            return instrument(window.epochs, window.graph, self.parameters.prior_gyro_bias_rad_s)
+            said = self._said.of(window.epochs, window.graph)
+            return instrument(said, window.graph, self.parameters.prior_gyro_bias_rad_s)
         except np.linalg.LinAlgError:
             return None
 
@@ -235,7 +271,7 @@ class Estimator:
 
         An epoch that is under way counts as far as it is, if it is long enough to be one.
         """
-        if self._window is not None and self._intake.pending >= MIN_EPOCH_STEPS:
+        if self._new or (self._window and self._intake.pending >= MIN_EPOCH_STEPS):
             return self._twin().finish()
         return self._answer()
 
@@ -245,13 +281,15 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            return misalignment(window.epochs, window.graph, self.parameters.prior_gyro_bias_rad_s)
+            said = self._said.of(window.epochs, window.graph)
+            return misalignment(said, window.graph, self.parameters.prior_gyro_bias_rad_s)
         except np.linalg.LinAlgError:
             return None
 
     def _twin(self) -> Estimator:
         other = copy(self)
         other._intake, other._down = self._intake.twin(), self._down.copy()
+        other._new = list(self._new)
         other._window = None if self._window is None else self._window.twin()
         return other
 

@@ -2,15 +2,15 @@
 
 The likelihood has more than one valley when motion is poor. So now and then several starts descend
 on a part of the window (the epochs whose field varied most, all in one chain with cuts in it; of
-an epoch of single steps every k-th field, rotations between them composed exactly): the device's
-present calibration, a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be
-called sure only if two starts that know nothing of each other arrive there.
+each as many rows in a state as the gyro carries, or every k-th): the device's present calibration,
+a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be called sure only if
+two starts that know nothing of each other arrive there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ahrsd.estimator import chain, start
 from ahrsd.estimator.excitation import spread
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, sigmas
+from ahrsd.estimator.grouping import group_size, grouped
 from ahrsd.estimator.lag import rates
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.steps import compose
@@ -26,7 +27,9 @@ from ahrsd.samples import Array
 
 _EPOCHS = 6
 _STEPS = 128  # rows per epoch, at most twice that
+_LOST, _LARGEST = 0.25, 15  # of the field's variance, and most rows, where rows share a state
 _DESCENT = 8  # Levenberg-Marquardt steps per start
+_NEAR = 0.1  # sigmas from the best so far at which a descent need not go on
 _SAME = 1.0  # sigmas within which two answers are one
 _LOUD = 2.0  # residual variance over that of the fields' differences that the model left over
 
@@ -80,16 +83,24 @@ def search(
     thin.graph.temper = graph.temper
     if window.loud > 1.0:
         thin.graph.hold = graph.hold
-    thin.attach(joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen]))
+    size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
+    thin.attach([joined([coarse(data[k], window.usual, size) for k in chosen])], [True])
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
-    own = _descend(thin, graph.c, graph.nodes[graph.last].bias)
-    starts = [present, start.linear_start(whole), start.sphere_start(fields)]
+    own = _descend(thin, graph.c, graph.nodes[graph.last].bias, None)
+    starts = [start.linear_start(whole), start.sphere_start(fields)]
+    best, independent = own, []
+    if np.array_equal(graph.c, present):
+        independent.append(own)
+    else:
+        starts.insert(0, present)
     known = [c for c in starts if c is not None]
     if window.loud > 1.0:
         known = [graph.with_held(c) for c in known]
-    independent = [_descend(thin, c, present_bias) for c in known if _positive(c)]
-    best = min([own, *independent], key=lambda r: r.cost)
+    for c in known:
+        if _positive(c):
+            independent.append(_descend(thin, c, present_bias, best))
+            best = min(best, independent[-1], key=lambda r: r.cost)
     loud = best.loud if best.loud > _LOUD else 1.0
     away = _distance(graph.c, best, graph.temper * loud if loud > 1.0 else 1.0)
     apart = sorted(_distance(r.c, best, graph.temper * loud) for r in independent)
@@ -101,9 +112,14 @@ def _positive(c: Array) -> bool:
     return bool(np.linalg.eigvalsh(chain.symmetric(c[:6]))[0] > 0.0)
 
 
-def _descend(thin: Window, c: Array, bias: Array) -> _Reached:
+def _descend(thin: Window, c: Array, bias: Array, best: _Reached | None) -> _Reached:
+    """Downhill from c, until it is clear that this leads to the best so far."""
     thin.restart_at(c, bias)
-    cost = thin.optimise(_DESCENT)
+
+    def near(at: Array) -> bool:
+        return best is not None and _distance(at, best, 1.0) < _NEAR
+
+    cost = thin.optimise(_DESCENT, near)
     graph = thin.graph
     try:
         information = np.asarray(np.linalg.inv(graph.covariance()[:9, :9]), dtype=np.float64)
@@ -119,6 +135,14 @@ def _distance(c: Array, best: _Reached, temper: float) -> float:
     if best.information is None:
         return float(np.inf)
     return sigmas(c - best.c, best.information / temper)
+
+
+def coarse(data: chain.Data, noise: chain.Noise, size_gauss: float) -> chain.Data:
+    """An epoch with as many rows in a state as the gyro carries, or else not too many rows."""
+    size = group_size(data, noise, size_gauss, lost=_LOST, largest=_LARGEST)
+    if size > 1:
+        return replace(grouped(data, size), measures_first=True)
+    return thinned(data, max(1, len(data) // _STEPS))
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:

@@ -13,7 +13,7 @@ noise and model errors cannot make them wander (`Graph.hold_blind`).
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Epoch, Piece, Place, Snapshot, scores_of
+from ahrsd.estimator.epoch import Epoch, Place, Snapshot, grown, scores_of
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
     Node,
@@ -30,7 +30,6 @@ from ahrsd.estimator.factors import (
     bias_prior,
     chain_step,
     epoch_factor,
-    gap_factor,
 )
 from ahrsd.estimator.graph import Graph, SingularError, sigmas
 from ahrsd.estimator.grouping import group_size, grouped
@@ -56,7 +55,6 @@ _GAIN = 0.05  # of log likelihood: less is not worth another step
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
 _ANOTHER_REST = 0.02  # rad between two directions at rest
-_SHORTEST_GAP_S = 0.1
 
 
 class Window:
@@ -85,6 +83,7 @@ class Window:
         self._covariance = belief  # of c, when it was last weighed
         self._work = 0
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
+        self._guess = usual  # the middle of them
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, belief, first, prior)
 
@@ -97,45 +96,33 @@ class Window:
 
     # -- growing and forgetting ------------------------------------------------------------------
 
-    def append(self, data: chain.Data) -> None:
-        """A new epoch of single steps, linked to the last one unless `data.measures_first`."""
-        guess = noise.first_guess(data, self.parameters)
-        self._guesses.append(guess)
-        moving = turned(data)
-        if moving:
-            self.graph.moments.take(data.field_b_gauss)
+    def append(self, new: Sequence[chain.Data]) -> None:
+        """New epochs of single steps, linked to the one before unless `measures_first`."""
         size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
-        data = grouped(data, group_size(data, guess, size))
-        self.attach(data if self.lag_s == 0.0 else delayed(data, self.lag_s), moving=moving)
+        moving, coarse = [], []
+        for data in new:
+            guess = noise.first_guess(data, self.parameters)
+            self._guesses.append(guess)
+            moving.append(turned(data))
+            if moving[-1]:
+                self.graph.moments.take(data.field_b_gauss)
+            few = grouped(data, group_size(data, guess, size))
+            coarse.append(few if self.lag_s == 0.0 else delayed(few, self.lag_s))
+        self._guess = noise.median(self._guesses)
+        self.attach(coarse, moving)
 
     def learn_from(self, other: Window) -> None:
         """First guesses of the noise and moments of the field, for a part of the other's data."""
-        self._guesses = other._guesses.copy()
+        self._guesses, self._guess = other._guesses.copy(), other._guess
         self.graph.moments = other.graph.moments
 
-    def attach(self, data: chain.Data, *, moving: bool = True) -> None:
-        """An epoch whose steps are grouped already."""
-        self._work = min(self._work + _WORK, _MOST_WORK)
-        graph = self.graph
-        a = graph.last
+    def attach(self, new: Sequence[chain.Data], moving: Sequence[bool]) -> None:
+        """Epochs whose steps are grouped already, and whether they calibrate."""
         walk = self.parameters.bias_walk_rad_s_sqrt_s
-        u = chain.start_directions(chain.symmetric(graph.c[:6]), graph.c[6:], data.field_b_gauss)
-        if data.measures_first and self.epochs:
-            gap_s = max(float(data.time_s[0] - self.epochs[-1].data.time_s[-1]), _SHORTEST_GAP_S)
-            node = Node.at(graph.nodes[a].bias, u[0])
-            graph.nodes[a + 1] = node
-            graph.factors.append(
-                gap_factor(a, graph.c, graph.nodes[a], node, 1.0 / (walk**2 * gap_s))
-            )
-            a += 1
-        elif data.measures_first:
-            graph.nodes[a] = Node.at(graph.nodes[a].bias, u[0])
-        u[0] = graph.nodes[a].direction
-        graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
-        info = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-        piece = Piece(data, a, info, moving, noise.Typical.of(data))
-        self.epochs += self._linearised([Place(piece, u, self.usual)])
-        graph.factors.append(self.epochs[-1].factor)
+        pieces = [grown(self.graph, d, walk, moving=m) for d, m in zip(new, moving, strict=True)]
+        self._work = min(self._work + _WORK * len(new), max(_MOST_WORK, _WORK * len(new)))
+        self.epochs += self._linearised([Place(piece, u, self.usual) for piece, u in pieces])
+        self.graph.factors += [epoch.factor for epoch in self.epochs[-len(new) :]]
 
     def fold(self) -> None:
         """Fold the oldest epochs until the window has its size."""
@@ -150,6 +137,11 @@ class Window:
             self.misfit.remember(old.factor, scores_of([old])[0], self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
+
+    @property
+    def untried(self) -> bool:
+        """Whether no step was ever possible: the answer is where it began."""
+        return not np.isfinite(self.step_sigmas)
 
     # -- linearisation ---------------------------------------------------------------------------
 
@@ -172,10 +164,10 @@ class Window:
             out.append(Epoch(at.piece, at.u, at.used, self.usual, q, factor))
         return out
 
-    def contradicted(self) -> bool:
-        """Whether the newest epoch contradicts the calibration; ask before it is tracked."""
+    def contradicted(self, k: int) -> bool:
+        """Whether epoch k contradicts the calibration; ask before it is tracked."""
         limit = self.parameters.outlier_sigma
-        return contradicts(self.epochs[-1], self.graph.c, self._covariance, self.usual, limit)
+        return contradicts(self.epochs[k], self.graph.c, self._covariance, self.usual, limit)
 
     def anew(self, count: int) -> Window:
         """A window of the last `count` epochs that remembers nothing before but noise and bias."""
@@ -186,10 +178,11 @@ class Window:
         mean, information = graph.anchor
         belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
         other = Window(self.parameters, mean, belief, node, self.usual)
-        other._guesses, other.lag_s = self._guesses.copy(), self.lag_s
-        for epoch, data in zip(kept, [first, *(e.data for e in kept[1:])], strict=True):
-            other.graph.moments.take(data.field_b_gauss)
-            other.attach(data, moving=epoch.turned)
+        other._guesses, other._guess = self._guesses.copy(), self._guess
+        other.lag_s = self.lag_s
+        for epoch in kept:
+            other.graph.moments.take(epoch.data.field_b_gauss)
+        other.attach([first, *(e.data for e in kept[1:])], [e.turned for e in kept])
         return other
 
     def _resting(self, u: Array) -> Array:
@@ -232,9 +225,8 @@ class Window:
         ]
         self._replace(which, places, outlier_sigma=p.outlier_sigma)
         found = [e.residuals for e in self.epochs]
-        guess = noise.median(self._guesses)
         self.usual = noise.at_least(
-            noise.pooled(found, guess, self.parameters), _GYRO_LEAST * guess.gyro_rad_s
+            noise.pooled(found, self._guess, self.parameters), _GYRO_LEAST * self._guess.gyro_rad_s
         )
 
     def delay(self, lag_s: float) -> None:
@@ -269,7 +261,7 @@ class Window:
         self._work = max(self._work, _RESTART_WORK * len(self.epochs))
 
     def _start_noise(self) -> chain.Noise:
-        guess = noise.median(self._guesses)
+        guess = self._guess
         return chain.Noise(min(self.usual.mag_gauss, _WIDER * guess.mag_gauss), guess.gyro_rad_s)
 
     def snapshot(self) -> Snapshot:
@@ -288,11 +280,13 @@ class Window:
         rises = Stack([graph.prior, *graph.factors], graph.c, graph.nodes).rises()
         return sum(e.cost for e in self.epochs) + float(rises.sum()) + graph.anchor_cost()
 
-    def optimise(self, steps: int = _MAX_STEPS) -> float:
+    def optimise(
+        self, steps: int = _MAX_STEPS, enough: Callable[[Array], bool] | None = None
+    ) -> float:
         """Levenberg-Marquardt over the whole window at fixed noise and weights; returns the cost.
 
-        Stops at the iteration limit or where damping alone no longer finds a lower cost; the
-        window is then at the best point found. Never raises on hopeless data: `step_sigmas` says.
+        Stops at the iteration limit, where damping alone finds no lower cost, or where c is
+        `enough`; the window is then at the best point found. Never raises on hopeless data.
         """
         c = self.graph.c
         present = all(np.array_equal(e.factor.point.c, c) for e in self.epochs if e.turned)
@@ -308,7 +302,7 @@ class Window:
             if new < cost:
                 gain, cost = cost - new, new
                 self._damping = max(self._damping / 10, _DAMPING_LIMITS[0])
-                if gain < _GAIN * self.graph.temper:
+                if gain < _GAIN * self.graph.temper or (enough and enough(self.graph.c)):
                     break
             else:
                 self.restore(kept)
@@ -328,14 +322,14 @@ class Window:
         self._replace(which, [Place(e.piece, u, e.used, e.weights) for e, u in places])
         return self.cost()
 
-    def track(self, *, everything: bool = False, exactly: bool = False) -> None:
-        """Follow the newest epoch; with `everything`, all are linearised anew first.
+    def track(self, new: int = 1, *, everything: bool = False, exactly: bool = False) -> None:
+        """Follow the newest epochs; with `everything`, all are linearised anew first.
 
         Ends where linearising again would hardly move the answer: by what the step was curved, or,
         `exactly`, by what another pass over everything did.
         """
         graph, everyone = self.graph, range(len(self.epochs))
-        stale: Sequence[int] = everyone if everything else everyone[-1:]
+        stale: Sequence[int] = everyone if everything else everyone[-new:]
         if everything:
             self._work = max(self._work, _FINISH_WORK * len(everyone))
         for _ in range(_MAX_TRACKS):
@@ -393,5 +387,4 @@ class Window:
     def _repeating(self) -> float:
         """By how much errors that repeat with the attitude shrink the information."""
         cells = sum((e.cells for e in self.epochs if e.turned), self._folded_cells)
-        white = noise.median(self._guesses).mag_gauss
-        return excess(cells, self.usual.mag_gauss, white)
+        return excess(cells, self.usual.mag_gauss, self._guess.mag_gauss)

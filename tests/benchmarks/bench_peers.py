@@ -28,7 +28,7 @@ import numpy as np
 from peers_table import best_peers, set_lines, time_lines, verdict_lines
 
 from ahrsd.accuracy import Answer
-from ahrsd.estimator.online import Estimator
+from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.methods import MethodError
 from ahrsd.montecarlo import Plan, Record, run_many, scored
 from ahrsd.montecarlo_methods import OURS, STREAM
@@ -223,7 +223,7 @@ def ours_s(experiment: Experiment, rows: int) -> float:
     spent = []
     for _ in range(3):
         begun_s = time.process_time()
-        estimator = Estimator()
+        estimator = Estimator(at_once=WHOLE if rows > 25 else 1)
         for block in blocks:
             estimator.add(block)
         if rows > 25:
