@@ -20,6 +20,9 @@ from ahrsd.mismatch.search import (
 )
 from ahrsd.samples import Array
 
+#: names of iron and metal that remember or follow the turns: half of any unlogged course looks so
+IMITATORS = ("viscous_magnetisation", "hysteresis", "eddy_current")
+
 
 def examined(state: State) -> State:
     """The state without the names that are no more than what the model leaves anyway.
@@ -35,10 +38,18 @@ def examined(state: State) -> State:
         worth = [_worth(state, basis, found, k) for k in range(len(state.named))]
         weakest = int(np.argmin(worth))
         if worth[weakest] > max(limits.beyond_nats, limits.beyond_share * found.unknown):
-            break
+            poor = [k for k in range(len(worth)) if _imitates(state.names[k], worth[k], found)]
+            if not poor:
+                break
+            weakest = min(poor, key=lambda k: worth[k])
         kept = tuple(judged for k, judged in enumerate(state.named) if k != weakest)
         state = refitted(state, kept)
     return state
+
+
+def _imitates(name: str, worth: float, found: Discrepancy) -> bool:
+    """Whether a name that needs no logged cause is worth less than what it leaves unexplained."""
+    return name in IMITATORS and worth < found.unknown
 
 
 def rest_of(state: State, basis: Base) -> Discrepancy | None:

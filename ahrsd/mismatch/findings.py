@@ -69,7 +69,7 @@ def finding(
         alternatives=tuple(a for a in alternatives if a.confidence > SMALLEST_SHARE),
         where=where(judged, added_value(state, number), basis),
         parameters=parameters,
-        heldout=_heldout(judged, basis, state.problem.thin),
+        heldout=_heldout(_with_all_else(judged, seen), basis, state.problem.thin),
         cost_if_left_out=cost(basis, number, added_value(state, number)),
         separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
@@ -255,6 +255,12 @@ def _shares(judged: Judged, seen: Survey, last: Survey, lead: float) -> dict[str
     found = posterior({mine: lead + max([judged.evidence, *own]), **evidence}, {})
     rest = {k: v for k, v in sorted(found.items(), key=lambda item: -item[1]) if k != mine}
     return {mine: found[mine], **rest}
+
+
+def _with_all_else(judged: Judged, seen: Survey) -> Judged:
+    """The name judged beside all the others with the noise that they leave, where it was."""
+    mine = (j for j in seen.judged if j.candidate.name == judged.candidate.name)
+    return next(mine, judged)
 
 
 def _heldout(judged: Judged, basis: Base, thin: int) -> Heldout:

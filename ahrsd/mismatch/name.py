@@ -23,7 +23,7 @@ from ahrsd.samples import Array
 #: shifts shorter than this are the effect itself a moment later
 MINIMUM_SHIFT_SHARE = 0.05
 #: what fewer blocks than this show cannot be known from the others: a jump of the outside field,
-#: which the filter follows within seconds; then nats beyond all doubt take the held-out gain's place
+#: which the filter follows within seconds; nats beyond all doubt then stand for the held-out gain
 LONELY_BLOCKS, LONELY_NATS = 2.5, 20.0
 
 
@@ -81,7 +81,8 @@ def judge(
         *without_known(basis, columns), round(MINIMUM_SHIFT_SHARE * len(columns))
     )
     beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
-    lonely = what.effective_blocks < LONELY_BLOCKS and evidence > LONELY_NATS
+    outside = candidate.effect.family == "world"
+    lonely = outside and what.effective_blocks < LONELY_BLOCKS and evidence > LONELY_NATS
     bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
     checks = (
         ("family-wise probability", family < limits.family_p),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from ahrsd.mismatch.evidence import colour, log_bayes
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.score import Score, score
+from ahrsd.mismatch.sums import Sums
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -33,6 +34,8 @@ ONSET_PASSES = 2
 SCALES = ("time_constant_s", "radius_gauss", "length_s")
 ANGLES = ("turn_deg",)
 SCALE_CHOICES = 3
+#: steps in which an object's place is sought, in parts of its distance, and the turn in radians
+PLACE_SHARES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.03)
 WORTH_NATS = 4.0
 #: an onset of the coarse grid that says less than this against its effect is sought more closely
 NEAR_NATS = -3.0
@@ -56,32 +59,6 @@ class Candidate:
     def scale(self) -> Array:
         """(p,) one prior deviation per parameter."""
         return np.array([parameter.scale for parameter in self.effect.parameters])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sums:
-    """What a fit with all its terms has in common with columns that were held against it.
-
-    known (3 N, q), innovation (3 N,): of the fit;  inner (q, q), seen (q,): their products
-    found: by effect and setting (p, p) X^T X, (q, p) Z^T X, (p,) X^T e
-    """
-
-    known: Array
-    innovation: Array
-    inner: Array
-    seen: Array
-    found: dict[tuple[str, str], tuple[Array, Array, Array]] = field(default_factory=dict)
-
-    @staticmethod
-    def of(known: Array, innovation: Array) -> Sums:
-        """Nothing held against it yet; (N, 3, q), (N, 3)."""
-        Z, e = known.reshape(-1, known.shape[2]), innovation.ravel()
-        return Sums(Z, e, Z.T @ Z, Z.T @ e)
-
-    def add(self, key: tuple[str, str], columns: Array) -> None:
-        """Whitened columns (N, 3, p)."""
-        X = columns.reshape(-1, columns.shape[2])
-        self.found[key] = X.T @ X, self.known.T @ X, X.T @ self.innovation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -328,11 +305,35 @@ def closest_scale(basis: Base, start: Candidate, reach: float) -> Candidate:
     key, best = scale_of(start), start
     if key is None:
         return start
+    if "place_m" in start.setting:
+        return _closest_place(basis, start)
     for share in (1.0, 1 / 3, 1 / 9):
         steps = [scaled(best.setting, key, k * share * reach) for k in (-1, 0, 1)]
         found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
         best = replace(found, tried=start.tried, evidence=found.evidence + np.log(len(steps)))
     return best
+
+
+def _closest_place(basis: Base, start: Candidate) -> Candidate:
+    """An object's place and the turn of the positions' frame, sought one after the other."""
+    best = replace(start, evidence=evidence_of(basis, start))
+    for share in PLACE_SHARES:
+        reach_m = share * float(start.setting["distance_m"])
+        for axis in range(4):
+            steps = [_displaced(best.setting, axis, reach_m, share, k) for k in (-1, 0, 1)]
+            found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
+            best = replace(
+                found, tried=start.tried, evidence=found.evidence + float(np.log(len(steps)))
+            )
+    return best
+
+
+def _displaced(setting: Setting, axis: int, reach_m: float, turn_rad: float, k: int) -> Setting:
+    """The setting with its place moved along north, east or down, or (3) its frame turned."""
+    if axis == 3:
+        return scaled(setting, "turn_deg", k * turn_rad)
+    place = [x + k * reach_m * (n == axis) for n, x in enumerate(setting["place_m"])]
+    return {**setting, "place_m": [round(x, 4) for x in place]}
 
 
 def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:
