@@ -109,7 +109,10 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """What the library has no name for: located, with its course in time."""
+    """What the library has no name for: located, with its course in time.
+
+    course: (time in s, value in `unit`) of one source along `where.direction`, about its mean
+    """
 
     detected: bool
     where: Where | None = None
@@ -119,6 +122,7 @@ class Unexplained:
     single_source_share: float | None = None
     follows: tuple[Suspect, ...] = ()
     evidence_nats: float = 0.0
+    course: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

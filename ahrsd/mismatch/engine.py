@@ -36,6 +36,7 @@ from ahrsd.mismatch.findings import (
     of_fact,
     whole_term,
 )
+from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.missing import lost_turns, missing_turns
@@ -143,6 +144,8 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = swapped(slim, last)
     state, surveys, left = without_stand_ins(state, surveys)
+    if unknown.detected(left, problem.limits):
+        left = with_free_course(state, left)
     return _Searched(start, state, surveys, first, last, left)
 
 
@@ -311,6 +314,6 @@ def _drawn(done: _Searched, basis: Base) -> Drawn:
         done.start.filtered.whitened,
         state.fit.filtered.whitened,
         contributions,
-        tuple(done.left.located.values()),
+        done.left.courses,
         {candidate.name: candidate.evidence for candidate in done.first.candidates},
     )

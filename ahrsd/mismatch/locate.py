@@ -33,6 +33,8 @@ SEGMENT_S = 20.0
 SEGMENTS = (6, 24)
 #: sizes of one coefficient over which the evidence is averaged: gauss, gauss, rad/s
 UNITS: Mapping[Frame, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
+#: of a recording's stretches one in so many is its beginning
+FIRST_SHARE = 12
 SPAN = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 
@@ -131,7 +133,7 @@ def locate(projected: Gram, frame: Frame, cut: Segments, colour: float) -> Locat
     walk = log_bayes_walk(G, s, 3, np.asarray(SPAN) * unit, colour)
     evidence = float(np.logaddexp(log_bayes(what, colour, SPAN), walk) - np.log(2.0))
     course, deviation = _posterior_mean(G / colour, s / colour, unit)
-    direction, share = _single_source(course, deviation)
+    direction, share = single_source(course, deviation)
     return Located(
         frame,
         evidence,
@@ -161,13 +163,21 @@ def _posterior_mean(G: Array, s: Array, unit: float) -> tuple[Array, Array]:
     return mean.reshape(-1, 3), np.sqrt(variance.reshape(-1, 3).mean(axis=1))
 
 
-def _single_source(course: Array, deviation: Array) -> tuple[Array, float]:
+def single_source(course: Array, deviation: Array) -> tuple[Array, float]:
+    """Unit vector (3,) along which a course (J, 3) moves most, and the share of what moves there.
+
+    It points to where the course goes from its beginning: what runs later is seldom on at first.
+    """
     weight = 1.0 / np.maximum(deviation, 1e-12)
     centred = (course - np.average(course, axis=0, weights=weight**2)) * weight[:, None]
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
     power = sizes**2
     along = course @ axes[0]
-    direction = axes[0] * np.copysign(1.0, along[np.argmax(np.abs(along))])
+    first = max(1, len(along) // FIRST_SHARE)
+    later = np.average(along, weights=weight**2) - np.average(
+        along[:first], weights=weight[:first] ** 2
+    )
+    direction = axes[0] * np.copysign(1.0, later)
     return np.asarray(direction), float(power[0] / max(power.sum(), 1e-300))
 
 

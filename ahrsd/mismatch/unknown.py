@@ -36,16 +36,27 @@ class Remainder:
 
     basis: with the noise that the strongest frame leaves;  located: by frame
     bins: (regime, evidence, p-value), the strongest first
+    free: the strongest frame with its course as a joint fit has it (`free_course`)
     """
 
     basis: Base
     located: dict[Frame, Located]
     bins: tuple[tuple[Regime, float, float], ...]
+    free: Located | None = None
 
     @property
     def strongest(self) -> Located:
         """The frame that explains most."""
         return max(self.located.values(), key=lambda one: one.evidence)
+
+    @property
+    def courses(self) -> tuple[Located, ...]:
+        """Every frame's course, as the joint fit has it where there is one."""
+        free = self.free
+        return tuple(
+            free if free is not None and free.frame == frame else one
+            for frame, one in self.located.items()
+        )
 
 
 def remainder(basis: Base, with_bins: bool = True) -> Remainder:
@@ -136,11 +147,12 @@ def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
     by_bin = bool(left.bins) and left.bins[0][1] > best.evidence
     time_s = basis.context.track.time_s
     whole = ((float(time_s[0]), float(time_s[-1])),)
-    spread = np.sqrt(np.average((best.course - best.course.mean(0)) ** 2, axis=0))
-    x, y, z = (float(part) for part in best.direction)
+    free = left.free or best
+    spread = np.sqrt(np.average((free.course - free.course.mean(0)) ** 2, axis=0))
+    x, y, z = (float(part) for part in free.direction)
     follows = tuple(
         Suspect(m.channel, m.correlation, m.p_value)
-        for m in locate.matches(basis.context.track, best)
+        for m in locate.matches(basis.context.track, free)
         if m.p_value < 0.2 and abs(m.correlation) > 0.5
     )
     return Unexplained(
@@ -154,11 +166,14 @@ def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
             (x, y, z),
         ),
         heldout=None if by_bin else _heldout(left, block_s),
-        size=float(np.ptp(best.source)),
+        size=float(np.ptp(free.source)),
         unit="rad/s" if best.frame == "gyro" else "gauss",
-        single_source_share=best.single_share,
+        single_source_share=free.single_share,
         follows=follows,
         evidence_nats=max(best.evidence, left.bins[0][1] if left.bins else -np.inf),
+        course=()
+        if by_bin
+        else tuple(zip(free.cut.middle_s.tolist(), free.source.tolist(), strict=True)),
     )
 
 
