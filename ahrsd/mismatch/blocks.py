@@ -11,7 +11,7 @@ with the plain loop.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +91,7 @@ class Recursion:
     matrix: Array
     reach: Array
     total: Array
+    _steps: dict[tuple[bool, bool], Array] = field(default_factory=dict)
 
     @property
     def states(self) -> int:
@@ -104,25 +105,32 @@ class Recursion:
             raise ValueError("a recursion needs an input")
         count, _, p = given.shape
         s, rows = self.states, self.layout.rows
-        columns = [*range(s)]
-        columns += [*range(s, s + 3)] * (gyro is not None)
-        columns += [*range(s + 3, s + 6)] * (mag is not None)
-        rest = np.zeros(self.matrix.shape[1:])
-        rest[3:, :s] = np.eye(s)
-        steps = self.layout.padded(self.matrix, rest)[:, :, :, columns]
+        steps = self._padded(gyro is not None, mag is not None)
+        width = steps.shape[-1]
         out = np.empty((count + 1, 3, p))
-        work = np.zeros((rows.shape[1], len(columns), p))
+        work = np.zeros((rows.shape[1], width, p))
         for row, step in zip(rows, steps, strict=True):
             at = np.minimum(row, count - 1)  # what stands behind a block's end is not looked at
             if gyro is not None:
                 work[:, s : s + 3] = gyro[at]
             if mag is not None:
-                work[:, len(columns) - 3 :] = mag[at]
+                work[:, width - 3 :] = mag[at]
             done = step @ work
             out[row] = done[:, :3]
             work[:, :s] = done[:, 3:]
         self._chain(out[:-1], work[:, :s])
         return out[:-1]
+
+    def _padded(self, gyro: bool, mag: bool) -> Array:
+        """(n, B, 3 + s, s + 3 or 6) the matrix step by step, its columns of the inputs given."""
+        if (gyro, mag) not in self._steps:
+            s = self.states
+            columns = [*range(s), *[*range(s, s + 3)] * gyro, *[*range(s + 3, s + 6)] * mag]
+            rest = np.zeros(self.matrix.shape[1:])
+            rest[3:, :s] = np.eye(s)
+            kept = self.layout.padded(self.matrix, rest)[:, :, :, columns]
+            self._steps[gyro, mag] = np.ascontiguousarray(kept)
+        return self._steps[gyro, mag]
 
     def _chain(self, out: Array, ends: Array) -> None:
         """Add what each block's true starting state contributes, in place."""

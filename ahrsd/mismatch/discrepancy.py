@@ -82,9 +82,9 @@ def discrepancy(basis: Base) -> Discrepancy:
     scaled = [part * unit for part, unit in zip(columns, units, strict=True)]
     group = np.repeat(np.arange(len(parts)), [part.shape[2] for part in scaled])
     together = np.concatenate(scaled, axis=2)
-    left = residual(np.concatenate([basis.known, together], axis=2), basis.innovation)
-    noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
     G, s = _projected(basis, together)
+    left = _left(basis, together, G, s)
+    noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
     nats, sizes = _fitted(G, s, group, noise, np.zeros(len(parts)))
     known = group == PLACES
     by_place = 0.0
@@ -181,6 +181,12 @@ def _projected(basis: Base, columns: Array) -> tuple[Array, Array]:
     cross = Z.T @ X
     M = solve(Z.T @ Z, cross)
     return X.T @ X - cross.T @ M, X.T @ e - M.T @ (Z.T @ e)
+
+
+def _left(basis: Base, columns: Array, G: Array, s: Array) -> Array:
+    """(N, 3) innovation with the known columns and these, projected G and s, regressed out."""
+    theta = solve(G, s[:, None])[:, 0]
+    return residual(basis.known, basis.innovation - columns @ theta)
 
 
 def _fitted(

@@ -48,6 +48,7 @@ _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _FEWEST = 15  # steps that a fit needs
 _SHORTEST_RUN = 8  # samples of a run that the linear start can use
 _DONE = 0.05  # largest step in standard deviations
+_NEAR = 3.0  # largest step in standard deviations behind which the gains are as before it
 _STEPS = 6
 _HALVINGS = 3
 _REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
@@ -270,13 +271,13 @@ def _descended(problem: _Problem, model: NullModel, steps: int) -> NullFit:
         gradient, data, prior = _normal(problem, point)
         covariance = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
         step = covariance @ gradient
-        new = _taken(problem, point, step, cost)
+        largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
+        new = _taken(problem, point, step, cost, largest < _NEAR)
         if new is None:
             converged = True  # nothing lower: the noise of the linearisation is reached
             break
         gained = cost - _cost(problem, new)
         point, cost = new, cost - gained
-        largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
         repetition = problem.prior.repetition
         converged = bool(largest < _DONE * np.sqrt(repetition) or gained < _DONE**2 * repetition)
     return NullFit(
@@ -302,8 +303,17 @@ def _named(problem: _Problem, point: _Point, covariance: Array) -> tuple[FittedT
     return tuple(out)
 
 
-def _at(problem: _Problem, model: NullModel, values: Array, last: _Point | None) -> _Point:
-    """Filter at these parameters; the terms' columns are those of the context before."""
+def _at(
+    problem: _Problem,
+    model: NullModel,
+    values: Array,
+    last: _Point | None,
+    held: Filtered | None = None,
+) -> _Point:
+    """Filter at these parameters; the terms' columns are those of the context before.
+
+    held: whose gains to take, the model being next to the same
+    """
     mag: Array | None = None
     gyro: Array | None = None
     columns: tuple[Columns, ...] = ()
@@ -312,7 +322,7 @@ def _at(problem: _Problem, model: NullModel, values: Array, last: _Point | None)
         context = build_context(problem.track, basis)
         columns = tuple(term.columns(context) for term in problem.terms)
         mag, gyro = _contributions(problem, columns, values)
-    filtered = run_filter(problem.track, model, mag, gyro)
+    filtered = run_filter(problem.track, model, mag, gyro, held=held)
     return _Point(model, values, filtered, mag, gyro, columns)
 
 
@@ -355,14 +365,18 @@ def _cost(problem: _Problem, point: _Point) -> float:
     return 0.5 * (float(np.sum(point.filtered.whitened**2)) + prior)
 
 
-def _taken(problem: _Problem, point: _Point, step: Array, cost: float) -> _Point | None:
-    """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does."""
+def _taken(problem: _Problem, point: _Point, step: Array, cost: float, near: bool) -> _Point | None:
+    """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does.
+
+    near: the step is so short that the gains stay as they are
+    """
     for halving in range(_HALVINGS):
         part = step / 4**halving
         model = _moved(point.model, part)
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
             continue
-        new = _at(problem, model, point.values + part[11:], point)
+        held = point.filtered if near else None
+        new = _at(problem, model, point.values + part[11:], point, held)
         if _cost(problem, new) <= cost * (1 + 1e-9):
             return new
     return None

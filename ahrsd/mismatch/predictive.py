@@ -22,7 +22,8 @@ from ahrsd.mismatch.diagnosis import Check
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.innovation import run_filter
+from ahrsd.mismatch.gains import Gains
+from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, NullModel, Term
@@ -53,12 +54,11 @@ def checks(
     noise = forward.noise_of(repaired.model, repaired.filtered)
     scene = scene_of(context)
     value = statistics(null.filtered.whitened, scene)
-    before = _bands(_simulated(null, noise, (), scene, context.model, library, copies, seed))
+    held = null.filtered
+    before = _bands(_simulated(null, noise, (), scene, held, library, copies, seed))
     after = before
     if terms:
-        after = _bands(
-            _simulated(repaired, noise, terms, scene, context.model, library, copies, seed + 1)
-        )
+        after = _bands(_simulated(repaired, noise, terms, scene, held, library, copies, seed + 1))
     return {
         name: Check(
             value[name],
@@ -143,19 +143,20 @@ def _simulated(
     noise: forward.Noise,
     terms: Sequence[Term],
     scene: Scene,
-    model: NullModel,
+    held: Filtered,
     library: Mapping[str, Effect],
     copies: int,
     seed: int,
 ) -> list[dict[str, float]]:
-    """The statistics of simulations of a fit, filtered by the null's model."""
+    """The statistics of simulations of a fit, filtered as the null's run was."""
     truth = forward.truth_along(fit.context())
     made = [
         forward.track_of(forward.simulated(truth, terms, noise, seed=1000 * seed + k))
         for k in range(copies)
     ]
-    whole = _filtered(_joined(made), model)
     rows = len(scene.segment)
+    alike = all(len(track) == rows for track in made)
+    whole = _filtered(_joined(made), held.model, _tiled(held, len(made)) if alike else None)
     return [
         statistics(whole[k * rows : (k + 1) * rows], scene)
         for k in range(copies)
@@ -163,8 +164,17 @@ def _simulated(
     ]
 
 
-def _filtered(track: Track, model: NullModel) -> Array:
-    return run_filter(track, model, sensitive=False).whitened
+def _filtered(track: Track, model: NullModel, held: Filtered | None) -> Array:
+    return run_filter(track, model, held=held, sensitive=False).whitened
+
+
+def _tiled(done: Filtered, copies: int) -> Filtered:
+    """The gains of the recording's own run, as often as there are copies of its motion."""
+    found = done.gains
+    gains = Gains(
+        np.tile(found.gain, (copies, 1, 1)), np.tile(found.innovation_covariance, (copies, 1, 1))
+    )
+    return replace(done, nominal_b=np.tile(done.nominal_b, (copies, 1)), gains=gains)
 
 
 def _joined(tracks: Sequence[Track]) -> Track:
