@@ -63,6 +63,7 @@ from ahrsd.mismatch.search import (
 from ahrsd.mismatch.stand_ins import without_stand_ins
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
+from ahrsd.mismatch.wandering import wandering
 from ahrsd.samples import Array
 
 #: a detection limit is this many standard deviations: what the gate would pass 9 times in 10
@@ -143,7 +144,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     slim = examined(paired(pruned(state)))
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = swapped(slim, last)
-    state, surveys, left = without_stand_ins(state, surveys)
+    state, surveys, left = wandering(*without_stand_ins(state, surveys))
     if unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
     return _Searched(start, state, surveys, first, last, left)
