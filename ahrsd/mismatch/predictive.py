@@ -151,8 +151,8 @@ def _simulated(
     """The statistics of simulations of a fit, filtered as the null's run was."""
     truth = forward.truth_along(fit.context())
     made = [
-        forward.track_of(forward.simulated(truth, terms, noise, seed=1000 * seed + k))
-        for k in range(copies)
+        forward.track_of(forward.simulated(truth, drawn, noise, seed=1000 * seed + k))
+        for k, drawn in enumerate(_drawn(fit, terms, copies, seed))
     ]
     rows = len(scene.segment)
     alike = all(len(track) == rows for track in made)
@@ -162,6 +162,27 @@ def _simulated(
         for k in range(copies)
         if len(made[k]) == rows
     ]
+
+
+def _drawn(fit: NullFit, terms: Sequence[Term], copies: int, seed: int) -> list[list[Term]]:
+    """The terms of each copy: values as they may be, given the calibration, for all that is known.
+
+    A repaired model whose coefficients are known to a tenth does not simulate them exactly.
+    """
+    if not terms or not np.any(fit.covariance):
+        return [list(terms) for _ in range(copies)]
+    sigma = np.sqrt(np.diag(fit.covariance))
+    information = np.linalg.inv(fit.covariance / np.outer(sigma, sigma))[11:, 11:]
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    root = sigma[11:, None] * vectors / np.sqrt(np.maximum(values, 1e-6))
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in range(copies):
+        change = root @ rng.normal(size=len(root))
+        ends = np.cumsum([len(term.value) for term in terms])
+        parts = np.split(change, ends[:-1])
+        out.append([replace(t, value=t.value + d) for t, d in zip(terms, parts, strict=True)])
+    return out
 
 
 def _filtered(track: Track, model: NullModel, held: Filtered | None) -> Array:
