@@ -4,7 +4,8 @@ A magnet that passes disturbs some rows; one that stays with the sensor disturbs
 another hard iron explains what it does. A field that differs from place to place does neither.
 
 A change before the answer was sure leaves a mixture that no epoch agrees with. There, a second hard
-iron from some epoch on must take most of the disagreement away.
+iron from some epoch on must take most of the disagreement away, more than what an instrument may
+have besides iron and bias (`instrument.py`): a lag of the field looks like a change to few epochs.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import numpy as np
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch import Epoch
 from ahrsd.estimator.graph import Graph
-from ahrsd.estimator.instrument import Said, disagreement
+from ahrsd.estimator.instrument import Said, believed, disagreement
 from ahrsd.samples import Array
 
 _MOST_ROWS = 0.6
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
 _HARD = slice(6, 9)
 _CHI2, _CALMED = 100.0, 3.0  # of a second hard iron; times by which the disagreement must fall
+_SIDE = 2  # epochs before and behind: a single one may have been somewhere else
 _LEAST = 0.03  # of the field: a smaller change may be a place
 _FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
 
@@ -58,17 +60,14 @@ def divides(said: Said, graph: Graph, sigma_bias: float, sigma_b: float) -> int 
     sigma_bias (rad/s) and sigma_b (gauss): what is believed of gyro bias and of a change
     without data.
     """
-    Hs, gs = said[0][:, :12, :12], said[1][:, :12]
-    if len(Hs) < 2:
+    Hs, gs = said
+    if len(Hs) < 2 * _SIDE:
         return None
-    pull = np.zeros((12, 12))
-    pull[:9, :9] = graph.temper * graph.anchor[1] + graph.hold
-    pull[9:, 9:] = np.eye(3) * graph.temper / sigma_bias**2
-    away = np.r_[graph.c - graph.anchor[0], np.zeros(3)]
-    H, g = pull + Hs.sum(axis=0), pull @ away + gs.sum(axis=0)
+    H, g = believed(graph, sigma_bias)
+    H, g = H + Hs.sum(axis=0), g + gs.sum(axis=0)
     steps, chi2 = _seconds(H, g, Hs, gs, np.eye(3) * graph.temper / sigma_b**2)
-    first = int(np.argmax(chi2)) + 1
-    step, change = steps[first - 1, :12], steps[first - 1, 12:]
+    first = int(np.argmax(chi2[_SIDE - 1 : len(Hs) - _SIDE])) + _SIDE
+    step, change = steps[first - 1, :-3], steps[first - 1, -3:]
     own = np.tile(step, (len(Hs), 1))
     own[first:, _HARD] += change
     one = disagreement(Hs, gs, -np.linalg.solve(H, g))
@@ -79,15 +78,16 @@ def divides(said: Said, graph: Graph, sigma_bias: float, sigma_b: float) -> int 
 
 
 def _seconds(H: Array, g: Array, Hs: Array, gs: Array, prior: Array) -> tuple[Array, Array]:
-    """Steps (N - 1, 15) and chi squared (N - 1,) of a second hard iron from each epoch on."""
+    """Steps (N - 1, 20) and chi squared (N - 1,) of a second hard iron from each epoch on."""
     late_H = np.cumsum(Hs[:0:-1], axis=0)[::-1]
     late_g = np.cumsum(gs[:0:-1], axis=0)[::-1]
-    both = np.empty((len(late_H), 15, 15))
-    both[:, :12, :12] = H
-    both[:, :12, 12:], both[:, 12:, :12] = late_H[:, :, _HARD], late_H[:, _HARD]
-    both[:, 12:, 12:] = late_H[:, _HARD, _HARD] + prior
-    gradient = np.column_stack([np.broadcast_to(g, (len(late_g), 12)), late_g[:, _HARD]])
+    n = len(g)
+    both = np.empty((len(late_H), n + 3, n + 3))
+    both[:, :n, :n] = H
+    both[:, :n, n:], both[:, n:, :n] = late_H[:, :, _HARD], late_H[:, _HARD]
+    both[:, n:, n:] = late_H[:, _HARD, _HARD] + prior
+    gradient = np.column_stack([np.broadcast_to(g, (len(late_g), n)), late_g[:, _HARD]])
     covariance = np.linalg.inv(both)
     steps = -(covariance @ gradient[:, :, None])[:, :, 0]
-    change = steps[:, 12:, None]
-    return steps, np.sum(change * np.linalg.solve(covariance[:, 12:, 12:], change), axis=(1, 2))
+    change = steps[:, n:, None]
+    return steps, np.sum(change * np.linalg.solve(covariance[:, n:, n:], change), axis=(1, 2))

@@ -91,17 +91,23 @@ class Informations:
 
 def instrument(said: Said, graph: Graph, sigma_bias: float) -> Instrument:
     """From what the epochs of a settled window say.  LinAlgError where the motion does not tell."""
-    H, g = said[0].sum(axis=0), said[1].sum(axis=0)
-    pull, mean = graph.temper * graph.anchor[1] + graph.hold, graph.anchor[0]
-    H[:9, :9] += pull
-    g[:9] += pull @ (graph.c - mean)
-    prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
-    H[9:, 9:] += np.diag(graph.temper / np.square(prior))
+    H, g = believed(graph, sigma_bias)
+    H, g = H + said[0].sum(axis=0), g + said[1].sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
     covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
     step = -covariance @ g
     misfit = max(1.0, disagreement(*said, step))
     return Instrument(step, misfit * covariance, misfit)
+
+
+def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
+    """H (17, 17) and gradient (17,) of what is known without the epochs."""
+    H, g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
+    pull = graph.temper * graph.anchor[1] + graph.hold
+    H[:9, :9], g[:9] = pull, pull @ (graph.c - graph.anchor[0])
+    prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
+    H[9:, 9:] = np.diag(graph.temper / np.square(prior))
+    return H, g
 
 
 def disagreement(H: Array, g: Array, steps: Array) -> float:
