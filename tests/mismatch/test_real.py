@@ -98,3 +98,17 @@ def test_a_magnet_is_put_on_and_taken_off() -> None:
         assert step.where.frame == "sensor"
     (lag,) = named(found, "mag_time_lag")
     assert values(lag)[0] == pytest.approx(0.0115, abs=2e-3)
+
+
+def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
+    found = diagnosed("broad/21_undisturbed_fast_combined.csv.gz")
+    (lag,) = found.findings
+    assert lag.effect == "mag_time_lag"
+    assert values(lag)[0] == pytest.approx(0.0115, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    "name", ["repoimu/TStick_Test11_Trial1.csv.gz", "vn100_distorters/clearIMU.csv.gz"]
+)
+def test_ordinary_recordings_get_no_name_of_physics(name: str) -> None:
+    assert {one.effect for one in diagnosed(name).findings} <= {"noise_burst", "noise_level"}
