@@ -133,7 +133,7 @@ class Core:
         if self.conversation.mode is Mode.PASSIVE:
             self._no_device()
         else:
-            self.epochs.begin(self._host_s, None)  # nothing is un-mapped before it is known how
+            self.epochs.begin_anew()  # nothing is un-mapped before it is known how, late or not
         self.take(self.conversation.opened(item.baud, self._host_s))
 
     def _link_lost(self, item: inputs.LinkLost) -> None:

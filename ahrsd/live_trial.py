@@ -5,7 +5,8 @@ corrections see the same motion and the same disturbances, so only their quality
 both show the sensor's noise and neither is worse. That says nothing of the gyroscope, nor of a
 matrix that is turned: `carried_field` does, with the new registers and with each alternative to
 them (either one put back, or both). The heading's jump is the difference of the two
-tilt-compensated headings of the same samples, averaged over the first seconds.
+tilt-compensated headings of the same samples, averaged over the first seconds in which the vehicle
+is level: only for that was it predicted, and on the side it may be twice as much.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ahrsd.writeback.trial import TrialMetrics
 
 _WINDOW_S = 60.0
 _JUMP_S = 3.0
+_LEVEL = np.cos(np.radians(15.0))
 _SPACING_S = 0.1  # samples closer than this add nothing to a spread
 
 
@@ -42,6 +44,7 @@ class LiveTrial:
         )
         self._rows: deque[tuple[float, Array]] = deque()
         self._jumps: list[float] = []
+        self._jump_ends_s: float | None = None
         self._start_s: float | None = None
         self._last_s = 0.0
         self._turned_rad = 0.0
@@ -61,7 +64,9 @@ class LiveTrial:
         while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
             self._rows.popleft()
         self._last_s = now_s
-        if now_s - self._start_s <= _JUMP_S and np.isfinite(down).all():
+        if self._jump_ends_s is None and down[2] >= _LEVEL:  # false where it is nan
+            self._jump_ends_s = float(block.time_s[0]) + _JUMP_S
+        if down[2] >= _LEVEL and now_s <= (self._jump_ends_s or now_s):
             mean, force = block.raw_b_gauss.mean(axis=0)[None], -down[None]
             new = tilt_compensated_heading(self._new.apply(mean), force)
             old = tilt_compensated_heading(self._old.apply(mean), force)

@@ -159,6 +159,10 @@ class RegisterEpochs:
         self._epochs = [*self._epochs, epoch][-EPOCHS_KEPT:]
         return epoch
 
+    def begin_anew(self) -> None:
+        """Nobody knows the registers, at whatever instant: the device may be another one."""
+        self._epochs = [Epoch(self.now.number + 1, -np.inf, None)]
+
     def at(self, host_s: float) -> Epoch:
         """The epoch of an instant; before the oldest that is kept, that one."""
         index = bisect_right(self._epochs, host_s, key=lambda epoch: epoch.since_s) - 1

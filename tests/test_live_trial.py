@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -91,6 +93,20 @@ def test_the_jump_is_of_the_first_seconds_only():
     early = run(trial, circle(3.0, 0.0)).heading_jump_deg
     later = run(trial, circle(20.0, 0.5, start_s=3.0)).heading_jump_deg
     assert later == pytest.approx(early)
+
+
+def test_on_its_side_a_vehicle_shows_no_jump_until_it_is_level():
+    """There the hard iron of z turns the heading too, and only for level was the jump predicted."""
+    level = circle(5.0, 0.0)
+    side = so3.exp(np.array([[np.radians(70.0), 0.0, 0.0]]))[0]
+    rolled = replace(
+        level, raw_b_gauss=FIELD_N @ side + np.tile(RIGHT.offset, (len(level), 1)),
+        accel_b_m_s2=level.accel_b_m_s2 @ side,
+    )  # fmt: skip
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    assert run(trial, rolled).heading_jump_deg is None
+    jump = run(trial, circle(5.0, 0.0, start_s=5.0)).heading_jump_deg
+    assert jump == pytest.approx(-np.degrees(np.arctan2(0.03, 0.29)), abs=1e-9)
 
 
 def test_without_a_specific_force_there_is_no_jump_and_no_turn_but_a_figure():

@@ -261,3 +261,19 @@ def test_samples_under_unknown_registers_are_dropped_and_leave_a_gap() -> None:
     ]
     assert np.isnan(blocks[1].dt_s[0])
     assert blocks[1].dt_s[1:] == pytest.approx(0.1)
+
+
+def test_what_arrives_over_a_new_link_is_not_un_mapped_by_what_was_before_it() -> None:
+    """A sample may be dated before the link: its bytes waited in the port."""
+    time_s = np.asarray(np.arange(9) * 0.1, float)
+    epochs = RegisterEpochs()
+    epochs.begin(0.15, Compensation.unknown())
+    before = epochs.now.number
+    epochs.begin_anew()
+    epochs.begin(0.55, Compensation.unknown())
+    assert epochs.now.number == before + 2
+    extractor = Extractor(PACKET)
+    extracted = extractor.extract(rows(time_s, np.ones((9, 3))))
+    steps = StreamTimeline().extend(time_s, extracted.usable)
+    blocks = sample_blocks(extractor, extracted, steps, time_s, epochs)
+    assert [(b.time_s[0], len(b), b.gap_before) for b in blocks] == [(pytest.approx(0.6), 3, True)]
