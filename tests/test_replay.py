@@ -108,14 +108,14 @@ def test_a_table_of_a_streams_samples_gives_its_estimate(whole, tmp_path):
     path = tmp_path / "same.csv"
     rows = np.delete(rows, 1, axis=1)
     np.savetxt(path, rows, delimiter=",", header=columns, comments="", fmt="%.12g")
-    table = replay(path, Config()).core
+    table = replay(path, Config(), held_out=False).core  # in the stream nothing was, so early
     assert table.stream.facts.samples == core.stream.facts.samples
     assert len(table.stream.gaps) == 2
     one, other = core.calibrator.estimate, table.calibrator.estimate
     assert one is not None
     assert other is not None
     apart = np.abs(one.hard_iron_gauss - other.hard_iron_gauss) / one.sigma[6:9]
-    assert apart.max() < 1.0
+    assert apart.max() < 0.5
     assert np.abs(one.soft_iron - other.soft_iron).max() < 2e-3
     assert np.abs(one.gyro_bias_rad_s - other.gyro_bias_rad_s).max() < 3e-4
 

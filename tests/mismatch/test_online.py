@@ -330,8 +330,9 @@ def gate_of(calibrator: Calibrator) -> bool:
 
 
 def test_a_step_shuts_the_gate_until_the_estimate_is_made_anew(monkeypatch):
-    """A step too small for the estimator to begin anew by itself: it is begun anew for it."""
+    """An estimator that does not begin anew by itself, here kept from it: it is begun anew."""
     monkeypatch.setattr("ahrsd.calibrator._PATIENCE_S", 20.0)
+    monkeypatch.setattr("ahrsd.estimator.online._CHANGED", 1_000)
     made = stepped(experiment("mam", samples=18000, rate_hz=40.0, seed=5), 300.0, 0.27 * MAGNET)
     config = Config()
     settings = CalibratorSettings(config.estimator.parameters(), config.gates.limits())
