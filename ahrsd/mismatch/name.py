@@ -25,6 +25,8 @@ MINIMUM_SHIFT_SHARE = 0.05
 #: what fewer blocks than this show cannot be known from the others: a jump of the outside field,
 #: which the filter follows within seconds; nats beyond all doubt then stand for the held-out gain
 LONELY_BLOCKS, LONELY_NATS = 2.5, 20.0
+#: what is shorter turns too little to tell a field outside from one on the vehicle
+LONELY_S = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +84,7 @@ def judge(
     )
     beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
     outside = candidate.effect.family == "world"
+    outside &= candidate.setting.get("length_s", np.inf) > LONELY_S
     lonely = outside and what.effective_blocks < LONELY_BLOCKS and evidence > LONELY_NATS
     bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
     checks = (
