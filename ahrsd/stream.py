@@ -40,6 +40,7 @@ FACTORY_RATE_HZ = 40.0
 _BLOCK_S, _LEAST_ROWS, _MOST_ROWS = 0.25, 4, 256
 _ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
+_GARBAGE_BYTES = 60  # of no text; less may have come between two whole messages
 _MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
 OTHERS = "others"
 _GONE = 400  # messages of other layouts without one of the stream's own
@@ -116,8 +117,10 @@ class Stream:
     def damaged(self, piece: Skipped) -> None:
         """Bytes before the next message that were none; other devices' lines are no loss."""
         self.facts.damaged += piece.cause in REJECTIONS
-        if piece.cause is not Cause.NOISE:
-            self.lost(max(1, round(len(piece.data) / _MESSAGE_BYTES)))
+        size, noise = len(piece.data), piece.cause is Cause.NOISE
+        if not noise or (size >= _GARBAGE_BYTES and not piece.data.isascii()):
+            tail = noise and self._lost_next > 0  # of a message that was counted
+            self.lost(size // _MESSAGE_BYTES if tail else max(1, round(size / _MESSAGE_BYTES)))
 
     def undecodable(self) -> None:
         """A message with a right checksum whose content is none."""

@@ -157,11 +157,30 @@ class TestWithoutTime:
     def test_lines_of_other_devices_are_no_loss(self):
         stream = Stream(RegisterEpochs(), 40.0)
         feed(stream, VNYMR, range(20))
-        stream.damaged(Skipped(0, bytes(3000), Cause.NOISE))
+        stream.damaged(Skipped(0, b"$GPGGA,1,2,3*00\r\n" * 100, Cause.NOISE))
+        stream.damaged(Skipped(0, b"\xb5\x62" * 20, Cause.NOISE))
         feed(stream, VNYMR, range(20))
         stream.flush()
         assert stream.gaps == []
         assert stream.health().crc_error_rate == 0.0
+
+    @pytest.mark.parametrize(
+        ("pieces", "lost"),
+        [
+            ([(120, Cause.NOISE)], 1),
+            ([(370, Cause.NOISE)], 3),
+            ([(15, Cause.CHECKSUM), (95, Cause.NOISE)], 1),
+            ([(15, Cause.CHECKSUM), (300, Cause.NOISE)], 3),
+        ],
+    )
+    def test_garbage_in_place_of_messages_is_not_bridged(self, pieces, lost):
+        stream = Stream(RegisterEpochs(), 40.0)
+        feed(stream, VNYMR, range(20))
+        for size, cause in pieces:
+            stream.damaged(Skipped(0, b"\x93\x07\xff" * (size // 3) + bytes(size % 3), cause))
+        feed(stream, VNYMR, range(20))
+        stream.flush()
+        assert [gap.length_s for gap in stream.gaps] == [pytest.approx((lost + 1) / 40)]
 
     def test_damage_before_the_first_message_shifts_no_time(self):
         stream = Stream(RegisterEpochs(), 40.0)
