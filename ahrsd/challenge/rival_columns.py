@@ -4,7 +4,8 @@
 
 A column D on the reading enters as D_k - A E_k A^-1 D_(k-1), a column W on the gyro as
 -A [h]x W dt. Calibration (A, b, w_b) is projected out of residual and columns alike, so that no
-rival fails for the sake of the calibration.
+rival fails for the sake of the calibration. h is smoothed along the gyro: a column made of a reading
+would hold the reading's noise, which is in the residual, and be chosen for it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ _STEPS = 9  # onsets that are tried for everything that may jump
 _RELAXATION_S = 30.0
 _PLAY_GAUSS = 0.03
 _SETTLING_S = 60.0
+_SMOOTH_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +61,9 @@ def regression(table: Table, estimate: Estimate) -> Regression:
     A, b = estimate.soft_iron, estimate.hard_iron_gauss
     step = np.where(np.isfinite(rows.dt_s), rows.dt_s, 0.0)[1:]
     rate = rows.gyro_b_rad_s - estimate.gyro_bias_rad_s
-    h = (rows.raw_b_gauss - b) @ np.linalg.inv(A).T
     turn = exp(-rate[1:] * step[:, None])
+    gain = min(float(np.median(step)) / _SMOOTH_S, 1.0)
+    h = _smoothed((rows.raw_b_gauss - b) @ np.linalg.inv(A).T, turn, gain)
     follow = A @ turn @ np.linalg.inv(A)
     use = step > 0
 
@@ -79,9 +82,10 @@ def regression(table: Table, estimate: Estimate) -> Regression:
         columns += list(np.moveaxis(pushed, 2, 0))
         names += [name] * block.shape[2]
     eye = np.broadcast_to(np.eye(3), (len(h), 3, 3))
-    nuisance = np.concatenate(
-        [on_reading(_iron(h)), on_reading(eye), on_gyro(eye)], axis=2
-    ).reshape(-1, 12)
+    # of A in r_k itself: on readings instead, dA = A would be the residual, noise and all
+    turned = np.einsum("kij,kj->ki", turn, h[:-1])
+    of_iron = _iron(turned) - np.einsum("kij,kjn->kin", follow, _iron(h[:-1]))
+    nuisance = np.concatenate([of_iron[use], on_reading(eye), on_gyro(eye)], axis=2).reshape(-1, 12)
     residual = on_reading(rows.raw_b_gauss - b).reshape(-1)
     matrix = np.stack([column.reshape(-1) for column in columns], axis=1)
     basis, values, _ = np.linalg.svd(nuisance, full_matrices=False)
@@ -95,6 +99,21 @@ def regression(table: Table, estimate: Estimate) -> Regression:
     unit, root = np.linalg.qr(matrix[:, seen] / left[seen])
     target = unit.T @ residual / np.std(residual)
     return Regression(residual, root, target, kept, rows.time_s[1:][use])
+
+
+def _smoothed(h: Array, turn: Array, gain: float) -> Array:
+    """(N, 3) with a reading's own noise nearly gone: else it is in residual and columns alike.
+
+    Carried along by the gyro forwards and backwards, each time with a little of the reading.
+    """
+    found = np.zeros_like(h)
+    for values, turns in ((h, turn), (h[::-1], np.swapaxes(turn, 1, 2)[::-1])):
+        way = values.copy()
+        for k, E in enumerate(turns, start=1):
+            carried = E @ way[k - 1]
+            way[k] = carried + gain * (values[k] - carried)
+        found += way / 2 if turns is turn else way[::-1] / 2
+    return found
 
 
 def _iron(h: Array) -> Array:
