@@ -384,12 +384,12 @@ def test_cost_and_memory_do_not_grow_with_the_run(kind):
 # -- real streams --------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def replayed(recordings):
+@pytest.fixture(params=[1, WHOLE])
+def replayed(request, recordings):
     def load(name):
         """Estimate and processor time per second of data of a table recording."""
         table = read_table(recordings / "vn100" / f"{name}.csv.gz")
-        estimator = Estimator()
+        estimator = Estimator(at_once=request.param)
         started = time.process_time()
         for part in table.blocks():
             estimator.add(part)

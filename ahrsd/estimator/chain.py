@@ -134,13 +134,13 @@ def linearise_all(
     count_gyro = 2.0 * np.add.reduceat((rows.stiff > 0.0).astype(np.float64), rows.first)
     return [
         Quadratic(
-            H=sums[k, :WIDTH, :WIDTH],
-            g=sums[k, :WIDTH, WIDTH],
+            H=sums[k, :WIDTH, :WIDTH].copy(),  # a view would keep all epochs' arrays alive
+            g=sums[k, :WIDTH, WIDTH].copy(),
             cost=0.5 * float(sums[k, WIDTH, WIDTH]),
             interior=insides[k],
-            tangents=field.tangents[a : b + 1],
-            weights=field.weights[a : b + 1],
-            seen=field.seen[a : b + 1],
+            tangents=field.tangents[a : b + 1].copy(),
+            weights=field.weights[a : b + 1].copy(),
+            seen=field.seen[a : b + 1].copy(),
             sum_mag=float(sum_mag[k]),
             sum_gyro=max(float(sums[k, WIDTH, WIDTH] - sum_mag[k]), 0.0),
             count_mag=float(count_mag[k]),

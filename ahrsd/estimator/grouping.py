@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ahrsd import so3
 from ahrsd.estimator import chain
 from ahrsd.estimator.lag import rates
-from ahrsd.estimator.noise import Typical
 from ahrsd.samples import Array
 
 Index = NDArray[np.intp]
@@ -30,30 +29,21 @@ _TURN_RAD = 0.3  # of rotation in a group; 1 step in 20 may turn faster
 _LOST = 0.03
 
 
-def group_size(
-    data: chain.Data,
-    noise: chain.Noise,
-    size_gauss: float,
-    *,
-    lost: float = _LOST,
-    largest: int = _LARGEST,
-) -> int:
-    """How many rows may share a state: odd, 1 where the gyro is poor or the turn fast.
+def group_size(data: chain.Data, noise: chain.Noise, size_gauss: float) -> int:
+    """How many steps may share a state: odd, 1 where the gyro is poor or the turn fast.
 
-    noise: a guess, per step; size_gauss: of the field; lost: of the field's variance, that the
-    gyro's noise may add. The mean of k fields has the variance s_m^2 / k, and the gyro's noise adds
-    k / 12 (size s_g dt)^2.
+    noise: a guess, per step; size_gauss: of the field. The mean of k fields has the variance
+    s_m^2 / k, and the gyro's noise adds k / 12 (size s_g dt)^2.
     """
-    typical = Typical.of(data)
-    gyro = size_gauss * noise.gyro_rad_s * typical.spread_s
-    ratio = noise.mag_gauss / np.sqrt(typical.count) / gyro
+    dt = float(np.median(data.dt_s[1:]))
+    ratio = noise.mag_gauss / (size_gauss * noise.gyro_rad_s * dt)
     turn = float(np.percentile(np.linalg.norm(data.angle_b_rad[1:], axis=1), 95))
-    most = min(ratio * np.sqrt(12 * lost), _TURN_RAD / max(turn, 1e-9), largest)
+    most = min(ratio * np.sqrt(12 * _LOST), _TURN_RAD / max(turn, 1e-9), _LARGEST)
     return max(1, int(most) - 1 + int(most) % 2)
 
 
 def grouped(data: chain.Data, size: int) -> chain.Data:
-    """An epoch with `size` of its rows, an odd number, in a state."""
+    """An epoch of single steps with `size` of them, an odd number, in a state."""
     n = len(data)
     if size == 1 or n < 4:
         return data
@@ -62,17 +52,12 @@ def grouped(data: chain.Data, size: int) -> chain.Data:
     rows = np.r_[0, start + length // 2, n - 1]
     inner = (linked > 0) & (np.arange(n) > 0)
     turn = so3.exp(np.where(inner[:, None], data.angle_b_rad, 0.0))
-    own = data.averaging or chain.Averaging(
-        np.ones(n), np.broadcast_to(np.eye(3), (n, 3, 3)), data.dt_s, rates(data)
-    )
-    angle, dt, spread, joins = _between(data, turn, linked, rows, own.spread_s)
-    steps = np.add.reduceat(own.count[: n - 1], start)
-    field, rate = data.field_b_gauss.copy()[rows], own.rate_b_rad_s[rows]
-    for mean, values in ((field, data.field_b_gauss), (rate, own.rate_b_rad_s)):
-        total = np.add.reduceat((values * own.count[:, None])[: n - 1], start)
-        mean[1:-1] = total / steps[:, None]
-    P = own.turn[rows]
-    P[1:-1] = _sums(turn, own, rows[1:-1], start, start + length) / steps[:, None, None]
+    angle, dt, spread, joins = _between(data, turn, linked, rows)
+    field = data.field_b_gauss.copy()[rows]
+    field[1:-1] = np.add.reduceat(data.field_b_gauss[: n - 1], start) / length[:, None]
+    rate = rates(data)
+    mean_rate = rate[rows]
+    mean_rate[1:-1] = np.add.reduceat(rate[: n - 1], start) / length[:, None]
     return chain.Data(
         field,
         angle,
@@ -81,7 +66,9 @@ def grouped(data: chain.Data, size: int) -> chain.Data:
         data.time_s[rows],
         data.measures_first,
         linked=None if joins.all() else joins.astype(np.float64),
-        averaging=chain.Averaging(np.r_[own.count[0], steps, own.count[-1]], P, spread, rate),
+        averaging=chain.Averaging(
+            np.r_[1, length, 1].astype(float), _means(turn, rows, start, length), spread, mean_rate
+        ),
     )
 
 
@@ -94,7 +81,7 @@ def _groups(linked: Array, size: int) -> tuple[Index, Index]:
 
 
 def _between(
-    data: chain.Data, turn: Array, linked: Array, rows: Index, spread_s: Array
+    data: chain.Data, turn: Array, linked: Array, rows: Index
 ) -> tuple[Array, Array, Array, Array]:
     """From one state to the next: rotation vector, time, root of the sum of dt^2, if linked."""
     total = np.broadcast_to(np.eye(3), (len(rows) - 1, 3, 3))
@@ -105,7 +92,7 @@ def _between(
     first = rows[:-1] + 1
     joins = np.minimum.reduceat(linked, first) > 0
     dt = np.add.reduceat(data.dt_s, first)
-    spread = np.sqrt(np.add.reduceat(spread_s**2, first))
+    spread = np.sqrt(np.add.reduceat(data.dt_s**2, first))
     return (
         np.vstack([np.zeros((1, 3)), so3.log(total)]),
         np.r_[dt[0], dt],
@@ -114,16 +101,17 @@ def _between(
     )
 
 
-def _sums(turn: Array, own: chain.Averaging, middle: Index, start: Index, end: Index) -> Array:
-    """Sum over the steps of each group of the rotations from its middle's frame to theirs."""
-    P = own.turn * own.count[:, None, None]
-    total = P[middle]
+def _means(turn: Array, rows: Index, start: Index, length: Index) -> Array:
+    """Mean over each group of the rotations from its middle's sensor frame to its steps'."""
+    P = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
+    middle, end = rows[1:-1], start + length
     ahead = behind = np.broadcast_to(np.eye(3), (len(middle), 3, 3))
-    for j in range(1, int((end - start).max()) // 2 + 1):
+    for j in range(1, int(length.max()) // 2 + 1):
         up, down = middle + j < end, middle - j >= start
-        k, m = np.minimum(middle + j, len(turn) - 1), np.maximum(middle - j, 0)
-        ahead = np.swapaxes(turn[k], 1, 2) @ ahead
-        behind = turn[m + 1] @ behind
-        total += np.where(up[:, None, None], P[k] @ ahead, 0.0)
-        total += np.where(down[:, None, None], P[m] @ behind, 0.0)
-    return total
+        ahead = np.swapaxes(turn[np.minimum(middle + j, len(turn) - 1)], 1, 2) @ ahead
+        behind = turn[np.maximum(middle - j + 1, 0)] @ behind
+        P[1:-1] += np.where(up[:, None, None], ahead, 0.0) + np.where(
+            down[:, None, None], behind, 0.0
+        )
+    P[1:-1] /= length[:, None, None]
+    return P

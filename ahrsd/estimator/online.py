@@ -28,9 +28,9 @@ from ahrsd.samples import Array, SampleBlock
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
 _CHANGED = 2  # epochs one after the other that contradict the answer: the iron has changed
 _FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
-_FRESH = 1.25  # at the end, a search that saw all but a quarter need not be repeated
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
 _AWAY, _AWAY_UNSETTLED = 3.0, 0.5
+_LOOKS = 4  # of the first search
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
@@ -73,7 +73,7 @@ class Estimator:
         self._whitening = np.eye(12)
         self._down: deque[Array] = deque(maxlen=64)
         self._searching, self._agreed, self._apart = True, False, 0.0
-        self._moving_epochs, self._last_search = 0, 0
+        self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
         self._said = Informations()
@@ -108,7 +108,7 @@ class Estimator:
         if self._new:
             self._grow()
         if self._window is not None:
-            if self._searching and self._moving_epochs > _FRESH * self._last_search:
+            if self._searching and self._moving_epochs > 0:
                 self._search(self._window, exactly=True)
             else:
                 self._window.track(everything=True, exactly=True)
@@ -168,7 +168,7 @@ class Estimator:
         self.restarted_s = float(window.epochs[-count].data.time_s[0])
         self._searching, self._agreed, self._strange = True, False, 0
         self._moving_epochs = sum(epoch.turned for epoch in window.epochs[-count:])
-        self._last_search, self._next_search = 0, _FIRST_SEARCH
+        self._next_search = _FIRST_SEARCH
         return window.anew(count)
 
     def _undivided(self, window: Window) -> Window:
@@ -207,11 +207,13 @@ class Estimator:
         first = Node.at(self._present_bias, direction)
         return Window(p, c, belief, first, noise.first_guess(data, p))
 
-    def _search(self, window: Window, *, exactly: bool = False) -> None:
+    def _search(self, window: Window, *, exactly: bool = False, looks: int = 1) -> None:
         """Other starts compete with the present answer, until they agree on good data.
 
-        With `exactly` the answer is then iterated to the end over all.
+        With `exactly` the answer is then iterated to the end over all. A first look at many epochs
+        cannot know what is held and how loud the residuals are, so that it is given more looks.
         """
+        looks = _LOOKS if window.untried else looks
         found = search(self.parameters, window, self._present_bias, [e.data for e in window.epochs])
         window.loud = found.loud
         unsettled = window.step_sigmas > _SETTLED
@@ -222,13 +224,14 @@ class Estimator:
             or (not window.folded and found.away > _AWAY)
         ):
             window.restart_at(found.c, found.bias)
-            window.track(everything=exactly, exactly=exactly)
+            window.track(everything=exactly, exactly=exactly, here=exactly)
         elif exactly or window.untried:
             window.track(everything=True, exactly=exactly)
-        self._last_search = self._moving_epochs
         self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
         settled = window.step_sigmas < _SETTLED
         self._searching = not (found.agreed and settled and self._sure(window))
+        if looks > 1 and not (found.agreed or window.untried):
+            self._search(window, exactly=exactly, looks=looks - 1)
 
     def _examine(self, window: Window) -> bool:
         """See whether the gyro's angles are the field's, and take out a lag where the epochs ask
@@ -248,6 +251,7 @@ class Estimator:
             window.delay(float(np.clip(window.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)))
             window.track(everything=True)
             least, changed = _LAG_SAME, True
+        self._said = Informations()  # nobody else asks before they are others
         return changed
 
     def _instrument(self, window: Window) -> Instrument | None:
@@ -289,7 +293,7 @@ class Estimator:
     def _twin(self) -> Estimator:
         other = copy(self)
         other._intake, other._down = self._intake.twin(), self._down.copy()
-        other._new = list(self._new)
+        other._new, other._said = list(self._new), Informations()
         other._window = None if self._window is None else self._window.twin()
         return other
 

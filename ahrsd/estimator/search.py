@@ -2,15 +2,15 @@
 
 The likelihood has more than one valley when motion is poor. So now and then several starts descend
 on a part of the window (the epochs whose field varied most, all in one chain with cuts in it; of
-each as many rows in a state as the gyro carries, or every k-th): the device's present calibration,
-a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be called sure only if
-two starts that know nothing of each other arrive there.
+an epoch of single steps every k-th field, rotations between them composed exactly): the device's
+present calibration, a linear fit, a sphere, and the answer as it stands. The lowest wins; it may be
+called sure only if two starts that know nothing of each other arrive there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from ahrsd.estimator import chain, start
 from ahrsd.estimator.excitation import spread
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, sigmas
-from ahrsd.estimator.grouping import group_size, grouped
 from ahrsd.estimator.lag import rates
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.steps import compose
@@ -27,7 +26,6 @@ from ahrsd.samples import Array
 
 _EPOCHS = 6
 _STEPS = 128  # rows per epoch, at most twice that
-_LOST, _LARGEST = 0.25, 15  # of the field's variance, and most rows, where rows share a state
 _DESCENT = 8  # Levenberg-Marquardt steps per start
 _NEAR = 0.1  # sigmas from the best so far at which a descent need not go on
 _SAME = 1.0  # sigmas within which two answers are one
@@ -83,8 +81,9 @@ def search(
     thin.graph.temper = graph.temper
     if window.loud > 1.0:
         thin.graph.hold = graph.hold
-    size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
-    thin.attach([joined([coarse(data[k], window.usual, size) for k in chosen])], [True])
+    thin.attach(
+        [joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen])], [True]
+    )
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
     own = _descend(thin, graph.c, graph.nodes[graph.last].bias, None)
@@ -135,14 +134,6 @@ def _distance(c: Array, best: _Reached, temper: float) -> float:
     if best.information is None:
         return float(np.inf)
     return sigmas(c - best.c, best.information / temper)
-
-
-def coarse(data: chain.Data, noise: chain.Noise, size_gauss: float) -> chain.Data:
-    """An epoch with as many rows in a state as the gyro carries, or else not too many rows."""
-    size = group_size(data, noise, size_gauss, lost=_LOST, largest=_LARGEST)
-    if size > 1:
-        return replace(grouped(data, size), measures_first=True)
-    return thinned(data, max(1, len(data) // _STEPS))
 
 
 def thinned(data: chain.Data, k: int) -> chain.Data:

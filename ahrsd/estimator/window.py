@@ -40,7 +40,7 @@ from ahrsd.estimator.staleness import bends, outdated
 from ahrsd.estimator.systematic import Cells, excess
 from ahrsd.samples import Array
 
-_SETTLED = 0.05  # sigmas of movement at which iterating stops
+_SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
 _LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
@@ -322,8 +322,12 @@ class Window:
         self._replace(which, [Place(e.piece, u, e.used, e.weights) for e, u in places])
         return self.cost()
 
-    def track(self, new: int = 1, *, everything: bool = False, exactly: bool = False) -> None:
+    def track(
+        self, new: int = 1, *, everything: bool = False, exactly: bool = False, here: bool = False
+    ) -> None:
         """Follow the newest epochs; with `everything`, all are linearised anew first.
+
+        here: all were linearised here just now, which need not be repeated.
 
         Ends where linearising again would hardly move the answer: by what the step was curved, or,
         `exactly`, by what another pass over everything did.
@@ -332,8 +336,9 @@ class Window:
         stale: Sequence[int] = everyone if everything else everyone[-new:]
         if everything:
             self._work = max(self._work, _FINISH_WORK * len(everyone))
-        for _ in range(_MAX_TRACKS):
-            self.refresh(stale)
+        for k in range(_MAX_TRACKS):
+            if k > 0 or not here:
+                self.refresh(stale)
             try:
                 information = self._weigh()
                 dc, dy = graph.step()
@@ -353,7 +358,7 @@ class Window:
                 continue
             graph.move(dc, dy)
             stale = outdated(self.epochs, bent, self.usual, exactly=exactly)
-            if not stale and self.step_sigmas < _SETTLED:
+            if not stale and self.step_sigmas < (_EXACT if exactly else _SETTLED):
                 return
             stale = everyone if exactly else stale or everyone[-1:]
             if len(stale) > self._work and not everything:
