@@ -6,7 +6,7 @@ then a full disk, a vehicle that says no, a killed program. Then the faults are 
 follows, in which samples must flow, the state must not wait, and a stop must end.
 
 hang:      no sample within `FLOW_S` after the last fault, or no end within `STOP_S` after a stop,
-           in virtual time; or one step of the world that takes more processor time than `STEP_CPU_S`
+           in virtual time; or a step of the world that takes more processor time than `STEP_CPU_S`
            (nothing in it waits; on a machine that others use, real time is theirs)
 differs:   the state says what the registers hold and they hold something else, without an alarm
 outputs:   after the stop the device has other outputs than the user's (registers 5 to 7 and 75 to
