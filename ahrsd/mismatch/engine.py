@@ -44,6 +44,7 @@ from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, at_model, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
+from ahrsd.mismatch.one_source import with_one_source
 from ahrsd.mismatch.predictive import checks
 from ahrsd.mismatch.problem import Problem, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, model_at_rate, quick, without_quick
@@ -145,6 +146,8 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = swapped(slim, last)
     state, surveys, left = wandering(*without_stand_ins(state, surveys))
+    if unknown.detected(left, problem.limits) or not bursts(basis_of(state)):
+        left = with_one_source(left)
     if unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
     return _Searched(start, state, surveys, first, last, left)

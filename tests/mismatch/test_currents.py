@@ -42,11 +42,24 @@ def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
         assert parameter.value == pytest.approx(truth, abs=4 * parameter.std + 2e-5)
 
 
+@pytest.mark.parametrize("shape", ["square", "quick square", "pulses", "levels"])
+def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
+    track = track_of(experiment("wam", seed=6, samples=3000))
+    found = diagnose(_disturbed(track, 0.3 * SHAPES[shape](track.time_s), logged=False))
+    assert found.findings == ()
+    where = found.unexplained.where
+    assert where is not None
+    assert where.frame == "sensor"
+    assert where.direction is not None
+    assert np.abs(np.array(where.direction) @ K) / np.linalg.norm(K) > 0.9
+
+
 @pytest.mark.parametrize("seed", [5, 6])
 def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=3000))
     found = diagnose(_disturbed(track, SHAPES["square"](track.time_s), logged=False))
     assert "dropped_samples" not in [one.effect for one in found.findings]
+    assert found.unexplained.detected
 
 
 @pytest.mark.parametrize("seed", [5, 6])
