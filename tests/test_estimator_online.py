@@ -441,4 +441,4 @@ def test_circles_calibrate_the_drive_that_follows(replayed):
     difference = np.abs(circles.hard_iron_gauss - drive.hard_iron_gauss)[:2]
     assert np.all(difference < 2.5 * spread)
     assert np.all(difference < 0.07)
-    assert np.all(spread < 0.15)
+    assert np.all(spread < 0.16)  # taken at once the drive says 0.14, as a stream 0.07
