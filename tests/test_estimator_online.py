@@ -434,11 +434,12 @@ def test_what_a_car_cannot_know_stays_where_the_device_has_it(replayed, name):
     assert cost < 0.025
 
 
-def test_circles_calibrate_the_drive_that_follows(replayed):
+def test_circles_calibrate_the_drive_that_follows(replayed, request):
     """The hard iron in the plane of the turn, of the same car minutes apart."""
     (circles, _), (drive, _) = replayed("circles_2022_rahul"), replayed("drive_2022_rahul")
     spread = np.sqrt(circles.sigma[6:8] ** 2 + drive.sigma[6:8] ** 2)
     difference = np.abs(circles.hard_iron_gauss - drive.hard_iron_gauss)[:2]
     assert np.all(difference < 2.5 * spread)
     assert np.all(difference < 0.07)
-    assert np.all(spread < 0.16)  # taken at once the drive says 0.14, as a stream 0.07
+    streamed = request.node.callspec.params["replayed"] == 1
+    assert np.all(spread < (0.15 if streamed else 0.16))  # the drive: 0.07 and 0.14

@@ -4,8 +4,8 @@
 
 A column D on the reading enters as D_k - A E_k A^-1 D_(k-1), a column W on the gyro as
 -A [h]x W dt. Calibration (A, b, w_b) is projected out of residual and columns alike, so that no
-rival fails for the sake of the calibration. h is smoothed along the gyro: a column made of a reading
-would hold the reading's noise, which is in the residual, and be chosen for it.
+rival fails for the sake of the calibration. h is smoothed along the gyro: a column made of a
+reading would hold the reading's noise, which is in the residual, and be chosen for it.
 """
 
 from __future__ import annotations
