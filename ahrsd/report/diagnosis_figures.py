@@ -31,6 +31,8 @@ def _binned(time_s: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _both(drawn: Drawn) -> tuple[tuple[Array, str, str], ...]:
+    if np.array_equal(drawn.before, drawn.after):  # nothing was named: one would hide the other
+        return ((drawn.before, BEFORE, "nothing named"),)
     return (drawn.before, BEFORE, "before"), (drawn.after, AFTER, "after")
 
 
@@ -45,10 +47,7 @@ def residual(found: Diagnosis, drawn: Drawn) -> Figure:
         for begin, end in spans:
             if end - begin < 0.95 * whole:
                 axes.axvspan(begin, end, color=GREY, alpha=0.15, lw=0)
-        for values, color, name in (
-            (drawn.before, BEFORE, "before"),
-            (drawn.after, AFTER, "after"),
-        ):
+        for values, color, name in _both(drawn):
             axes.plot(*_binned(drawn.time_s, values[:, k]), color=color, lw=1.0, label=name)
         axes.set_ylabel(f"{_AXES[k]}, sigma")
     figure.axes[0].legend(ncols=2, loc="upper right")

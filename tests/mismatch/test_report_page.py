@@ -1,5 +1,7 @@
 """The report of a diagnosis in a real browser, and its words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from browser import BROWSER, look_at
@@ -21,6 +23,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.spoken import lines
 from ahrsd.mismatch.values import NullModel
+from ahrsd.report import diagnosis_figures
 from ahrsd.report.diagnosis_page import write_diagnosis_report
 from ahrsd.rerun_diagnosis import write_rrd
 
@@ -89,6 +92,19 @@ def test_the_words_of_a_diagnosis():
         "",
         "not in the library:",
     ]
+
+
+def test_one_line_where_before_and_after_are_the_same():
+    found = diagnosis()
+    drawn = found.drawn
+    assert drawn is not None
+
+    def labels(drawn):
+        axes = diagnosis_figures.residual(found, drawn).axes[0]
+        return [line.get_label() for line in axes.get_lines()]
+
+    assert labels(drawn) == ["before", "after"]
+    assert labels(replace(drawn, after=drawn.before)) == ["nothing named"]
 
 
 def test_nothing_found_says_what_would_have_been_seen():
