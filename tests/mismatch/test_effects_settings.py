@@ -11,7 +11,7 @@ from effect_motion import FIELD_N, SOFT_IRON, moving
 from ahrsd import so3
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.effects.sensor_element import aliased
+from ahrsd.mismatch.effects.sensor_element import aliased, lines
 
 
 def seen(context, mag):
@@ -163,3 +163,17 @@ def test_an_object_beside_the_way_is_found_to_a_hand_s_breadth():
     places = [s["place_m"] for s in effect.settings(seen(context, noisy)) if "place_m" in s]
     away = np.linalg.norm(np.array(places) - truth["place_m"], axis=1)
     assert away.min() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "found"), [(40 / 3, False), (40 / 6, False), (10.0, True), (7.3, True)]
+)
+def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_hz, found):
+    """10 Hz is what 50 Hz looks like at 40 Hz."""
+    time_s = np.arange(4000) / 40.0
+    residual = np.random.default_rng(2).normal(size=(4000, 3))
+    residual[:, 1] += 0.5 * np.cos(2 * np.pi * frequency_hz * time_s)
+    dt_s = np.r_[np.nan, np.diff(time_s)]
+    at = [line["frequency_hz"] for line in lines(residual, time_s, dt_s)]
+    assert len(at) == 2
+    assert any(abs(one - frequency_hz) < 2e-3 for one in at) == found

@@ -26,6 +26,8 @@ _MG = 1e-3
 _USUAL_GAUSS = 0.5  # of the earth's field: parameters of non-linear terms are errors at this field
 _MAINS_HZ = (50.0, 60.0, 100.0, 120.0, 400.0)
 _LINES = 2
+#: parts of the sample rate at which the device's own filters and updates leave lines
+_IN_STEP = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 2 / 5)
 _LOWEST_HZ = 0.3  # below, a line is a slow course and other effects fit it as well
 _REPEATED = 0.2  # share of repeated readings from which the magnetometer is slower than the output
 
@@ -290,7 +292,10 @@ def aliased(frequency_hz: float, rate_hz: float) -> float:
 
 
 def lines(residual: Array, time_s: Array, dt_s: Array) -> tuple[Setting, ...]:
-    """The strongest lines of (N, 3) in the longest gap-free run, and which mains they may be."""
+    """The strongest lines of (N, 3) in the longest gap-free run, and which mains they may be.
+
+    None that keeps step with the samples: no source outside the device does.
+    """
     run = max(series.runs(dt_s), key=lambda r: int(r.stop - r.start))
     values, step_s = residual[run] - residual[run].mean(axis=0), series.median_step(dt_s[run])
     if len(values) < 64 or not np.any(values):
@@ -302,13 +307,14 @@ def lines(residual: Array, time_s: Array, dt_s: Array) -> tuple[Setting, ...]:
     power = power / _background(power)
     width = 2.0 / (len(values) * step_s)
     found: list[Setting] = []
-    for _ in range(_LINES):
+    for _ in range(_LINES + len(_IN_STEP)):
         at = int(np.argmax(power))
         best = float(frequency[at] + series.peak(power, at) * frequency[1])
         mains = [f for f in _MAINS_HZ if abs(aliased(f, 1 / step_s) - best) < width + 5e-4 * f]
-        found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
+        if mains or min(abs(best * step_s - part) for part in _IN_STEP) > width * step_s / 4:
+            found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
         power = np.where(np.abs(frequency - best) < 2 * width, 0.0, power)
-    return tuple(found)
+    return tuple(found[:_LINES])
 
 
 def _background(power: Array) -> Array:
