@@ -2,7 +2,8 @@
 
 Locks are advice: a program that opened a port without any is only visible here. Descriptors are
 compared by device number, because /dev/serial/by-id and udev names are links. A pty's other end is
-not a competitor: the process that has the master side open is left out.
+not a competitor: the process that has the master side open is left out; nor is a pty of another
+container, which may have the same number.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ def holders(path: str | Path, proc: Path = Path("/proc")) -> tuple[Holder, ...]:
     for entry in proc.iterdir():
         if not entry.name.isdecimal() or int(entry.name) == os.getpid():
             continue
-        open_devices = dict(_open_devices(entry))
+        open_devices = {
+            number: status.st_rdev
+            for number, status in _open_devices(entry)
+            if not _of_other_ptys(status, device)
+        }
         if device.st_rdev in open_devices.values() and not _serves(
             entry, open_devices, device.st_rdev
         ):
@@ -57,8 +62,18 @@ def is_pty(path: str | Path) -> bool:
     return os.major(Path(path).stat().st_rdev) in _PTY_SLAVE_MAJORS
 
 
-def _open_devices(process: Path) -> Iterator[tuple[str, int]]:
-    """Descriptor number and device number of every character device that a process has open."""
+def _of_other_ptys(status: os.stat_result, device: os.stat_result) -> bool:
+    """Whether it is a pty that only has the device's number: a container counts its own.
+
+    Ports of hardware have one number everywhere; a pty is one of its file system.
+    """
+    same_number = status.st_rdev == device.st_rdev
+    is_slave = os.major(status.st_rdev) in _PTY_SLAVE_MAJORS
+    return same_number and is_slave and status.st_dev != device.st_dev
+
+
+def _open_devices(process: Path) -> Iterator[tuple[str, os.stat_result]]:
+    """Descriptor number and state of every character device that a process has open."""
     try:
         descriptors = list((process / "fd").iterdir())
     except OSError:  # ended meanwhile, or another user's
@@ -69,7 +84,7 @@ def _open_devices(process: Path) -> Iterator[tuple[str, int]]:
         except OSError:
             continue
         if stat.S_ISCHR(status.st_mode):
-            yield descriptor.name, status.st_rdev
+            yield descriptor.name, status
 
 
 def _serves(process: Path, open_devices: dict[str, int], device: int) -> bool:

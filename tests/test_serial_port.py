@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import stat
 import subprocess
 import sys
 import termios
@@ -326,3 +327,20 @@ def test_the_latency_timer_is_read_and_set_where_allowed(tmp_path):
 
 def test_a_pty_has_no_latency_timer(pty):
     assert latency_timer_ms(pty.path) is None
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes device nodes")
+def test_a_pty_of_the_same_number_elsewhere_is_no_holder(tmp_path):
+    """A container counts its ptys from 0 as well: what is open there is another device."""
+    master, slave = os.openpty()
+    try:
+        path = os.ttyname(slave)
+        os.mknod(tmp_path / "elsewhere", stat.S_IFCHR | 0o600, os.fstat(slave).st_rdev)
+        for pid, node in (("7", path), ("8", str(tmp_path / "elsewhere"))):
+            (tmp_path / "proc" / pid / "fd").mkdir(parents=True)
+            (tmp_path / "proc" / pid / "fd" / "3").symlink_to(node)
+            (tmp_path / "proc" / pid / "cmdline").write_bytes(b"minicom\0")
+        assert [holder.pid for holder in holders(path, tmp_path / "proc")] == [7]
+    finally:
+        os.close(slave)
+        os.close(master)
