@@ -112,14 +112,13 @@ def evaluate(
     calibrations, without = sources.read_calibrations(calibration_path, method)
     world = sources.place_and_date(position, date, model)  # type: ignore[arg-type]
     track, said = sources.read_track(recording, Config(), rate_hz, progress)
-    fixes = None
     gps = reference_path or sources.gps_beside(recording)
+    fixes = None
     if gps is not None and sources.is_gps(gps):
         fixes, place = sources.read_fixes(gps)
         if world is None and date is not None:
-            position = ",".join(f"{value:.6f}" for value in place)
-            world = sources.place_and_date(position, date, model)  # type: ignore[arg-type]
-            said.append(f"the position is that of the middle GPS fix: {position}")
+            world = sources.place_and_date(place, date, model)  # type: ignore[arg-type]
+            said.append(f"the position is that of the middle GPS fix: {place}")
     elif gps is not None:
         track = sources.with_columns_of(track, gps)
     fixes = fixes or fixes_of_track(track)

@@ -102,8 +102,8 @@ def gps_beside(recording: Path) -> Path | None:
     return None
 
 
-def read_fixes(path: Path) -> tuple[Fixes, tuple[float, float, float]]:
-    """Fixes of a CSV with t_s (or time_s), lat_deg, lon_deg; and the middle one's position."""
+def read_fixes(path: Path) -> tuple[Fixes, str]:
+    """Fixes of a CSV with t_s (or time_s), lat_deg, lon_deg; the middle one as for --position."""
     columns = _columns(path)
     time = next((name for name in _GPS_TIME if name in columns), None)
     missing = [name for name in _GPS_PLACE if name not in columns]
@@ -117,8 +117,7 @@ def read_fixes(path: Path) -> tuple[Fixes, tuple[float, float, float]]:
     alt = columns.get("alt_m", np.zeros(len(lat)))
     place = np.column_stack([lat, lon, np.nan_to_num(alt)])
     place = place[np.isfinite(place).all(axis=1)]
-    middle = place[len(place) // 2]
-    return fixes, (float(middle[0]), float(middle[1]), float(middle[2]))
+    return fixes, ",".join(f"{value:.6f}" for value in place[len(place) // 2])
 
 
 def is_gps(path: Path) -> bool:
