@@ -174,17 +174,14 @@ def _told(
     ]
     filtered = fast.state.fit.filtered
     noise = level_facts(filtered, spec_given=problem.spec.sigma_mag_gauss is not None)
+    lesser = tuple(fact.words for fact in facts if not matters(fact))
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
         *sorted((*named, *quickly), key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
-    left = (
-        unknown.described(done.left, problem.block_s, limits)
-        if unknown.detected(done.left, limits)
-        else bursts(basis) or Unexplained(False)
-    )
+    left = _left(done, problem, basis)
     something = left.detected
     terms = tuple(whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(named))
     quick_terms = tuple(
@@ -203,7 +200,7 @@ def _told(
         sensitivity=() if found or something else _limits(problem, basis, done.first, fast),
         notes=(
             *notes,
-            *(fact.words for fact in facts if not matters(fact)),
+            *lesser,
             *(() if found or something else would_have_shown(problem.recorded)),
         ),
         model=model_at_rate(state.fit.model, problem.thin),
@@ -211,6 +208,13 @@ def _told(
         drawn=_drawn(done, basis),
         omnibus=_whiteness(done),
     )
+
+
+def _left(done: _Searched, problem: Problem, basis: Base) -> Unexplained:
+    """What no name explains."""
+    if unknown.detected(done.left, problem.limits):
+        return unknown.described(done.left, problem.block_s, problem.limits)
+    return bursts(basis) or Unexplained(False)
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

@@ -108,9 +108,6 @@ def run_filter(
     innovation = np.where(used[:, None], (field - predicted) @ model.soft_iron, 0.0)
     root = _inverse_root(found.innovation_covariance) * used[:, None, None]
     whitened = np.einsum("nij,nj->ni", root, innovation)
-    likelihood = -0.5 * np.sum(whitened**2, axis=1) - 1.5 * np.log(2 * np.pi)
-    with np.errstate(divide="ignore"):
-        likelihood += np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
     return Filtered(
         track=track,
         model=model,
@@ -121,12 +118,20 @@ def run_filter(
         nominal_b=nominal,
         orientation=orientation,
         used=used,
-        log_likelihood=np.where(used, likelihood, 0.0),
+        log_likelihood=np.where(used, _log_likelihood(whitened, root), 0.0),
         gains=found,
         recursion=_sensitivity(layout, state, found, model.soft_iron, root, motion, predicted)
         if sensitive
         else None,
     )
+
+
+def _log_likelihood(whitened: Array, root: Array) -> Array:
+    """Per row; whatever where root (N, 3, 3) is zero."""
+    likelihood = -0.5 * np.sum(whitened**2, axis=1) - 1.5 * np.log(2 * np.pi)
+    with np.errstate(divide="ignore"):
+        likelihood += np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
+    return np.asarray(likelihood)
 
 
 def sensitivities(filtered: Filtered, columns: Columns) -> Array:
