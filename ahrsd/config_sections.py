@@ -311,6 +311,8 @@ class WriteBack(Section):
     approval: Literal["operator", "auto"] = _POLICY.approval
     """operator: a person approves each candidate by its id; auto: a change within
     `gates.max_step_auto_deg` needs nobody."""
+    armed_at_start: bool = _POLICY.armed_at_start
+    """Begin every run as if a person had said `ahrsd operator arm`; only approval auto asks."""
     commit_unattended: bool = _POLICY.commit_unattended
     """Save to flash without an operator's yes (mode commit, approval auto)."""
     keep_on_stop: bool = _POLICY.keep_on_stop

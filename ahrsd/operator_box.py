@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-VERBS: Final = ("approve", "lock", "unlock", "rollback")
+VERBS: Final = ("arm", "disarm", "approve", "lock", "unlock", "rollback")
 LONGEST_S: Final = 30.0
 _LARGEST_BYTES = 1024
 

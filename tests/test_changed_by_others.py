@@ -30,7 +30,9 @@ def estimate() -> Estimate:
 @pytest.fixture
 def observing() -> VirtualRun:
     """A run that would write what its calibrator says, as soon as it says it."""
-    policy = WriteBackPolicy(mode=Mode.STAGE, approval="auto", max_change_auto_deg=180.0)
+    policy = WriteBackPolicy(
+        mode=Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=180.0
+    )
     device = build(Setup("rov", seed=3, output="imu", rate_hz=50))
     run = VirtualRun(device, core_settings(Config(), policy=policy), step_s=0.1)
     assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 10.0), run.notes

@@ -174,7 +174,11 @@ def planted_run(
         device.memory.ram[84, 0] = device.memory.stored(84, (*np.eye(3).ravel(), *gyro))
         device.sensor.changed()
     policy = WriteBackPolicy(
-        mode=Mode.COMMIT, approval="auto", commit_unattended=True, max_change_auto_deg=180.0
+        mode=Mode.COMMIT,
+        approval="auto",
+        armed_at_start=True,
+        commit_unattended=True,
+        max_change_auto_deg=180.0,
     )
     run = VirtualRun(device, core_settings(Config(), policy=policy), step_s=0.1)
     assert run.until(lambda: state(run) == "OBSERVING", 10.0), run.notes

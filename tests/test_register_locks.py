@@ -58,7 +58,9 @@ def test_a_lock_forbids_writes_and_lets_old_values_come_back(here, emulated, tmp
 
 def test_a_daemon_begins_locked_where_a_person_locked_before(here, tmp_path):
     assert here("registers", "lock", "dry dock", "--serial", SERIAL) == 0
-    policy = WriteBackPolicy(mode=Mode.STAGE, approval="auto", max_change_auto_deg=180.0)
+    policy = WriteBackPolicy(
+        mode=Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=180.0
+    )
     device = build(Setup(output="imu", rate_hz=20, motion=(("static", 1000.0),)))
     world = VirtualRun(device, core_settings(Config(), policy=policy))
     world.journal[SERIAL] = [vars_of(record) for record in journal(tmp_path).records()]

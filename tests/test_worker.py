@@ -129,7 +129,11 @@ class BesideRun(VirtualRun):
         self.fed: list[Input] = []
         self.waiting: deque[Examine] = deque()
         policy = WriteBackPolicy(
-            mode=mode, approval="auto", commit_unattended=True, max_change_auto_deg=180.0
+            mode=mode,
+            approval="auto",
+            armed_at_start=True,
+            commit_unattended=True,
+            max_change_auto_deg=180.0,
         )
         settings = replace(core_settings(Config(), policy=policy), beside=True)
         device = build(Setup("rov", seed=3, output="imu", rate_hz=50))

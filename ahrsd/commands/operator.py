@@ -7,12 +7,13 @@ from pathlib import Path
 import click
 
 from ahrsd.errors import EXIT_BUSY, EXIT_USAGE, DeviceError
+from ahrsd.operator_box import VERBS
 
 _WAIT_S = 5.0
 
 
 @click.command()
-@click.argument("verb", type=click.Choice(["approve", "lock", "unlock", "rollback"]))
+@click.argument("verb", type=click.Choice(VERBS))
 @click.argument("text", default="")
 @click.option(
     "--state-directory",
@@ -25,6 +26,7 @@ def command(verb: str, text: str, directory: Path | None) -> None:
 
     \b
     approve ID     write candidate ID, which the daemon's log names
+    arm            let this run write by itself (approval auto); disarm takes it back
     rollback       undo what was written and is not saved
     lock REASON    write nothing any more;  unlock REASON: it was looked at
 

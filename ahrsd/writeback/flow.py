@@ -172,7 +172,7 @@ class Flow:
         elif text.strip().lower() != self.proposal.id:
             self.desk.note("warning", f"{text!r} is not the candidate, it is {self.proposal.id}")
         else:
-            self.approver = "operator"
+            self.approver, self.safe.armed = "operator", True
             self.desk.note("info", f"{self.proposal.id} approved")
 
     def _compose(self, estimate: Estimate, gyro_is_raw: bool) -> Proposal | None:

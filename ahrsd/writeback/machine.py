@@ -28,6 +28,7 @@ from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
 from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     ON_TIMEOUT,
@@ -152,6 +153,8 @@ class WriteBack:
         self._saw_reset = False
         if self.state is not State.RECONCILING:
             flow.enter(State.RECONCILING, "the device was read again")
+        unfinished = self.history.open
+        self._safe.armed |= unfinished is not None and unfinished.approver == "operator"
         flow.reconcile(restarted)
         return self._answer()
 
@@ -231,10 +234,12 @@ class WriteBack:
         return self._answer()
 
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
-        """A person's command: approve ID, lock REASON, unlock REASON, rollback."""
+        """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
         self._desk.host_s = host_s
         reason = argument or "no reason given"
         verbs: dict[str, Callable[[], None]] = {
+            "arm": partial(self._arm, True),
+            "disarm": partial(self._arm, False),
             "approve": partial(self._flow.approve, argument),
             "lock": partial(self._flow.lock, reason),
             "unlock": partial(self._flow.unlock, reason),
@@ -296,6 +301,11 @@ class WriteBack:
             self._desk.running = ""
             self._flow.on_failure(str(error))
         return self._answer()
+
+    def _arm(self, armed: bool) -> None:
+        """Whether this run may begin a write or a save; what is under way is not undone."""
+        self._safe.armed = armed
+        self._desk.note("info", "armed: this run may write" if armed else NOT_ARMED)
 
     def _answer(self) -> list[Action]:
         """Take the steps that are due now, then hand over everything that was asked for."""

@@ -57,6 +57,8 @@ class WriteBackPolicy:
     configure_stream:  session settings (registers 6, 7, 75 to 77) may be changed [False]
     approval:          who says yes: "operator" types the candidate's id, "auto" needs no one and
                        is limited to `max_change_auto_deg` [operator]
+    armed_at_start:    begin a run armed; else a person's word in that run must come first: `arm`,
+                       or an approval [False]
     commit_unattended: flash without an operator's yes [False]
     serial:            write only to this device; None: the first one seen in this run [None]
     keep_on_stop:      leave unsaved values in RAM when the daemon stops [False: they are undone]
@@ -72,6 +74,7 @@ class WriteBackPolicy:
     mode: Mode = Mode.OBSERVE
     configure_stream: bool = False
     approval: Literal["operator", "auto"] = "operator"
+    armed_at_start: bool = False
     commit_unattended: bool = False
     serial: int | None = None
     keep_on_stop: bool = False

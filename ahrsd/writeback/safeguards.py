@@ -18,6 +18,7 @@ from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
+NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
 
 
 class Safeguards:
@@ -28,6 +29,7 @@ class Safeguards:
         self.stillness = Stillness(policy.still)
         self.journal_ok = False
         self.stopping = False
+        self.armed = policy.armed_at_start
         self.gates: tuple[GateResult, ...] = ()
         self.flash_gates: tuple[GateResult, ...] = ()
         self._serial = policy.serial
@@ -99,6 +101,8 @@ class Safeguards:
             reasons.append(
                 f"the mode is {self.policy.mode.name.lower()}; stage or commit may write"
             )
+        elif self.policy.approval == "auto" and not self.armed:
+            reasons.append(NOT_ARMED)
         reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.gates if not gate.ok]
         if not self.gates:
             reasons.append("no gate has judged yet")
@@ -110,6 +114,8 @@ class Safeguards:
     def save_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
         """Why the flash may not be written now."""
         reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
+        if not self.armed:
+            reasons.append(NOT_ARMED)
         unattended = history.open is not None and history.open.approver != "operator"
         if unattended and not self.policy.commit_unattended:
             reasons.append("no operator approved it and commit_unattended is off")
@@ -132,10 +138,12 @@ class Safeguards:
         if not permitted(command, mode, self.policy.configure_stream, purpose):
             return False
         if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
-            return not self.interlock_holds(host_s)
+            return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_holds(host_s)
         if isinstance(command, Word) and command.word == "VNWNV":
-            return self.journal_ok and not (
-                self.interlock_holds(host_s) or self.stillness.why_not(host_s)
+            return (
+                self.armed
+                and self.journal_ok
+                and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
             )
         return True
 

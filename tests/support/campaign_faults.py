@@ -43,7 +43,8 @@ PER_SCHEDULE = 40
 BEGIN_S, FAULTS_S, CALM_S = 3.0, 30.0, 12.0
 FLOW_S, STOP_S, STEP_CPU_S = 10.0, 5.0, 5.0
 POLICY = WriteBackPolicy(
-    mode=Mode.COMMIT, configure_stream=True, approval="auto", commit_unattended=True,
+    mode=Mode.COMMIT, configure_stream=True, approval="auto",
+    armed_at_start=True, commit_unattended=True,
     max_change_auto_deg=180.0, min_interval_s=0.0, cooldown_s=0.0, ram_writes_per_day=10**6,
     flash_writes_per_day=10**6, flash_writes_lifetime=10**6, rollbacks_to_lock=10**6,
     trial=TrialPolicy(duration_s=3.0, max_spread_percent=100.0, worse_percent=1e6),

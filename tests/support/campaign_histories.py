@@ -1,10 +1,11 @@
 """Random histories in which something always forbids a write: how many writes there are.
 
-Five families, taken in turn; in the first four every single verdict has what the name says:
+Six families, taken in turn; in the first five every single verdict has what the name says:
 
 ram gate red    one to three gates that guard RAM are red, the mode is stage or commit
 flash gate red  all is green but one to three gates that guard the flash; mode commit
 observe, passive all is green, the mode forbids
+not armed       all is green, nobody need approve, and nobody has spoken in this run
 mixed           gates come and go; a write is wrong where the newest verdict was not green
 """
 
@@ -31,7 +32,7 @@ from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
 from ahrsd.writeback.states import State
 from drivers.vn100.commands import Command, Read, Word, Write
 
-FAMILIES = ("ram gate red", "flash gate red", "observe", "passive", "mixed")
+FAMILIES = ("ram gate red", "flash gate red", "observe", "passive", "not armed", "mixed")
 STEPS = 24
 
 
@@ -114,13 +115,15 @@ class History:
         if family in ("ram gate red", "mixed") and draw.random() < 0.5:
             mode = Mode.STAGE
         auto = {"approval": "auto", "max_change_auto_deg": 90.0, "commit_unattended": True}
+        if not (unarmed := family == "not armed"):
+            auto["armed_at_start"] = True
         self.rig = Rig(
             WriteBackPolicy(
                 mode=mode,
                 trial=TrialPolicy(interlock=bool(draw.random() < 0.5)),
                 cooldown_s=0.0,
                 min_interval_s=0.0,
-                **(auto if draw.random() < 0.5 else {}),
+                **(auto if draw.random() < 0.5 or unarmed else {}),
             )
         )
         self.green = False
@@ -153,7 +156,7 @@ class History:
             return True
         if self.family == "observe":
             return not isinstance(command, Read)
-        if self.family == "ram gate red":
+        if self.family in ("ram gate red", "not armed"):
             return isinstance(command, Write) or command == Word("VNWNV")
         if self.family == "flash gate red":
             return command == Word("VNWNV")
@@ -180,7 +183,8 @@ class History:
         if what <= 3:
             self.verdict()
         elif what <= 5 and rig.wb.proposal is not None:
-            rig.approve()
+            if self.family != "not armed":
+                rig.approve()
         elif what == 6:
             rig.live(field_spread=float(draw.choice([0.005, 0.005, 0.5])), turns=draw.uniform(0, 3))
         elif what == 7:

@@ -145,7 +145,7 @@ def test_a_lock_while_saving_does_not_interrupt_it(make_rig):
 def test_an_unknown_command_is_answered(make_rig):
     rig = make_rig()
     rig.do(rig.wb.on_operator("explode", "", rig.now_s))
-    assert "possible: approve, lock, unlock, rollback" in rig.notes("warning")[-1]
+    assert "possible: arm, disarm, approve, lock, unlock, rollback" in rig.notes("warning")[-1]
     rig.do(rig.wb.on_operator("rollback", "", rig.now_s))
     assert "nothing to roll back" in rig.notes("warning")[-1]
 
@@ -276,6 +276,9 @@ def test_the_gate_itself_asks_everything_again(make_rig):
     rig.stand_still()
     safe, now_s = rig.wb._safe, rig.now_s
     write, save = Write(23, rig.device.ram[23]), Word("VNWNV")
+    assert not safe.allow(write, Purpose.STAGE, now_s)  # nobody has spoken in this run
+    assert not safe.allow(save, Purpose.SAVE, now_s)
+    rig.do(rig.wb.on_operator("arm", "", now_s))
     assert safe.allow(write, Purpose.STAGE, now_s)
     assert safe.allow(save, Purpose.SAVE, now_s)
     assert not safe.allow(write, Purpose.STAGE, now_s + 1.1)

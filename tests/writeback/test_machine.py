@@ -8,6 +8,7 @@ import pytest
 from ahrsd.events import RegisterWritten
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import TrialPolicy
+from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import State
 from drivers.vn100.commands import Word, Write
 
@@ -56,7 +57,7 @@ def test_nothing_is_sent_before_the_record_is_on_the_disk(make_rig):
 
 
 def test_observe_says_to_the_byte_what_it_would_write_and_sends_nothing(make_rig):
-    rig = make_rig(Mode.OBSERVE, approval="auto", max_change_auto_deg=90.0)
+    rig = make_rig(Mode.OBSERVE, approval="auto", armed_at_start=True, max_change_auto_deg=90.0)
     rig.whole_way()
     assert rig.wb.state is State.QUALIFIED
     assert rig.device.log == []
@@ -135,7 +136,7 @@ def test_an_applied_onboard_estimator_holds_the_write(make_rig):
 
 @pytest.mark.parametrize("gates", ["RED", "none"])
 def test_no_write_with_a_red_gate_or_without_gates(make_rig, gates):
-    rig = make_rig(Mode.STAGE, approval="auto", max_change_auto_deg=90.0)
+    rig = make_rig(Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=90.0)
     rig.connect()
     rig.pass_time(0.1)
     rig.verdict(gates=rig.RED if gates == "RED" else ())
@@ -214,13 +215,13 @@ def test_an_approval_expires(make_rig):
 
 
 def test_auto_approves_small_changes_only(make_rig):
-    large = make_rig(Mode.STAGE, approval="auto")
+    large = make_rig(Mode.STAGE, approval="auto", armed_at_start=True)
     large.connect()
     large.pass_time(0.1)
     large.verdict()
     assert large.wb.state is State.QUALIFIED
     assert any("must approve" in text for text in large.wb.holds())
-    small = make_rig(Mode.STAGE, approval="auto")
+    small = make_rig(Mode.STAGE, approval="auto", armed_at_start=True)
     small.connect()
     small.pass_time(0.1)
     small.verdict(soft_iron=np.eye(3), hard_iron_gauss=np.array([0.01, 0.0, 0.0]))
@@ -228,9 +229,52 @@ def test_auto_approves_small_changes_only(make_rig):
     assert small.journal[0].facts["approver"] == "auto"
 
 
+def test_a_run_writes_by_itself_only_when_a_person_armed_it(make_rig):
+    rig = make_rig(Mode.COMMIT, approval="auto", max_change_auto_deg=90.0, commit_unattended=True)
+    rig.connect()
+    rig.pass_time(0.1)
+    rig.verdict()
+    assert rig.wb.state is State.QUALIFIED
+    assert NOT_ARMED in rig.wb.holds()
+    assert not any(isinstance(command, Write) for command in rig.device.log)
+    rig.do(rig.wb.on_operator("arm", "", rig.now_s))
+    assert rig.wb.state is State.TRIAL
+    rig.do(rig.wb.on_operator("disarm", "", rig.now_s))  # on trial still, but nothing is saved
+    rig.live(turns=2.5)
+    rig.stand_still()
+    assert rig.wb.state is State.PROVEN
+    assert rig.wb.holds() == [NOT_ARMED]
+    assert rig.device.flash_writes == 0
+    rig.do(rig.wb.on_operator("arm", "", rig.now_s))
+    rig.stand_still()
+    assert rig.wb.state is State.COMMITTED
+    assert rig.device.flash_writes == 1
+
+
+def test_nobody_is_armed_after_a_restart_but_an_approved_write_goes_its_way(make_rig):
+    for approve in (False, True):
+        auto = {} if approve else {"approval": "auto", "max_change_auto_deg": 90.0}
+        rig = make_rig(Mode.COMMIT, commit_unattended=True, **auto)
+        rig.connect()
+        rig.pass_time(0.1)
+        rig.verdict()
+        rig.approve() if approve else rig.do(rig.wb.on_operator("arm", "", rig.now_s))
+        assert rig.wb.state is State.TRIAL
+        rig.back("program")
+        rig.verdict()
+        rig.live(turns=2.5)
+        rig.stand_still()
+        assert rig.wb.state is (State.COMMITTED if approve else State.PROVEN)
+
+
 def test_flash_needs_an_operator_or_the_explicit_setting(make_rig):
     for allowed in (False, True):
-        rig = make_rig(approval="auto", max_change_auto_deg=90.0, commit_unattended=allowed)
+        rig = make_rig(
+            approval="auto",
+            armed_at_start=True,
+            max_change_auto_deg=90.0,
+            commit_unattended=allowed,
+        )
         rig.whole_way()
         assert (rig.wb.state is State.COMMITTED) is allowed
         assert rig.device.flash_writes == int(allowed)
