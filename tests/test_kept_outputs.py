@@ -36,7 +36,8 @@ def outputs(memory):
 
 def world(mode=Mode.OBSERVE, configure=True, **setup):
     policy = WriteBackPolicy(
-        mode=mode, configure_stream=configure, approval="auto", armed_at_start=True, commit_unattended=True,
+        mode=mode, configure_stream=configure, approval="auto",
+        armed_at_start=True, commit_unattended=True,
         max_change_auto_deg=180.0, min_interval_s=0.0,
         trial=TrialPolicy(duration_s=3.0, max_spread_percent=100.0, worse_percent=1e6),
     )  # fmt: skip

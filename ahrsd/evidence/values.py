@@ -11,6 +11,8 @@ from ahrsd.evidence.coverage import Coverage
 from ahrsd.evidence.field import FieldFacts
 from ahrsd.evidence.heading import SECTOR_DEG, HeadingProof
 
+_NAMED = 3
+
 
 @dataclass(frozen=True, slots=True)
 class HealthFacts:
@@ -204,8 +206,10 @@ class Evidence:
 
     @property
     def unmeasured_names(self) -> str:
-        """Their paths."""
-        return ", ".join(self.unmeasured())
+        """The first of their paths; what each needs is said by the gate that judges it."""
+        paths = self.unmeasured()
+        rest = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
+        return ", ".join(paths[:_NAMED]) + rest
 
 
 def numbers(value: object, path: str = "") -> Iterator[tuple[str, float]]:

@@ -73,7 +73,7 @@ def _result(
     measured = math.isfinite(value)
     slack = _ROUNDING * abs(limit)
     ok = measured and (value <= limit + slack if gate.at_most else value >= limit - slack)
-    words = gate.advice.format(v=value, l=limit, e=evidence) if measured else gate.missing
+    words = (gate.advice if measured else gate.missing).format(v=value, l=limit, e=evidence)
     return GateResult(
         gate=gate.gate,
         value=value,

@@ -7,7 +7,7 @@ from ahrsd.gates.row import Level, least, most, no, yes
 _MOVE = "drive at least two full circles in calm surroundings"
 _TILT = "pitch and roll by 30 deg if the vehicle can"
 _SEEN = "({e.motion.tilts})"
-_ACCEL = "add acceleration to the stream: tilt is not known without it"
+_NO_TILT = "tilt is not known: {e.motion.turn}"
 
 STREAM = (
     most(
@@ -123,7 +123,7 @@ MOTION = (
         Level.CANDIDATE,
         meaning="headings shown, in sectors of 10 deg",
         advice="{v:.0f} of {l:.0f} deg of heading are covered: {e.motion.turn}",
-        missing=_ACCEL,
+        missing=_NO_TILT,
     ),
     least(
         "motion.planar_circle",
@@ -178,7 +178,7 @@ MOTION = (
         Level.CANDIDATE,
         meaning="move of the vertical hard iron although the motion was too flat to see it",
         advice=f"the vertical hard iron moved by {{v:.3f}} gauss on flat motion: {_TILT} {_SEEN}",
-        missing=_ACCEL,
+        missing=_NO_TILT,
     ),
 )
 
@@ -249,6 +249,7 @@ FIELD = (
         meaning="mean corrected field against the world model",
         advice="the field is {v:.0f} % off the world model (limit {l:.0f}): check the location, "
         "or go away from steel",
+        missing="no segment is complete yet",
         applies="position_known",
     ),
     most(

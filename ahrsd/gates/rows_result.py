@@ -290,7 +290,8 @@ STEADY = (
         meaning="range of the sensor's temperature",
         advice="the temperature moved by {v:.1f} degC (limit {l:.1f}): let the sensor warm up "
         "and start again",
-        missing="the stream has no temperature: add it (VNIMU, or binary Temp)",
+        missing="no segment is complete yet, or the stream has no temperature (VNIMU and binary "
+        "Temp have it)",
     ),
     most(
         "gyro_bias.size",

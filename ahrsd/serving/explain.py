@@ -124,20 +124,31 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
     if gates:
         holds = "1 gate holds" if len(gates) == 1 else f"{len(gates)} gates hold"
         lines.append(f"{holds} a write back:")
-        lines += [_gate_line(gate) for gate in gates]
+        lines += _gate_lines(gates)
     if explained["others"]:
         lines.append("also:" if gates else "what holds a write back:")
         lines += [f"  {text}" for text in explained["others"]]
     return [*lines, f"next: {explained['next']}"]
 
 
+def _gate_lines(gates: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line a gate; gates that cannot be measured for the same reason share one."""
+    unmeasured: dict[str, list[str]] = {}
+    lines = []
+    for gate in gates:
+        if gate["value"] is None:
+            unmeasured.setdefault(gate["advice"], []).append(gate["gate"])
+        else:
+            lines.append(_gate_line(gate))
+    return lines + [f"  not measured: {', '.join(g)}: {why}" for why, g in unmeasured.items()]
+
+
 def _gate_line(gate: Mapping[str, Any]) -> str:
     value, unit = gate["value"], f" {gate['unit']}" if gate["unit"] else ""
-    shown = "not measured" if value is None else f"{value:.3g}{unit}"
     held = f", since {_span(gate['for_s'])}" if gate["for_s"] is not None else ""
     limit = gate["limit"]
     allowed = "" if limit is None else f" (limit {limit:.3g}{unit})"
-    return f"  {gate['gate']:<28} {shown}{allowed}{held}: {gate['advice']}"
+    return f"  {gate['gate']:<28} {value:.3g}{unit}{allowed}{held}: {gate['advice']}"
 
 
 def _span(seconds: float) -> str:

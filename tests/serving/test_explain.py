@@ -60,11 +60,19 @@ def test_a_red_gate_that_guards_another_step_holds_nothing():
     assert explained["next"].endswith("ahrsd operator approve 12ab34cd")
 
 
-def test_a_gate_that_was_not_measured_says_so():
-    missing = GATE | {"value": None, "for_s": None}
-    held = {"state": "CANDIDATE", "holds": ["gate heldout_heading.rms: turn"], "proposal": None}
-    lines = explain_lines(explain_json(status(gates=[missing], write_back=held)))
-    assert "not measured (limit 1.5 deg): turn again elsewhere" in lines[3]
+def test_gates_that_were_not_measured_say_so_together_where_the_reason_is_one():
+    missing = [
+        GATE | {"gate": name, "value": None, "for_s": None, "advice": advice}
+        for name, advice in (("a.rms", "turn"), ("b.held", "tilt"), ("a.max", "turn"))
+    ]
+    holds = [f"gate {gate['gate']}: {gate['advice']}" for gate in missing]
+    held = {"state": "CANDIDATE", "holds": holds, "proposal": None}
+    lines = explain_lines(explain_json(status(gates=missing, write_back=held)))
+    assert lines[2:5] == [
+        "3 gates hold a write back:",
+        "  not measured: a.rms, a.max: turn",
+        "  not measured: b.held: tilt",
+    ]
 
 
 @pytest.mark.parametrize(
