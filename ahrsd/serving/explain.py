@@ -31,10 +31,18 @@ STATES: dict[str, str] = {
 }
 
 _NEXT = {
+    "STAGING": "nothing: the write takes a second or two",
+    "STAGED": "nothing: the trial begins by itself",
+    "TRIAL": "drive as usual: two turns or ten minutes, then the new values are proven or undone",
+    "SAVING": "stand still: the save takes a second",
+    "COMMITTED": "nothing: the device's next restart confirms the save",
     "FAULT": "look at `ahrsd registers diff`, then `ahrsd operator rollback` or `unlock`",
     "FLASH_TORN": "see `ahrsd registers history`, write the old values back, then unlock",
     "LOCKED": "find out why (`ahrsd registers history`), then `ahrsd operator unlock REASON`",
 }
+
+#: states in which the new values are in the device, so that what holds is about another write
+WRITTEN = frozenset({"STAGING", "STAGED", "TRIAL", "SAVING", "COMMITTED", "CONFIRMED"})
 
 
 def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
@@ -120,13 +128,14 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
         lines.append(f"stream: {explained['stream']}")
     if explained["mismatch"]:
         lines.append(f"mismatch: {explained['mismatch']}")
+    write = "further write" if explained["state"] in WRITTEN else "write"
     gates: Sequence[Mapping[str, Any]] = explained["gates"]
     if gates:
         holds = "1 gate holds" if len(gates) == 1 else f"{len(gates)} gates hold"
-        lines.append(f"{holds} a write back:")
+        lines.append(f"{holds} a {write} back:")
         lines += _gate_lines(gates)
     if explained["others"]:
-        lines.append("also:" if gates else "what holds a write back:")
+        lines.append("also:" if gates else f"what holds a {write} back:")
         lines += [f"  {text}" for text in explained["others"]]
     return [*lines, f"next: {explained['next']}"]
 

@@ -97,6 +97,17 @@ def test_gates_that_were_not_measured_say_so_together_where_the_reason_is_one():
             "look at it (`ahrsd status`), then: ahrsd operator approve 12ab34cd",
         ),
         ({"gates": [GATE | {"ok": True}]}, "nothing: the next step is taken by itself"),
+        (
+            {
+                "gates": [GATE | {"ok": True}],
+                "write_back": {
+                    "state": "TRIAL",
+                    "holds": ["the last write was 3 s ago"],
+                    "proposal": None,
+                },
+            },
+            "drive as usual: two turns or ten minutes, then the new values are proven or undone",
+        ),
     ],
 )
 def test_what_to_do_next(changes, words):
