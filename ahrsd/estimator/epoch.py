@@ -15,6 +15,7 @@ from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
+_BORDERS = np.r_[chain.FIRST, chain.LAST]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +127,23 @@ def grown(graph: Graph, data: chain.Data, walk: float, *, moving: bool) -> tuple
     graph.until_s = float(data.time_s[-1])
     information = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
     return Piece(data, a, information, moving, noise.Typical.of(data)), u
+
+
+def place_borders(graph: Graph, begun: Sequence[Epoch]) -> None:
+    """Put borders that are at directions of single fields to where their epochs alone want them.
+
+    Until then a chain is bent towards the noise of one field and seems that noisy itself; for an
+    epoch at rest, whose borders nothing else moves, for ever. A direction that an epoch does not
+    tell stays: against that a rad of doubt is nothing.
+    """
+    for epoch in begun:
+        H, g = epoch.quadratic.H[_BORDERS][:, _BORDERS], epoch.quadratic.g[_BORDERS]
+        step = -np.linalg.solve(H + np.eye(len(g)), g)
+        own = [(epoch.a + 1, step[2:])]
+        if epoch.data.measures_first:
+            own.append((epoch.a, step[:2]))
+        for j, tangent in own:
+            graph.nodes[j] = graph.nodes[j].moved(np.r_[np.zeros(3), tangent])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ import numpy as np
 
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Epoch, Place, Snapshot, grown, scores_of
+from ahrsd.estimator.epoch import Epoch, Place, Snapshot, grown, place_borders, scores_of
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import (
     Node,
@@ -121,8 +121,10 @@ class Window:
         walk = self.parameters.bias_walk_rad_s_sqrt_s
         pieces = [grown(self.graph, d, walk, moving=m) for d, m in zip(new, moving, strict=True)]
         self._work = min(self._work + _WORK * len(new), max(_MOST_WORK, _WORK * len(new)))
-        self.epochs += self._linearised([Place(piece, u, self.usual) for piece, u in pieces])
-        self.graph.factors += [epoch.factor for epoch in self.epochs[-len(new) :]]
+        begun = self._linearised([Place(piece, u, self.usual) for piece, u in pieces])
+        self.epochs += begun
+        self.graph.factors += [epoch.factor for epoch in begun]
+        place_borders(self.graph, begun)
 
     def fold(self) -> None:
         """Fold the oldest epochs until the window has its size."""
@@ -258,6 +260,7 @@ class Window:
             graph.nodes[epoch.a + 1] = Node.at(bias, u[-1])
             places.append(Place(epoch.piece, u, self.usual))
         self._replace(range(len(self.epochs)), places)
+        place_borders(graph, [epoch for epoch in self.epochs if not epoch.turned])
         self._work = max(self._work, _RESTART_WORK * len(self.epochs))
 
     def _start_noise(self) -> chain.Noise:
