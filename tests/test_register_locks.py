@@ -104,6 +104,35 @@ def test_where_a_daemon_runs_it_is_told_and_its_journal_is_left_alone(here, tmp_
     assert "the daemon heard it" in capsys.readouterr().out
 
 
+def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, capsys):
+    def answers(serial):
+        class Daemon:
+            def __init__(self, path):
+                assert path == tmp_path / "socket"
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_):
+                pass
+
+            def ask(self, what):
+                return {"status": {"device": {"serial": serial}}}[what]
+
+        return Daemon
+
+    OperatorBox(tmp_path).prepare()
+    (tmp_path / "socket").touch()
+    monkeypatch.setattr("ahrsd.commands.register_locks._daemon_heard", lambda *_: True)
+    monkeypatch.setattr("ahrsd.commands.register_locks.Asked", answers(77))
+    assert here("registers", "lock", "crew aboard", "--serial", SERIAL) == 0
+    assert kinds(tmp_path) == ["LOCKED"]
+    monkeypatch.setattr("ahrsd.commands.register_locks.Asked", answers(SERIAL))
+    assert here("registers", "unlock", "gone", "--serial", SERIAL) == 0
+    assert "the daemon heard it" in capsys.readouterr().out
+    assert kinds(tmp_path) == ["LOCKED"]
+
+
 def test_a_daemon_that_is_gone_leaves_its_folder_and_the_journal_takes_the_word(
     here, tmp_path, monkeypatch
 ):

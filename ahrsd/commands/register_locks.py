@@ -15,9 +15,10 @@ import click
 
 from ahrsd.commands.register_sources import journals
 from ahrsd.config import default_state_directory
-from ahrsd.errors import JournalError
+from ahrsd.errors import DeviceError, JournalError
 from ahrsd.journal import Journal, journal_path
 from ahrsd.operator_box import OperatorBox
+from ahrsd.serving.client import Asked, default_socket_path
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.reconcile import Kind
 
@@ -63,7 +64,8 @@ def refuse_locked(journal: Journal) -> None:
 
 
 def _say(kind: Kind, reason: str, serial: int | None, state: Path) -> None:
-    if _daemon_heard("lock" if kind is Kind.LOCKED else "unlock", reason, state):
+    elsewhere = serial is not None and _daemons_device(state) not in (None, serial)
+    if not elsewhere and _daemon_heard("lock" if kind is Kind.LOCKED else "unlock", reason, state):
         click.echo(f"the daemon heard it; {state} has its journal")
         return
     journal = Journal.open(_journal_of(kind, serial, state))
@@ -82,6 +84,19 @@ def _daemon_heard(verb: str, reason: str, state: Path) -> bool:
         return box.folder.is_dir() and box.heard(verb, reason, _WAIT_S)
     except OSError as error:
         raise JournalError(f"{box.folder}: {error.strerror}; try as root") from None
+
+
+def _daemons_device(state: Path) -> int | None:
+    """Serial number of the device that the daemon of this folder has; None where nobody says."""
+    path = default_socket_path(state)
+    if not path.exists():
+        return None
+    try:
+        with Asked(path) as daemon:
+            device = daemon.ask("status")["device"]
+    except DeviceError:
+        return None
+    return None if device is None else int(device["serial"])
 
 
 def _journal_of(kind: Kind, serial: int | None, state: Path) -> Path:
