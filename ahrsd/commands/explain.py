@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from ahrsd.commands.json_output import write_json
-from ahrsd.commands.running import connected, socket_options
+from ahrsd.commands.running import connected, socket_options, tell
 
 
 @click.command()
@@ -20,9 +19,4 @@ def command(path: Path | None, directory: Path | None, json_path: str | None) ->
     """
     from ahrsd.serving.explain import explain_lines
 
-    with connected(path, directory) as daemon:
-        explained = daemon.ask("explain")
-    if json_path is not None:
-        write_json(json_path, explained)
-    if json_path != "-":
-        click.echo("\n".join(explain_lines(explained)))
+    tell(connected(path, directory), "explain", json_path, explain_lines)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import click
 
+from ahrsd.commands.json_output import write_json
 from ahrsd.config import default_state_directory
 from ahrsd.serving.client import Asked, find_socket
 
@@ -26,3 +27,15 @@ def socket_options(command: F) -> F:
 def connected(path: Path | None, directory: Path | None) -> Asked:
     """A connection. Raises DeviceError where no daemon answers."""
     return Asked(path or find_socket(directory or default_state_directory()))
+
+
+def tell(
+    daemon: Asked, what: str, json_path: str | None, lines: Callable[[dict[str, Any]], list[str]]
+) -> None:
+    """Ask for `what`; print its `lines`, or the answer itself as JSON where that was asked for."""
+    with daemon:
+        answer = daemon.ask(what)
+    if json_path is not None:
+        write_json(json_path, answer)
+    if json_path != "-":
+        click.echo("\n".join(lines(answer)))

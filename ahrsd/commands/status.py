@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from ahrsd.commands.json_output import write_json
-from ahrsd.commands.running import connected, socket_options
+from ahrsd.commands.running import connected, socket_options, tell
 
 
 @click.command()
@@ -20,9 +19,4 @@ def command(path: Path | None, directory: Path | None, json_path: str | None) ->
     """
     from ahrsd.serving.lines import status_lines
 
-    with connected(path, directory) as daemon:
-        status = daemon.ask("status")
-    if json_path is not None:
-        write_json(json_path, status)
-    if json_path != "-":
-        click.echo("\n".join(status_lines(status)))
+    tell(connected(path, directory), "status", json_path, status_lines)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -166,6 +166,23 @@ class Discrete(Effect):
     def columns(self, context: Context, setting: Setting) -> Columns:
         """None."""
         return Columns()
+
+
+class Clipped(Discrete):
+    """A sensor's range, none if 0. `quantity` names the readings (N, 3) that end there."""
+
+    quantity: ClassVar[str]
+    after_noise = True
+
+    def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
+        """Clipped readings."""
+        limit = float(value[0]) or np.inf
+        clipped = np.clip(getattr(readings, self.quantity), -limit, limit)
+        return replace(readings, **{self.quantity: clipped})
+
+    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
+        """The stronger, the lower the limit."""
+        return np.array([self.typical[0] / strength if strength else 0.0]), {}
 
 
 def lacking(effect: Effect) -> str:

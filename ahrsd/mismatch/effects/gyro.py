@@ -8,7 +8,7 @@ import numpy as np
 
 from ahrsd.mismatch.effects import series, shapes
 from ahrsd.mismatch.effects.base import (
-    Discrete,
+    Clipped,
     Effect,
     Linear,
     Parameter,
@@ -233,8 +233,8 @@ class GyroTimeLag(Effect):
         return strength * np.array(self.typical), {}
 
 
-class GyroSaturation(Discrete):
-    """G10; a limit of 0 is none."""
+class GyroSaturation(Clipped):
+    """G10."""
 
     identifier = "gyro_saturation"
     code = "G10"
@@ -242,19 +242,10 @@ class GyroSaturation(Discrete):
     words = "the rate is beyond the gyro's range"
     equation = "w_i = clip(w_i, -limit, limit)"
     parameters = (Parameter("limit", "rad/s", 10.0, 100.0),)
+    quantity = "gyro_b_rad_s"
     typical = (0.3,)
-    after_noise = True
     signature = "flat tops in the rates"
     confusers = (("gyro_nonlinearity", "look at the histogram of the rates"),)
     manoeuvre = "turn more slowly"
     size = "2000 deg/s range of the VN-100"
     source = "dossier G10"
-
-    def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """Clipped rates."""
-        limit = float(value[0]) or np.inf
-        return replace(readings, gyro_b_rad_s=np.clip(readings.gyro_b_rad_s, -limit, limit))
-
-    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """The stronger, the lower the limit."""
-        return np.array([self.typical[0] / strength if strength else 0.0]), {}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ahrsd.mismatch.effects import series, shapes
 from ahrsd.mismatch.effects.base import (
-    Discrete,
+    Clipped,
     Effect,
     Linear,
     Parameter,
@@ -174,8 +174,8 @@ class MagNonlinearity(Linear):
         return Columns(mag=np.asarray((m**3)[:, :, None] * np.eye(3)))
 
 
-class MagSaturation(Discrete):
-    """M14; a limit of 0 is none."""
+class MagSaturation(Clipped):
+    """M14."""
 
     identifier = "mag_saturation"
     code = "M14"
@@ -183,22 +183,13 @@ class MagSaturation(Discrete):
     words = "the field is beyond the magnetometer's range"
     equation = "m_i = clip(m_i, -limit, limit)"
     parameters = (Parameter("limit", "gauss", 1.0, 10.0),)
+    quantity = "mag_b_gauss"
     typical = (0.4,)
-    after_noise = True
     signature = "flat tops in the readings"
     confusers = (("hard_iron_step", "look at the histogram of the readings"),)
     manoeuvre = "move the sensor away from the magnet"
     size = "2.5 G range of the VN-100; a magnet at 1 cm"
     source = "BROAD trial 32 (dossier M14)"
-
-    def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """Clipped readings."""
-        limit = float(value[0]) or np.inf
-        return replace(readings, mag_b_gauss=np.clip(readings.mag_b_gauss, -limit, limit))
-
-    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """The stronger, the lower the limit."""
-        return np.array([self.typical[0] / strength if strength else 0.0]), {}
 
 
 class MagQuantisation(Effect):
