@@ -15,6 +15,7 @@ _AXES = ("x", "y", "z")
 _FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
 _PILED = 6.0  # times as many at the limit as in the same width just inside it
 _MARGIN, _NEAR = 3.0, 0.02  # noise levels, and share of the limit, at which it begins to act
+_TOP_STEPS = 1.5  # of coarse numbers, as many at the top as one step below are no limit
 _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
 
 
@@ -26,7 +27,9 @@ def clipping(track: Track) -> list[Fact]:
         ("mag_saturation", track.mag_b_gauss, mag_noise, "gauss", "sensor"),
         ("gyro_saturation", track.gyro_b_rad_s, gyro_noise, "rad/s", "gyro"),
     ):
-        found = [_flat_tops(values[:, axis], noise) for axis in range(3)]
+        found = [
+            _flat_tops(column, max(noise, _TOP_STEPS * step_of(column))) for column in values.T
+        ]
         if not any(rows.any() for rows, _ in found):
             continue
         limit = max(level for rows, level in found if rows.any())
@@ -65,7 +68,7 @@ def _flat_tops(values: Array, noise: float) -> tuple[NDArray[np.bool], float]:
     """Rows at a limit of one axis, and that limit's size.
 
     At a limit readings are equal bit by bit, several in a row, and pile up: just inside it,
-    within the noise, there are far fewer.
+    within the noise and the steps of the numbers, there are far fewer.
     """
     rows = np.zeros(len(values), dtype=bool)
     size = 0.0

@@ -174,6 +174,8 @@ def _told(
     ]
     filtered = fast.state.fit.filtered
     noise = level_facts(filtered, spec_given=problem.spec.sigma_mag_gauss is not None)
+    if any(fact.effect == "mag_quantisation" for fact in facts):
+        noise = []  # coarse numbers scatter
     lesser = tuple(fact.words for fact in facts if not matters(fact))
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.mismatch.clipping import step_of
 from ahrsd.mismatch.coarse import noise_of
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact, spans_of
@@ -18,6 +19,7 @@ from ahrsd.samples import Array
 _AXES = ("x", "y", "z")
 _STUCK_S = 1.0
 _MOVED = 8.0  # noise levels by which the field must have turned during the repetition
+_STEPS = 3.0  # steps of coarse numbers by which the field must turn to have a new reading
 _HELD_SHARE = 0.4  # of the moving samples that repeat the one before
 _DOUBLED_SHARE = 2e-3
 _TURNING = 5.0  # gyro noise levels
@@ -29,7 +31,7 @@ def repeats(track: Track, clipped: NDArray[np.bool] | None = None) -> list[Fact]
     if clipped is not None:
         again &= ~clipped
     expected = _expected_change(track)
-    stuck, bad = _stuck(track, again, expected)
+    stuck, bad = _stuck(track, again)
     held = _held(track, again & ~bad, expected)
     doubled = [] if held else _doubled(track, again & ~bad)
     return stuck + held + doubled
@@ -52,19 +54,31 @@ def _expected_change(track: Track) -> Array:
     return np.asarray(step * size)
 
 
+def _turned(track: Track, first: int, last: int) -> float:
+    """Gauss by which the whole turn over these rows moves the reading that they repeat."""
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    turn = rate[first:last].T @ np.nan_to_num(track.dt_s[first:last], nan=0.0)
+    return float(np.linalg.norm(np.cross(turn, track.mag_b_gauss[first])))
+
+
 def _resolution(track: Track) -> float:
-    return max(noise_of(track)[0], 1e-6)
+    """The noise, or the step of the numbers where that is coarser: within it readings repeat."""
+    return max(noise_of(track)[0], _step(track), 1e-6)
 
 
-def _stuck(
-    track: Track, again: NDArray[np.bool], expected: Array
-) -> tuple[list[Fact], NDArray[np.bool]]:
+def _step(track: Track) -> float:
+    """The coarsest step of the three axes' numbers, 0 where there is none."""
+    return max(step_of(column) for column in track.mag_b_gauss.T)
+
+
+def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[np.bool]]:
     bad = np.zeros(len(track), dtype=bool)
     intervals: list[tuple[float, float]] = []
+    least = _MOVED * _resolution(track)
     for first, last in spans_of(again):
         begin = float(track.time_s[first - 1])
         length = float(track.time_s[last - 1]) - begin
-        if length < _STUCK_S or expected[first:last].sum() < _MOVED * _resolution(track):
+        if length < _STUCK_S or _turned(track, first, last) < least:
             continue
         bad[first:last] = True
         intervals.append((begin, begin + length))
@@ -87,7 +101,7 @@ def _stuck(
 
 
 def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
-    moving = expected > np.quantile(expected, 0.5)
+    moving = expected > max(float(np.quantile(expected, 0.5)), _STEPS * _step(track))
     count = int(np.count_nonzero(moving))
     if count < 50 or np.count_nonzero(again & moving) < _HELD_SHARE * count:
         return []
