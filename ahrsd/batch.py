@@ -21,7 +21,10 @@ from ahrsd.diagnosing import track_of
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.misalignment import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
+from ahrsd.mismatch.correction import without
 from ahrsd.mismatch.hygiene import as_recorded
+from ahrsd.mismatch.model_file import RepairedModel
+from ahrsd.mismatch.roles import prepared
 from ahrsd.replay import Replayed, replay
 from ahrsd.result import calibration_json, why_not_converged
 from ahrsd.summary import said_of
@@ -104,22 +107,61 @@ def calibrate(
     *,
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
+    model: RepairedModel | None = None,
 ) -> BatchResult:
-    """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`."""
+    """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`.
+
+    model: what its terms add to the readings is taken out first; AhrsdError where a term needs a
+    column that the recording has not.
+    """
     seen: list[Event] = []
     done = replay(
         path, config, rate_hz=rate_hz, listeners=[seen.append], progress=progress, held_out=False
     )
-    calibrator = _of_everything(done, seen)
+    left: tuple[str, ...] = ()
+    if model is not None:
+        seen, left = _without_terms(path, seen, model)
+    calibrator = _of_everything(done, seen, again=model is not None)
     estimate = calibrator.finish()
     if estimate is not None:
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
     turned = calibrator.estimator.misalignment()
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     wrong = tuple(fact.words for fact in as_recorded(track_of(blocks))) if blocks else ()
-    return BatchResult(
-        path.name, done.core, estimate, tuple(seen), tuple(done.warnings), turned, wrong
+    warnings = (
+        *done.warnings,
+        *(f"{name} is in the model and cannot be taken out" for name in left),
     )
+    return BatchResult(path.name, done.core, estimate, tuple(seen), warnings, turned, wrong)
+
+
+def _without_terms(
+    path: Path, seen: list[Event], model: RepairedModel
+) -> tuple[list[Event], tuple[str, ...]]:
+    """The events, their samples without what the model's terms add; and what stays in them."""
+    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
+    if not blocks:
+        return seen, ()
+    track, refused = prepared(track_of(blocks))
+    try:
+        track, left = without(track, model.calibration, model.terms)
+    except ValueError as error:
+        raise AhrsdError("; ".join([f"{path}: {error}", *refused])) from None
+    rows = iter(np.cumsum([0, *map(len, blocks)]).tolist())
+    begin, events = next(rows), []
+    for event in seen:
+        if isinstance(event, SamplesSeen):
+            part, begin = slice(begin, end := next(rows)), end
+            event = replace(
+                event,
+                block=replace(
+                    event.block,
+                    raw_b_gauss=track.mag_b_gauss[part],
+                    gyro_b_rad_s=track.gyro_b_rad_s[part],
+                ),
+            )
+        events.append(event)
+    return events, left
 
 
 def _spoken(turned: Misalignment) -> str:
@@ -132,10 +174,10 @@ def _spoken(turned: Misalignment) -> str:
     )
 
 
-def _of_everything(done: Replayed, seen: list[Event]) -> Calibrator:
-    """A calibrator that has had every sample."""
+def _of_everything(done: Replayed, seen: list[Event], *, again: bool) -> Calibrator:
+    """A calibrator that has had every sample; `again`: not as the core took them."""
     core = done.core
-    if not done.of_daemon:
+    if not done.of_daemon and not again:
         return core.calibrator
     settings = replace(core.settings.calibrator, held_out=False)
     calibrator = Calibrator(

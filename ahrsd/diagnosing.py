@@ -19,6 +19,7 @@ from ahrsd.events import Event, SamplesSeen
 from ahrsd.mismatch.aligned import align, differing
 from ahrsd.mismatch.diagnosis import Diagnosis
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.model_file import RepairedModel, from_text
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.recording.opening import Kind, open_recording
 from ahrsd.recording.table import read_table
@@ -111,6 +112,16 @@ def load_spec(path: Path) -> Spec:
             raise AhrsdError(f"{path}: {key} = {value!r}: must be a positive number")
         values[key] = float(value)
     return Spec(**values)
+
+
+def load_model(path: Path) -> RepairedModel:
+    """A repaired model's file.  AhrsdError in one line where it cannot be read or is none."""
+    try:
+        return from_text(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be read: {error.strerror}; check the path") from error
+    except ValueError as error:
+        raise AhrsdError(f"{path}: {error}") from None
 
 
 def diagnose_recording(

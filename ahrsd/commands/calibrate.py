@@ -28,6 +28,12 @@ _METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow
 @click.option("--method", type=click.Choice(_METHODS), default=_METHODS[0], show_default=True)
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option(
+    "--model",
+    "model_path",
+    type=click.Path(path_type=Path),
+    help="A repaired model of `diagnose --report`: what it names is taken out first.",
+)
 @click.option("--json", "json_path", help="calibration.json into this file, - for stdout.")
 @click.option("--report", "report_path", type=click.Path(path_type=Path), help="Write a page.")
 @click.option("--figure", "figure_path", type=click.Path(path_type=Path),
@@ -37,6 +43,7 @@ def command(
     method: str,
     path: Path | None,
     rate_hz: float | None,
+    model_path: Path | None,
     json_path: str | None,
     report_path: Path | None,
     figure_path: Path | None,
@@ -46,6 +53,7 @@ def command(
     Exit 1 where the motion does not determine the answer; the output then says what is missing.
     """
     from ahrsd.batch import calibrate
+    from ahrsd.diagnosing import load_model
     from ahrsd.published import saturated
     from ahrsd.summary import estimate_lines
 
@@ -55,8 +63,9 @@ def command(
     if figure_path is not None and method != _ALL:
         raise AhrsdError("--figure compares the methods: give --method all with it")
     config = load_config(path) if path else Config()
+    model = None if model_path is None else load_model(model_path)
     with byte_progress(recording) as progress:
-        result = calibrate(recording, config, rate_hz=rate_hz, progress=progress)
+        result = calibrate(recording, config, rate_hz=rate_hz, progress=progress, model=model)
     if method in _METHODS[:2] and (words := saturated(result)):
         raise RecordingError(
             recording, words, "record again, away from magnets and strong currents"

@@ -172,13 +172,14 @@ def _recorded(
 
 def _simulate_along(output: Path, model_path: Path, recording: Path, seed: int) -> None:
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
-    from ahrsd.commands.simulate_effects import along, read_model
+    from ahrsd.commands.simulate_effects import along
+    from ahrsd.diagnosing import load_model
     from ahrsd.mismatch.injection import terms_json
     from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table
 
     if not is_table(output):
         raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
-    model = read_model(model_path)
+    model = load_model(model_path)
     columns, notes = along(model, recording, seed)
     for note in notes:
         click.echo(f"{recording}: {note}", err=True)

@@ -10,7 +10,7 @@ from ahrsd.errors import AhrsdError
 from ahrsd.mismatch import forward, roles
 from ahrsd.mismatch.effects import profiles, request
 from ahrsd.mismatch.injection import injected, readings_of, terms_json
-from ahrsd.mismatch.model_file import RepairedModel, from_text
+from ahrsd.mismatch.model_file import RepairedModel
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
 
@@ -29,16 +29,6 @@ def with_effects(
     except ValueError as error:
         raise AhrsdError(f"--effect: {error}") from None
     return injected(experiment, readings, terms), terms_json(terms)
-
-
-def read_model(path: Path) -> RepairedModel:
-    """A model file.  AhrsdError in one line where it cannot be read or is none."""
-    try:
-        return from_text(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise AhrsdError(f"{path}: cannot be read: {error.strerror}; check the path") from error
-    except ValueError as error:
-        raise AhrsdError(f"{path}: {error}") from None
 
 
 def along(model: RepairedModel, recording: Path, seed: int) -> tuple[dict[str, Array], list[str]]:
