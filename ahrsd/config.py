@@ -29,6 +29,7 @@ from ahrsd.config_sections import (
     Section,
     Socket,
     Still,
+    Terms,
     Trial,
     WriteBack,
 )
@@ -64,6 +65,7 @@ class Config(Section):
     estimator: Estimator = Estimator()
     gates: Gates = Gates()
     interlock: Interlock = Interlock()
+    terms: Terms = Terms()
     location: Location = Location()
     write_back: WriteBack = WriteBack()
     trial: Trial = Trial()

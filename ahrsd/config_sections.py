@@ -281,6 +281,19 @@ class Interlock(Section):
     """Older than this counts as no. [s]"""
 
 
+class Terms(Section):
+    """What a repaired model of `ahrsd diagnose --report` names, taken out before calibrating."""
+
+    model: Path | None = None
+    """The model.json; its terms that follow a column from sample to sample are taken out, what is
+    left holds where those columns are at the model's zero."""
+    file: Path | None = None
+    """File that the vehicle rewrites, a JSON object such as {"motor_current_a": 3.2}; temperature
+    comes with the stream."""
+    max_age_s: float = Field(default=0.5, gt=0.0, le=60.0)
+    """Samples further from the last word than this are not calibrated. [s]"""
+
+
 class Location(Section):
     """Where the vehicle is, for the field that the world magnetic model expects there."""
 

@@ -37,6 +37,7 @@ from ahrsd.said import (
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream import Stream
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
+from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.states import State
@@ -45,8 +46,7 @@ from drivers.vn100.registers import Values
 from drivers.vn100.session import DeviceFault, Stray
 from drivers.vn100.session import Event as SessionEvent
 
-_WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01
-_RATE = 7
+_WATCHDOG_RESET, _HARD_FAULT, _RATE = 0x0A, 0x01, 7  # two VNERR codes, a register
 
 
 class Core:
@@ -58,6 +58,7 @@ class Core:
         self.epochs = RegisterEpochs()
         rate, source = settings.stream_rate_hz, settings.stream_rate_source
         self.stream = Stream(self.epochs, rate, source, keep_gaps=settings.keep)
+        self.vehicle = VehicleTerms(self.stream.warnings.setdefault, settings.columns_max_age_s)
         self.conversation = Conversation(
             settings.policy.mode,
             change_stream=settings.policy.configure_stream,
@@ -73,10 +74,9 @@ class Core:
         self._proposed: Affine | None = None
         self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
-        self.faults = self.strays = self.undecodable = 0
+        self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
         self._stopping = ""
         self._closing = self._uptime_due = self._unread = False
-        self._breaks = self._restarts = 0
         self._serial: int | None = None
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
@@ -93,6 +93,7 @@ class Core:
             inputs.LinkLost: self._link_lost,
             inputs.Interlock: lambda it: add(back.on_interlock(it.safe, self._host_s)),
             inputs.Operator: self._operator,
+            **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.hear),
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
             inputs.JournalOpened: self._journal_opened,
@@ -336,15 +337,16 @@ class Core:
         if self.stream.take_replaced():
             self.calibrator = self.calibrator.anew()
             self._begin(self._desk.compare(self.calibrator, *self._compared))
-        present, _ = user_compensation(self.registers)
+        block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
         self._out.append(events.SamplesSeen(block, present, self._proposed))
         self._errands.add(self.writeback.on_samples(block))
-        if self._trial is not None:
-            metrics = self._trial.take(block)
-            self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-        how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
-        now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
-        self._begin(self._desk.examine(self.calibrator, block, now))
+        if (free := self.vehicle.without(block)) is not None:
+            if self._trial is not None:
+                metrics = self._trial.take(free)
+                self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
+            how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+            now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
+            self._begin(self._desk.examine(self.calibrator, free, now))
         self._errands.let_out(self)
 
     def _begin(self, piece: Piece) -> None:
@@ -365,8 +367,7 @@ class Core:
 
     def _judged(self, found: Finding, estimate: Estimate) -> None:
         at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates
-        self._out.append(events.Estimated(at_s, host_s, estimate))
-        self._out.append(events.Judged(at_s, host_s, gates))
+        self._out += [events.Estimated(at_s, host_s, estimate), events.Judged(at_s, host_s, gates)]
         self.decisions.judged(at_s, self.writeback.state.value, gates, estimate)
         if found.when.era != self._era():
             return  # it judged what is in force no more; nothing may be written by it

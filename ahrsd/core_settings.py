@@ -21,6 +21,7 @@ class CoreSettings:
     keep: how many decisions, and how many of the first and of the newest gaps, stay in memory for
         a summary; None: all, for a recording, whose length is known. Counts and hash are always
         those of everything.
+    columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
     beside: the slow part of the work is done beside the core (`examination`), not at once
     """
 
@@ -31,6 +32,7 @@ class CoreSettings:
     stream_rate_hz: float | None = None
     stream_rate_source: str = "as given"
     keep: int | None = None
+    columns_max_age_s: float = 0.5
     beside: bool = False
 
     @property

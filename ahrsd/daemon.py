@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from typing import Protocol
 
 from ahrsd import inputs
+from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import Config
 from ahrsd.operator_box import OperatorBox
 from ahrsd.rerun_sink import RerunSink
@@ -37,6 +38,7 @@ _SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
 _STOP_S = 1.6  # for putting things back; a service manager's patience is limited
 _AMENDS_S = 2.0
 _INTERLOCK_S = 0.2
+_COLUMNS_S = 0.04
 _WATCH_S = 1.0
 _WALL_STEP_S = 1.0
 _SUSPENDED_S = 0.5
@@ -74,6 +76,7 @@ class Daemon:
     """Runs one device until `stop` is called. `listeners` on the shell see every event.
 
     baud: of the port where it was found already, else as the configuration says
+    terms: text of a repaired model; columns: what the vehicle measures, for its terms
     """
 
     def __init__(
@@ -87,6 +90,8 @@ class Daemon:
         baud: int | None = None,
         box: OperatorBox | None = None,
         public: Public | None = None,
+        terms: str = "",
+        columns: ColumnsFile | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -97,13 +102,14 @@ class Daemon:
         if shell.worker is not None:
             shell.worker.woken = self._inbox.wake
         self._interlock, self._box, self._public = interlock, box, public
+        self._terms, self._columns = terms, columns
         self._safe: bool | None = None
         self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
         self.stopped_s: float | None = None  # when `stop` was called, monotonic
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
-        self._next_interlock_ns = 0
+        self._next_interlock_ns = self._next_columns_ns = 0
         self._wall_offset_s = float("nan")
         self._asleep_s = _asleep_s()
         self._watch = Watch(time.monotonic())
@@ -130,6 +136,8 @@ class Daemon:
         """Until stopped. Raises PortError only where the port cannot be opened the first time."""
         try:
             self._tell_wall()
+            if self._terms:
+                self._feed(inputs.TermsKnown(self.clock.now_ns(), self._terms))
             self._open()
             while not self._stop_reason:
                 self._turn(_LONGEST_WAIT_S)
@@ -192,12 +200,16 @@ class Daemon:
             self._feed(inputs.Tick(now_ns))
 
     def _around(self) -> None:
-        """The vehicle's word, operators and the wall clock: before bytes are judged by them."""
+        """Vehicle, operators and the wall clock: before bytes are judged by what they say."""
         now = self.clock.now_ns()
         if self._interlock is not None and now >= self._next_interlock_ns:
             self._next_interlock_ns = now + int(self._interlock_s * 1e9)
             self._safe = self._interlock.safe()
             self._feed(inputs.Interlock(now, self._safe))
+        if self._columns is not None and now >= self._next_columns_ns:
+            self._next_columns_ns = now + int(_COLUMNS_S * 1e9)
+            if (values := self._columns.news()) is not None:
+                self._feed(inputs.Columns(now, values))
         while not self._operator.empty():
             self._feed(self._operator.get())
         self._tell_wall()
@@ -240,6 +252,8 @@ class Daemon:
         error = "" if capture is None else capture.status.error
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
             self.shell.say(remark.level, remark.text, now_ns)
+        if self._columns is not None and self._columns.fault:
+            self.shell.say(logging.WARNING, self._columns.fault, now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
         if self._public is not None:
             self._public.look(self.shell.core, self._link_facts(error), now_s)

@@ -62,8 +62,24 @@ class Interlock:
 
 
 @dataclass(frozen=True, slots=True)
+class Columns:
+    """What the vehicle measures at this moment, by column name (`motor_current_a`)."""
+
+    host_ns: int
+    values: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class TermsKnown:
+    """The text of a repaired model whose terms are not to be calibrated in."""
+
+    host_ns: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Operator:
-    """A person's command: "approve" (argument: candidate hash), "lock", "unlock", "rollback"."""
+    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason."""
 
     host_ns: int
     verb: str
@@ -129,6 +145,8 @@ Input = (
     | LinkOpened
     | LinkLost
     | Interlock
+    | Columns
+    | TermsKnown
     | Operator
     | RegistersKnown
     | Samples

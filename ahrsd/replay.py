@@ -17,10 +17,10 @@ from ahrsd.config import CONFIG_KEY, Config, recorded_config
 from ahrsd.core import Core
 from ahrsd.core_settings import BESIDE_KEY, CoreSettings
 from ahrsd.errors import RecordingError
-from ahrsd.inputs import Input, Received, RegistersKnown, Samples
+from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
 from ahrsd.recording.bytestream import read_chunks
 from ahrsd.recording.opening import Kind, Recording, open_recording
-from ahrsd.settings import core_settings
+from ahrsd.settings import core_settings, terms_text
 from ahrsd.shell import Listener, Shell, Viewer
 from ahrsd.stream import NoSamplesError
 from ahrsd.stream_rate import rate_of
@@ -70,6 +70,8 @@ def replay(
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
     done = Replayed(core, recording, list(recording.notes))
     items = recording.inputs() if done.of_daemon else _registers_first(recording)
+    if (text := terms_text(config)) and not done.of_daemon:
+        shell.feed(TermsKnown(0, text))
     for item in _paced(items, core, speed):
         shell.feed(item)
         if progress is not None and isinstance(item, Received):

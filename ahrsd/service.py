@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
+from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import CONFIG_KEY, Config
 from ahrsd.config_text import print_config
 from ahrsd.core import Core
@@ -28,7 +29,7 @@ from ahrsd.rerun_sink import RerunLimits, RerunSink
 from ahrsd.sdnotify import Notifier
 from ahrsd.serial_reader import find_device
 from ahrsd.serving.public import Public
-from ahrsd.settings import core_settings, with_date
+from ahrsd.settings import core_settings, terms_text, with_date
 from ahrsd.shell import JournalKeeper, Shell, journal_in
 from ahrsd.summary import summary_lines
 from ahrsd.worker import SWITCH_S, Worker
@@ -167,6 +168,7 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     port, notifier = config.device.port, Notifier()
     if port is None:
         raise ConfigError(["device.port: no port is given"])
+    terms = terms_text(config)
     try:
         with _signals(_stop_searching):
             found = _search(config, port, notifier, wait)
@@ -182,9 +184,21 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     interlock = None
     if config.interlock.file is not None:
         interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
+    columns = None if config.terms.file is None else ColumnsFile(config.terms.file)
     box = _open_box(config)
     public = open_public(config, shell, notifier)
-    daemon = Daemon(config, shell, port, clock, interlock, baud=found.baud, box=box, public=public)
+    daemon = Daemon(
+        config,
+        shell,
+        port,
+        clock,
+        interlock,
+        baud=found.baud,
+        box=box,
+        public=public,
+        terms=terms,
+        columns=columns,
+    )
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
     sys.setswitchinterval(SWITCH_S)
     try:

@@ -7,6 +7,8 @@ import datetime
 from ahrsd.calibrator import CalibratorSettings
 from ahrsd.config import Config
 from ahrsd.core_settings import CoreSettings
+from ahrsd.errors import ConfigError
+from ahrsd.mismatch.model_file import from_text
 from ahrsd.worldfield import WorldField, world_field
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -52,4 +54,20 @@ def core_settings(
         output_rate_hz=config.device.rate_hz,
         reply_timeout_s=config.device.reply_timeout_s,
         stream_rate_hz=stream_rate_hz,
+        columns_max_age_s=config.terms.max_age_s,
     )
+
+
+def terms_text(config: Config) -> str:
+    """The text of `terms.model`, empty without one.  Raises ConfigError where it is none."""
+    path = config.terms.model
+    if path is None:
+        return ""
+    try:
+        text = path.read_text(encoding="utf-8")
+        from_text(text)
+    except OSError as error:
+        raise ConfigError([f"terms.model = {path}: cannot be read: {error.strerror}"]) from error
+    except ValueError as error:
+        raise ConfigError([f"terms.model = {path}: {error}"]) from error
+    return text

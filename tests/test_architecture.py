@@ -26,6 +26,7 @@ SHELL = (
     "ahrsd.batch",
     "ahrsd.bundle",
     "ahrsd.challenge",
+    "ahrsd.columns_file",
     "ahrsd.commands",
     "ahrsd.config",
     "ahrsd.config_sections",

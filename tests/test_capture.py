@@ -22,6 +22,7 @@ from mcap.reader import make_reader
 
 from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import (
+    Columns,
     Examined,
     Input,
     Interlock,
@@ -34,6 +35,7 @@ from ahrsd.inputs import (
     RegistersKnown,
     Samples,
     Stop,
+    TermsKnown,
     Tick,
     WallClock,
 )
@@ -50,6 +52,8 @@ EVERY_INPUT: list[Input] = [
     WallClock(11, 1762171200.25),
     Received(12, b""),
     Interlock(13, True),
+    TermsKnown(13, '{"schema": "ahrsd.model/1"}'),
+    Columns(13, {"motor_current_a": 3.25}),
     Operator(14, "approve", "ab12"),
     LinkLost(15, "unplugged"),
     JournalOpened(15, 100012345, [{"seq": 1, "old": {"23": [1.0, 1e-7]}}], "line 2 is damaged"),

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ahrsd.inputs import (
+    Columns,
     Examined,
     Input,
     Interlock,
@@ -24,6 +25,7 @@ from ahrsd.inputs import (
     RegistersKnown,
     Samples,
     Stop,
+    TermsKnown,
     Tick,
     WallClock,
 )
@@ -37,6 +39,8 @@ _TYPES = {
         LinkOpened,
         LinkLost,
         Interlock,
+        Columns,
+        TermsKnown,
         Operator,
         RegistersKnown,
         Samples,

@@ -1,0 +1,143 @@
+"""Columns that the vehicle tells beside the stream, and what a repaired model's terms make of them.
+
+    vehicle.know(text)                                # model.json of `ahrsd diagnose --report`
+    vehicle.told(host_s, {"motor_current_a": 3.2})    # as often as the vehicle says it
+    block = vehicle.with_columns(block)               # by the host's time of each sample
+    free = vehicle.without(block)                     # what is calibrated; None: no column
+
+Only terms that a column gives from one sample to the next can be taken out of a running stream: a
+current's field, a temperature's bias. What follows the motion, the edges of a column or the time
+of one recording stays where it is, and is said.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.inputs import Columns, TermsKnown
+from ahrsd.mismatch.effects.base import Readings
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.model_file import from_text
+from ahrsd.mismatch.values import Term
+from ahrsd.samples import Array, SampleBlock
+
+_KEPT = 256  # instants of a column: some seconds at any rate that a vehicle tells it
+_PROBE = 64
+
+
+class VehicleTerms:
+    """See the module. `warn` takes sentences for a person; one may come again and again."""
+
+    def __init__(self, warn: Callable[[str], object], max_age_s: float) -> None:
+        self.terms: tuple[Term, ...] = ()
+        self._warn, self._max_age_s = warn, max_age_s
+        self._columns: dict[str, deque[tuple[float, float]]] = {}
+        self._gap = False
+
+    def hear(self, item: Columns | TermsKnown) -> None:
+        """What the vehicle measures, or the model. A text that is no model is said, not raised."""
+        if isinstance(item, Columns):
+            self.told(item.host_ns * 1e-9, item.values)
+            return
+        try:
+            self.know(item.text)
+        except ValueError as error:
+            self._warn(f"the model of the terms {error}")
+
+    def know(self, text: str) -> None:
+        """The model's text; terms that cannot be followed are said. ValueError: it is no model."""
+        terms = from_text(text).terms
+        self.terms = tuple(term for term in terms if follows_a_column(term))
+        for term in terms:
+            if term not in self.terms:
+                self._warn(
+                    f"{term.identifier} is in the model and does not follow a column from sample "
+                    "to sample: it stays in the readings"
+                )
+        if self.terms:
+            names = ", ".join(f"{t.identifier} ({t.setting['covariate']})" for t in self.terms)
+            self._warn(f"calibrated without {names}")
+
+    def told(self, host_s: float, values: Mapping[str, float]) -> None:
+        """The columns at a moment."""
+        for name, value in values.items():
+            self._columns.setdefault(name, deque(maxlen=_KEPT)).append((host_s, value))
+
+    def with_columns(self, block: SampleBlock) -> SampleBlock:
+        """The block with what the vehicle told; nan where that is older than `max_age_s`."""
+        if not self._columns:
+            return block
+        told = {name: self._at(block.host_s, known) for name, known in self._columns.items()}
+        return replace(block, covariates={**told, **block.covariates})
+
+    def _at(self, host_s: Array, known: deque[tuple[float, float]]) -> Array:
+        at_s, values = np.array(known).T
+        after = np.clip(np.searchsorted(at_s, host_s), 0, len(at_s) - 1)
+        before = np.maximum(after - 1, 0)
+        away_s = np.minimum(np.abs(host_s - at_s[after]), np.abs(host_s - at_s[before]))
+        return np.where(away_s <= self._max_age_s, np.interp(host_s, at_s, values), np.nan)
+
+    def without(self, block: SampleBlock) -> SampleBlock | None:
+        """The block without what the terms add; None where one of its columns is not known."""
+        if not self.terms or not len(block):
+            return block
+        parts = [_added(term, block.time_s, block.dt_s, block.covariates) for term in self.terms]
+        if not all(np.isfinite(part).all() for part in parts):
+            self._gap = True
+            self._warn("samples without " + ", ".join(self._missing(block)) + " are not calibrated")
+            return None
+        gap, self._gap = block.gap_before or self._gap, False
+        mag, gyro = np.sum(parts, axis=0)
+        return replace(
+            block,
+            raw_b_gauss=block.raw_b_gauss - mag,
+            gyro_b_rad_s=block.gyro_b_rad_s - gyro,
+            gap_before=gap,
+        )
+
+    def _missing(self, block: SampleBlock) -> list[str]:
+        wanted = dict.fromkeys(str(term.setting["covariate"]) for term in self.terms)
+        known = block.covariates
+        return [name for name in wanted if name not in known or not np.isfinite(known[name]).all()]
+
+
+def follows_a_column(term: Term) -> bool:
+    """Whether columns alone give the term's effect, each sample by itself.
+
+    Asked of the effect: readings in which everything but time and columns is unknown must give
+    finite numbers, and the same ones in two halves as in one piece.
+    """
+    name = term.setting.get("covariate")
+    if EFFECTS[term.identifier].kind != "mean" or not isinstance(name, str) or name == "accel":
+        return False
+    time_s = np.arange(_PROBE, dtype=np.float64)
+    dt_s = np.ones(_PROBE)
+    column = np.random.default_rng(1).normal(20.0, 5.0, _PROBE)
+    whole, first, second = (
+        _added(term, time_s[rows], dt_s[rows], {name: column[rows]})
+        for rows in (slice(None), slice(_PROBE // 2), slice(_PROBE // 2, None))
+    )
+    joined = np.concatenate([first, second], axis=1)
+    return bool(np.isfinite(whole).all() and np.allclose(joined, whole, rtol=1e-9))
+
+
+def _added(term: Term, time_s: Array, dt_s: Array, columns: Mapping[str, Array]) -> Array:
+    """(2, N, 3): what the term adds to field and rate; nan where it needs more than columns."""
+    count, nothing = len(time_s), np.full((len(time_s), 3), np.nan)
+    if term.setting["covariate"] not in columns:
+        return np.full((2, count, 3), np.nan)
+    silent = Readings(
+        time_s=time_s, dt_s=dt_s, mag_b_gauss=np.zeros((count, 3)),
+        gyro_b_rad_s=np.zeros((count, 3)), accel_b_m_s2=nothing, rate_b_rad_s=nothing,
+        field_b=nothing, R_nb=np.full((count, 3, 3), np.nan), soft_iron=np.full((3, 3), np.nan),
+        covariates=dict(columns),
+    )  # fmt: skip
+    try:
+        made = EFFECTS[term.identifier].simulate(silent, term.value, term.setting)
+    except KeyError:  # a setting that this effect needs is not in the file
+        return np.full((2, count, 3), np.nan)
+    return np.stack([made.mag_b_gauss, made.gyro_b_rad_s])
