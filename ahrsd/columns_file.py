@@ -9,7 +9,7 @@ numbers is no word; why is said by `fault`.
 from __future__ import annotations
 
 import json
-import math
+import sys
 from pathlib import Path
 
 _LONGEST = 4096
@@ -36,16 +36,29 @@ class ColumnsFile:
             return None
         self._seen_ns = written_ns
         try:
-            body = json.loads(data)
+            found = columns_of(data)
         except ValueError as error:
-            self.fault = f"{self.path}: is not JSON: {error}"
-            return None
-        if not isinstance(body, dict) or not all(map(_is_number, body.values())):
-            self.fault = f'{self.path}: must be an object of numbers, {{"motor_current_a": 3.2}}'
+            self.fault = f"{self.path}: {error}"
             return None
         self.fault = ""
+        return found
+
+
+def columns_of(data: bytes) -> dict[str, float]:
+    """The columns in the file's bytes.  Raises ValueError with what is wrong in words."""
+    try:
+        body = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"is not JSON: {error}") from None
+    if isinstance(body, dict) and all(map(_is_number, body.values())):
         return {str(name): float(value) for name, value in body.items()}
+    raise ValueError('must be an object of numbers, {"motor_current_a": 3.2}')
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Also no whole number that is beyond all floats."""
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )

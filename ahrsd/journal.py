@@ -69,7 +69,7 @@ def _parse(line: bytes) -> Record | None:
         body = json.loads(line)
         crc = body.pop("crc")
         seq, time, kind = body.pop("seq"), body.pop("time"), body.pop("kind")
-    except (ValueError, AttributeError, KeyError, TypeError):
+    except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
         return None
     record = Record(seq, time, kind, body)
     return record if _line(record) == line and crc in line.decode() else None

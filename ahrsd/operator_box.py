@@ -77,7 +77,7 @@ def _taken(file: Path) -> tuple[str, str] | None:
     try:
         word = json.loads(body)
         verb, argument = word["verb"], word["argument"]
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         verb, argument = None, None
     if verb not in VERBS or not isinstance(argument, str):
         log.warning("operator: %s is not a word; use `ahrsd operator`", file.name)

@@ -150,7 +150,8 @@ def test_the_file_is_read_once_and_says_what_is_wrong_with_it(tmp_path):
     assert (file.news(), file.fault) == (None, "")
     for k, (text, words) in enumerate(
         [("", "is not JSON"), ("[1]", "object of numbers"), ('{"a": NaN}', "object of numbers"),
-         ('{"a": true}', "object of numbers")]
+         ('{"a": true}', "object of numbers"), ("[" * 4000, "is not JSON"),
+         ('{"a": 1' + "0" * 400 + "}", "object of numbers")]
     ):  # fmt: skip
         path.write_text(text)
         os.utime(path, ns=(k, k))

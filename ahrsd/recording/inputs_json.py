@@ -82,7 +82,7 @@ def decode(data: bytes) -> Input:
         elif kind is Samples:
             body["block"] = _block(body["block"])
         return kind(**body)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"not a recorded input: {error}") from error
 
 

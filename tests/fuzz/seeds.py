@@ -85,6 +85,7 @@ def main() -> None:
         "capture": captures(),
         "journal": journals(),
         "socket_line": requests(),
+        "columns": [b'{"motor_current_a": 3.2, "rudder_deg": -4}', b'{"a": [1e999]}', b"[" * 4000],
     }
     for target, inputs in seeds.items():
         folder = CORPUS / target

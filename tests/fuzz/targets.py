@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+from ahrsd.columns_file import columns_of
 from ahrsd.config import Config, check_config
 from ahrsd.config_text import print_config
 from ahrsd.core import Core
@@ -120,6 +121,16 @@ def socket_line(data: bytes) -> None:
             assert str(error)
 
 
+def columns(data: bytes) -> None:
+    """What the vehicle writes is numbers or refused in words."""
+    try:
+        found = columns_of(data)
+    except ValueError as error:
+        assert str(error)
+        return
+    assert all(math.isfinite(value) for value in found.values())
+
+
 TARGETS: dict[str, Target] = {
     "deframer": deframer,
     "messages": messages,
@@ -128,4 +139,5 @@ TARGETS: dict[str, Target] = {
     "capture": capture,
     "journal": journal,
     "socket_line": socket_line,
+    "columns": columns,
 }
