@@ -8,7 +8,6 @@ from ahrsd.calibrator import CalibratorSettings
 from ahrsd.config import Config
 from ahrsd.core_settings import CoreSettings
 from ahrsd.errors import ConfigError
-from ahrsd.mismatch.model_file import from_text
 from ahrsd.worldfield import WorldField, world_field
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -63,6 +62,8 @@ def terms_text(config: Config) -> str:
     path = config.terms.model
     if path is None:
         return ""
+    from ahrsd.mismatch.model_file import from_text  # takes 50 MB: only where there is a model
+
     try:
         text = path.read_text(encoding="utf-8")
         from_text(text)

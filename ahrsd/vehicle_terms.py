@@ -15,18 +15,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ahrsd.inputs import Columns, TermsKnown
-from ahrsd.mismatch.effects.base import Readings
-from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.model_file import from_text
-from ahrsd.mismatch.values import Term
 from ahrsd.samples import Array, SampleBlock
 
+if TYPE_CHECKING:
+    from ahrsd.mismatch.values import Term
+
 _KEPT = 256  # instants of a column: some seconds at any rate that a vehicle tells it
-_PROBE = 64
+Added = Callable[["Term", Array, Array, Mapping[str, Array]], Array]
 
 
 class VehicleTerms:
@@ -37,6 +37,7 @@ class VehicleTerms:
         self._warn, self._max_age_s = warn, max_age_s
         self._columns: dict[str, deque[tuple[float, float]]] = {}
         self._gap = False
+        self._added: Added | None = None
 
     def hear(self, item: Columns | TermsKnown) -> None:
         """What the vehicle measures, or the model. A text that is no model is said, not raised."""
@@ -50,7 +51,11 @@ class VehicleTerms:
 
     def know(self, text: str) -> None:
         """The model's text; terms that cannot be followed are said. ValueError: it is no model."""
-        terms = from_text(text).terms
+        # the library of effects takes 50 MB, which a daemon without a model does without
+        from ahrsd.mismatch.column_terms import added, follows_a_column
+        from ahrsd.mismatch.model_file import from_text
+
+        terms, self._added = from_text(text).terms, added
         self.terms = tuple(term for term in terms if follows_a_column(term))
         for term in terms:
             if term not in self.terms:
@@ -83,9 +88,10 @@ class VehicleTerms:
 
     def without(self, block: SampleBlock) -> SampleBlock | None:
         """The block without what the terms add; None where one of its columns is not known."""
-        if not self.terms or not len(block):
+        if not self.terms or self._added is None or not len(block):
             return block
-        parts = [_added(term, block.time_s, block.dt_s, block.covariates) for term in self.terms]
+        columns = block.covariates
+        parts = [self._added(term, block.time_s, block.dt_s, columns) for term in self.terms]
         if not all(np.isfinite(part).all() for part in parts):
             self._gap = True
             self._warn("samples without " + ", ".join(self._missing(block)) + " are not calibrated")
@@ -103,41 +109,3 @@ class VehicleTerms:
         wanted = dict.fromkeys(str(term.setting["covariate"]) for term in self.terms)
         known = block.covariates
         return [name for name in wanted if name not in known or not np.isfinite(known[name]).all()]
-
-
-def follows_a_column(term: Term) -> bool:
-    """Whether columns alone give the term's effect, each sample by itself.
-
-    Asked of the effect: readings in which everything but time and columns is unknown must give
-    finite numbers, and the same ones in two halves as in one piece.
-    """
-    name = term.setting.get("covariate")
-    if EFFECTS[term.identifier].kind != "mean" or not isinstance(name, str) or name == "accel":
-        return False
-    time_s = np.arange(_PROBE, dtype=np.float64)
-    dt_s = np.ones(_PROBE)
-    column = np.random.default_rng(1).normal(20.0, 5.0, _PROBE)
-    whole, first, second = (
-        _added(term, time_s[rows], dt_s[rows], {name: column[rows]})
-        for rows in (slice(None), slice(_PROBE // 2), slice(_PROBE // 2, None))
-    )
-    joined = np.concatenate([first, second], axis=1)
-    return bool(np.isfinite(whole).all() and np.allclose(joined, whole, rtol=1e-9))
-
-
-def _added(term: Term, time_s: Array, dt_s: Array, columns: Mapping[str, Array]) -> Array:
-    """(2, N, 3): what the term adds to field and rate; nan where it needs more than columns."""
-    count, nothing = len(time_s), np.full((len(time_s), 3), np.nan)
-    if term.setting["covariate"] not in columns:
-        return np.full((2, count, 3), np.nan)
-    silent = Readings(
-        time_s=time_s, dt_s=dt_s, mag_b_gauss=np.zeros((count, 3)),
-        gyro_b_rad_s=np.zeros((count, 3)), accel_b_m_s2=nothing, rate_b_rad_s=nothing,
-        field_b=nothing, R_nb=np.full((count, 3, 3), np.nan), soft_iron=np.full((3, 3), np.nan),
-        covariates=dict(columns),
-    )  # fmt: skip
-    try:
-        made = EFFECTS[term.identifier].simulate(silent, term.value, term.setting)
-    except KeyError:  # a setting that this effect needs is not in the file
-        return np.full((2, count, 3), np.nan)
-    return np.stack([made.mag_b_gauss, made.gyro_b_rad_s])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,13 +16,14 @@ from ahrsd.config import Config, check_config
 from ahrsd.core import Core
 from ahrsd.errors import ConfigError
 from ahrsd.inputs import Columns, RegistersKnown, Samples, Stop, TermsKnown
+from ahrsd.mismatch.column_terms import follows_a_column
 from ahrsd.mismatch.forward import Noise
 from ahrsd.mismatch.model_file import RepairedModel, to_text
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import SampleBlock
 from ahrsd.settings import core_settings, terms_text
 from ahrsd.simulation import Settings, simulate
-from ahrsd.vehicle_terms import VehicleTerms, follows_a_column
+from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -170,3 +173,9 @@ def test_a_configured_model_must_be_one(tmp_path):
     path.write_text(model_text(term()))
     assert terms_text(config) == path.read_text()
     assert terms_text(Config()) == ""
+
+
+def test_without_a_model_the_daemon_does_not_load_the_library_of_effects():
+    code = "import sys, ahrsd.service; print([m for m in sys.modules if 'effects' in m])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "[]\n"
