@@ -25,28 +25,77 @@ def skew(v: Array) -> Array:
     return out
 
 
-def _series(phi: Array) -> tuple[Array, Array, Array, Array, Array]:
-    t2 = np.sum(phi * phi, axis=-1)
+def _series(t2: Array) -> tuple[Array, Array, Array]:
     t = np.sqrt(t2)
     small = t < _SMALL
     safe = np.where(small, 1.0, t)  # the untaken branch must not divide by zero
-    a = np.where(small, 1 - t2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - t2 / 24, (1 - np.cos(safe)) / safe**2)
-    c = np.where(small, 1 / 6 - t2 / 120, (safe - np.sin(safe)) / safe**3)
-    K = skew(phi)
-    return a[..., None, None], b[..., None, None], c[..., None, None], K, K @ K
+    sine, safe2 = np.sin(safe), safe * safe
+    a = np.where(small, 1 - t2 / 6, sine / safe)
+    b = np.where(small, 0.5 - t2 / 24, (1 - np.cos(safe)) / safe2)
+    c = np.where(small, 1 / 6 - t2 / 120, (safe - sine) / (safe * safe2))
+    return a, b, c
+
+
+def _polynomial(v: Array, t2: Array, a: Array, b: Array) -> Array:
+    """I + a [v]x + b [v]x^2 of v (3, ...) with |v|^2 = t2: (3, 3, ...)."""
+    out = v[:, None] * (b * v)  # [v]x^2 = v v^T - |v|^2 I
+    x, y, z = a * v
+    out[0, 1] -= z
+    out[1, 0] += z
+    out[0, 2] += y
+    out[2, 0] -= y
+    out[1, 2] -= x
+    out[2, 1] += x
+    rest = 1 - b * t2
+    for i in range(3):
+        out[i, i] += rest
+    return np.asarray(out)
+
+
+def _columns(phi: Array) -> tuple[Array, Array]:
+    v = np.ascontiguousarray(np.moveaxis(phi, -1, 0))
+    return v, np.sum(v * v, axis=0)
+
+
+def _matrices(columns: Array) -> Array:
+    return np.ascontiguousarray(np.moveaxis(columns, (0, 1), (-2, -1)))
 
 
 def exp(phi: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad."""
-    a, b, _, K, K2 = _series(phi)
-    return np.asarray(np.eye(3) + a * K + b * K2)
+    v, t2 = _columns(phi)
+    a, b, _ = _series(t2)
+    return _matrices(_polynomial(v, t2, a, b))
 
 
 def exp_and_left_jacobian(phi: Array) -> tuple[Array, Array]:
     """Exp(phi) and Jl(phi), both (..., 3, 3)."""
-    a, b, c, K, K2 = _series(phi)
-    return np.asarray(np.eye(3) + a * K + b * K2), np.asarray(np.eye(3) + b * K + c * K2)
+    R, Jl = columns_exp_and_left_jacobian(_columns(phi)[0])
+    return _matrices(R), _matrices(Jl)
+
+
+def columns_exp_and_left_jacobian(v: Array) -> tuple[Array, Array]:
+    """Exp(v) and Jl(v), both (3, 3, ...), of rotation vectors v (3, ...)."""
+    t2 = np.sum(v * v, axis=0)
+    a, b, c = _series(t2)
+    return _polynomial(v, t2, a, b), _polynomial(v, t2, b, c)
+
+
+def products(R: Array) -> Array:
+    """Products of all rotations (n, 3, 3) up to each row: within parts, then of the parts."""
+    n, part = len(R), 16
+    if n <= part:
+        parts = R.copy()[None]
+    else:
+        whole = np.concatenate([R, np.broadcast_to(np.eye(3), (-n % part, 3, 3))])
+        parts = whole.reshape(-1, part, 3, 3)
+    step = 1
+    while step < part:
+        parts[:, step:] = parts[:, :-step] @ parts[:, step:]
+        step *= 2
+    if n > part:
+        parts[1:] = products(parts[:-1, -1])[:, None] @ parts[1:]
+    return parts.reshape(-1, 3, 3)[:n]
 
 
 def log(R: Array) -> Array:
@@ -85,15 +134,28 @@ def _log_near_pi(R: Array, v: Array, t: Array) -> Array:
 
 
 def tangent_basis(u: Array) -> Array:
-    """(N, 3, 2) orthonormal bases of the planes normal to the unit vectors u (N, 3).
+    """(N, 3, 2) orthonormal bases of the planes normal to the unit vectors u (N, 3)."""
+    out = np.empty((len(u), 3, 2))
+    _bases(u.T, out.transpose(1, 2, 0))
+    return out
+
+
+def frames(u: Array) -> Array:
+    """(3, 3, N): two tangents of the unit vectors u (3, N), and these themselves."""
+    out = np.empty((3, 3, u.shape[1]))
+    _bases(u, out)
+    out[:, 2] = u
+    return out
+
+
+def _bases(u: Array, out: Array) -> None:
+    """Tangents of u (3, N) into the first two columns of `out` (3, 2+, N).
 
     Without branches (Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017).
     """
-    x, y, z = u.T
+    x, y, z = u
     s = np.copysign(1.0, z)
     a = -1.0 / (s + z)
     ab = x * y * a
-    out = np.empty((len(u), 3, 2))
-    out[:, 0, 0], out[:, 1, 0], out[:, 2, 0] = 1.0 + s * x * x * a, s * ab, -s * x
-    out[:, 0, 1], out[:, 1, 1], out[:, 2, 1] = ab, s + y * y * a, -y
-    return out
+    out[0, 0], out[1, 0], out[2, 0] = 1.0 + s * x * x * a, s * ab, -s * x
+    out[0, 1], out[1, 1], out[2, 1] = ab, s + y * y * a, -y

@@ -161,7 +161,7 @@ def test_a_gap_is_not_bridged_and_costs_information():
     b = cramer_rao(cut, whole.truth.soft_iron, SM, SG)
     assert a.hard_iron_gauss < b.hard_iron_gauss < 2 * a.hard_iron_gauss
     eigenvalues = np.linalg.eigvalsh(b.covariance[6:, 6:] - a.covariance[6:, 6:])
-    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
+    assert eigenvalues[0] > -1e-11 * eigenvalues[-1]  # zero but for rounding
 
 
 def test_scales_with_the_noise_and_with_the_units():

@@ -109,14 +109,15 @@ def test_derivatives_of_the_residuals(case):
     field, motion = chain.parts(rows, x)
     n = len(u)
     J = np.zeros((5 * n - 2, 12 + 2 * n))
-    r = np.concatenate([field.r.ravel(), motion.q[1:].ravel()])
+    r = np.concatenate([field.r.T.ravel(), motion.q[:, 1:].T.ravel()])
     for k in range(n):
         own = slice(12 + 2 * k, 14 + 2 * k)
-        J[3 * k : 3 * k + 3, :9], J[3 * k : 3 * k + 3, own] = field.by_x[k], field.own[k]
+        at = slice(3 * k, 3 * k + 3)
+        J[at, :9], J[at, own] = field.by_x[:, :, k], field.own[:, :, k]
     for k in range(1, n):
         at = slice(3 * n + 2 * k - 2, 3 * n + 2 * k)
-        J[at, 9:12] = motion.by_bias[k]
-        J[at, 10 + 2 * k : 12 + 2 * k] = motion.prev[k]
+        J[at, 9:12] = motion.by_bias[:, :, k]
+        J[at, 10 + 2 * k : 12 + 2 * k] = motion.prev[:, :, k]
         J[at, 12 + 2 * k : 14 + 2 * k] = -motion.scale[k] * np.eye(2)
     r_numeric, J_numeric = dense(data, u, x, bias)
     np.testing.assert_allclose(r, r_numeric, atol=1e-9)
@@ -203,7 +204,7 @@ def test_weights_of_outliers_are_those_of_the_residuals_there():
     data, u, x, bias = epoch()
     data.field_b_gauss[5] += 0.1
     q = chain.linearise_all([chain.Chain(data, u, bias, NOISE)], x, outlier_sigma=4.6)[0]
-    expected = chain.robust_weights(data.field_error(u, x), 4.6 * NOISE.mag_gauss)
+    expected = chain.robust_weights(data.field_error(u, x).T, 4.6 * NOISE.mag_gauss)
     np.testing.assert_allclose(q.weights, expected)
     assert expected[5] < 0.02
     given = chain.linearise(data, u, x, bias, NOISE, weights=expected)
@@ -221,7 +222,7 @@ def test_symmetric_and_its_columns():
 
 def test_robust_weights():
     residual = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 20.0, 0.0]])
-    np.testing.assert_allclose(chain.robust_weights(residual, 10.0), [1.0, 1.0, 0.25])
+    np.testing.assert_allclose(chain.robust_weights(residual.T, 10.0), [1.0, 1.0, 0.25])
 
 
 def test_directions_that_nothing_determines_are_an_error():

@@ -247,3 +247,14 @@ def test_node_moves_on_the_sphere():
     np.testing.assert_allclose(moved.bias, [1.0, 2.0, 3.0])
     assert node.direction @ moved.direction == pytest.approx(0.8)
     np.testing.assert_allclose(moved.tangent, so3.tangent_basis(moved.direction[None])[0])
+
+
+def test_belief_counts_only_where_the_data_know_little():
+    """In sigmas of the prior, of the directions of which the data say nearly nothing."""
+    graph = random_graph(nodes=2, rank=10)
+    variances, directions = np.full(9, 1e-3), np.linalg.qr(np.arange(81).reshape(9, 9) ** 0.5)[0]
+    variances[:2] = 0.5
+    covariance = np.outer(SIGMA, SIGMA) * ((directions * variances) @ directions.T)
+    graph.c = graph.anchor[0] + SIGMA * (directions @ np.r_[3.0, -4.0, np.full(7, 20.0)])
+    assert graph.strayed(covariance) == pytest.approx(12.5)
+    assert graph.strayed(1e-2 * covariance) == 0.0

@@ -43,7 +43,6 @@ from ahrsd.estimator.rows import (
     robust_weights,
     symmetric,
     symmetric_columns,
-    times,
     upper_triangle,
 )
 from ahrsd.samples import Array
@@ -61,6 +60,7 @@ __all__ = [
     "move",
     "parts",
     "robust_weights",
+    "squares",
     "start_directions",
     "symmetric",
     "symmetric_columns",
@@ -82,8 +82,8 @@ class Quadratic:
     """An epoch's cost around its linearisation point: c + g^T z + z^T H z / 2, z of WIDTH numbers.
 
     `cost` and the sums of squares of the whitened residuals are those with the interior directions
-    at their best for z = 0; weights (n,) those of the field residuals; seen (n, 2)
-    the squared sizes of the columns of M P_k T_k.
+    at their best for z = 0; tangents (3, 2, n); weights (n,) those of the field residuals; seen
+    (2, n) the squared sizes of the columns of M P_k T_k.
     """
 
     H: Array
@@ -128,8 +128,8 @@ def linearise_all(
     insides = [inside.part(a, b) for a, b in ends]
     sums = _sums(field, motion, blocks, rows)
     sums -= np.array([part.half.T @ part.half for part in insides])
-    best = field.r + times(field.own, inside.step(np.zeros(WIDTH)))
-    sum_mag = np.add.reduceat(np.sum(best**2, axis=1), rows.first)
+    best = field.r + np.einsum("rin,ni->rn", field.own, inside.step(np.zeros(WIDTH)))
+    sum_mag = np.add.reduceat(np.sum(best**2, axis=0), rows.first)
     count_mag = 3.0 * np.add.reduceat(field.weights * rows.measured, rows.first)
     count_gyro = 2.0 * np.add.reduceat((rows.stiff > 0.0).astype(np.float64), rows.first)
     return [
@@ -138,9 +138,9 @@ def linearise_all(
             g=sums[k, :WIDTH, WIDTH].copy(),
             cost=0.5 * float(sums[k, WIDTH, WIDTH]),
             interior=insides[k],
-            tangents=field.tangents[a : b + 1].copy(),
+            tangents=field.tangents[:, :, a : b + 1].copy(),
             weights=field.weights[a : b + 1].copy(),
-            seen=field.seen[a : b + 1].copy(),
+            seen=field.seen[:, a : b + 1].copy(),
             sum_mag=float(sum_mag[k]),
             sum_gyro=max(float(sums[k, WIDTH, WIDTH] - sum_mag[k]), 0.0),
             count_mag=float(count_mag[k]),
@@ -157,14 +157,18 @@ def _sums(
     diag, _, border = blocks
     sums = np.zeros((len(rows.first), WIDTH + 1, WIDTH + 1))
     for k, (a, b) in enumerate(zip(rows.first, rows.last + 1, strict=True)):
-        J, K = field.J[a:b].reshape(-1, 12), motion.J[a:b].reshape(-1, 6)
-        sums[k][_FIELD] = (J.T @ J)[2:, 2:]
-        sums[k][_MOTION] += (K.T @ K)[2:, 2:]
+        sums[k][_FIELD] = squares(field.J[:, 2:, a:b])
+        sums[k][_MOTION] += squares(motion.J[:, 2:, a:b])
     for where, ends in ((FIRST, rows.first), (LAST, rows.last)):
-        sums[:, where, where] = diag[ends]
-        sums[:, where, _SPOKEN] = border[ends]
-        sums[:, _SPOKEN, where] = border[ends].transpose(0, 2, 1)
+        sums[:, where, where] = diag[:, :, ends].transpose(2, 0, 1)
+        sums[:, where, _SPOKEN] = border[:, :, ends].transpose(2, 0, 1)
+        sums[:, _SPOKEN, where] = border[:, :, ends].transpose(2, 1, 0)
     return sums
+
+
+def squares(J: Array) -> Array:
+    """Sum of J_rn J_rn^T over residuals r and rows n, (i, i), of J (r, i, n)."""
+    return np.asarray((J @ J.transpose(0, 2, 1)).sum(axis=0))
 
 
 def move(u: Array, quadratic: Quadratic, z: Array) -> Array:
@@ -172,5 +176,5 @@ def move(u: Array, quadratic: Quadratic, z: Array) -> Array:
     step = np.empty((len(u), 2))
     step[0], step[-1] = z[FIRST], z[LAST]
     step[1:-1] = quadratic.interior.step(z)
-    moved = u + times(quadratic.tangents, step)
+    moved = u + np.einsum("cin,ni->nc", quadratic.tangents, step)
     return np.asarray(moved / np.sqrt(np.sum(moved * moved, axis=1, keepdims=True)))

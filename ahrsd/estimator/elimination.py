@@ -41,22 +41,22 @@ class Interior:
 
 
 def eliminated(diag: Array, upper: Array, border: Array, first: Index, last: Index) -> Interior:
-    """Of chains in one row: blocks (N, 2, 2), those above them (N - 1, 2, 2), border (N, 2, 13).
+    """Of chains in one row: blocks (2, 2, N), those above them (2, 2, N - 1), border (2, 13, N).
 
     border: coupling to the 12 shared numbers, and the gradient; first, last: rows of each chain's
     border blocks, whose rows of the result mean nothing. LinAlgError where a direction is not
     determined.
     """
-    n = len(diag)
+    n = diag.shape[2]
     right = np.zeros((_GRADIENT + 1, n, 2))
-    right[:_SHARED] = border[:, :, :_SHARED].transpose(2, 0, 1)
-    right[_GRADIENT] = border[:, :, _SHARED]
+    right[:_SHARED] = border[:, :_SHARED].transpose(1, 2, 0)
+    right[_GRADIENT] = border[:, _SHARED].T
     right[:, first], right[:, last] = 0.0, 0.0
-    right[_SHARED : _SHARED + 2, first + 1] = upper[first].transpose(1, 0, 2)
-    right[_SHARED + 2 : _GRADIENT, last - 1] = upper[last - 1].transpose(2, 0, 1)
+    right[_SHARED : _SHARED + 2, first + 1] = upper[:, :, first].transpose(0, 2, 1)
+    right[_SHARED + 2 : _GRADIENT, last - 1] = upper[:, :, last - 1].transpose(1, 2, 0)
     diag, upper = diag.copy(), upper.copy()
-    diag[first] = diag[last] = np.eye(2)
-    upper[first] = upper[last - 1] = 0.0
+    diag[:, :, first] = diag[:, :, last] = np.eye(2)[:, :, None]
+    upper[:, :, first] = upper[:, :, last - 1] = 0.0
     return Interior(*halfway(diag, upper, right))
 
 
@@ -71,11 +71,10 @@ def halfway(diag: Array, upper: Array, right: Array) -> tuple[Array, Array]:
 
 def band(diag: Array, upper: Array) -> Array:
     """Lower banded storage (4, 2n) of a symmetric block tridiagonal matrix with 2x2 blocks."""
-    n = len(diag)
-    out = np.zeros((4, 2 * n), order="F")
-    out[0, 0::2], out[0, 1::2] = diag[:, 0, 0], diag[:, 1, 1]
-    out[1, 0::2] = diag[:, 1, 0]
-    out[1, 1:-1:2] = upper[:, 1, 0]
-    out[2, 0:-2:2], out[2, 1:-2:2] = upper[:, 0, 0], upper[:, 1, 1]
-    out[3, 0:-2:2] = upper[:, 0, 1]
+    out = np.zeros((4, 2 * diag.shape[2]), order="F")
+    out[0, 0::2], out[0, 1::2] = diag[0, 0], diag[1, 1]
+    out[1, 0::2] = diag[1, 0]
+    out[1, 1:-1:2] = upper[1, 0]
+    out[2, 0:-2:2], out[2, 1:-2:2] = upper[0, 0], upper[1, 1]
+    out[3, 0:-2:2] = upper[0, 1]
     return out

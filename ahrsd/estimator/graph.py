@@ -32,6 +32,7 @@ class SingularError(ValueError):
 _C = gtsam.symbol("c", 0)
 # Unit of the gyro bias inside GTSAM: (rad/s) / 100, which brings its pivots near the directions'.
 _UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.0]
+_BADLY = 0.1
 _HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
@@ -122,18 +123,35 @@ class Graph:
         d = self.c - self.anchor[0]
         return float(0.5 * d @ (self._belief() + self.hold) @ d)
 
+    def strayed(self, covariance: Array) -> float:
+        """Mean square in sigmas of the prior of where c is in the directions that are badly known.
+
+        covariance (9, 9) of c, tempered; badly: to no more than _BADLY of the prior's sigma. Beyond
+        1 belief and data disagree by more than either allows. In planar motion directions that fit
+        the noise lead up a valley to any size; this holds them back.
+        """
+        values, vectors = self._against_belief(covariance)
+        badly = vectors[:, values > _BADLY**2]
+        away = badly.T @ self._whitening @ (self.c - self.anchor[0])
+        return float(np.mean(away * away)) if len(away) else 0.0
+
     def hold_blind(self, limit: float, covariance: Array) -> None:
         """Hold the directions whose sigma stays above `limit` of the prior's at the prior's mean.
 
-        covariance (9+, 9+) of c first, tempered. In the eigenbasis of the posterior, whitened by
+        covariance (9, 9) of c, tempered. In the eigenbasis of the posterior, whitened by
         the prior, both are diagonal: holding one direction moves no other.
         """
-        W = self._whitening
-        scaled = W @ covariance[:9, :9] @ W.T
-        values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+        values, vectors = self._against_belief(covariance)
         self._blind = vectors[:, values > limit**2]
-        blind = W.T @ self._blind
+        blind = self._whitening.T @ self._blind
         self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
+
+    def _against_belief(self, covariance: Array) -> tuple[Array, Array]:
+        """Variances (9,) over the prior's and their directions, columns, whitened by the prior."""
+        W = self._whitening
+        scaled = W @ covariance @ W.T
+        values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+        return values, vectors
 
     def _all(self) -> list[Factor]:
         return [self.prior, *self.factors]
@@ -159,6 +177,20 @@ class Graph:
         delta = net.optimize(given)
         dy = {j: np.array(delta.at(_y(j))) * _UNITS[Y_A] for j in self.nodes}
         return np.asarray(solved[C], dtype=np.float64), dy
+
+    def ahead(self) -> tuple[Array, Array]:
+        """Where an undamped step would take c, dc (9,), and the information (9, 9) of c.
+
+        Raises SingularError as `step` does.
+        """
+        _, H, g = self._reduced()
+        H, g = H[:14, :14].copy(), g[:14].copy()
+        pull = self._belief() + self.hold
+        H[C, C] += pull
+        g[C] += pull @ (self.c - self.anchor[0])
+        covariance = _inverse(H)
+        information = np.asarray(np.linalg.inv(covariance[C, C]), dtype=np.float64)
+        return -(covariance @ g)[C], information
 
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
         """Move all values by a step, the calibration along its valley (`retraction.py`)."""

@@ -13,6 +13,7 @@ field's differences inside it, which matter only if the sensor turned much (_TUR
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -25,8 +26,9 @@ from ahrsd.samples import Array
 
 Index = NDArray[np.intp]
 _LARGEST = 7
-_TURN_RAD = 0.3  # of rotation in a group; 1 step in 20 may turn faster
+_TURN_RAD, _OFTEN = 0.3, 0.95  # of rotation in a group; share of the steps that may not turn faster
 _LOST = 0.03
+_FEWEST = 3  # rows that are never grouped
 
 
 def group_size(data: chain.Data, noise: chain.Noise, size_gauss: float) -> int:
@@ -37,81 +39,104 @@ def group_size(data: chain.Data, noise: chain.Noise, size_gauss: float) -> int:
     """
     dt = float(np.median(data.dt_s[1:]))
     ratio = noise.mag_gauss / (size_gauss * noise.gyro_rad_s * dt)
-    turn = float(np.percentile(np.linalg.norm(data.angle_b_rad[1:], axis=1), 95))
+    turns = np.sqrt(np.sum(data.angle_b_rad[1:] ** 2, axis=1))
+    fast = int(np.ceil(_OFTEN * (len(turns) - 1)))
+    turn = float(np.partition(turns, fast)[fast])
     most = min(ratio * np.sqrt(12 * _LOST), _TURN_RAD / max(turn, 1e-9), _LARGEST)
     return max(1, int(most) - 1 + int(most) % 2)
 
 
-def grouped(data: chain.Data, size: int) -> chain.Data:
-    """An epoch of single steps with `size` of them, an odd number, in a state."""
-    n = len(data)
-    if size == 1 or n < 4:
-        return data
-    linked = np.ones(n) if data.linked is None else data.linked
-    start, length = _groups(linked, size)
-    rows = np.r_[0, start + length // 2, n - 1]
-    inner = (linked > 0) & (np.arange(n) > 0)
-    turn = so3.exp(np.where(inner[:, None], data.angle_b_rad, 0.0))
-    angle, dt, spread, joins = _between(data, turn, linked, rows)
-    field = data.field_b_gauss.copy()[rows]
-    field[1:-1] = np.add.reduceat(data.field_b_gauss[: n - 1], start) / length[:, None]
-    rate = rates(data)
-    mean_rate = rate[rows]
-    mean_rate[1:-1] = np.add.reduceat(rate[: n - 1], start) / length[:, None]
-    return chain.Data(
-        field,
-        angle,
-        dt,
-        data.down_b[rows],
-        data.time_s[rows],
-        data.measures_first,
-        linked=None if joins.all() else joins.astype(np.float64),
-        averaging=chain.Averaging(
-            np.r_[1, length, 1].astype(float), _means(turn, rows, start, length), spread, mean_rate
-        ),
+def grouped(epochs: Sequence[chain.Data], sizes: Sequence[int]) -> list[chain.Data]:
+    """Epochs of single steps with as many of them in a state, odd numbers; all at once."""
+    out = list(epochs)
+    which = [k for k, size in enumerate(sizes) if size > 1 and len(epochs[k]) > _FEWEST]
+    if which:
+        few = _grouped([epochs[k] for k in which], [sizes[k] for k in which])
+        for k, data in zip(which, few, strict=True):
+            out[k] = data
+    return out
+
+
+def _grouped(epochs: Sequence[chain.Data], sizes: Sequence[int]) -> list[chain.Data]:
+    lengths = np.array([len(d) for d in epochs])
+    first = np.cumsum(lengths) - lengths
+    linked = [np.ones(len(d)) if d.linked is None else d.linked for d in epochs]
+    edges = [_edges(own, size) for own, size in zip(linked, sizes, strict=True)]
+    ends = np.cumsum([len(e) for e in edges])
+    links = np.concatenate(linked)
+    links[first] = 0.0
+    edge = np.concatenate([e + at for e, at in zip(edges, first, strict=True)])
+    count = np.diff(np.r_[edge, len(links)])
+    rows = edge + count // 2
+    turn = so3.exp(
+        np.where(links[:, None] > 0, np.concatenate([d.angle_b_rad for d in epochs]), 0.0)
     )
+    step = np.concatenate([d.dt_s for d in epochs])
+    angle, dt, spread, joins = _between(step, turn, links, rows)
+    field, rate, P = (
+        np.add.reduceat(np.concatenate([d.field_b_gauss for d in epochs]), edge) / count[:, None],
+        np.add.reduceat(np.concatenate([rates(d) for d in epochs]), edge) / count[:, None],
+        _means(turn, rows, edge, count),
+    )
+    out = []
+    for data, own, end, at in zip(epochs, edges, ends, first, strict=True):
+        piece, own_rows = slice(end - len(own), end), rows[end - len(own) : end] - at
+        own_dt, own_spread, own_joins = dt[piece].copy(), spread[piece].copy(), joins[piece].copy()
+        own_dt[0], own_spread[0], own_joins[0] = own_dt[1], own_spread[1], 1.0
+        averaging = chain.Averaging(
+            count[piece].astype(float), P[piece].copy(), own_spread, rate[piece].copy()
+        )
+        out.append(
+            chain.Data(
+                field[piece].copy(),
+                angle[piece].copy(),
+                own_dt,
+                data.down_b[own_rows],
+                data.time_s[own_rows],
+                data.measures_first,
+                linked=None if own_joins.all() else own_joins,
+                averaging=averaging,
+            )
+        )
+    return out
 
 
-def _groups(linked: Array, size: int) -> tuple[Index, Index]:
-    """First row and length of the groups that make up the rows 1 to n - 2."""
+def _edges(linked: Array, size: int) -> Index:
+    """First row of each group of an epoch; its first and last row are groups by themselves."""
     n = len(linked)
-    edges = [1, *(2 + np.flatnonzero(linked[2 : n - 1] == 0)), n - 1]
-    start = np.concatenate([np.arange(a, b, size) for a, b in pairwise(edges)])
-    return start, np.diff(np.r_[start, n - 1])
+    cuts = [1, *(2 + np.flatnonzero(linked[2 : n - 1] == 0)), n - 1]
+    return np.concatenate([[0], *(np.arange(a, b, size) for a, b in pairwise(cuts)), [n - 1]])
 
 
 def _between(
-    data: chain.Data, turn: Array, linked: Array, rows: Index
+    step_s: Array, turn: Array, linked: Array, rows: Index
 ) -> tuple[Array, Array, Array, Array]:
-    """From one state to the next: rotation vector, time, root of the sum of dt^2, if linked."""
-    total = np.broadcast_to(np.eye(3), (len(rows) - 1, 3, 3))
-    for j in range(int(np.diff(rows).max())):
-        k = rows[:-1] + 1 + j
-        inside = k <= rows[1:]
-        total = total @ np.where(inside[:, None, None], turn[np.minimum(k, rows[-1])], np.eye(3))
-    first = rows[:-1] + 1
-    joins = np.minimum.reduceat(linked, first) > 0
-    dt = np.add.reduceat(data.dt_s, first)
-    spread = np.sqrt(np.add.reduceat(data.dt_s**2, first))
+    """To each state from the one before: rotation vector, time, root of the sum of squared steps
+    of time, 1 if linked else 0; of the first state only the shapes.
+    """
+    before = np.r_[rows[0], rows[:-1]]
+    total = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+    for j in range(1, int((rows - before).max()) + 1):
+        k = before + j
+        total = total @ np.where((k <= rows)[:, None, None], turn[np.minimum(k, rows)], np.eye(3))
+    first = np.r_[rows[0], rows[:-1] + 1]
     return (
-        np.vstack([np.zeros((1, 3)), so3.log(total)]),
-        np.r_[dt[0], dt],
-        np.r_[spread[0], spread],
-        np.r_[True, joins],
+        so3.log(total),
+        np.asarray(np.add.reduceat(step_s, first)),
+        np.sqrt(np.add.reduceat(step_s**2, first)),
+        np.minimum.reduceat(linked, first),
     )
 
 
 def _means(turn: Array, rows: Index, start: Index, length: Index) -> Array:
     """Mean over each group of the rotations from its middle's sensor frame to its steps'."""
     P = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
-    middle, end = rows[1:-1], start + length
-    ahead = behind = np.broadcast_to(np.eye(3), (len(middle), 3, 3))
+    end = start + length
+    ahead = behind = np.broadcast_to(np.eye(3), P.shape)
     for j in range(1, int(length.max()) // 2 + 1):
-        up, down = middle + j < end, middle - j >= start
-        ahead = np.swapaxes(turn[np.minimum(middle + j, len(turn) - 1)], 1, 2) @ ahead
-        behind = turn[np.maximum(middle - j + 1, 0)] @ behind
-        P[1:-1] += np.where(up[:, None, None], ahead, 0.0) + np.where(
-            down[:, None, None], behind, 0.0
-        )
-    P[1:-1] /= length[:, None, None]
+        up, down = rows + j < end, rows - j >= start
+        ahead = np.swapaxes(turn[np.minimum(rows + j, len(turn) - 1)], 1, 2) @ ahead
+        behind = turn[np.maximum(rows - j + 1, 0)] @ behind
+        P += np.where(up[:, None, None], ahead, 0.0) + np.where(down[:, None, None], behind, 0.0)
+    P /= length[:, None, None]
     return P

@@ -23,7 +23,6 @@ from operator import is_not
 
 import numpy as np
 
-from ahrsd import so3
 from ahrsd.estimator import chain
 from ahrsd.estimator.elimination import halfway
 from ahrsd.estimator.epoch import Epoch
@@ -129,25 +128,31 @@ def _informations(epochs: Sequence[Epoch], graph: Graph) -> Said:
         [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
     )
     field, motion = chain.parts(rows, graph.c)
-    by_angle, angle = motion.by_bias / rows.dt_s[:, None, None], rows.angle_b_rad
-    turn = np.concatenate([by_angle @ so3.skew(angle), -by_angle @ angle[:, :, None]], axis=2)
+    turn = _of_angle(motion.by_bias / rows.dt_s, rows.angle_b_rad)
     seen = np.concatenate([e.data.seen(e.u) for e in epochs])
     rate = np.concatenate([rates(e.data) for e in epochs])
-    swept = np.cross(rate, seen) @ chain.symmetric(graph.c[:6])
-    late = field.by_x[:, 0, 6, None] * swept  # by_x holds - sqrt(weight) / s_m in that place
+    swept = chain.symmetric(graph.c[:6]) @ np.cross(rate, seen).T
+    late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
     diag, upper, border = chain.interior(field, motion)
-    columns = np.zeros((len(rate), 2, _SIZE + 1))
-    columns[:, :, :12], columns[:, :, _SIZE] = border[:, :, :12], border[:, :, 12]
-    columns[:, :, _OF_ANGLE] = -motion.scale[:, None, None] * turn
-    columns[:-1, :, _OF_ANGLE] += np.swapaxes(motion.prev[1:], 1, 2) @ turn[1:]
-    columns[:, :, LAG] = (late[:, None, :] @ field.own)[:, 0]
-    _, half = halfway(diag, upper, columns.transpose(2, 0, 1))
-    J = np.concatenate([field.by_x, late[:, :, None], field.r[:, :, None]], axis=2)
-    K = np.concatenate([motion.by_bias, turn, motion.q[:, :, None]], axis=2)
+    columns = np.zeros((2, _SIZE + 1, len(rate)))
+    columns[:, :12], columns[:, _SIZE] = border[:, :12], border[:, 12]
+    columns[:, _OF_ANGLE] = -motion.scale * turn
+    columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
+    columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
+    _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
+    J = np.concatenate([field.by_x, late[:, None], field.r[:, None]], axis=1)
+    K = np.concatenate([motion.by_bias, turn, motion.q[:, None]], axis=1)
     H = np.zeros((len(epochs), _SIZE + 1, _SIZE + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
-        Jk, Kk, Y = J[a:b].reshape(-1, 11), K[a:b].reshape(-1, 8), half[2 * a : 2 * b]
+        Y = half[2 * a : 2 * b]
         H[k] = -(Y.T @ Y)
-        H[k][_FIELD] += Jk.T @ Jk
-        H[k][_MOTION] += Kk.T @ Kk
+        H[k][_FIELD] += chain.squares(J[:, :, a:b])
+        H[k][_MOTION] += chain.squares(K[:, :, a:b])
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+
+
+def _of_angle(by_angle: Array, angle: Array) -> Array:
+    """dq/dtheta and dq/ds, (2, 4, N), of dq/dphi (2, 3, N) and phi (3, N)."""
+    (x, y, z), (p, q, r) = by_angle.transpose(1, 0, 2), angle
+    turn = [y * r - z * q, z * p - x * r, x * q - y * p]  # by_angle [phi]x
+    return np.array([*turn, -(x * p + y * q + z * r)]).transpose(1, 0, 2)

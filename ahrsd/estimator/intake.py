@@ -196,26 +196,9 @@ def _down(accel: Array, angle: Array) -> Array:
     """
     if not np.isfinite(accel).all():
         return np.full_like(accel, np.nan)
-    R = _products(so3.exp(angle))
-    up = R.transpose(0, 2, 1) @ (R @ accel[:, :, None]).mean(axis=0)
-    return np.asarray(-up[:, :, 0] / np.maximum(np.linalg.norm(up, axis=1), 1e-9))
-
-
-def _products(R: Array) -> Array:
-    """Products of all rotations (n, 3, 3) up to each row: within parts, then of the parts."""
-    n, part = len(R), 16
-    if n <= part:
-        parts = R.copy()[None]
-    else:
-        whole = np.concatenate([R, np.broadcast_to(np.eye(3), (-n % part, 3, 3))])
-        parts = whole.reshape(-1, part, 3, 3)
-    step = 1
-    while step < part:
-        parts[:, step:] = parts[:, :-step] @ parts[:, step:]
-        step *= 2
-    if n > part:
-        parts[1:] = _products(parts[:-1, -1])[:, None] @ parts[1:]
-    return parts.reshape(-1, 3, 3)[:n]
+    R = so3.products(so3.exp(angle))
+    up = np.einsum("nji,j->ni", R, np.einsum("nij,nj->i", R, accel))
+    return np.asarray(-up / np.maximum(np.sqrt(np.sum(up * up, axis=1, keepdims=True)), 1e-9))
 
 
 def with_border(data: chain.Data, before: chain.Data) -> chain.Data:

@@ -130,8 +130,7 @@ class Estimator:
         """The window with the new epochs in it, and how many they were."""
         new, self._new = self._new, []
         window = self._window = self._window or self._begin(new[0])
-        window.append(new)
-        self._moving_epochs += sum(epoch.turned for epoch in window.epochs[-len(new) :])
+        self._moving_epochs += window.take(new)
         return self._unchanged(window, len(new)), len(new)
 
     def _follow(self, window: Window, new: int) -> None:
@@ -156,6 +155,8 @@ class Estimator:
         next to do so too.
         """
         sure = not self._searching and window.step_sigmas < _SETTLED
+        if sure:
+            window.join()
         for k in range(-new, 0):
             self._strange = self._strange + 1 if sure and window.contradicted(k) else 0
             if self._strange == _CHANGED:
@@ -214,7 +215,7 @@ class Estimator:
         cannot know what is held and how loud the residuals are, so that it is given more looks.
         """
         looks = _LOOKS if window.untried else looks
-        found = search(self.parameters, window, self._present_bias, [e.data for e in window.epochs])
+        found = search(self.parameters, window, self._present_bias, window.data)
         window.loud = found.loud
         unsettled = window.step_sigmas > _SETTLED
         better = found.gain > _GAIN_FOLDED * window.graph.temper

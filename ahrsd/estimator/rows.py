@@ -128,10 +128,11 @@ class Chain:
 class Rows:
     """Chains in one row, N rows in all; the motion into the first row of each links nothing.
 
-    first, last (E,): where each begins and ends; per row: field_b_gauss, angle_b_rad, bias (N, 3),
-    dt_s; stiff (N,) 1 / (spread of the gyro's noise), 0 where nothing links; count (N,), turn
-    (N, 3, 3) or None as in `Averaging`; mag_gauss (N,) noise of a step; weights (N,) of the field;
-    measured (N,) 0 where the field was counted by the epoch before.
+    Arrays of vectors and matrices have the row as their last axis (`linearise_all` runs over long
+    axes). first, last (E,): where each begins and ends; per row: field_b_gauss, angle_b_rad, u,
+    bias (3, N), dt_s (N,); stiff (N,) 1 / (spread of the gyro's noise), 0 where nothing links;
+    count (N,), turn (3, 3, N) or None as in `Averaging`; mag_gauss (N,) noise of a step; weights
+    (N,) of the field; measured (N,) 0 where the field was counted by the epoch before.
     """
 
     first: Index
@@ -167,6 +168,7 @@ class Rows:
                 for d, o, n in zip(data, own, sizes, strict=True)
             ]
             count, turn, spread = (np.concatenate(own) for own in zip(*each, strict=True))
+            turn = np.ascontiguousarray(turn.transpose(1, 2, 0))
         gyro = np.repeat([c.noise.gyro_rad_s for c in chains], sizes)
         measured = np.ones(len(dt))
         measured[first] = [d.measures_first for d in data]
@@ -176,11 +178,11 @@ class Rows:
         return Rows(
             first,
             first + sizes - 1,
-            np.concatenate([d.field_b_gauss for d in data]),
-            np.concatenate([d.angle_b_rad for d in data]),
+            _columns([d.field_b_gauss for d in data]),
+            _columns([d.angle_b_rad for d in data]),
             dt,
-            np.concatenate([c.u for c in chains]),
-            np.repeat([c.bias for c in chains], sizes, axis=0),
+            _columns([c.u for c in chains]),
+            np.repeat(np.array([c.bias for c in chains]).T, sizes, axis=1),
             linked / (gyro * spread),
             count,
             turn,
@@ -190,9 +192,13 @@ class Rows:
         )
 
 
+def _columns(pieces: Sequence[Array]) -> Array:
+    return np.ascontiguousarray(np.concatenate(pieces).T)
+
+
 def robust_weights(residual: Array, limit_gauss: Array | float) -> Array:
-    """1 for residuals (n, 3) within the limit, (limit / size)^2 beyond: outliers lose weight."""
-    size2 = np.maximum(np.sum(residual * residual, axis=1), 1e-24)
+    """1 for residuals (3, N) within the limit, (limit / size)^2 beyond: outliers lose weight."""
+    size2 = np.maximum(np.sum(residual * residual, axis=0), 1e-24)
     return np.asarray(np.minimum(1.0, limit_gauss**2 / size2))
 
 
@@ -203,32 +209,32 @@ def times(J: Array, v: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldPart:
-    """Whitened field residuals with their derivatives: (N, 3, 12), d r/d d_k (2), x (9), r (1)."""
+    """Whitened field residuals with their derivatives: (3, 12, N), d r/d d_k (2), x (9), r (1)."""
 
     J: Array
     tangents: Array
     weights: Array
-    seen: Array  # (N, 2) squared sizes of the columns of M P_k T_k
+    seen: Array  # (2, N) squared sizes of the columns of M P_k T_k
 
     @property
     def r(self) -> Array:
-        """Residuals (N, 3)."""
-        return self.J[:, :, 11]
+        """Residuals (3, N)."""
+        return self.J[:, 11]
 
     @property
     def own(self) -> Array:
-        """d r/d d_k (N, 3, 2)."""
-        return self.J[:, :, :2]
+        """d r/d d_k (3, 2, N)."""
+        return self.J[:, :2]
 
     @property
     def by_x(self) -> Array:
-        """d r/d x (N, 3, 9)."""
-        return self.J[:, :, 2:11]
+        """d r/d x (3, 9, N)."""
+        return self.J[:, 2:11]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPart:
-    """Whitened motion residuals, (N, 2, 6): d q/d d_(k-1) (2), d q/d w_b (3), q (1).
+    """Whitened motion residuals, (2, 6, N): d q/d d_(k-1) (2), d q/d w_b (3), q (1).
 
     Row k is the motion from row k - 1 to row k; row 0 is zero. -d q/d d_k = scale I.
     """
@@ -238,67 +244,75 @@ class MotionPart:
 
     @property
     def q(self) -> Array:
-        """Residuals (N, 2)."""
-        return self.J[:, :, 5]
+        """Residuals (2, N)."""
+        return self.J[:, 5]
 
     @property
     def prev(self) -> Array:
-        """d q/d d_(k-1) (N, 2, 2)."""
-        return self.J[:, :, :2]
+        """d q/d d_(k-1) (2, 2, N)."""
+        return self.J[:, :2]
 
     @property
     def by_bias(self) -> Array:
-        """d q/d w_b (N, 2, 3)."""
-        return self.J[:, :, 2:5]
+        """d q/d w_b (2, 3, N)."""
+        return self.J[:, 2:5]
 
 
 def parts(rows: Rows, x: Array, outlier_sigma: float | None = None) -> tuple[FieldPart, MotionPart]:
     """Residuals of field and motion with their derivatives; see `linearise_all`."""
-    frame = np.empty((len(rows.u), 3, 3))  # tangents, and the direction itself
-    frame[:, :, :2], frame[:, :, 2] = so3.tangent_basis(rows.u), rows.u
+    frame = so3.frames(rows.u)
     return _field(rows, frame, x, outlier_sigma), _motion(rows, frame)
 
 
 def _field(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> FieldPart:
-    seen = frame if rows.turn is None else rows.turn @ frame
-    image = symmetric(x[:6]) @ seen
-    error = rows.field_b_gauss - image[:, :, 2] - x[6:9]
+    seen = frame if rows.turn is None else np.einsum("ijn,jkn->ikn", rows.turn, frame)
+    image = (symmetric(x[:6]) @ seen.reshape(3, -1)).reshape(seen.shape)
+    error = rows.field_b_gauss - image[:, 2] - x[6:9, None]
     weights = rows.weights
     if outlier_sigma is not None:
         limit = outlier_sigma * rows.mag_gauss / np.sqrt(rows.count)
         weights = robust_weights(error, limit)
-    J = np.empty((len(error), 3, 12))
-    J[:, :, :2] = -image[:, :, :2]
-    J[:, :, 2:8] = -symmetric_columns(seen[:, :, 2])
-    J[:, :, 8:11] = -np.eye(3)
-    J[:, :, 11] = error
-    J *= (np.sqrt(weights * rows.count * rows.measured) / rows.mag_gauss)[:, None, None]
-    own = image[:, :, :2]
-    return FieldPart(J, frame[:, :, :2], weights, np.sum(own * own, axis=1))
+    scale = np.sqrt(weights * rows.count * rows.measured) / rows.mag_gauss
+    J = np.zeros((3, 12, error.shape[1]))
+    np.multiply(image[:, :2], -scale, out=J[:, :2])
+    direction = seen[:, 2] * -scale
+    for j, (r, c) in enumerate(zip(_ROWS, _COLS, strict=True)):
+        J[r, 2 + j], J[c, 2 + j] = direction[c], direction[r]
+    for r in range(3):
+        J[r, 8 + r] = -scale
+    np.multiply(error, scale, out=J[:, 11])
+    own = image[:, :2]
+    return FieldPart(J, frame[:, :2], weights, np.sum(own * own, axis=0))
 
 
 def _motion(rows: Rows, frame: Array) -> MotionPart:
-    dt = rows.dt_s[:, None]
-    R, Jl = so3.exp_and_left_jacobian(rows.bias * dt - rows.angle_b_rad)
-    turned = R[1:] @ frame[:-1]
-    across = np.swapaxes(frame[1:, :, :2], 1, 2) * rows.stiff[1:, None, None]
-    moved = across @ turned
-    J = np.zeros((len(frame), 2, 6))
-    J[1:, :, :2], J[1:, :, 5] = moved[:, :, :2], moved[:, :, 2]
-    J[1:, :, 2:5] = -across @ so3.skew(turned[:, :, 2] * dt[1:]) @ Jl[1:]
+    dt = rows.dt_s
+    R, Jl = so3.columns_exp_and_left_jacobian(rows.bias * dt - rows.angle_b_rad)
+    turned = np.einsum("ijn,jkn->ikn", R[:, :, 1:], frame[:, :, :-1])
+    across = frame[:, :2, 1:] * rows.stiff[1:]
+    moved = np.einsum("jin,jkn->ikn", across, turned)
+    J = np.zeros((2, 6, frame.shape[2]))
+    J[:, :2, 1:], J[:, 5, 1:] = moved[:, :2], moved[:, 2]
+    (x, y, z), (p, q, r) = turned[:, 2] * dt[1:], across
+    beside = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
+    np.einsum("jin,jkn->ikn", beside, Jl[:, :, 1:], out=J[:, 2:5, 1:])
     return MotionPart(J, rows.stiff)
 
 
 def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
-    """Diagonal blocks, blocks above them, and the border columns x (9), bias (3), gradient."""
-    scale = motion.scale[:, None, None]
-    own = np.swapaxes(field.own, 1, 2) @ field.J
-    prev = np.swapaxes(motion.prev[1:], 1, 2) @ motion.J[1:]
-    diag = own[:, :, :2] + np.eye(2) * scale**2
-    diag[:-1] += prev[:, :, :2]
-    border = np.empty((len(own), 2, 13))
-    border[:, :, :9] = own[:, :, 2:11]
-    border[:, :, 9:] = -scale * motion.J[:, :, 2:]
-    border[:, :, 12] += own[:, :, 11]
-    border[:-1, :, 9:] += prev[:, :, 2:]
-    return diag, -scale[1:] * np.swapaxes(motion.prev[1:], 1, 2), border
+    """Diagonal blocks (2, 2, N), blocks above them (2, 2, N - 1), and the border columns
+    (2, 13, N): x (9), bias (3), gradient.
+    """
+    scale = motion.scale
+    own = np.einsum("rin,rjn->ijn", field.own, field.J)
+    prev = np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], motion.J[:, :, 1:])
+    diag = own[:, :2].copy()
+    for i in range(2):
+        diag[i, i] += scale**2
+    diag[:, :, :-1] += prev[:, :2]
+    border = np.empty((2, 13, len(scale)))
+    border[:, :9] = own[:, 2:11]
+    np.multiply(motion.J[:, 2:], -scale, out=border[:, 9:])
+    border[:, 12] += own[:, 11]
+    border[:, 9:, :-1] += prev[:, 2:]
+    return diag, -scale[1:] * motion.prev[:, :, 1:].transpose(1, 0, 2), border

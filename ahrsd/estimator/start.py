@@ -61,13 +61,7 @@ def sphere_start(field: Array) -> Array | None:
 
 def _orientation(data: chain.Data) -> Array:
     """R_0k of every step against the epoch's first, (n, 3, 3)."""
-    steps = so3.exp(np.vstack([np.zeros((1, 3)), data.angle_b_rad[1:]]))
-    out = np.empty_like(steps)
-    total = np.eye(3)
-    for k, R in enumerate(steps):
-        total = total @ R
-        out[k] = total
-    return out
+    return so3.products(so3.exp(np.vstack([np.zeros((1, 3)), data.angle_b_rad[1:]])))
 
 
 def _solve(gram: Array, rows: int, field: Array) -> Array | None:

@@ -12,53 +12,39 @@ noise and model errors cannot make them wander (`Graph.hold_blind`).
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.estimator import chain, noise
+from ahrsd.estimator import chain
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Epoch, Place, Snapshot, grown, place_borders, scores_of
-from ahrsd.estimator.excitation import turned
-from ahrsd.estimator.factors import (
-    Node,
-    Point,
-    Stack,
-    bias_prior,
-    chain_step,
-    epoch_factor,
-)
-from ahrsd.estimator.graph import Graph, SingularError, sigmas
-from ahrsd.estimator.grouping import group_size, grouped
-from ahrsd.estimator.lag import delayed
-from ahrsd.estimator.misfit import Misfit
+from ahrsd.estimator.epoch import Place, Snapshot, place_borders, scores_of
+from ahrsd.estimator.factors import Node, Stack
+from ahrsd.estimator.graph import SingularError, sigmas
+from ahrsd.estimator.linearised import Linearised
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.staleness import bends, outdated
-from ahrsd.estimator.systematic import Cells, excess
+from ahrsd.estimator.systematic import excess
 from ahrsd.samples import Array
 
 _SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
 _LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
-_WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
 BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
 _FINISH_WORK = 20  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
 _DAMPING, _DAMPING_FAR = 1e-3, 1e2
+_STILL = 1e12  # damping at which the calibration stays where it is
 _DAMPING_LIMITS = (1e-9, 1e6)
+_SHORT, _STRAIGHT = 5.0, 0.02  # sigmas of a step, and by how much it is curved, to be foreseen
 _GAIN = 0.05  # of log likelihood: less is not worth another step
-_GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
-_GUESSES = 64  # epochs whose first guess of the noise is remembered
-_ANOTHER_REST = 0.02  # rad between two directions at rest
 
 
-class Window:
-    """Epochs and graph. `c` = [M (6), b (3)] in gauss is the calibration as it stands."""
+class Window(Linearised):
+    """Epochs and graph, and how the answer moves over them."""
 
     def __init__(
         self,
@@ -68,103 +54,17 @@ class Window:
         first: Node,
         usual: chain.Noise,
     ) -> None:
-        self.parameters = parameters
-        self.usual = usual
-        self.epochs: list[Epoch] = []
-        self.misfit = Misfit()
+        super().__init__(parameters, c, belief, first, usual)
         self.found_misfit = 1.0
         self.step_sigmas = float(np.inf)
-        self.folded = False
-        self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
         self.loud = 1.0  # what searching found the model to leave over (`search.Found`)
-        self._folded_cells = Cells()
         self._damping = _DAMPING
-        self._rest: Array | None = None
         self._covariance = belief  # of c, when it was last weighed
-        self._work = 0
-        self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
-        self._guess = usual  # the middle of them
-        prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
-        self.graph = Graph(c, belief, first, prior)
-
-    def twin(self) -> Window:
-        """A copy that goes its own way."""
-        other = copy(self)
-        other.graph, other.epochs = self.graph.twin(), list(self.epochs)
-        other._guesses, other.misfit = self._guesses.copy(), copy(self.misfit)
-        return other
-
-    # -- growing and forgetting ------------------------------------------------------------------
-
-    def append(self, new: Sequence[chain.Data]) -> None:
-        """New epochs of single steps, linked to the one before unless `measures_first`."""
-        size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
-        moving, coarse = [], []
-        for data in new:
-            guess = noise.first_guess(data, self.parameters)
-            self._guesses.append(guess)
-            moving.append(turned(data))
-            if moving[-1]:
-                self.graph.moments.take(data.field_b_gauss)
-            few = grouped(data, group_size(data, guess, size))
-            coarse.append(few if self.lag_s == 0.0 else delayed(few, self.lag_s))
-        self._guess = noise.median(self._guesses)
-        self.attach(coarse, moving)
-
-    def learn_from(self, other: Window) -> None:
-        """First guesses of the noise and moments of the field, for a part of the other's data."""
-        self._guesses, self._guess = other._guesses.copy(), other._guess
-        self.graph.moments = other.graph.moments
-
-    def attach(self, new: Sequence[chain.Data], moving: Sequence[bool]) -> None:
-        """Epochs whose steps are grouped already, and whether they calibrate."""
-        walk = self.parameters.bias_walk_rad_s_sqrt_s
-        pieces = [grown(self.graph, d, walk, moving=m) for d, m in zip(new, moving, strict=True)]
-        self._work = min(self._work + _WORK * len(new), max(_MOST_WORK, _WORK * len(new)))
-        begun = self._linearised([Place(piece, u, self.usual) for piece, u in pieces])
-        self.epochs += begun
-        self.graph.factors += [epoch.factor for epoch in begun]
-        place_borders(self.graph, begun)
-
-    def fold(self) -> None:
-        """Fold the oldest epochs until the window has its size."""
-        while (
-            len(self.epochs) > 1
-            and sum(e.data.steps for e in self.epochs) > self.parameters.window_steps
-        ):
-            old = self.epochs.pop(0)
-            self.folded |= old.turned
-            if old.turned:
-                self._folded_cells += old.cells
-            self.misfit.remember(old.factor, scores_of([old])[0], self.graph)
-            while self.graph.first < self.epochs[0].a:
-                self.graph.fold_oldest()
 
     @property
     def untried(self) -> bool:
         """Whether no step was ever possible: the answer is where it began."""
         return not np.isfinite(self.step_sigmas)
-
-    # -- linearisation ---------------------------------------------------------------------------
-
-    def _linearised(
-        self, places: Sequence[Place], outlier_sigma: float | None = None
-    ) -> list[Epoch]:
-        """Epochs at the present values; with `outlier_sigma` at weights of their own."""
-        self._work -= len(places)
-        graph, chains = self.graph, []
-        for at in places:
-            first, last = graph.nodes[at.piece.a], graph.nodes[at.piece.a + 1]
-            at.u[0], at.u[-1] = first.direction, last.direction
-            chains.append(chain.Chain(at.piece.data, at.u, first.bias, at.used, at.weights))
-        found = chain.linearise_all(chains, graph.c, outlier_sigma=outlier_sigma)
-        out = []
-        for at, q in zip(places, found, strict=True):
-            a, rest = at.piece.a, None if at.piece.turned else self._resting(at.u)
-            point = Point(graph.c, graph.nodes[a], graph.nodes[a + 1])
-            factor = epoch_factor(q, a, point, at.piece.walk, rest=rest)
-            out.append(Epoch(at.piece, at.u, at.used, self.usual, q, factor))
-        return out
 
     def contradicted(self, k: int) -> bool:
         """Whether epoch k contradicts the calibration; ask before it is tracked."""
@@ -187,62 +87,6 @@ class Window:
         other.attach([first, *(e.data for e in kept[1:])], [e.turned for e in kept])
         return other
 
-    def _resting(self, u: Array) -> Array:
-        """Direction at rest: that of the last rest unless it is clearly another.
-
-        Differences that are only noise would seem to say something of the bias along the field.
-        """
-        mean = u.mean(axis=0)
-        mean /= np.linalg.norm(mean)
-        if self._rest is None or float(np.linalg.norm(mean - self._rest)) > _ANOTHER_REST:
-            self._rest = mean
-        return self._rest
-
-    def _replace(self, which: Sequence[int], places: Sequence[Place], **weighing: float) -> None:
-        if not which:
-            return
-        factors = self.graph.factors
-        where = {id(factor): i for i, factor in enumerate(factors)}
-        for k, new in zip(which, self._linearised(places, **weighing), strict=True):
-            factors[where[id(self.epochs[k].factor)]] = new.factor
-            self.epochs[k] = new
-
-    def _moved_directions(self, which: Sequence[int]) -> list[Array]:
-        """Directions of these epochs where the present values put them."""
-        graph, epochs = self.graph, [self.epochs[k] for k in which]
-        if not epochs:
-            return []
-        z = Stack([e.factor for e in epochs], graph.c, graph.nodes).z
-        return [
-            chain.move(e.u, e.quadratic, chain_step(own, calibrates=e.turned))
-            for e, own in zip(epochs, z, strict=True)
-        ]
-
-    def refresh(self, which: Sequence[int]) -> None:
-        """Linearise epochs again at the present values, with fresh noise and outlier weights."""
-        epochs, p = [self.epochs[k] for k in which], self.parameters
-        places = [
-            Place(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
-            for e, u in zip(epochs, self._moved_directions(which), strict=True)
-        ]
-        self._replace(which, places, outlier_sigma=p.outlier_sigma)
-        found = [e.residuals for e in self.epochs]
-        self.usual = noise.at_least(
-            noise.pooled(found, self._guess, self.parameters), _GYRO_LEAST * self._guess.gyro_rad_s
-        )
-
-    def delay(self, lag_s: float) -> None:
-        """Take the field to be `lag_s` late in every epoch of the window, and in those to come."""
-        everyone = range(len(self.epochs))
-        places = []
-        for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):
-            data = delayed(epoch.data, lag_s - self.lag_s)
-            places.append(Place(replace(epoch.piece, data=data), u, epoch.used, epoch.weights))
-        self._replace(everyone, places)
-        self.lag_s = lag_s
-
-    # -- moving ----------------------------------------------------------------------------------
-
     def restart_at(self, c: Array, bias: Array) -> None:
         """Put the calibration at c, directions from the field alone, noise as first guessed.
 
@@ -252,6 +96,12 @@ class Window:
         self.usual = self._start_noise()
         self._damping = _DAMPING_FAR
         graph.c = c.copy()
+        if not self.epochs:
+            graph.nodes[graph.last] = Node.at(bias, graph.nodes[graph.last].direction)
+            self.join()
+            self._work = max(self._work, _RESTART_WORK * len(self.epochs))
+            return
+        self.join()
         places = []
         for k, epoch in enumerate(self.epochs):
             u = chain.start_directions(chain.symmetric(c[:6]), c[6:], epoch.data.field_b_gauss)
@@ -289,7 +139,8 @@ class Window:
         """Levenberg-Marquardt over the whole window at fixed noise and weights; returns the cost.
 
         Stops at the iteration limit, where damping alone finds no lower cost, or where c is
-        `enough`; the window is then at the best point found. Never raises on hopeless data.
+        `enough`; the window is then at the best point found. A last step that is short and straight
+        is taken without looking: its cost is that foreseen. Never raises on hopeless data.
         """
         c = self.graph.c
         present = all(np.array_equal(e.factor.point.c, c) for e in self.epochs if e.turned)
@@ -297,6 +148,9 @@ class Window:
         for _ in range(steps):
             kept = self.snapshot()
             try:
+                if (gain := self._foreseen()) is not None:
+                    self.graph.move(*self.graph.step())
+                    return cost - gain
                 dc, dy = self.graph.step(self._damping)
                 self.graph.move(dc, dy)
                 new = self._cost_here()
@@ -315,6 +169,15 @@ class Window:
                     break
         return cost
 
+    def _foreseen(self) -> float | None:
+        """What an undamped step gains, if it is as short and straight as to be foreseen."""
+        graph = self.graph
+        dc, information = graph.ahead()
+        if not sigmas(dc, information) < _SHORT:
+            return None
+        bent = bends(self.epochs, graph.c + dc, graph.moments, information)
+        return 0.5 * float(dc @ information @ dc) if bent.max() < _STRAIGHT else None
+
     def _cost_here(self) -> float:
         """Cost after a step, everything linearised there; infinite where M is not positive."""
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
@@ -330,18 +193,20 @@ class Window:
     ) -> None:
         """Follow the newest epochs; with `everything`, all are linearised anew first.
 
-        here: all were linearised here just now, which need not be repeated.
+        here: all were linearised here just now, at directions from the field alone.
 
         Ends where linearising again would hardly move the answer: by what the step was curved, or,
         `exactly`, by what another pass over everything did.
         """
+        self.join()
         graph, everyone = self.graph, range(len(self.epochs))
         stale: Sequence[int] = everyone if everything else everyone[-new:]
         if everything:
             self._work = max(self._work, _FINISH_WORK * len(everyone))
-        for k in range(_MAX_TRACKS):
-            if k > 0 or not here:
-                self.refresh(stale)
+        if here:
+            self._smooth()
+        for _ in range(_MAX_TRACKS):
+            self.refresh(stale)
             try:
                 information = self._weigh()
                 dc, dy = graph.step()
@@ -367,6 +232,17 @@ class Window:
             if len(stale) > self._work and not everything:
                 return
 
+    def _smooth(self) -> None:
+        """Put the directions where the chains want them at the present calibration.
+
+        Those of the field alone are so noisy that a step of the calibration from there goes astray.
+        """
+        try:
+            _, dy = self.graph.step(_STILL)
+        except SingularError:
+            return
+        self.graph.move(np.zeros(9), dy)
+
     def _careful(self) -> bool:
         """A large step with care, as far as the work allowed goes; whether iterating may go on.
 
@@ -388,7 +264,12 @@ class Window:
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
         self.found_misfit = self.misfit.value(factors, asked, graph, graph.step())
         graph.temper = max(1.0, self.found_misfit, self._repeating())
-        covariance = self._covariance = graph.covariance()[:9, :9] * graph.temper
+        covariance = graph.covariance()[:9, :9] * graph.temper
+        strayed = graph.strayed(covariance)
+        if strayed > graph.temper:
+            graph.temper = strayed
+            covariance = graph.covariance()[:9, :9] * graph.temper
+        self._covariance = covariance
         graph.hold_blind(BLIND, covariance)
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
