@@ -46,8 +46,8 @@ from ahrsd.mismatch.null import NullFit, at_model, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.one_source import with_one_source
 from ahrsd.mismatch.predictive import checks
-from ahrsd.mismatch.problem import Problem, problem_of
-from ahrsd.mismatch.quick import Quick, cleaned, model_at_rate, quick, without_quick
+from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
+from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.score import score
@@ -58,6 +58,7 @@ from ahrsd.mismatch.search import (
     basis_of,
     forward,
     pruned,
+    settled,
     survey,
     swapped,
 )
@@ -150,7 +151,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
         left = with_one_source(left)
     if unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
-    return _Searched(start, state, surveys, first, last, left)
+    return _Searched(start, settled(state), surveys, first, last, left)
 
 
 def _told(
@@ -198,14 +199,14 @@ def _told(
         p_value=_p_value(seen, found, done.left),
         findings=found,
         unexplained=left,
-        posterior_predictive=_checked(done, fast, (*terms, *quick_terms), library),
+        posterior_predictive=_checked(done, fast, (*terms, *quick_terms), library, noise),
         sensitivity=() if found or something else _limits(problem, basis, done.first, fast),
         notes=(
             *notes,
             *lesser,
             *(() if found or something else would_have_shown(problem.recorded)),
         ),
-        model=model_at_rate(state.fit.model, problem.thin),
+        model=model_at_rate(state.fit.model, problem),
         terms=(*terms, *quick_terms),
         drawn=_drawn(done, basis),
         omnibus=_whiteness(done),
@@ -255,7 +256,11 @@ def _stopped(recording: str, facts: list[Fact], notes: tuple[str, ...]) -> Diagn
 
 
 def _checked(
-    done: _Searched, fast: Quick, terms: tuple[Term, ...], library: Mapping[str, Effect]
+    done: _Searched,
+    fast: Quick,
+    terms: tuple[Term, ...],
+    library: Mapping[str, Effect],
+    noise: Sequence[Fact],
 ) -> dict[str, Check]:
     """Posterior predictive checks; a delay that is out of the track stays out of the model.
 
@@ -271,7 +276,8 @@ def _checked(
         replace(term, value=fitted.value) if fitted.identifier in DELAYS else term
         for term, fitted in zip(terms, state.fit.terms, strict=True)
     ]
-    return checks(null, state.fit, kept, library=library)
+    loud = [span for fact in noise for span in fact.where.intervals_s]
+    return checks(null, state.fit, kept, library=library, loud=loud)
 
 
 def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:

@@ -11,7 +11,7 @@ rate says.  What the gyro's noise did to that attitude counts as motion: a body 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.signal import lfilter
@@ -38,12 +38,16 @@ class Noise:
     gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias
     colour:  autoregression of the magnetometer's noise, e_k = sum_j colour_j e_(k-j) + white;
              empty: white.  mag_gauss is the deviation of e whatever its colour
+    freedom: of Student's t, which the magnetometer's white noise follows; inf: normal
+    level:   (N,) of the magnetometer's noise row by row, in parts of mag_gauss; None: 1
     """
 
     mag_gauss: float
     gyro_rad_s: float
     gyro_walk_rad_s_sqrt_s: float = 0.0
     colour: tuple[float, ...] = ()
+    freedom: float = float("inf")
+    level: Array | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Raises ValueError where a deviation is negative or the colour grows without end."""
@@ -198,11 +202,17 @@ def _noisy(readings: Readings, noise: Noise, seed: int) -> Readings:
     mag, gyro, walk = (
         np.random.default_rng([seed, stream]).standard_normal(shape) for stream in range(3)
     )
+    if np.isfinite(noise.freedom):
+        square = np.random.default_rng([seed, 3]).chisquare(noise.freedom, shape)
+        mag = mag * np.sqrt((noise.freedom - 2) / square)
+    mag = _coloured(mag, noise.colour)
+    if noise.level is not None:
+        mag = mag * noise.level[:, None]
     passed = np.sqrt(np.concatenate([[0.0], np.diff(readings.time_s)]))[:, None]
     bias = noise.gyro_walk_rad_s_sqrt_s * np.cumsum(passed * walk, axis=0)
     return replace(
         readings,
-        mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * _coloured(mag, noise.colour),
+        mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * mag,
         gyro_b_rad_s=readings.gyro_b_rad_s + noise.gyro_rad_s * gyro + bias,
     )
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import Array
 
 SCHEMA = "ahrsd.model/1"
+_LEVELS = ("mag_gauss", "gyro_rad_s", "gyro_walk_rad_s_sqrt_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +45,7 @@ def to_text(model: RepairedModel, library: Mapping[str, Effect] = EFFECTS) -> st
             "hard_iron_gauss": calibration.hard_iron_gauss.tolist(),
             "gyro_bias_rad_s": calibration.gyro_bias_rad_s.tolist(),
         },
-        "noise": asdict(model.noise),
+        "noise": {name: getattr(model.noise, name) for name in (*_LEVELS, "colour")},
         "terms": [_term_json(term, library[term.identifier]) for term in model.terms],
     }
     return json.dumps(body, indent=1, allow_nan=False) + "\n"
@@ -89,8 +90,7 @@ def of_diagnosis(found: Diagnosis) -> RepairedModel:
 
 
 def _noise(body: dict[str, Any]) -> Noise:
-    names = ("mag_gauss", "gyro_rad_s", "gyro_walk_rad_s_sqrt_s")
-    mag, gyro, walk = (_number(body, "noise", name) for name in names)
+    mag, gyro, walk = (_number(body, "noise", name) for name in _LEVELS)
     colour = body["noise"].get("colour")
     if not isinstance(colour, list):
         raise ValueError("noise.colour must be a list of numbers")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
+from scipy.stats import t as student
 
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact, spans_of
@@ -46,7 +47,7 @@ class Colour:
 
 @dataclass(frozen=True, slots=True)
 class Tails:
-    """excess_kurtosis: 0 for Gaussian; freedom: of the Student-t that has it, inf for none;
+    """excess_kurtosis: 0 for Gaussian; freedom: of the likeliest Student-t, inf for none;
     outliers: share beyond 4 deviations (6e-5 for Gaussian)."""
 
     excess_kurtosis: float
@@ -81,9 +82,16 @@ def tails_of(done: Filtered) -> Tails:
     z = (e - e.mean()) / max(float(e.std()), 1e-300)
     kurtosis = float(np.mean(z**4) - 3.0)
     deviation = float(np.sqrt(24.0 / len(z)))
-    freedom = 4.0 + 6.0 / kurtosis if kurtosis > 3 * deviation else float("inf")
+    freedom = _freedom(z) if kurtosis > 3 * deviation else float("inf")
     middle = 1.4826 * float(np.median(np.abs(e - np.median(e))))
     return Tails(kurtosis, freedom, float(np.mean(np.abs(e) > 4 * max(middle, 1e-300))))
+
+
+def _freedom(z: Array) -> float:
+    """Most likely freedom of the Student-t of values of variance 1; kurtosis says little of it."""
+    tried = np.exp(np.linspace(np.log(2.2), np.log(60.0), 34))
+    nats = [float(np.sum(student.logpdf(z, v, scale=np.sqrt((v - 2) / v)))) for v in tried]
+    return float(tried[int(np.argmax(nats))])
 
 
 def levels(done: Filtered, block_s: float = _BLOCK_S) -> tuple[Array, Array, Array]:

@@ -21,9 +21,11 @@ WALK_CAP_RAD_S_SQRT_S = 1.2e-5
 _TRUST = 0.25
 _WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
 _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
+#: where readings are too far apart to be compared with each other
+_USUAL_MAG_GAUSS = 1e-3
 _FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 _PIECES, _PIECE_ROWS = 6, 400
-_SAME = 0.02  # relative change of a noise level that changes nothing
+SAME = 0.02  # relative change of a noise level that changes nothing
 
 
 def first_guess(track: Track, spec: Spec) -> NullModel:
@@ -33,7 +35,7 @@ def first_guess(track: Track, spec: Spec) -> NullModel:
         np.eye(3),
         np.zeros(3),
         np.zeros(3),
-        spec.sigma_mag_gauss or max(mag, _FLOOR_MAG_GAUSS),
+        spec.sigma_mag_gauss or (max(mag, _FLOOR_MAG_GAUSS) if mag else _USUAL_MAG_GAUSS),
         spec.sigma_gyro_rad_s or max(gyro, _FLOOR_GYRO_RAD_S),
     )
 
@@ -46,7 +48,7 @@ def alike(a: NullModel, b: NullModel) -> bool:
     ]
     walk = max(a.gyro_walk_rad_s_sqrt_s, b.gyro_walk_rad_s_sqrt_s)
     same_walk = abs(a.gyro_walk_rad_s_sqrt_s - b.gyro_walk_rad_s_sqrt_s) <= 0.2 * walk
-    return same_walk and all(abs(np.log(x / y)) < _SAME for x, y in levels)
+    return same_walk and all(abs(np.log(x / y)) < SAME for x, y in levels)
 
 
 def estimated(

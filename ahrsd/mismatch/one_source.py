@@ -5,6 +5,10 @@ noise, and it counts as the noise's colour.  But it always points the same way. 
 coloured, has no direction: the scores of short stretches, each made white by its own information,
 are alike on all axes.  Mauchly's test of sphericity says how unlikely theirs are (Anderson,
 Multivariate Statistical Analysis, 10.7), in the sensor's axes and in the world's.
+
+One direction noise does have: the filter remembers the field's size for good and its direction for
+seconds, so slow noise stays along the field.  Where that hardly turns in a frame, in the world
+never, a source along it is none.
 """
 
 from __future__ import annotations
@@ -34,6 +38,8 @@ SHORTEST_S = 3.0
 FEWEST = 20
 #: share of the strongest direction of a single source
 SINGLE = 0.6
+#: mean square of the cosine between the source and the field, at most
+ALONG = 0.5
 _SMALLEST = 1e-9
 
 
@@ -64,9 +70,22 @@ def _directed(basis: Base, frame: Frame, cut: Segments) -> _Directed:
     gram = group_gram(basis, {group_name(frame): frame_columns(basis.context, frame, cut)})
     where = gram.groups[group_name(frame)]
     scores = whitened_scores(gram.total[where, where], gram.total[where, -1])
-    nats, p_value, share = sphericity(scores @ _even(basis))
+    scores = scores @ _even(basis)
+    nats, p_value, share = sphericity(scores)
+    if _along(basis, frame, scores) > ALONG:
+        share = 0.0
     one = locate(gram, frame, cut, basis.colour)
     return _Directed(replace(one, evidence=nats, p_value=p_value), share)
+
+
+def _along(basis: Base, frame: Frame, scores: Array) -> float:
+    """How much the strongest direction of scores (J, 3) is the field's."""
+    context = basis.context
+    field = context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True)
+    if frame == "world":
+        field = np.einsum("nij,nj->ni", context.R_nb, field)
+    strongest = np.linalg.eigh(scores.T @ scores)[1][:, -1]
+    return float(np.mean((field @ strongest) ** 2))
 
 
 def whitened_scores(information: Array, score: Array) -> Array:

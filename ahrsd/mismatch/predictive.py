@@ -23,14 +23,15 @@ from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.gains import Gains
-from ahrsd.mismatch.innovation import Filtered, run_filter
+from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, sensitivities
+from ahrsd.mismatch.noise import tails_of
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.track import Track
-from ahrsd.mismatch.values import Context, NullModel, Term
+from ahrsd.mismatch.values import Context, Term
 from ahrsd.samples import Array
 
 COPIES = 16
-_OUTSIDE = 0.05
+_OUTSIDE = 0.01
 _SEGMENT_S = 20.0
 _LAGS = 50
 _LEAST = 1e-12
@@ -42,32 +43,95 @@ def checks(
     terms: Sequence[Term],
     *,
     library: Mapping[str, Effect] = EFFECTS,
+    loud: Sequence[tuple[float, float]] = (),
     copies: int = COPIES,
     seed: int = 0,
 ) -> dict[str, Check]:
-    """The statistics of the recording, inside the null's bands and inside the repaired model's.
+    """The statistics of what each model leaves, inside the band of its own simulations or not.
 
     null: the fit without terms, of the recording;  repaired, terms: the fit with them, and them.
-    Deterministic.
+    loud: where the noise was found to be at another level, seconds.  Value and band are the
+    repaired model's.  Deterministic.
     """
-    context = null.context()
-    noise = forward.noise_of(repaired.model, repaired.filtered)
-    scene = scene_of(context)
-    value = statistics(null.filtered.whitened, scene)
-    held = null.filtered
-    before = _bands(_simulated(null, noise, (), scene, held, library, copies, seed))
-    after = before
-    if terms:
-        after = _bands(_simulated(repaired, noise, terms, scene, held, library, copies, seed + 1))
+    noise = noise_law(repaired, loud)
+    before = _compared(null, noise, (), library, copies, seed)
+    after = _compared(repaired, noise, terms, library, copies, seed + 1) if terms else before
     return {
-        name: Check(
-            value[name],
-            after[name],
-            before[name][0] <= value[name] <= before[name][1],
-            after[name][0] <= value[name] <= after[name][1],
-        )
-        for name in value
+        name: Check(value, band, _inside(*before[name]), _inside(value, band))
+        for name, (value, band) in after.items()
     }
+
+
+def noise_law(fit: NullFit, loud: Sequence[tuple[float, float]] = ()) -> forward.Noise:
+    """The noise of a fit as it is: levels, colour, and Student's tails where they are heavy.
+
+    loud: spans in seconds that have a level of their own, each relative to the filter's.
+    """
+    done = fit.filtered
+    within = np.zeros(len(done.track), dtype=bool)
+    for begin, end in loud:
+        within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
+    law = forward.noise_of(fit.model, done)
+    level = np.ones(len(within))
+    if loud or law.colour:
+        for rows in (within, ~within):
+            if np.any(rows & done.used):
+                level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
+    even = replace(done, whitened=done.whitened / level[:, None])
+    return replace(law, freedom=tails_of(even).freedom, level=level)
+
+
+def _compared(
+    fit: NullFit,
+    noise: forward.Noise,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+    copies: int,
+    seed: int,
+) -> dict[str, tuple[float, tuple[float, float]]]:
+    """Each statistic of the recording as a model leaves it, and the band of its simulations.
+
+    Recording and simulations alike have the model's parameters fitted: to first order, by taking
+    its whitened columns out.
+    """
+    context = fit.context()
+    scene = scene_of(context)
+    found = _Fitted.of(fit, context)
+    value = statistics(found.left(fit.filtered.whitened), scene)
+    truth = forward.truth_along(context)
+    made = [
+        forward.track_of(forward.simulated(truth, terms, noise, 1000 * seed + k, library))
+        for k in range(copies)
+    ]
+    rows = len(scene.segment)
+    whole = [track for track in made if len(track) == rows]
+    simulated = _filtered(whole, fit)
+    bands = _bands([statistics(found.left(e), scene) for e in np.split(simulated, len(whole))])
+    return {name: (value[name], bands[name]) for name in value}
+
+
+def _inside(value: float, band: tuple[float, float]) -> bool:
+    return band[0] <= value <= band[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """The whitened columns (3 N, q) of calibration and terms, orthonormal."""
+
+    columns: Array
+
+    @staticmethod
+    def of(fit: NullFit, context: Context) -> _Fitted:
+        """Of a fit, whose filter is `sensitive`."""
+        parts = [nuisance_columns(fit.filtered), *(term.columns(context) for term in fit.terms)]
+        seen = [sensitivities(fit.filtered, part) for part in parts]
+        flat = np.concatenate(seen, axis=2).reshape(-1, sum(part.shape[2] for part in seen))
+        return _Fitted(np.linalg.svd(flat / np.linalg.norm(flat, axis=0), full_matrices=False)[0])
+
+    def left(self, whitened: Array) -> Array:
+        """Whitened innovations (N, 3) with the columns taken out."""
+        flat = whitened.ravel()
+        return np.asarray((flat - self.columns @ (self.columns.T @ flat)).reshape(-1, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,17 +184,18 @@ def statistics(e: Array, scene: Scene) -> dict[str, float]:
     line                    highest line of the periodogram over its mean
     covariates              largest correlation with a column or its derivative, in deviations
     """
+    seen = e[np.any(e != 0.0, axis=1)]
     along = np.sum(e * scene.unit_b, axis=1)[:, None]
     power = np.abs(np.fft.rfft(e, axis=0)[1:]) ** 2
     out = {
-        "normalised_innovation": float(np.mean(e**2)),
+        "normalised_innovation": float(np.mean(seen**2)),
         "autocorrelation": _portmanteau(e),
         "shift_sensor": _shift(e, scene),
         "shift_world": _shift(np.einsum("nij,nj->ni", scene.R_nb, e), scene),
         "shift_turn": _shift(np.cross(scene.unit_b, e), scene),
         "field_size": max(_shift(along, scene), _follows(along, scene.time)),
         "heading": _follows(e, scene.heading),
-        "tail": float(np.quantile(np.abs(e), 0.999)),
+        "tail": float(np.quantile(np.abs(seen), 0.999)),
         "line": float((power / power.mean(axis=0)).max()),
     }
     if scene.columns.shape[1]:
@@ -138,55 +203,18 @@ def statistics(e: Array, scene: Scene) -> dict[str, float]:
     return out
 
 
-def _simulated(
-    fit: NullFit,
-    noise: forward.Noise,
-    terms: Sequence[Term],
-    scene: Scene,
-    held: Filtered,
-    library: Mapping[str, Effect],
-    copies: int,
-    seed: int,
-) -> list[dict[str, float]]:
-    """The statistics of simulations of a fit, filtered as the null's run was."""
-    truth = forward.truth_along(fit.context())
-    made = [
-        forward.track_of(forward.simulated(truth, drawn, noise, seed=1000 * seed + k))
-        for k, drawn in enumerate(_drawn(fit, terms, copies, seed))
-    ]
-    rows = len(scene.segment)
-    alike = all(len(track) == rows for track in made)
-    whole = _filtered(_joined(made), held.model, _tiled(held, len(made)) if alike else None)
-    return [
-        statistics(whole[k * rows : (k + 1) * rows], scene)
-        for k in range(copies)
-        if len(made[k]) == rows
-    ]
-
-
-def _drawn(fit: NullFit, terms: Sequence[Term], copies: int, seed: int) -> list[list[Term]]:
-    """The terms of each copy: values as they may be, given the calibration, for all that is known.
-
-    A repaired model whose coefficients are known to a tenth does not simulate them exactly.
-    """
-    if not terms or not np.any(fit.covariance):
-        return [list(terms) for _ in range(copies)]
-    sigma = np.sqrt(np.diag(fit.covariance))
-    information = np.linalg.inv(fit.covariance / np.outer(sigma, sigma))[11:, 11:]
-    values, vectors = np.linalg.eigh((information + information.T) / 2)
-    root = sigma[11:, None] * vectors / np.sqrt(np.maximum(values, 1e-6))
-    rng = np.random.default_rng(seed)
-    out = []
-    for _ in range(copies):
-        change = root @ rng.normal(size=len(root))
-        ends = np.cumsum([len(term.value) for term in terms])
-        parts = np.split(change, ends[:-1])
-        out.append([replace(t, value=t.value + d) for t, d in zip(terms, parts, strict=True)])
-    return out
-
-
-def _filtered(track: Track, model: NullModel, held: Filtered | None) -> Array:
-    return run_filter(track, model, held=held, sensitive=False).whitened
+def _filtered(tracks: Sequence[Track], fit: NullFit) -> Array:
+    """Whitened innovations of tracks of the fit's own length, its terms taken out as in its run."""
+    count = len(tracks)
+    mag, gyro = (
+        None if part is None else np.tile(part, (count, 1))
+        for part in (fit.terms_mag, fit.terms_gyro)
+    )
+    held = _tiled(fit.filtered, count)
+    blind = np.tile(np.isnan(fit.filtered.track.mag_b_gauss).any(axis=1), count)
+    joined = _joined(tracks)
+    joined.mag_b_gauss[blind] = np.nan
+    return run_filter(joined, fit.model, mag, gyro, held=held, sensitive=False).whitened
 
 
 def _tiled(done: Filtered, copies: int) -> Filtered:
@@ -237,7 +265,7 @@ def _portmanteau(e: Array) -> float:
 
 def _shift(values: Array, scene: Scene) -> float:
     """Largest |mean| of a segment (N, k), in standard deviations of a mean of unit noise."""
-    count = np.bincount(scene.segment)
+    count = np.bincount(scene.segment, weights=np.any(values != 0.0, axis=1))
     kept = count > 0.3 * count.max()
     sums = np.column_stack([np.bincount(scene.segment, weights=column) for column in values.T])
     return float(np.abs(sums[kept] / np.sqrt(count[kept])[:, None]).max())

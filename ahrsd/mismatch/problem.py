@@ -27,6 +27,8 @@ class Problem:
 
     recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
     lag_s:    lag of the magnetometer that is already taken out of the track
+    averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
+              is read more seldom than the gyro
     """
 
     track: Track
@@ -37,6 +39,7 @@ class Problem:
     thin: int
     cold: NullModel
     lag_s: float = 0.0
+    averaged: float = 1.0
 
     @property
     def rate_hz(self) -> float:
@@ -60,25 +63,42 @@ def problem_of(
     """The recording at working rate, and a calibration to start from."""
     cold = cold_start(track, spec)
     m = working_factor(track)
-    root = float(np.sqrt(m))
+    work = thinned(track, m, cold)
+    averaged = _readings(track) / max(_readings(work), 1)
     start = replace(
         cold,
-        sigma_mag_gauss=cold.sigma_mag_gauss / root,
-        sigma_gyro_rad_s=cold.sigma_gyro_rad_s / root,
+        sigma_mag_gauss=cold.sigma_mag_gauss / float(np.sqrt(averaged)),
+        sigma_gyro_rad_s=cold.sigma_gyro_rad_s / float(np.sqrt(m)),
     )
-    work = thinned(track, m, cold)
     known = spec
     if m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
         # the gyro's differences at the working rate would be its motion
         known = replace(spec, sigma_gyro_rad_s=cold.sigma_gyro_rad_s)
-    return Problem(work, noise_of_thinned(known, m), library, limits, track, m, cold), start
+    known = noise_of_thinned(known, averaged, m)
+    return Problem(work, known, library, limits, track, m, cold, averaged=averaged), start
 
 
-def noise_of_thinned(spec: Spec, m: float) -> Spec:
-    """What is known of the noise, for averages of m samples."""
-    root = float(np.sqrt(m))
+def noise_of_thinned(spec: Spec, mag: float, gyro: float) -> Spec:
+    """What is known of the noise, for averages of so many samples."""
+
+    def of_mean(sigma: float | None, count: float) -> float | None:
+        return None if sigma is None else sigma / float(np.sqrt(count))
+
     return replace(
         spec,
-        sigma_mag_gauss=None if spec.sigma_mag_gauss is None else spec.sigma_mag_gauss / root,
-        sigma_gyro_rad_s=None if spec.sigma_gyro_rad_s is None else spec.sigma_gyro_rad_s / root,
+        sigma_mag_gauss=of_mean(spec.sigma_mag_gauss, mag),
+        sigma_gyro_rad_s=of_mean(spec.sigma_gyro_rad_s, gyro),
     )
+
+
+def model_at_rate(model: NullModel, problem: Problem) -> NullModel:
+    """A model of the working rows as one of single samples."""
+    return replace(
+        model,
+        sigma_mag_gauss=model.sigma_mag_gauss * float(np.sqrt(problem.averaged)),
+        sigma_gyro_rad_s=model.sigma_gyro_rad_s * float(np.sqrt(problem.thin)),
+    )
+
+
+def _readings(track: Track) -> int:
+    return int(np.count_nonzero(np.isfinite(track.mag_b_gauss).all(axis=1)))

@@ -10,14 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.null import at_model
-from ahrsd.mismatch.problem import Problem, noise_of_thinned
+from ahrsd.mismatch.problem import Problem, model_at_rate, noise_of_thinned
 from ahrsd.mismatch.search import State, Survey, refitted, survey
 from ahrsd.mismatch.thin import thinned
-from ahrsd.mismatch.values import NullModel
 
 #: sought at the recorded rate only
 QUICK = ("ac_interference", "rotor_field", "sync_pulses")
@@ -76,26 +73,17 @@ def cleaned(found: Quick, whole: Problem) -> Problem:
     return without_quick(replace(whole, recorded=recorded, track=track))
 
 
-def model_at_rate(model: NullModel, m: int) -> NullModel:
-    """A model of averages of m samples as one of single samples."""
-    root = float(np.sqrt(m))
-    return replace(
-        model,
-        sigma_mag_gauss=model.sigma_mag_gauss * root,
-        sigma_gyro_rad_s=model.sigma_gyro_rad_s * root,
-    )
-
-
 def _at_recorded_rate(state: State, whole: Problem) -> State:
     library = {name: whole.library[name] for name in (*QUICK, *BOTH) if name in whole.library}
     lag_s = state.problem.lag_s
     problem = replace(
         whole,
         track=delayed_gyro(whole.recorded, lag_s),
-        spec=noise_of_thinned(whole.spec, 1.0 / whole.thin),
+        spec=noise_of_thinned(whole.spec, 1.0 / whole.averaged, 1.0 / whole.thin),
         library=library,
         thin=1,
+        averaged=1.0,
         lag_s=lag_s,
     )
-    fit = at_model(problem.track, model_at_rate(state.fit.model, whole.thin), state.fit.terms)
+    fit = at_model(problem.track, model_at_rate(state.fit.model, whole), state.fit.terms)
     return replace(state, problem=problem, fit=fit)

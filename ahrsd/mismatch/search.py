@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.delays import DELAYS, plain
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
@@ -252,6 +253,21 @@ def refitted(state: State, named: tuple[Judged, ...]) -> State:
         problem.track, problem.spec, start, tuple(fitted), noise=not state.walk, walk=state.walk
     )
     return replace(state, fit=fit, named=named)
+
+
+def settled(state: State) -> State:
+    """The state with its noise as large as it is where a walking bias has taken over a part of it.
+
+    While names are sought it stays as it was: what is still to be named would count as noise.
+    """
+    if not state.walk:
+        return state
+    fit, problem = state.fit, state.problem
+    again = noise_fit.rescaled(fit.filtered, problem.spec)
+    if again.sigma_mag_gauss > fit.model.sigma_mag_gauss * (1 - noise_fit.SAME):
+        return state
+    fit = fit_null(problem.track, problem.spec, again, fit.terms, noise=False)
+    return replace(state, fit=fit)
 
 
 def _lag_taken_out(state: State, judged: Judged, lag_s: float) -> State:
