@@ -443,3 +443,14 @@ def test_circles_calibrate_the_drive_that_follows(replayed, request):
     assert np.all(difference < 0.07)
     streamed = request.node.callspec.params["replayed"] == 1
     assert np.all(spread < (0.15 if streamed else 0.16))  # the drive: 0.07 and 0.14
+
+
+def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():
+    """It is as often below 1, where it counts as 1: else sigmas were always too large."""
+    run = bench.simulate("mam", "rov", 5, samples=4000)
+    estimator = Estimator(at_once=WHOLE)
+    estimator.add(run.block)
+    estimate = estimator.finish()
+    assert 1.15 < estimate.misfit < 1.4
+    of_bound = np.sqrt(np.diag(estimate.covariance) / np.diag(bench.bound(run)))
+    assert np.all(of_bound[6:] < 1.06)

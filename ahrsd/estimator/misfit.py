@@ -67,8 +67,9 @@ class Misfit:
 
     def value(
         self, factors: Sequence[Factor], scores: Sequence[Score], graph: Graph, step: Step
-    ) -> float:
-        """Mean square of the scores per degree of freedom, where `step` leads.
+    ) -> tuple[float, float]:
+        """Mean square of the scores per degree of freedom, where `step` leads, and its sigma by
+        chance were the model right.
 
         At the joint optimum, not at the present values: what all epochs ask for together is not
         disagreement.
@@ -77,7 +78,8 @@ class Misfit:
         biases = np.array([graph.nodes[f.a].bias + dy[f.a][:3] for f in factors])
         s, n = _squares(factors, scores, graph.c + dc, biases)
         total, count = self._sum + s, self._count + n
-        return total / max(count - _USED, 0.2 * count, 1.0)
+        freedom = max(count - _USED, 0.2 * count, 1.0)
+        return total / freedom, float(np.sqrt(2.0 / freedom))
 
 
 def _squares(

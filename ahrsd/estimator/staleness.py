@@ -18,7 +18,7 @@ from ahrsd.estimator.retraction import Moments, moved
 from ahrsd.samples import Array
 
 _WORTH = 0.02  # sigmas
-_ANOTHER_NOISE, _EXACTLY = 0.1, 0.02  # of the gyro's level, that an epoch may have assumed else
+_ANOTHER_NOISE, _EXACTLY = 0.1, 0.04  # of the gyro's level, that an epoch may have assumed else
 
 
 def bends(epochs: Sequence[Epoch], c: Array, moments: Moments, information: Array) -> Array:

@@ -40,6 +40,7 @@ _DAMPING, _DAMPING_FAR = 1e-3, 1e2
 _STILL = 1e12  # damping at which the calibration stays where it is
 _DAMPING_LIMITS = (1e-9, 1e6)
 _SHORT, _STRAIGHT = 5.0, 0.02  # sigmas of a step, and by how much it is curved, to be foreseen
+_CHANCE = 2.0  # sigmas of the misfit by chance from which it counts
 _GAIN = 0.05  # of log likelihood: less is not worth another step
 
 
@@ -262,8 +263,9 @@ class Window(Linearised):
         """
         graph, factors, asked = self.graph, [e.factor for e in self.epochs], scores_of(self.epochs)
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
-        self.found_misfit = self.misfit.value(factors, asked, graph, graph.step())
-        graph.temper = max(1.0, self.found_misfit, self._repeating())
+        self.found_misfit, chance = self.misfit.value(factors, asked, graph, graph.step())
+        told = self.found_misfit > 1.0 + _CHANCE * chance  # else sigmas would only ever grow by it
+        graph.temper = max(1.0, self.found_misfit if told else 1.0, self._repeating())
         covariance = graph.covariance()[:9, :9] * graph.temper
         strayed = graph.strayed(covariance)
         if strayed > graph.temper:

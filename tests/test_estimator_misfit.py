@@ -1,0 +1,41 @@
+"""The misfit: what it is for a right model, and how far it goes by chance."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ahrsd.estimator.factors import SIZE, Factor, Node, Point
+from ahrsd.estimator.misfit import Misfit, scores
+
+EPOCHS = 20
+
+
+def _misfit(rng, louder=1.0):
+    """Of epochs whose gradients have `louder` times the sigma that their information says."""
+    node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
+    point, factors = Point(np.zeros(9), node, node), []
+    for k in range(EPOCHS):
+        J = rng.normal(size=(40, SIZE))
+        g = louder * J.T @ rng.normal(size=40)
+        factors.append(Factor(k, k + 1, J.T @ J, g, point))
+    nodes = dict.fromkeys(range(EPOCHS + 1), node)
+    graph = SimpleNamespace(c=np.zeros(9), nodes=nodes)
+    still = np.zeros(9), dict.fromkeys(nodes, np.zeros(5))
+    return Misfit().value(factors, scores(factors), graph, still)
+
+
+def test_sigma_of_the_misfit_by_chance():
+    rng = np.random.default_rng(0)
+    found = np.array([_misfit(rng) for _ in range(150)])
+    freedom = 12 * EPOCHS
+    assert found[:, 0].mean() == pytest.approx(freedom / (freedom - 12), rel=0.02)
+    assert found[:, 0].std() == pytest.approx(found[0, 1], rel=0.2)
+
+
+def test_epochs_that_disagree():
+    figure, chance = _misfit(np.random.default_rng(1), louder=2.0)
+    assert figure == pytest.approx(4.2, rel=0.3)
+    assert figure > 1.0 + 10 * chance
