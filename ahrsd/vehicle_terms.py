@@ -34,6 +34,7 @@ class VehicleTerms:
 
     def __init__(self, warn: Callable[[str], object], max_age_s: float) -> None:
         self.terms: tuple[Term, ...] = ()
+        self.waits_for: tuple[str, ...] = ()  # columns that the newest samples lack
         self._warn, self._max_age_s = warn, max_age_s
         self._columns: dict[str, deque[tuple[float, float]]] = {}
         self._gap = False
@@ -93,9 +94,10 @@ class VehicleTerms:
         columns = block.covariates
         parts = [self._added(term, block.time_s, block.dt_s, columns) for term in self.terms]
         if not all(np.isfinite(part).all() for part in parts):
-            self._gap = True
-            self._warn("samples without " + ", ".join(self._missing(block)) + " are not calibrated")
+            self._gap, self.waits_for = True, self._missing(block)
+            self._warn(f"samples without {', '.join(self.waits_for)} are not calibrated")
             return None
+        self.waits_for = ()
         gap, self._gap = block.gap_before or self._gap, False
         mag, gyro = np.sum(parts, axis=0)
         return replace(
@@ -105,7 +107,7 @@ class VehicleTerms:
             gap_before=gap,
         )
 
-    def _missing(self, block: SampleBlock) -> list[str]:
+    def _missing(self, block: SampleBlock) -> tuple[str, ...]:
         wanted = dict.fromkeys(str(term.setting["covariate"]) for term in self.terms)
         known = block.covariates
-        return [name for name in wanted if name not in known or not np.isfinite(known[name]).all()]
+        return tuple(n for n in wanted if n not in known or not np.isfinite(known[n]).all())

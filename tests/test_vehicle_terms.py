@@ -89,6 +89,7 @@ def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
     free, said = vehicle(term(), term("mag_time_lag", [0.01], {}))
     host_s = np.array([10.0, 10.1])
     assert free.without(block(host_s)) is None
+    assert free.waits_for == ("motor_current_a",)
     assert said == [
         "mag_time_lag is in the model and does not follow a column from sample to sample: it stays "
         "in the readings",
@@ -101,6 +102,7 @@ def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
     assert after.gyro_b_rad_s.tolist() == [[0.0] * 3] * 2
     again = free.without(block(host_s, motor_current_a=np.zeros(2)))
     assert not again.gap_before
+    assert free.waits_for == ()
 
 
 def test_without_a_model_the_block_is_the_same_object():

@@ -89,6 +89,8 @@ def _stream(status: Mapping[str, Any]) -> str:
         return str(refused[0])
     if not status["stream"]["samples"]:
         return "no samples yet"
+    if waits := status["stream"]["waits_for"]:
+        return f"the vehicle does not tell {', '.join(waits)}: nothing is calibrated without it"
     return ""
 
 

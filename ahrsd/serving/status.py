@@ -100,6 +100,7 @@ class StatusMaker:
             "faults": core.faults,
             "strays": core.strays,
             "refused": [str(error) for error in core.stream.refused.values()],
+            "waits_for": list(core.vehicle.waits_for),
         }
 
 

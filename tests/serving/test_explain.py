@@ -12,7 +12,7 @@ def status(**changes):
         "mode": "commit",
         "mode_now": "commit",
         "link": {"open": True, "port": "/dev/vn100"},
-        "stream": {"samples": 5000, "refused": []},
+        "stream": {"samples": 5000, "refused": [], "waits_for": []},
         "mismatch": {"open": False, "step": None},
         "gates": [],
         "write_back": {"state": "CANDIDATE", "holds": [], "proposal": None},
@@ -79,8 +79,15 @@ def test_gates_that_were_not_measured_say_so_together_where_the_reason_is_one():
     ("changes", "words"),
     [
         ({"link": {"open": False, "port": "/dev/vn100"}}, "no device on /dev/vn100"),
-        ({"stream": {"samples": 0, "refused": ["VNYPR has no field"]}}, "VNYPR has no field"),
-        ({"stream": {"samples": 0, "refused": []}}, "no samples yet"),
+        (
+            {"stream": {"samples": 0, "refused": ["VNYPR has no field"], "waits_for": []}},
+            "VNYPR has no field",
+        ),
+        ({"stream": {"samples": 0, "refused": [], "waits_for": []}}, "no samples yet"),
+        (
+            {"stream": {"samples": 9, "refused": [], "waits_for": ["motor_current_a"]}},
+            "the vehicle does not tell motor_current_a: nothing is calibrated without it",
+        ),
         (
             {"write_back": {"state": "LOCKED", "holds": ["locked"], "proposal": None}},
             "find out why (`ahrsd registers history`), then `ahrsd operator unlock REASON`",

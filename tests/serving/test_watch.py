@@ -23,7 +23,8 @@ def status(count):
         "device": {"model": "VN-100", "serial": 7, "firmware": "3.1"},
         "link": {"open": True, "port": "/dev/vn100", "baud": 115200},
         "stream": {
-            "samples": 500, "samples_per_s": 40.0, "refused": [], "rejected": 0, "faults": 0,
+            "samples": 500, "samples_per_s": 40.0, "refused": [], "waits_for": [],
+            "rejected": 0, "faults": 0,
             "skipped_bytes": 0, "gaps": 0, "restarts": 0,
         },
         "motion": {"heading_deg": None, "roll_deg": None, "pitch_deg": None, "next": "drive"},
