@@ -8,6 +8,7 @@ calibration and the other names leave):
 
     sensor, world, gyro   a free value in every twenty-fourth of the recording
     attitude              a field in sensor axes by the field's and gravity's direction
+    rate                  an error of the gyro by the size and the products of its rates
     rest                  a field in sensor axes wherever the vehicle stands: that is one place
 
 A name is worth what it explains beyond them: the maximum of the marginal likelihood with it, over
@@ -25,7 +26,7 @@ from scipy import linalg, optimize
 
 from ahrsd.mismatch import locate
 from ahrsd.mismatch.evidence import SIZES, colour
-from ahrsd.mismatch.gram import solve
+from ahrsd.mismatch.gram import RANK_SHARE, solve
 from ahrsd.mismatch.regression import Base, residual
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
@@ -38,7 +39,7 @@ SMALLEST, LARGEST = -6.0, 8.0
 STILL_RAD_S, STILL_S = 0.05, 2.0
 LEAVING_S = (1.0, 0.5)  # the way from a place, far and near half
 MOST_RESTS = 24
-PLACES = 4  # number of their group
+PLACES = 5  # number of their group
 ITERATIONS = 40
 
 
@@ -82,15 +83,15 @@ def discrepancy(basis: Base) -> Discrepancy:
     scaled = [part * unit for part, unit in zip(columns, units, strict=True)]
     group = np.repeat(np.arange(len(parts)), [part.shape[2] for part in scaled])
     together = np.concatenate(scaled, axis=2)
-    G, s = _projected(basis, together)
+    G, s = projected(basis, together)
     left = _left(basis, together, G, s)
     noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
-    nats, sizes = _fitted(G, s, group, noise, np.zeros(len(parts)))
+    nats, sizes = fitted(G, s, group, noise, np.zeros(len(parts)))
     known = group == PLACES
     by_place = 0.0
     if known.any():
         rest = np.zeros(np.count_nonzero(known), dtype=np.intp)
-        by_place, _ = _fitted(G[np.ix_(known, known)], s[known], rest, noise, np.zeros(1))
+        by_place, _ = fitted(G[np.ix_(known, known)], s[known], rest, noise, np.zeros(1))
     return Discrepancy(basis, together, group, noise, sizes, nats, nats - by_place)
 
 
@@ -100,13 +101,13 @@ def beyond(found: Discrepancy, without: Base, columns: Array, scale: Array) -> f
     without: the basis without it;  columns (N, 3, p) whitened;  scale (p,): prior deviations
     """
     count = len(found.sizes)
-    G, s = _projected(without, np.concatenate([found.columns, columns * scale], axis=2))
+    G, s = projected(without, np.concatenate([found.columns, columns * scale], axis=2))
     plain = slice(0, len(found.group))
     start = np.maximum(found.sizes, 0.0)  # from a variance of zero no slope leads away
-    less, sizes = _fitted(G[plain, plain], s[plain], found.group, found.noise, start)
+    less, sizes = fitted(G[plain, plain], s[plain], found.group, found.noise, start)
     group = np.concatenate([found.group, np.full(len(scale), count)])
     starts = [np.append(found.sizes, 0.0), np.append(sizes, 0.0)]
-    more = max(_fitted(G, s, group, found.noise, at, count)[0] for at in starts)
+    more = max(fitted(G, s, group, found.noise, at, count)[0] for at in starts)
     return more - less - float(np.log(len(SIZES)))
 
 
@@ -122,6 +123,7 @@ def _random_effects(context: Context) -> list[tuple[Callable[[Context], Columns]
         (course("world"), UNIT_GAUSS),
         (course("gyro"), UNIT_RAD_S),
         (by_attitude, UNIT_GAUSS),
+        (by_rate, UNIT_RAD_S),
     ]
     rests = places(context)
     if len(rests):
@@ -144,9 +146,26 @@ def by_attitude(context: Context) -> Columns:
     if context.world_levelled:
         down = context.R_nb[:, 2, :].T
         shapes += [*down, *_second(*down), *(a * b for a in (x, y, z) for b in down)]
-    values = np.stack(shapes, axis=1)
-    values = values / np.maximum(values.std(axis=0), 1e-3)
-    return Columns(mag=np.einsum("np,ij->nipj", values, np.eye(3)).reshape(len(values), 3, -1))
+    return every_direction(np.stack(shapes, axis=1))
+
+
+def by_rate(context: Context) -> Columns:
+    """An error of the gyro by its rates: their sizes and products, and with the whole rate's size.
+
+    In proportion to them it is scale and misalignment.
+    """
+    rate = context.rate_b_rad_s
+    x, y, z = rate.T
+    whole = np.linalg.norm(rate, axis=1, keepdims=True)
+    values = np.column_stack([np.abs(rate), rate * whole, rate**2, x * y, x * z, y * z])
+    return every_direction(values, gyro=True)
+
+
+def every_direction(values: Array, *, gyro: bool = False) -> Columns:
+    """Columns (N, 3, 3 k) of each of the (N, k) courses on each axis, of unit deviation."""
+    values = values / np.maximum(values.std(axis=0), 1e-6)
+    matrix = np.einsum("np,ij->nipj", values, np.eye(3)).reshape(len(values), 3, -1)
+    return Columns(gyro=matrix) if gyro else Columns(mag=matrix)
 
 
 def _second(x: Array, y: Array, z: Array) -> list[Array]:
@@ -173,14 +192,24 @@ def places(context: Context) -> locate.Segments:
     return locate.Segments(np.arange(count + 1.0), index)
 
 
-def _projected(basis: Base, columns: Array) -> tuple[Array, Array]:
-    """Information (q, q) and score (q,) of the columns with the known ones regressed out."""
+def projected(basis: Base, columns: Array) -> tuple[Array, Array]:
+    """Information (q, q) and score (q,) of the columns with the known ones regressed out.
+
+    Combinations with less information than RANK_SHARE of what the columns had are left out: they
+    are made of the noise of the field that the columns were built from.
+    """
     Z = basis.known.reshape(-1, basis.known.shape[2])
     X = columns.reshape(len(Z), -1)
     e = basis.innovation.ravel()
     cross = Z.T @ X
     M = solve(Z.T @ Z, cross)
-    return X.T @ X - cross.T @ M, X.T @ e - M.T @ (Z.T @ e)
+    whole = X.T @ X
+    root = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh((whole - cross.T @ M) / np.outer(root, root))
+    kept = values > RANK_SHARE * len(root)
+    directions = root[:, None] * vectors[:, kept]
+    s = vectors[:, kept].T @ ((X.T @ e - M.T @ (Z.T @ e)) / root)
+    return (directions * values[kept]) @ directions.T, directions @ s
 
 
 def _left(basis: Base, columns: Array, G: Array, s: Array) -> Array:
@@ -189,7 +218,7 @@ def _left(basis: Base, columns: Array, G: Array, s: Array) -> Array:
     return residual(basis.known, basis.innovation - columns @ theta)
 
 
-def _fitted(
+def fitted(
     G: Array,
     s: Array,
     group: NDArray[np.intp],

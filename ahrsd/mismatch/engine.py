@@ -143,10 +143,10 @@ class _Searched:
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     state, first, last = forward(State(problem, start))
-    slim = examined(paired(pruned(state)))
+    slim, beside = examined(paired(pruned(state)))
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = swapped(slim, last)
-    state, surveys, left = wandering(*without_stand_ins(state, surveys))
+    state, surveys, left = wandering(*without_stand_ins(state, surveys, beside))
     if unknown.detected(left, problem.limits) or not bursts(basis_of(state)):
         left = with_one_source(left)
     if unknown.detected(left, problem.limits):

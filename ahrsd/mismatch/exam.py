@@ -24,17 +24,18 @@ from ahrsd.samples import Array
 IMITATORS = ("viscous_magnetisation", "hysteresis", "eddy_current")
 
 
-def examined(state: State) -> State:
+def examined(state: State) -> tuple[State, bool]:
     """The state without the names that are no more than what the model leaves anyway.
 
-    One at a time, the weakest first, everything else fitted anew after each.
+    One at a time, the weakest first, everything else fitted anew after each; and whether anything
+    is left beside the names.
     """
     limits = state.problem.limits
     while state.named:
         basis = basis_of(state)
         found = rest_of(state, basis)
         if found is None:
-            break
+            return state, False
         worth = [_worth(state, basis, found, k) for k in range(len(state.named))]
         weakest = int(np.argmin(worth))
         if worth[weakest] > max(limits.beyond_nats, limits.beyond_share * found.unknown):
@@ -44,7 +45,7 @@ def examined(state: State) -> State:
             weakest = min(poor, key=lambda k: worth[k])
         kept = tuple(judged for k, judged in enumerate(state.named) if k != weakest)
         state = refitted(state, kept)
-    return state
+    return state, True
 
 
 def _imitates(name: str, worth: float, found: Discrepancy) -> bool:

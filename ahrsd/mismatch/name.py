@@ -24,7 +24,7 @@ from ahrsd.samples import Array
 MINIMUM_SHIFT_SHARE = 0.05
 #: what fewer blocks than this show cannot be known from the others: a jump of the outside field,
 #: which the filter follows within seconds; nats beyond all doubt then stand for the held-out gain
-LONELY_BLOCKS, LONELY_NATS = 2.5, 20.0
+LONELY_BLOCKS, LONELY_NATS = 5.0, 20.0
 #: what is shorter turns too little to tell a field outside from one on the vehicle
 LONELY_S = 8.0
 

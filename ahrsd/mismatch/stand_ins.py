@@ -1,4 +1,5 @@
-"""Names that only stand in for a course in time: steps, drifts and bumps of an unlogged source."""
+"""Names that only stand in for something else: steps, drifts and bumps for the course of an
+unlogged source, any name for what has another form (`rivals`)."""
 
 from __future__ import annotations
 
@@ -6,10 +7,20 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
-from ahrsd.mismatch.findings import added_value
-from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.bursts import bursts
+from ahrsd.mismatch.findings import added_value, where
+from ahrsd.mismatch.locate import FRAMES, Frame
 from ahrsd.mismatch.regression import Base, evidence_of
-from ahrsd.mismatch.search import State, Survey, basis_of, refitted, term_group
+from ahrsd.mismatch.rivals import of_another_form
+from ahrsd.mismatch.search import (
+    STEPS,
+    State,
+    Survey,
+    basis_of,
+    counterpart,
+    refitted,
+    term_group,
+)
 
 #: names that are a course in time and nothing else, by the frame that they act in
 TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
@@ -19,14 +30,19 @@ TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
 }
 
 
+#: a bump of the outside field
+BUMP = "field_anomaly"
+
+
 def without_stand_ins(
-    state: State, surveys: list[Survey]
+    state: State, surveys: list[Survey], beside: bool
 ) -> tuple[State, list[Survey], unknown.Remainder]:
     """Names that only stand in for a course in time taken out again, and what is then left.
 
     Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
     all of what their frame's own coefficients explain, and where a few of them do.  A gyro whose
-    bias wanders as an ordinary one's does is noise.
+    bias wanders as an ordinary one's does is noise.  Every name is held against what has another
+    form, unless so much is `beside` the names that no form of theirs can be seen.
     """
     limits = state.problem.limits
     left = unknown.remainder(basis_of(state))
@@ -39,7 +55,50 @@ def without_stand_ins(
         if shaped and not doubtful:
             doubtful = shaped if _stand_in(state, frame, shaped, left) else []
         state, surveys, left = _dropped(state, surveys, doubtful, left)
+    state, surveys, left = _dropped(state, surveys, _bumps(state, left), left)
+    if state.named and not beside:
+        wrong = _of_another_form(state)
+        if wrong:
+            frame = _frame_of(state, wrong[0])
+            state, surveys, left = _dropped(state, surveys, wrong, left)
+            if not unknown.detected(left, limits):
+                left = replace(left, stood_in=frame)
     return state, surveys, left
+
+
+def _of_another_form(state: State) -> list[int]:
+    """Terms that come and go as nothing in the library does, or are of another form."""
+    basis = basis_of(state)
+    # a magnet is put on and taken off again; a gyro's bias does not come back
+    back = [k for k, name in enumerate(state.names) if name == STEPS["gyro"]]
+    back = [k for k in back if counterpart(state, k) is not None]
+    courses = [name for names in TIME_SHAPED.values() for name in names]
+    return sorted({*back, *of_another_form(state, basis, courses)})
+
+
+def _bumps(state: State, left: unknown.Remainder) -> list[int]:
+    """Bumps of the outside field that are part of a longer course: of the rest, or of one another.
+
+    One that repeats at its place is told by that.
+    """
+    bumps = [k for k, name in enumerate(state.names) if name == BUMP]
+    if not bumps:
+        return []
+    basis = basis_of(state)
+    once = [
+        k for k in bumps if len(where(state.named[k], added_value(state, k), basis).intervals_s) < 2
+    ]
+    rest = unknown.detected(left, state.problem.limits) and left.strongest.frame != "gyro"
+    if rest or bursts(basis) is not None:
+        return once
+    loose = [k for k in once if "place_m" not in state.named[k].candidate.setting]
+    return loose if len(loose) > 1 else []
+
+
+def _frame_of(state: State, number: int) -> Frame:
+    effect = state.named[number].candidate.effect
+    frame = effect.frame or effect.family
+    return next((known for known in FRAMES if known == frame), "sensor")
 
 
 def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remainder) -> bool:

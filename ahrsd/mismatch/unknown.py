@@ -37,16 +37,20 @@ class Remainder:
     basis: with the noise that the strongest frame leaves;  located: by frame
     bins: (regime, evidence, p-value), the strongest first
     free: the strongest frame with its course as a joint fit has it (`free_course`)
+    stood_in: the frame of a name that was taken out again though the tests show nothing there
     """
 
     basis: Base
     located: dict[Frame, Located]
     bins: tuple[tuple[Regime, float, float], ...]
     free: Located | None = None
+    stood_in: Frame | None = None
 
     @property
     def strongest(self) -> Located:
         """The frame that explains most."""
+        if self.stood_in is not None:
+            return self.located[self.stood_in]
         return max(self.located.values(), key=lambda one: one.evidence)
 
     @property
@@ -134,7 +138,7 @@ def detected(left: Remainder, limits: Limits) -> bool:
     by_bin = any(
         evidence > limits.unknown_nats and p < limits.unknown_p for _, evidence, p in left.bins
     )
-    return by_time or by_bin
+    return by_time or by_bin or left.stood_in is not None
 
 
 def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:

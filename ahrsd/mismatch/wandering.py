@@ -29,7 +29,7 @@ from ahrsd.mismatch.search import (
 )
 
 NAME = "gyro_bias_drift"
-#: means over a segment change less than the walk itself does: sizes that are tried
+#: of that size, which are tried
 FACTORS = (1.0, 2.0)
 
 
@@ -42,8 +42,8 @@ def wandering(
     clear = gyro.evidence > max(others) + FRAME_LEAD
     if not clear or not unknown.detected(left, problem.limits) or _named(state):
         return state, surveys, left
-    size = _walk(gyro)
-    if size < ORDINARY_WALK_RAD_S_SQRT_S or _walks(left) < problem.limits.lead_nats:
+    nats, size = _walks(left)
+    if size < ORDINARY_WALK_RAD_S_SQRT_S or nats < problem.limits.lead_nats:
         return state, surveys, left
     seen = survey(state)
     mine = next((j for j in seen.judged if j.candidate.name == NAME), None)
@@ -64,15 +64,11 @@ def _named(state: State) -> bool:
     return any(name in WANDERING for name in state.names)
 
 
-def _walk(gyro: locate.Located) -> float:
-    """Size of the walk, rad/s per root second, that the course's changes are of."""
-    change = float(np.mean(np.diff(gyro.course, axis=0) ** 2))
-    change -= 2.0 * float(np.mean(gyro.deviation**2))
-    return float(np.sqrt(max(change, 0.0) * 1.5 / gyro.cut.length_s))
+def _walks(left: unknown.Remainder) -> tuple[float, float]:
+    """Nats by which the gyro's course is a random walk's rather than independent values.
 
-
-def _walks(left: unknown.Remainder) -> float:
-    """Nats by which the gyro's course is a random walk's rather than independent values."""
+    And the walk's size, rad/s per root second, that is the likeliest.
+    """
     gyro, basis = left.located["gyro"], left.basis
     name, unit = locate.group_name("gyro"), locate.UNITS["gyro"]
     gram = group_gram(basis, {name: locate.frame_columns(basis.context, "gyro", gyro.cut)})
@@ -80,4 +76,9 @@ def _walks(left: unknown.Remainder) -> float:
     G, s = gram.total[columns, columns], gram.total[columns, -1]
     what = score(gram, name, np.full(len(s), unit), 1e-3)
     walk = log_bayes_walk(G, s, 3, np.asarray(locate.SPAN) * unit, basis.colour)
-    return float(walk - log_bayes(what, basis.colour, locate.SPAN))
+    sizes = unit * np.geomspace(locate.SPAN[0], locate.SPAN[-1], 25)
+    likely = max(sizes, key=lambda size: log_bayes_walk(G, s, 3, np.array([size]), basis.colour))
+    # a walk's mean square distance from its own mean is a sixth of its variance at the end
+    whole_s = float(gyro.cut.edges_s[-1] - gyro.cut.edges_s[0])
+    root = float(np.sqrt(6.0 / whole_s))
+    return float(walk - log_bayes(what, basis.colour, locate.SPAN)), float(likely) * root

@@ -1,0 +1,111 @@
+"""Names held against free forms of the same kind.
+
+A name predicts a form: a coefficient that stays the same, an error that grows with the rate in one
+way.  What has another form is explained in part by the names that are nearest to it.  So
+every name is compared with
+
+    drift     its own columns with a coefficient that changes with time
+    parts     its own columns with a coefficient for every sixth of what it explains
+    rate      an error of the gyro that depends on the rates in any way
+    memory    a field in sensor axes that depends on where the field has been: relays (Preisach's
+              model of hysteresis) in directions all over the sphere
+
+each a random effect whose size is found by marginal likelihood, which makes it pay for its
+coefficients.  Where a free form is more likely than the name, or is there beside it and takes most
+of what it explained, the name only stood in for it.  A course in time has its own test
+(`stand_ins`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from ahrsd.mismatch.discrepancy import (
+    UNIT_GAUSS,
+    UNIT_RAD_S,
+    by_rate,
+    every_direction,
+    fitted,
+    projected,
+)
+from ahrsd.mismatch.findings import added_value
+from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.search import State, term_group, without_term
+from ahrsd.mismatch.values import Columns, Context
+from ahrsd.samples import Array
+
+#: nats by which a free form must be more than the name: odds of 1000 to 1
+MORE_NATS = 7.0
+#: part of a name's evidence that must be left beside a free form that is there too
+OWN_SHARE = 0.5
+PARTS = 6
+#: where relays flip, in parts of the field's range along their direction
+RELAYS = (0.3, 0.55)
+_SMALL = -5.0  # logarithm of a deviation to begin with: next to nothing
+
+
+def of_another_form(state: State, basis: Base, courses: Sequence[str]) -> list[int]:
+    """Numbers of the terms whose names only stand in for something of another form.
+
+    courses: names that are a course in time and nothing else
+    """
+    noise = max(1.0, basis.colour)
+    columns = basis.whitened([by_rate(basis.context), by_memory(basis.context)])
+    free = [part * unit for part, unit in zip(columns, (UNIT_RAD_S, UNIT_GAUSS), strict=True)]
+    out = []
+    for k, name in enumerate(state.names):
+        scale = state.named[k].candidate.scale
+        mine = basis.known[:, :, basis.groups[term_group(k)]] * scale
+        left = without_term(state, k, basis)
+        own = [] if name in courses else _varied(mine, added_value(state, k) / scale)
+        if any(_rivals(left, mine, part, noise, 1.0) for part in own) or any(
+            _rivals(left, mine, part, noise, OWN_SHARE) for part in free
+        ):
+            out.append(k)
+    return out
+
+
+def compared(left: Base, mine: Array, other: Array, noise: float) -> tuple[float, float, float]:
+    """Nats of a name's columns (N, 3, p), of a free form's (N, 3, q), and of both together."""
+    p, q = mine.shape[2], other.shape[2]
+    G, s = projected(left, np.concatenate([mine, other], axis=2))
+    group = np.repeat(np.array([0, 1], dtype=np.intp), [p, q])
+    own, free = slice(0, p), slice(p, p + q)
+    name, _ = fitted(G[own, own], s[own], group[own], noise, np.zeros(1))
+    form, _ = fitted(G[free, free], s[free], group[free] - 1, noise, np.zeros(1))
+    starts = (np.zeros(2), np.array([0.0, _SMALL]))
+    return name, form, max(fitted(G, s, group, noise, start)[0] for start in starts)
+
+
+def _rivals(left: Base, mine: Array, other: Array, noise: float, share: float) -> bool:
+    """Whether a free form is more than the name, which keeps less than `share` beside it."""
+    name, form, both = compared(left, mine, other, noise)
+    return max(form, both) > name + MORE_NATS and both - form < share * name
+
+
+def _varied(columns: Array, value: Array) -> list[Array]:
+    """Columns (N, 3, p) of the value (p,) with coefficients that drift, and that jump."""
+    slow = np.cos(np.linspace(0.0, np.pi, len(columns)))[:, None, None]
+    power = np.cumsum(np.sum((columns @ value) ** 2, axis=1))
+    part = np.minimum((PARTS * power / max(float(power[-1]), 1e-300)).astype(int), PARTS - 1)
+    cut = [np.where((part == k)[:, None, None], columns, 0.0) for k in range(PARTS)]
+    return [np.concatenate([columns, slow * columns], axis=2), np.concatenate(cut, axis=2)]
+
+
+def by_memory(context: Context) -> Columns:
+    """A field in sensor axes by relays along thirteen directions."""
+    corners = [np.array(v, float) for v in product((-1, 0, 1), repeat=3) if v > (0, 0, 0)]
+    along = context.field_b @ np.column_stack([v / np.linalg.norm(v) for v in corners])
+    values = np.column_stack([_relay(one, part) for one in along.T for part in RELAYS])
+    return every_direction(values - values.mean(axis=0))
+
+
+def _relay(along: Array, part: float) -> Array:
+    """(N,) 1 since `along` was last above a threshold, -1 since below its opposite, 0 before."""
+    middle, half = (along.max() + along.min()) / 2, part * np.ptp(along) / 2
+    sign = np.where(along > middle + half, 1.0, np.where(along < middle - half, -1.0, 0.0))
+    last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(sign)), 0))
+    return np.asarray(sign[last])
