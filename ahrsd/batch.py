@@ -131,6 +131,7 @@ def calibrate(
     warnings = (
         *done.warnings,
         *(f"{name} is in the model and cannot be taken out" for name in left),
+        *([] if calibrator.step is None else [calibrator.step.words]),
     )
     return BatchResult(path.name, done.core, estimate, tuple(seen), warnings, turned, wrong)
 

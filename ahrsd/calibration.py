@@ -105,6 +105,8 @@ class Estimate:
                      0 where the data do not ask for it
     gyro_misscaled:  share of themselves by which the gyro's angles are too small against the turns
                      of the field; 0 where they may be right
+    contradicted_s:  since when the newest motion contradicts the answer, as if the iron were
+                     another; None where it agrees
     """
 
     soft_iron: Array
@@ -124,6 +126,7 @@ class Estimate:
     warnings: tuple[str, ...] = field(default=())
     mag_lag_s: float = 0.0
     gyro_misscaled: float = 0.0
+    contradicted_s: float | None = None
 
     @property
     def correction(self) -> Affine:

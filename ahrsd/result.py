@@ -103,6 +103,11 @@ def why_not_converged(estimate: Estimate | None) -> list[str]:
             f"not converged: the field turns {abs(wrong):.0%} {'more' if wrong > 0 else 'less'} "
             "than the gyro says: the rate in Hz, the times of samples or the gyro's unit are wrong"
         ]
+    if (since_s := estimate.contradicted_s) is not None:
+        return [
+            f"not converged: from about {since_s:.0f} s on the field contradicts what was before: "
+            "a magnet came near or the iron changed; turn on, away from steel and magnets"
+        ]
     if blind := estimate.observability.unobservable:
         return [f"this motion does not determine: {'; '.join(blind)}"]
     if estimate.heading_sigma_deg >= _HOPELESS_DEG:

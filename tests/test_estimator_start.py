@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -72,10 +74,21 @@ def test_sphere_start_refuses_a_plane():
 
 @pytest.mark.parametrize(("amplitude", "expected"), [(0.0, False), (0.02, True), (0.5, True)])
 def test_turned_wants_a_rotation(amplitude, expected):
-    assert turned(epoch(amplitude, 1e-3, n=512)) is expected
+    assert turned(epoch(amplitude, 1e-3, n=512), np.zeros(3)) is expected
 
 
 def test_a_field_that_wanders_while_the_gyro_rests_is_no_turn():
     data = epoch(0.0, 1e-3, n=512)
     data.field_b_gauss[:, 2] += np.linspace(0, 0.05, 512)
-    assert not turned(data)
+    assert not turned(data, np.zeros(3))
+
+
+def test_a_magnet_that_comes_while_the_gyro_rests_is_no_turn_and_a_steady_turn_is_one():
+    """The mean rate may be bias, so only what is left of it tells a steady turn."""
+    data, bias = epoch(0.0, 1e-3, n=512), np.array([0.02, -0.01, 0.015])
+    data.angle_b_rad[:] += bias * data.dt_s[:, None]
+    away = np.exp(-0.5 * ((np.arange(512) - 256) / 80.0) ** 2)
+    data.field_b_gauss[:] += 0.3 * away[:, None] * np.array([0.6, -0.5, 0.6])
+    assert not turned(data, bias)
+    steady = data.angle_b_rad + np.array([0.0, 0.0, 0.02]) * data.dt_s[:, None]
+    assert turned(replace(data, angle_b_rad=steady), bias)

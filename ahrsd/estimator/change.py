@@ -6,9 +6,15 @@ another hard iron explains what it does. A field that differs from place to plac
 A change before the answer was sure leaves a mixture that no epoch agrees with. There, a second hard
 iron from some epoch on must take most of the disagreement away, more than what an instrument may
 have besides iron and bias (`instrument.py`): a lag of the field looks like a change to few epochs.
+
+Where it does not, but earlier and later data still ask for different irons by more than the
+covariance allows (a drift, a change amid other trouble, two places), the answer is in between, and
+known no better than that.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +30,7 @@ _HARD = slice(6, 9)
 _CHI2, _CALMED = 100.0, 3.0  # of a second hard iron; times by which the disagreement must fall
 _SIDE = 2  # epochs before and behind: a single one may have been somewhere else
 _LEAST = 0.03  # of the field: a smaller change may be a place
+_CHANCE = 12.0  # chi squared of the best of all times, in units of the misfit, that chance makes
 _FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
 
 
@@ -53,8 +60,21 @@ def contradicts(
     return bool(explained > _EXPLAINED * q.cost)
 
 
-def divides(said: Said, graph: Graph, sigma_bias: float, sigma_b: float) -> int | None:
-    """Which of the epochs is the first of those that another hard iron explains; None if none is.
+@dataclass(frozen=True, slots=True)
+class Division:
+    """What two parts of the data say of each other.
+
+    first: which of the epochs is the first of those that another hard iron explains; None if none
+        is
+    parted: by how much the variance of the answer is larger for what they differ, at least 1
+    """
+
+    first: int | None
+    parted: float
+
+
+def divided(said: Said, graph: Graph, sigma_bias: float, sigma_b: float) -> Division | None:
+    """Whether a second hard iron is asked for from some epoch on; None for too few epochs.
 
     said: what they say (`instrument.py`) at a settled calibration: linear around it.
     sigma_bias (rad/s) and sigma_b (gauss): what is believed of gyro bias and of a change
@@ -74,7 +94,9 @@ def divides(said: Said, graph: Graph, sigma_bias: float, sigma_b: float) -> int 
     two = max(1.0, disagreement(Hs, gs, own))
     size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
     told = chi2[first - 1] > _CHI2 * two and one > _CALMED * two
-    return first if told and np.linalg.norm(change) > _LEAST * size else None
+    told = told and bool(np.linalg.norm(change) > _LEAST * size)
+    parted = max(1.0, float(np.max(chi2)) / (graph.temper * _CHANCE))
+    return Division(first if told else None, parted)
 
 
 def _seconds(H: Array, g: Array, Hs: Array, gs: Array, prior: Array) -> tuple[Array, Array]:

@@ -71,7 +71,8 @@ class Linearised:
         """
         size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
         guesses = [noise.first_guess(data, self.parameters) for data in new]
-        moving = [turned(data) for data in new]
+        bias = self.graph.nodes[self.graph.last].bias
+        moving = [turned(data, bias) for data in new]
         for data, moves in zip(new, moving, strict=True):
             if moves:
                 self.graph.moments.take(data.field_b_gauss)

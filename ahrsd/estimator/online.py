@@ -76,6 +76,8 @@ class Estimator:
         self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
+        self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
+        self._parted = 1.0  # variance over the expected of what earlier and later data ask for
         self._said = Informations()
         self._lag_spread: Array = np.zeros(12)  # what a lag that is one sigma off does
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
@@ -112,9 +114,12 @@ class Estimator:
                 self._search(self._window, exactly=True)
             else:
                 self._window.track(everything=True, exactly=True)
+            settled = self._window.step_sigmas < _SETTLED
             self._window = self._undivided(self._window)
             if self._examine(self._window) and self._searching:
                 self._search(self._window, exactly=True)
+            if not settled:  # nobody could be asked before
+                self._window = self._undivided(self._window)
         return self._answer()
 
     def _append(self, data: chain.Data) -> None:
@@ -152,13 +157,18 @@ class Estimator:
         """The window, or a new one where two epochs one after the other contradict a sure answer.
 
         Then the iron has changed: everything before them is forgotten. One that does waits for the
-        next to do so too.
+        next to do so too, and until motion agrees again the answer is in doubt.
         """
         sure = not self._searching and window.step_sigmas < _SETTLED
         if sure:
             window.join()
         for k in range(-new, 0):
-            self._strange = self._strange + 1 if sure and window.contradicted(k) else 0
+            strange = sure and window.contradicted(k)
+            self._strange = self._strange + 1 if strange else 0
+            if not sure or (window.epochs[k].turned and not strange):
+                self._doubted_s = None
+            elif strange and self._doubted_s is None:
+                self._doubted_s = float(window.epochs[k].data.time_s[0])
             if self._strange == _CHANGED:
                 window = self._window = self._anew(window, _CHANGED - 1 - k)
                 break
@@ -167,9 +177,9 @@ class Estimator:
     def _anew(self, window: Window, count: int) -> Window:
         """The iron changed before the last `count` epochs: what was before is forgotten."""
         self.restarted_s = float(window.epochs[-count].data.time_s[0])
-        self._searching, self._agreed, self._strange = True, False, 0
+        self._searching, self._agreed, self._strange, self._doubted_s = True, False, 0, None
         self._moving_epochs = sum(epoch.turned for epoch in window.epochs[-count:])
-        self._next_search = _FIRST_SEARCH
+        self._next_search, self._parted = _FIRST_SEARCH, 1.0
         return window.anew(count)
 
     def _undivided(self, window: Window) -> Window:
@@ -179,15 +189,16 @@ class Estimator:
         p = self.parameters
         try:
             said = self._said.of(window.epochs, window.graph)
-            first = change.divides(
+            found = change.divided(
                 said, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
             )
         except np.linalg.LinAlgError:
             return window
-        if first is None:
+        self._parted = 1.0 if found is None else found.parted
+        if found is None or found.first is None:
             return window
         turned = [k for k, epoch in enumerate(window.epochs) if epoch.turned]
-        window = self._anew(window, len(window.epochs) - turned[first])
+        window = self._anew(window, len(window.epochs) - turned[found.first])
         window.track(everything=True)
         self._search(window, exactly=True)
         return window
@@ -311,7 +322,7 @@ class Estimator:
         observed = summary.observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        covariance = covariance * (1.0 + doubt**2)
+        covariance = covariance * (1.0 + doubt**2) * self._parted
         covariance = covariance + np.outer(self._lag_spread, self._lag_spread)
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)
@@ -339,8 +350,10 @@ class Estimator:
                 and window.step_sigmas < _SETTLED
                 and heading < _HOPELESS_DEG
                 and self._misscaled == 0.0
+                and self._doubted_s is None
             ),
             warnings=() if self.restarted_s is None else (change.spoken(self.restarted_s),),
             mag_lag_s=window.lag_s,
             gyro_misscaled=self._misscaled,
+            contradicted_s=self._doubted_s,
         )
