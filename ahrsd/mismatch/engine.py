@@ -192,6 +192,7 @@ def _told(
         for k, one in enumerate(quickly, start=fast.known)
     )
     seen = (*state.named, *fast.state.named[fast.known :])
+    found = tuple(replace(one, confidence=one.confidence * (1 - limits.doubt)) for one in found)
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),

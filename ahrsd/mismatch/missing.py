@@ -68,7 +68,6 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
     dt = np.nan_to_num(done.track.dt_s, nan=0.0)[:, None]
     v = np.cross(done.predicted_b, rate_b_rad_s * dt) @ done.model.soft_iron
     size = np.linalg.norm(v, axis=1)
-    sigma = float(np.sqrt(np.median(done.gains.innovation_covariance[:, 0, 0]) / samples))
     ahead = np.zeros_like(v)
     behind = np.zeros_like(v)
     stop = len(v) - samples
@@ -79,6 +78,7 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
         ahead[:stop] += done.innovation[k : stop + k] / samples
         behind[samples:] += done.innovation[samples - 1 - k : len(v) - 1 - k] / samples
     jump = ahead - behind
+    sigma = _scatter(done, jump[complete], samples)
     steps = np.sum(jump * v, axis=1) / np.maximum(size**2, 1e-300)
     rest = np.linalg.norm(jump - steps[:, None] * v, axis=1)
     fresh = np.sum(behind * v, axis=1) < 0.5 * size**2
@@ -97,6 +97,18 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
         _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
         len(_peaks(across, far, samples)),
     )
+
+
+def _scatter(done: Filtered, jump: Array, samples: int) -> float:
+    """Deviation of a mean of so many samples: the filter's, or what the jumps show if it is more.
+
+    Slow noise jumps by more than white noise does.  The smallest quarter of the jumps is noise.
+    """
+    white = float(np.sqrt(np.median(done.gains.innovation_covariance[:, 0, 0]) / samples))
+    if not len(jump):
+        return white
+    lowest = float(np.quantile(np.abs(jump), 0.25)) / 0.3186  # of a normal deviate
+    return max(white, lowest / float(np.sqrt(2.0)))
 
 
 def _fact(track: Track, found: _Jumps) -> Fact:
