@@ -192,7 +192,7 @@ def _told(
         for k, one in enumerate(quickly, start=fast.known)
     )
     seen = (*state.named, *fast.state.named[fast.known :])
-    found = tuple(replace(one, confidence=one.confidence * (1 - limits.doubt)) for one in found)
+    found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),
@@ -212,6 +212,12 @@ def _told(
         drawn=_drawn(done, basis),
         omnibus=_whiteness(done),
     )
+
+
+def _doubted(one: Finding, sure: float) -> Finding:
+    """The finding with all its confidences that much less."""
+    others = tuple(replace(share, confidence=share.confidence * sure) for share in one.alternatives)
+    return replace(one, confidence=one.confidence * sure, alternatives=others)
 
 
 def _left(done: _Searched, problem: Problem, basis: Base) -> Unexplained:
