@@ -50,6 +50,7 @@ from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
+from ahrsd.mismatch.rivals import of_the_rate
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     State,
@@ -150,7 +151,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     if unknown.detected(left, problem.limits) or not bursts(basis_of(state)):
         left = with_one_source(left)
     if unknown.detected(left, problem.limits):
-        left = with_free_course(state, left)
+        left = with_free_course(state, of_the_rate(left))
     return _Searched(start, settled(state), surveys, first, last, left)
 
 

@@ -19,6 +19,7 @@ of what it explained, the name only stood in for it.  A course in time has its o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -34,6 +35,7 @@ from ahrsd.mismatch.discrepancy import (
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.search import State, term_group, without_term
+from ahrsd.mismatch.unknown import Remainder
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -66,6 +68,17 @@ def of_another_form(state: State, basis: Base, courses: Sequence[str]) -> list[i
         ):
             out.append(k)
     return out
+
+
+def of_the_rate(left: Remainder) -> Remainder:
+    """The remainder, told of the gyro where an error that depends on the rates explains it best."""
+    basis = left.basis
+    columns = basis.whitened([by_rate(basis.context)])[0] * UNIT_RAD_S
+    G, s = projected(basis, columns)
+    nats, _ = fitted(G, s, np.zeros(len(s), dtype=np.intp), max(1.0, basis.colour), np.zeros(1))
+    if left.stood_in is None and nats > left.strongest.evidence + MORE_NATS:
+        return replace(left, stood_in="gyro")
+    return left
 
 
 def compared(left: Base, mine: Array, other: Array, noise: float) -> tuple[float, float, float]:

@@ -55,7 +55,10 @@ def without_stand_ins(
         if shaped and not doubtful:
             doubtful = shaped if _stand_in(state, frame, shaped, left) else []
         state, surveys, left = _dropped(state, surveys, doubtful, left)
-    state, surveys, left = _dropped(state, surveys, _bumps(state, left), left)
+    bumps, one_course = _bumps(state, left)
+    state, surveys, left = _dropped(state, surveys, bumps, left)
+    if one_course:
+        left = replace(left, stood_in="world")
     if state.named and not beside:
         wrong = _of_another_form(state)
         if wrong:
@@ -76,23 +79,23 @@ def _of_another_form(state: State) -> list[int]:
     return sorted({*back, *of_another_form(state, basis, courses)})
 
 
-def _bumps(state: State, left: unknown.Remainder) -> list[int]:
+def _bumps(state: State, left: unknown.Remainder) -> tuple[list[int], bool]:
     """Bumps of the outside field that are part of a longer course: of the rest, or of one another.
 
-    One that repeats at its place is told by that.
+    The second says that it is the latter.  One that repeats at its place is told by that.
     """
     bumps = [k for k, name in enumerate(state.names) if name == BUMP]
     if not bumps:
-        return []
+        return [], False
     basis = basis_of(state)
     once = [
         k for k in bumps if len(where(state.named[k], added_value(state, k), basis).intervals_s) < 2
     ]
     rest = unknown.detected(left, state.problem.limits) and left.strongest.frame != "gyro"
     if rest or bursts(basis) is not None:
-        return once
+        return once, False
     loose = [k for k in once if "place_m" not in state.named[k].candidate.setting]
-    return loose if len(loose) > 1 else []
+    return (loose, True) if len(loose) > 1 else ([], False)
 
 
 def _frame_of(state: State, number: int) -> Frame:
