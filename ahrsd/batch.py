@@ -22,7 +22,8 @@ from ahrsd.errors import AhrsdError
 from ahrsd.estimator.misalignment import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
 from ahrsd.mismatch.correction import without
-from ahrsd.mismatch.hygiene import as_recorded
+from ahrsd.mismatch.facts import matters
+from ahrsd.mismatch.hygiene import hygiene
 from ahrsd.mismatch.model_file import RepairedModel
 from ahrsd.mismatch.roles import prepared
 from ahrsd.replay import Replayed, replay
@@ -34,7 +35,7 @@ from ahrsd.summary import said_of
 class BatchResult:
     """What `ahrsd calibrate` says.
 
-    wrong: units, axes and signs that cannot be as recorded, in words
+    wrong: units, axes, signs and times that cannot be as recorded, in words
     """
 
     name: str
@@ -127,10 +128,12 @@ def calibrate(
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
     turned = calibrator.estimator.misalignment()
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
-    wrong = tuple(fact.words for fact in as_recorded(track_of(blocks))) if blocks else ()
+    facts = hygiene(track_of(blocks)) if blocks else ()
+    wrong = tuple(fact.words for fact in facts if fact.stops)
     warnings = (
         *done.warnings,
         *(f"{name} is in the model and cannot be taken out" for name in left),
+        *(fact.words for fact in facts if not fact.stops and matters(fact)),
         *([] if calibrator.step is None else [calibrator.step.words]),
     )
     return BatchResult(path.name, done.core, estimate, tuple(seen), warnings, turned, wrong)

@@ -240,3 +240,12 @@ def test_a_gyro_that_is_not_what_it_says_is_named(tmp_path, gyro, words):
     assert any(
         words in said and "put this right" in said for said in result.json("magyc")["warnings"]
     )
+
+
+def test_a_field_that_stands_still_while_the_sensor_turns_is_named(tmp_path):
+    rows = tumbling(4)
+    assert not any("repeats one reading" in said for said in tried(tmp_path, rows).said())
+    rows[500:900, 1:4] = rows[500, 1:4]
+    said = [text for text in tried(tmp_path, rows).said() if "repeats one reading" in text]
+    assert len(said) == 1
+    assert said[0].startswith("the magnetometer repeats one reading while the sensor turns, ")
