@@ -72,20 +72,24 @@ def _directed(basis: Base, frame: Frame, cut: Segments) -> _Directed:
     scores = whitened_scores(gram.total[where, where], gram.total[where, -1])
     scores = scores @ _even(basis)
     nats, p_value, share = sphericity(scores)
-    if _along(basis, frame, scores) > ALONG:
+    if along_field(_field_in(basis, frame), scores) > ALONG:
         share = 0.0
     one = locate(gram, frame, cut, basis.colour)
     return _Directed(replace(one, evidence=nats, p_value=p_value), share)
 
 
-def _along(basis: Base, frame: Frame, scores: Array) -> float:
-    """How much the strongest direction of scores (J, 3) is the field's."""
+def _field_in(basis: Base, frame: Frame) -> Array:
     context = basis.context
-    field = context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True)
-    if frame == "world":
-        field = np.einsum("nij,nj->ni", context.R_nb, field)
+    if frame == "sensor":
+        return context.field_b
+    return np.asarray(np.einsum("nij,nj->ni", context.R_nb, context.field_b))
+
+
+def along_field(field: Array, scores: Array) -> float:
+    """Mean square of the cosine between a field (N, 3) and the strongest direction of (J, 3)."""
+    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
     strongest = np.linalg.eigh(scores.T @ scores)[1][:, -1]
-    return float(np.mean((field @ strongest) ** 2))
+    return float(np.mean((unit @ strongest) ** 2))
 
 
 def whitened_scores(information: Array, score: Array) -> Array:

@@ -24,7 +24,7 @@ from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.gains import Gains
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, sensitivities
-from ahrsd.mismatch.noise import tails_of
+from ahrsd.mismatch.noise import colour_of, tails_of
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, Term
@@ -35,6 +35,7 @@ _OUTSIDE = 0.01
 _SEGMENT_S = 20.0
 _LAGS = 50
 _LEAST = 1e-12
+_BEYOND = 2.0  # times what noise has in means over segments
 
 
 def checks(
@@ -66,8 +67,13 @@ def noise_law(fit: NullFit, loud: Sequence[tuple[float, float]] = ()) -> forward
     """The noise of a fit as it is: levels, colour, and Student's tails where they are heavy.
 
     loud: spans in seconds that have a level of their own, each relative to the filter's.
+    What stays for 20 s in the sensor's axes or the world's, more than the colour of the rest makes
+    of it, is no noise and left out.
     """
-    done = fit.filtered
+    done, quick = fit.filtered, replace(fit.filtered, whitened=_quick(fit))
+    slow = done.normalised_innovation - quick.normalised_innovation
+    if slow > _BEYOND * _slow_power(quick, segments_of(done.track)):
+        done = quick
     within = np.zeros(len(done.track), dtype=bool)
     for begin, end in loud:
         within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
@@ -79,6 +85,27 @@ def noise_law(fit: NullFit, loud: Sequence[tuple[float, float]] = ()) -> forward
                 level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
     even = replace(done, whitened=done.whitened / level[:, None])
     return replace(law, freedom=tails_of(even).freedom, level=level)
+
+
+def _quick(fit: NullFit) -> Array:
+    """Whitened innovations (N, 3) less their means over segments, in both frames."""
+    context, used = fit.context(), fit.filtered.used
+    segment = segments_of(context.track)
+    count = np.maximum(np.bincount(segment, weights=used), 1.0)[:, None]
+
+    def centred(values: Array) -> Array:
+        means = np.column_stack([np.bincount(segment, weights=column) for column in values.T])
+        return np.where(used[:, None], values - (means / count)[segment], 0.0)
+
+    in_world = np.einsum("nij,nj->ni", context.R_nb, centred(fit.filtered.whitened))
+    return np.asarray(np.einsum("nji,nj->ni", context.R_nb, centred(in_world)))
+
+
+def _slow_power(quick: Filtered, segment: NDArray[np.intp]) -> float:
+    """Mean square that the means over segments take of noise of this colour, in both frames."""
+    colour = colour_of(quick)
+    density = colour.variance / max(1.0 - float(colour.coefficients.sum()), _LEAST) ** 2
+    return 2.0 * density * len(np.unique(segment)) / max(int(np.count_nonzero(quick.used)), 1)
 
 
 def _compared(
@@ -157,7 +184,7 @@ def scene_of(context: Context) -> Scene:
     return Scene(
         unit_b=context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True),
         R_nb=context.R_nb,
-        segment=((track.time_s - track.time_s[0]) // _SEGMENT_S).astype(np.intp),
+        segment=segments_of(track),
         time=_courses([track.time_s]),
         heading=_courses([f(n * heading) for n in (1, 2) for f in (np.cos, np.sin)]),
         columns=_courses(
@@ -169,6 +196,11 @@ def scene_of(context: Context) -> Scene:
             ]
         ).reshape(len(track), -1),
     )
+
+
+def segments_of(track: Track) -> NDArray[np.intp]:
+    """(N,) number of the 20 s piece that a row is in."""
+    return np.asarray((track.time_s - track.time_s[0]) // _SEGMENT_S, dtype=np.intp)
 
 
 def statistics(e: Array, scene: Scene) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.mismatch.one_source import sphericity, whitened_scores
+from ahrsd.mismatch.one_source import ALONG, along_field, sphericity, whitened_scores
 
 
 def test_noise_has_no_direction_however_coloured() -> None:
@@ -37,3 +37,14 @@ def test_scores_are_made_white_by_their_own_information() -> None:
     parts = [whitened_scores(information, score[k : k + 40].ravel()) for k in range(0, count, 40)]
     white = np.concatenate(parts)
     assert np.abs(white.T @ white / count - np.eye(3)).max() < 0.08
+
+
+def test_slow_noise_along_a_steady_field_is_told_from_a_source() -> None:
+    rng = np.random.default_rng(6)
+    field = np.array([0.2, 0.0, 0.4]) + 0.02 * rng.standard_normal((500, 3))
+    noise = rng.standard_normal((80, 3)) + np.outer(3 * rng.standard_normal(80), [0.45, 0.0, 0.89])
+    source = rng.standard_normal((80, 3)) + np.outer(3 * rng.standard_normal(80), [0.0, 1.0, 0.0])
+    assert along_field(field, noise) > 0.9
+    assert along_field(field, source) < 0.1
+    turning = rng.standard_normal((500, 3))
+    assert along_field(turning, noise) < 0.4 < ALONG

@@ -78,6 +78,52 @@ def test_what_was_left_out_is_outside_and_the_repaired_model_is_not(name, seen_i
     assert outside == []
 
 
+def test_what_only_one_of_two_names_explains_stays_outside():
+    both, truth, model = recorded("hard_iron_step", strength=0.3, seed=7)
+    wrong, setting = EFFECTS["motor_current_field"].example(
+        forward.truth_along(both.context()), 1.0
+    )
+    terms = (Term("motor_current_field", wrong, 0.1 * np.abs(wrong), setting),)
+    fit = repaired(both, terms, model)
+    named = (replace(terms[0], value=fit.terms[0].value),)
+    found = predictive.checks(both, fit, named)
+    assert truth[0].identifier == "hard_iron_step"
+    assert not found["shift_sensor"].inside_after
+
+
+@pytest.mark.parametrize(
+    ("colour", "freedom", "read"), [((0.8,), np.inf, 1), ((), 3.5, 1), ((), np.inf, 3)]
+)
+def test_noise_of_any_colour_and_tail_is_inside_and_so_is_a_reading_now_and_then(
+    colour, freedom, read
+):
+    context, _ = moving(11, rows=3000)
+    model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
+    noise = replace(forward.noise_of(model), colour=colour, freedom=freedom)
+    track = forward.track_of(forward.simulated(forward.truth_along(context), (), noise, 3))
+    mag = track.mag_b_gauss.copy()
+    mag[np.arange(len(track)) % read != 0] = np.nan
+    null = fit_null(replace(track, mag_b_gauss=mag), start=model, walk=False)
+    found = predictive.checks(null, null, ())
+    assert [name for name, check in found.items() if not check.inside_after] == []
+
+
+def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
+    context, _ = moving(11, rows=3000)
+    model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
+    time_s = context.track.time_s
+    level = np.where((time_s > 30) & (time_s < 60), 3.0, 1.0)
+    noise = replace(forward.noise_of(model), level=level)
+    track = forward.track_of(forward.simulated(forward.truth_along(context), (), noise, 3))
+    fit = fit_null(track, start=model, walk=False)
+    law = predictive.noise_law(fit, [(30.0, 60.0)])
+    loud = law.level[(time_s > 31) & (time_s < 59)]
+    assert loud.min() / law.level[time_s < 29].max() == pytest.approx(3.0, rel=0.1)
+    assert law.freedom > 30  # one level taken for all, the tails would be heavy
+    known = predictive.checks(fit, fit, (), loud=[(30.0, 60.0)])
+    assert [name for name, check in known.items() if not check.inside_after] == []
+
+
 def test_the_same_question_has_the_same_answer():
     null, _, _ = recorded(rows=600)
     assert predictive.checks(null, null, ()) == predictive.checks(null, null, ())
