@@ -15,6 +15,8 @@ from ahrsd.samples import Array
 FOLDS = 5
 _LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading
 _LEAST = 10
+_BLOCK_S, _LEAST_BLOCKS = 20.0, 5  # errors further apart are taken to be independent
+_DRAWS = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +73,26 @@ def compare(
         reference_deg=np.mod(np.degrees(reference.heading_rad[seen]), 360.0),
         error_deg=error_deg,
     )
+
+
+def rms_difference(one: HeadingFigures, other: HeadingFigures) -> tuple[float, float] | None:
+    """95 % interval of the RMS of one less that of the other, deg; at the same instants.
+
+    Their squares in stretches of 20 s are drawn again and again, both in the same ones: what the
+    recording's places and turns do to both is no difference. None where the instants are others
+    or cover too little.
+    """
+    if not np.array_equal(one.time_s, other.time_s):
+        return None
+    _, block = np.unique(np.floor(one.time_s / _BLOCK_S), return_inverse=True)
+    blocks = int(block.max()) + 1
+    if blocks < _LEAST_BLOCKS:
+        return None
+    count, *sums = (np.bincount(block, v) for v in (None, one.error_deg**2, other.error_deg**2))
+    drawn = np.random.default_rng(0).multinomial(blocks, np.full(blocks, 1 / blocks), _DRAWS)
+    first, second = (np.sqrt((drawn @ total) / (drawn @ count)) for total in sums)
+    low, high = np.quantile(first - second, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def _mean_at(

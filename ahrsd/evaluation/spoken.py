@@ -7,7 +7,7 @@ from typing import Literal
 
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.field import FieldFigures
-from ahrsd.evaluation.heading import HeadingFigures
+from ahrsd.evaluation.heading import HeadingFigures, rms_difference
 from ahrsd.evaluation.judging import Evaluation, HeadingJudged, Reckoned
 
 SCHEMA = "ahrsd.evaluation/1"
@@ -154,13 +154,15 @@ def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) ->
         lines.append(f"dead reckoning by {first.reckoned.velocity}, XY error RMS over distance")
     lines += [
         f"{'method':20}{'heading [deg]':>14}{'worst [deg]':>13}{'XY error [%]':>14}"
-        f"{'spread [%]':>12}",
+        f"{'spread [%]':>12}  heading RMS less that of {first.calibration.method}, 95 %",
         _row("(before)", *_figures(first, "before")),
     ]
     by_heading = sorted(found, key=lambda one: _figures(one, "after")[0])
     for one in by_heading if first.headings else found:
         row = _row(one.calibration.method, *_figures(one, "after"))
-        lines.append(row + ("" if one.calibration.converged else "  not converged"))
+        apart = _apart(one, first)
+        between = "" if apart is None else f"  {apart[0]:+.2f} to {apart[1]:+.2f}"
+        lines.append(row + between + ("" if one.calibration.converged else "  not converged"))
     lines += [f"{name:20}no answer: {why}" for name, why in without.items()]
     common = set.intersection(*(set(one.warnings) for one in found))
     return lines + [f"  warning: {text}" for text in first.warnings if text in common]
@@ -172,8 +174,18 @@ def comparison_json(found: Sequence[Evaluation], without: Mapping[str, str]) -> 
         "schema": SCHEMA_OF_MANY,
         "recording": found[0].recording,
         "evaluations": [evaluation_json(one) for one in found],
+        "heading_rms_difference_deg": {
+            one.calibration.method: _apart(one, found[0]) for one in found[1:]
+        },
         "without": dict(without),
     }
+
+
+def _apart(one: Evaluation, first: Evaluation) -> tuple[float, float] | None:
+    """95 % interval of how much larger its heading RMS is than that of the first, deg."""
+    if one is first or not first.headings:
+        return None
+    return rms_difference(one.headings[0].figures.after, first.headings[0].figures.after)
 
 
 def _figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:

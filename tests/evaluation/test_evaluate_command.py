@@ -218,6 +218,9 @@ def test_every_calibration_of_a_file_in_one_table(files, run, capsys, tmp_path):
     assert printed == pytest.approx(rms, abs=0.006)
     assert rms[0] < 1.0 < rms[1]
     assert set(body["without"]) == {"tls"}
+    low, high = body["heading_rms_difference_deg"]["ellipsoid"]
+    assert low < rms[1] - rms[0] < high
+    assert f"{low:+.2f} to {high:+.2f}" in lines[first + 2]
 
 
 def test_a_file_of_one_calibration_has_no_table(files, run, capsys):

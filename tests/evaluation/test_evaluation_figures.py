@@ -11,7 +11,7 @@ from vehicle import DECLINATION_DEG, FIELD_N, HARD_IRON, SOFT_IRON
 
 from ahrsd.evaluation import EvaluationError, judge
 from ahrsd.evaluation.field import field_figures
-from ahrsd.evaluation.heading import compare
+from ahrsd.evaluation.heading import HeadingFigures, compare, rms_difference
 from ahrsd.evaluation.references import (
     column,
     course,
@@ -304,3 +304,28 @@ def test_json_and_table_hold_the_same_figures(vehicle, perfect):
         body["heading"][0]["before"]["rms_deg"], abs=0.01
     )
     assert any("dead reckoning by Doppler velocity" in line for line in lines)
+
+
+def _figures(error_deg, *, later_s=0.0):
+    time_s = np.arange(len(error_deg)) + later_s
+    nothing = np.zeros(len(error_deg))
+    return HeadingFigures(0.0, 0.0, 0.0, (), 0.0, time_s, nothing, np.asarray(error_deg))
+
+
+def test_a_difference_of_two_headings_has_an_interval():
+    """Errors that stay for 20 s: the same ones, as large ones, and twice as large ones."""
+    rng = np.random.default_rng(3)
+    shared = np.repeat(rng.standard_normal(40), 20)
+    one = _figures(shared)
+    assert rms_difference(one, one) == (0.0, 0.0)
+    low, high = rms_difference(one, _figures(2 * shared))
+    assert low < -np.sqrt(np.mean(shared**2)) < high < -0.7
+    low, high = rms_difference(one, _figures(np.repeat(rng.standard_normal(40), 20)))
+    assert -0.6 < low < 0.0 < high < 0.6
+    assert high - low > 0.3  # 40 errors of size 1, not 800
+
+
+def test_headings_at_other_instants_or_over_a_minute_are_not_compared():
+    one = _figures(np.ones(400))
+    assert rms_difference(one, _figures(np.ones(400), later_s=0.5)) is None
+    assert rms_difference(_figures(np.ones(70)), _figures(np.ones(70))) is None
