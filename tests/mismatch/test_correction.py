@@ -1,4 +1,4 @@
-"""What a repaired model names is taken out of a recording, and its calibration comes out straight."""
+"""What a repaired model names is taken out of a recording: its calibration comes out straight."""
 
 from __future__ import annotations
 
