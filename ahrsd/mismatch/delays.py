@@ -18,6 +18,7 @@ from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import posterior
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.regression import Base
+from ahrsd.samples import Array
 
 #: effects that are a delay of the magnetometer against the gyro, and their sign
 DELAYS: Mapping[str, float] = {
@@ -28,6 +29,8 @@ DELAYS: Mapping[str, float] = {
 }
 #: log prior against the plain lag: rarer, and told only where the data ask for it
 RARER = {"mag_low_pass": -1.0, "gyro_integration": -2.0}
+#: steps within this part of the middle one are alike, and so many must be
+ALIKE, ALIKE_SHARE = 0.25, 0.95
 
 
 def plain(lag_s: float) -> str:
@@ -40,21 +43,31 @@ def weighed(
     library: Mapping[str, Effect],
     lag_s: float,
     deviation_s: float,
-    recorded_step_s: float,
+    recorded_step_s: float | None,
 ) -> dict[str, float]:
-    """Probabilities of the delays; basis: of the model with the lag taken out and its term in."""
+    """Probabilities of the delays; basis: of the model with the lag taken out and its term in.
+
+    recorded_step_s: None where the steps are not alike: then there is no half of one
+    """
     name = plain(lag_s)
     scale = library[name].parameters[0].scale
     evidence = {name: 0.0}
     if lag_s > 0:
         evidence["mag_low_pass"] = _low_pass(basis, library["mag_low_pass"], lag_s)
-    miss = (lag_s - recorded_step_s / 2) / max(deviation_s, 1e-9)
-    if lag_s > 0:
+    if lag_s > 0 and recorded_step_s is not None:
+        miss = (lag_s - recorded_step_s / 2) / max(deviation_s, 1e-9)
         evidence["gyro_integration"] = float(
             0.5 * ((lag_s / scale) ** 2 - miss**2) + np.log(scale / max(deviation_s, 1e-9))
         )
     found = posterior(evidence, RARER)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def usual_step(dt_s: Array) -> float | None:
+    """The step that nearly all rows (N,) have, seconds; None where there is none."""
+    middle = float(np.nanmedian(dt_s))
+    alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < ALIKE
+    return middle if np.mean(alike) > ALIKE_SHARE else None
 
 
 def _low_pass(basis: Base, effect: Effect, lag_s: float) -> float:

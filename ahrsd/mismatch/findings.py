@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ahrsd.mismatch.confound import separating_manoeuvre
-from ahrsd.mismatch.delays import DELAYS, weighed
+from ahrsd.mismatch.delays import DELAYS, usual_step, weighed
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
 from ahrsd.mismatch.discrepancy import Discrepancy
 from ahrsd.mismatch.effects.base import Effect
@@ -181,7 +181,7 @@ def _delay_shares(
         return None
     term = state.fit.terms[number]
     change, deviation = (float(part[0]) for part in refined(basis, number, term.identifier, beside))
-    recorded = float(np.nanmedian(state.problem.recorded.dt_s))
+    recorded = usual_step(state.problem.recorded.dt_s)
     lag_s = DELAYS[term.identifier] * (state.lag_s(number) + change)
     return weighed(basis, state.problem.library, lag_s, deviation, recorded)
 

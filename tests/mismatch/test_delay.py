@@ -7,6 +7,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.mismatch.delay import delayed_gyro
+from ahrsd.mismatch.delays import usual_step
 from ahrsd.mismatch.track import Track
 
 
@@ -39,3 +40,12 @@ def test_no_delay_is_the_same_track():
     t = np.arange(10.0)
     track = Track(t, t, np.zeros((10, 3)), np.ones((10, 3)), None, {}, (slice(0, 10),))
     assert delayed_gyro(track, 0.0) is track
+
+
+def test_steps_that_are_not_alike_have_no_half():
+    """With one sample in seven missing half a step is no convention that a delay could be."""
+    t = 0.025 * np.arange(4000)
+    dt = np.diff(t, prepend=np.nan)
+    assert usual_step(dt) == pytest.approx(0.025)
+    kept = np.delete(t, np.arange(3, 4000, 7))
+    assert usual_step(np.diff(kept, prepend=np.nan)) is None
