@@ -13,6 +13,7 @@ import argparse
 import resource
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,8 +75,12 @@ def resident_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-def measure(samples: int) -> tuple[list[Point], Array]:
-    """Points at 10^4 and at every tenth of `samples`; error of the hard iron at the end, gauss."""
+def measure(
+    samples: int, seen: Callable[[Point], None] = lambda _: None
+) -> tuple[list[Point], Array]:
+    """Points at 10^4 and at every tenth of `samples`, given to `seen` as they come; error of the
+    hard iron at the end, gauss.
+    """
     rng = np.random.default_rng(0)
     estimator = Estimator()
     points: list[Point] = []
@@ -91,6 +96,7 @@ def measure(samples: int) -> tuple[list[Point], Array]:
         if start + BLOCK in tenths:
             cost = (spent - since) / (start + BLOCK - last) * 1e6
             points.append(Point(start + BLOCK, cost, resident_mb()))
+            seen(points[-1])
             last, since = start + BLOCK, spent
     estimate = estimator.estimate()
     assert estimate is not None
@@ -110,13 +116,16 @@ def _part(made: SampleBlock, k: int) -> SampleBlock:
     )
 
 
+def _say(point: Point) -> None:
+    sys.stdout.write(f"{point}\n")
+    sys.stdout.flush()
+
+
 def main() -> None:
     """Print the points, the ratio and the growth."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--samples", type=int, default=10_000_000)
-    points, error = measure(parser.parse_args().samples)
-    for point in points:
-        sys.stdout.write(f"{point}\n")
+    points, error = measure(parser.parse_args().samples, _say)
     sys.stdout.write(
         f"cost at the end over that of the first {FIRST:,d}: "
         f"{points[-1].cost_us / points[0].cost_us:.2f}; memory since {points[1].samples:,d}: "
