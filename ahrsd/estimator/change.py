@@ -20,11 +20,13 @@ import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.excitation import spread
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.instrument import Said, believed, disagreement
 from ahrsd.samples import Array
 
 _MOST_ROWS = 0.6
+_ATTITUDES = 0.1  # rad, spread of the field's direction over the rows that contradict
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
 _HARD = slice(6, 9)
 _CHI2, _CALMED = 100.0, 3.0  # of a second hard iron; times by which the disagreement must fall
@@ -44,6 +46,8 @@ def contradicts(
 ) -> bool:
     """Most of its rows are beyond what noise and the covariance (9, 9) of c allow, and b mends it.
 
+    They must be of more than one attitude: in one, another iron and another place are the same.
+
     Its directions must still be where the epoch was linearised, at c.
     """
     u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
@@ -53,6 +57,8 @@ def contradicts(
     error = np.sum(epoch.data.field_error(u, c) ** 2, axis=1)
     beyond = error > limit_sigma**2 * (usual.mag_gauss**2 / epoch.data.count + known)
     if not epoch.turned or float(np.mean(beyond)) <= _MOST_ROWS:
+        return False
+    if spread(u[beyond]) < _ATTITUDES:
         return False
     q = epoch.quadratic
     H, g = q.H[np.ix_(_FREE, _FREE)], q.g[_FREE]
