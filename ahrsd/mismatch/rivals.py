@@ -41,6 +41,8 @@ from ahrsd.samples import Array
 
 #: nats by which a free form must be more than the name: odds of 1000 to 1
 MORE_NATS = 7.0
+#: and by this part of the name's own evidence: no form of ours is exact to a thousandth of its size
+MORE_SHARE = 0.01
 #: part of a name's evidence that must be left beside a free form that is there too
 OWN_SHARE = 0.5
 PARTS = 6
@@ -96,7 +98,8 @@ def compared(left: Base, mine: Array, other: Array, noise: float) -> tuple[float
 def _rivals(left: Base, mine: Array, other: Array, noise: float, share: float) -> bool:
     """Whether a free form is more than the name, which keeps less than `share` beside it."""
     name, form, both = compared(left, mine, other, noise)
-    return max(form, both) > name + MORE_NATS and both - form < share * name
+    more = MORE_NATS + MORE_SHARE * max(name, 0.0)
+    return max(form, both) > name + more and both - form < share * name
 
 
 def _varied(columns: Array, value: Array) -> list[Array]:
