@@ -33,6 +33,7 @@ from ahrsd.mismatch.discrepancy import (
     projected,
 )
 from ahrsd.mismatch.findings import added_value
+from ahrsd.mismatch.locate import frame_columns
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.search import State, term_group, without_term
 from ahrsd.mismatch.unknown import Remainder
@@ -73,12 +74,18 @@ def of_another_form(state: State, basis: Base, courses: Sequence[str]) -> list[i
 
 
 def of_the_rate(left: Remainder) -> Remainder:
-    """The remainder, told of the gyro where an error that depends on the rates explains it best."""
-    basis = left.basis
-    columns = basis.whitened([by_rate(basis.context)])[0] * UNIT_RAD_S
-    G, s = projected(basis, columns)
-    nats, _ = fitted(G, s, np.zeros(len(s), dtype=np.intp), max(1.0, basis.colour), np.zeros(1))
-    if left.stood_in is None and nats > left.strongest.evidence + MORE_NATS:
+    """The remainder, told of the gyro where an error that depends on the rates explains it best.
+
+    Best: more than the strongest frame's free course, of which little is left beside it. What moves
+    a vehicle draws a current, so that a course may look as if it followed the rates.
+    """
+    basis, best = left.basis, left.strongest
+    if left.stood_in is not None or best.frame == "gyro":
+        return left
+    course = frame_columns(basis.context, best.frame, best.cut)
+    mine, rate = basis.whitened([course, by_rate(basis.context)])
+    noise = max(1.0, basis.colour)
+    if _rivals(basis, mine * UNIT_GAUSS, rate * UNIT_RAD_S, noise, OWN_SHARE):
         return replace(left, stood_in="gyro")
     return left
 
