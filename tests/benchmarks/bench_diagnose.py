@@ -70,6 +70,8 @@ def main() -> None:
     parser.add_argument("--only", default="")
     parser.add_argument("--strength", type=float, nargs=2, default=(0.3, 3.0))
     options = parser.parse_args()
+    if not any((options.nulls, options.singles, options.pairs, options.hidden)):
+        parser.error("ask for some: --nulls 10 --singles 14 --pairs 4 takes two minutes")
     rng = np.random.default_rng(options.seed)
     score: Counter[str] = Counter()
     seconds = []
