@@ -56,9 +56,15 @@ class Scripted(threading.Thread):
                     os.write(self.master, YMR + self.script.get(line, b"") + YMR)
 
     def close(self):
-        for descriptor in (self.slave, self.master):
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
+        """Once for each end: a number that is closed belongs to whoever opens something next."""
+        slave, self.slave = self.slave, -1
+        if slave >= 0:
+            os.close(slave)
+        if threading.current_thread() is not self:
+            self.join(5.0)  # no other end: its read ends, and eats nothing of the next test
+        master, self.master = self.master, -1
+        if master >= 0:
+            os.close(master)
 
 
 @pytest.fixture
