@@ -159,6 +159,12 @@ def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudF
         time.sleep(_SEARCH_AGAIN_S)
 
 
+def _interlock(config: Config) -> InterlockFile | None:
+    """The vehicle's word, where one is configured."""
+    path = config.interlock.file
+    return None if path is None else InterlockFile(path, config.interlock.max_age_s)
+
+
 def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool = False) -> int:
     """`ahrsd run`: until a signal; returns the exit code.
 
@@ -181,10 +187,6 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     capture = new_capture_path(config.captures) if config.capture.enabled else None
     take_heap(needed_bytes(config.estimator.parameters()))
     shell = open_shell(config, clock, capture)
-    interlock = None
-    if config.interlock.file is not None:
-        interlock = InterlockFile(config.interlock.file, config.interlock.max_age_s)
-    columns = None if config.terms.file is None else ColumnsFile(config.terms.file)
     box = _open_box(config)
     public = open_public(config, shell, notifier)
     daemon = Daemon(
@@ -192,12 +194,12 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
         shell,
         port,
         clock,
-        interlock,
+        _interlock(config),
         baud=found.baud,
         box=box,
         public=public,
         terms=terms,
-        columns=columns,
+        columns=None if config.terms.file is None else ColumnsFile(config.terms.file),
     )
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
     sys.setswitchinterval(SWITCH_S)

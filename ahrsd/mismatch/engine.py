@@ -174,10 +174,7 @@ def _told(
         finding(fast.state, fast.last.basis, k, seen, fast.last)
         for k, seen in enumerate(fast.surveys, start=fast.known)
     ]
-    filtered = fast.state.fit.filtered
-    noise = level_facts(filtered, spec_given=problem.spec.sigma_mag_gauss is not None)
-    if any(fact.effect == "mag_quantisation" for fact in facts):
-        noise = []  # coarse numbers scatter
+    noise = _noise_facts(problem, fast, facts)
     lesser = tuple(fact.words for fact in facts if not matters(fact))
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
@@ -186,7 +183,6 @@ def _told(
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
     left = _left(done, problem, basis)
-    something = left.detected
     terms = tuple(whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(named))
     quick_terms = tuple(
         whole_term(fast.state, fast.last.basis, k, one.effect)
@@ -194,25 +190,30 @@ def _told(
     )
     seen = (*state.named, *fast.state.named[fast.known :])
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
+    something = bool(found) or left.detected
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),
-        mismatch=bool(found) or something,
+        mismatch=something,
         p_value=_p_value(seen, found, done.left),
         findings=found,
         unexplained=left,
         posterior_predictive=_checked(done, fast, (*terms, *quick_terms), library, noise),
-        sensitivity=() if found or something else _limits(problem, basis, done.first, fast),
-        notes=(
-            *notes,
-            *lesser,
-            *(() if found or something else would_have_shown(problem.recorded)),
-        ),
+        sensitivity=() if something else _limits(problem, basis, done.first, fast),
+        notes=(*notes, *lesser, *(() if something else would_have_shown(problem.recorded))),
         model=model_at_rate(state.fit.model, problem),
         terms=(*terms, *quick_terms),
         drawn=_drawn(done, basis),
         omnibus=_whiteness(done),
     )
+
+
+def _noise_facts(problem: Problem, fast: Quick, facts: Sequence[Fact]) -> list[Fact]:
+    """What is to be said of the noise's level; coarse numbers scatter by themselves."""
+    if any(fact.effect == "mag_quantisation" for fact in facts):
+        return []
+    given = problem.spec.sigma_mag_gauss is not None
+    return level_facts(fast.state.fit.filtered, spec_given=given)
 
 
 def _doubted(one: Finding, sure: float) -> Finding:
