@@ -60,7 +60,7 @@ class Track:
 def track(segment: Segment, bias_b_rad_s: Array) -> Track:
     """Integrate a segment."""
     dt_s = np.diff(segment.time_s, prepend=segment.time_s[:1])
-    R = _products(so3.exp(segment.angle_b_rad - np.outer(dt_s, bias_b_rad_s)))
+    R = so3.products(so3.exp(segment.angle_b_rad - np.outer(dt_s, bias_b_rad_s)))
     middle = (R + np.concatenate([R[:1], R[:-1]])) / 2
     drift_s = np.cumsum(middle * dt_s[:, None, None], axis=0)
     force_0 = np.einsum("kij,kj->ki", R, segment.accel_b_m_s2)
@@ -78,21 +78,6 @@ def track(segment: Segment, bias_b_rad_s: Array) -> Track:
         force_0_m_s2=np.add.reduceat(force_0, starts) / counts[:, None],
         bias_b_rad_s=np.array(bias_b_rad_s, dtype=float),
     )
-
-
-def _products(R: Array) -> Array:
-    """Running products R_0 R_1 ... R_k, (n, 3, 3): within blocks side by side, then across."""
-    n = len(R)
-    size = int(np.ceil(np.sqrt(n)))
-    count = -(-n // size)
-    padded = np.broadcast_to(np.eye(3), (count * size, 3, 3)).copy()
-    padded[:n] = R
-    blocks = padded.reshape(count, size, 3, 3)
-    for k in range(1, size):
-        blocks[:, k] = blocks[:, k - 1] @ blocks[:, k]
-    for j in range(1, count):
-        blocks[j] = blocks[j - 1, -1] @ blocks[j]
-    return np.asarray(blocks.reshape(-1, 3, 3)[:n])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
