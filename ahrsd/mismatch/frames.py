@@ -9,6 +9,9 @@ linear in [P, (b x) P, c, b x c].  Integrated over windows it needs no derivativ
 reading, and the normal equations of all 24 unknowns, made once, hold those of each of the 48
 signed permutations P = s Pi: 10 unknowns [s, s b, c, b x c], for which the 24 are a linear map.
 Iron that deforms is left out here; it bends all 48 alike.
+
+A turn at a constant rate c is in every one of them, whatever the gyro says: a frame is told by what
+it explains beyond that.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ _ROWS, _WINDOWS = 4000, 80  # samples and windows, those that turn most
 class Frame:
     """One of the 48: gyro_true_i = signs_i * gyro_(axes_i) * scale.
 
-    cost: residual sum of squares over that of no motion at all, 0..1
+    cost: residual sum of squares over that of a turn at a constant rate, 0..1
     """
 
     axes: tuple[int, int, int]
@@ -92,30 +95,38 @@ def _blocks(track: Track, length: int) -> Iterator[slice]:
 
 def ranked(found: Windows) -> list[Frame]:
     """The best first; of each frame and its negative, the one whose scale is positive."""
+    constant = np.vstack([np.zeros((18, 6)), np.eye(6)])
+    usual = max(found.total - _solved(found, constant)[1], 1e-300)
     out = []
     for axes in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             P = np.zeros((3, 3))
             P[range(3), axes] = signs
-            scale, cost = _fitted(found, P)
+            scale, gained = _fitted(found, P)
             if scale > 0:
                 i, j, k = axes
                 a, b, c = signs
-                out.append(Frame((i, j, k), (a, b, c), scale, cost))
+                out.append(Frame((i, j, k), (a, b, c), scale, (found.total - gained) / usual))
     return sorted(out, key=lambda frame: frame.cost)
 
 
 def _fitted(found: Windows, P: Array) -> tuple[float, float]:
-    """Scale and cost of P = s Pi, the hard iron and the bias free."""
+    """Scale of P = s Pi and what it explains, the hard iron and the bias free."""
     T = np.zeros((24, 10))
     T[:9, 0] = P.ravel()
     for axis in range(3):
         T[9:18, 1 + axis] = -(skew(np.eye(3)[axis]) @ P).ravel()
     T[18:, 4:] = np.eye(6)
+    solved, gained = _solved(found, T)
+    return float(solved[0]), gained
+
+
+def _solved(found: Windows, T: Array) -> tuple[Array, float]:
+    """Unknowns (k,) of which the 24 are a linear map (24, k), and what they explain."""
     gram, right = T.T @ found.gram @ T, T.T @ found.right
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    normal = gram / scale[:, None] / scale + 1e-9 * np.eye(10)
+    normal = gram / scale[:, None] / scale + 1e-9 * np.eye(T.shape[1])
     solved = np.linalg.solve(normal, right / scale)
     # twice the linear part less the quadratic one: right also where the ridge acts
     gained = 2 * solved @ (right / scale) - solved @ (gram / scale[:, None] / scale) @ solved
-    return float(solved[0] / scale[0]), float(1.0 - gained / max(found.total, 1e-300))
+    return np.asarray(solved / scale), float(gained)

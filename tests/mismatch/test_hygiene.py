@@ -74,6 +74,22 @@ def test_a_wrong_frame_is_named_and_undone(track: Track, axes: list[int], signs:
     assert np.array_equal(put_right(wrong, (fact,)).gyro_b_rad_s, track.gyro_b_rad_s)
 
 
+def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
+    """Soft iron bends its circle to an ellipse, and any frame explains that a little."""
+    rng = np.random.default_rng(8)
+    time_s = np.arange(8000) / 40.0
+    angle = 0.4 * time_s
+    h = 0.45 * np.column_stack([0.5 * np.cos(angle), -0.5 * np.sin(angle), 0.8 + 0 * angle])
+    iron = np.array([[1.06, 0.04, 0.0], [0.04, 0.95, -0.03], [0.0, -0.03, 0.99]])
+    mag = h @ iron + np.array([0.1, -0.05, 0.12]) + 6e-4 * rng.standard_normal(h.shape)
+    gyro = np.array([0.003, -0.002, 0.404]) + 3e-4 * rng.standard_normal(h.shape)
+    dt_s = np.full(len(h), 1 / 40.0)
+    dt_s[0] = np.nan
+    spin = Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, len(h)),))
+    assert [fact.words for fact in hygiene(spin)] == []
+    assert any("would not have been seen" in line for line in would_have_shown(spin))
+
+
 def test_left_handed_axes_are_called_so(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * np.array([1.0, 1.0, -1.0]))
     assert "left-handed" in _only(hygiene(wrong)).words
