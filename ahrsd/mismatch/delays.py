@@ -3,7 +3,7 @@
 All four act as one number, tau, and only the motion's finer structure tells some of them apart.
 With the delay taken out of the track exactly, each is weighed against the plain lag:
 
-    low-pass     what A (LP_tau[h](t) - h(t - tau)) explains beyond the lag, at its full size tau
+    low-pass     what A (LP_tau[h](t) - h(t - tau)) explains beyond the lag, at its full size
     half sample  tau = dt / 2 exactly: a point against the lag's decade of possible sizes
     sign         a late magnetometer and a late gyro have opposite signs; neither is early
 """
@@ -14,10 +14,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ahrsd.mismatch.effects.base import Effect
+from ahrsd.mismatch.effects import series
+from ahrsd.mismatch.effects.base import Effect, readings_of
 from ahrsd.mismatch.evidence import posterior
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
 #: effects that are a delay of the magnetometer against the gyro, and their sign
@@ -53,7 +55,7 @@ def weighed(
     scale = library[name].parameters[0].scale
     evidence = {name: 0.0}
     if lag_s > 0:
-        evidence["mag_low_pass"] = _low_pass(basis, library["mag_low_pass"], lag_s)
+        evidence["mag_low_pass"] = _low_pass(basis, lag_s)[0]
     if lag_s > 0 and recorded_step_s is not None:
         miss = (lag_s - recorded_step_s / 2) / max(deviation_s, 1e-9)
         evidence["gyro_integration"] = float(
@@ -70,12 +72,36 @@ def usual_step(dt_s: Array) -> float | None:
     return middle if np.mean(alike) > ALIKE_SHARE else None
 
 
-def _low_pass(basis: Base, effect: Effect, lag_s: float) -> float:
-    """Log likelihood ratio of a low-pass of that delay against the plain lag."""
-    columns = effect.columns(basis.context, {"time_constant_s": lag_s})
-    X = basis.whitened([columns])[0].reshape(-1)
+def time_constant_less_lag(basis: Base, name: str, lag_s: float) -> float:
+    """By how much the time constant of a low-pass differs from the lag that fits best, seconds.
+
+    name: group of the delay's term.  In quick turns a filter trails by less than its time constant.
+    """
+    return -float(_low_pass(basis, lag_s)[1][basis.groups[name]][0])
+
+
+def _low_pass(basis: Base, lag_s: float) -> tuple[float, Array]:
+    """Log likelihood ratio of a low-pass of that delay against the plain lag.
+
+    And what it moves the known coefficients (q,) by.
+    """
+    X = basis.whitened([beyond_the_lag(basis.context, lag_s)])[0].reshape(-1)
     Z = basis.known.reshape(-1, basis.known.shape[2])
     M = solve(Z.T @ Z, (Z.T @ X)[:, None])[:, 0]
     rest = X - Z @ M
     s, G = float(rest @ basis.innovation.ravel()), float(rest @ X)
-    return (s * lag_s - 0.5 * G * lag_s**2) / basis.colour
+    return (s - 0.5 * G) / basis.colour, M
+
+
+def beyond_the_lag(context: Context, lag_s: float) -> Columns:
+    """What a low-pass of time constant tau does beyond a delay by tau, gauss (N, 3, 1).
+
+    g(t) = h(t - tau) is the field of a track whose delay is taken out, D its derivative by time:
+    LP_tau[h] - g = tau^2/2 D^2 g - tau^3/3 D^3 g + ..., half of what a filter of g has at D^2.
+    """
+    readings = readings_of(context)
+    time_s, dt_s = readings.time_s, readings.dt_s
+    second = series.derivative(series.field_dot(readings), time_s, dt_s)
+    third = series.derivative(second, time_s, dt_s)
+    change = lag_s**2 / 2 * second - lag_s**3 / 3 * third
+    return Columns(mag=(change @ readings.soft_iron.T)[:, :, None])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ahrsd.mismatch.confound import separating_manoeuvre
-from ahrsd.mismatch.delays import DELAYS, usual_step, weighed
+from ahrsd.mismatch.delays import DELAYS, time_constant_less_lag, usual_step, weighed
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
 from ahrsd.mismatch.discrepancy import Discrepancy
 from ahrsd.mismatch.effects.base import Effect
@@ -126,6 +126,7 @@ def whole_term(
         half_s = float(np.nanmedian(state.problem.recorded.dt_s)) / 2
         return Term(name, value / half_s, deviation / half_s, {})
     if name == "mag_low_pass":
+        value = value + time_constant_less_lag(basis, term_group(number), float(value[0]))
         setting = {"time_constant_s": float(value[0])}
     return Term(name, value, deviation, setting)
 

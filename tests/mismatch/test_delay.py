@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from effect_motion import moving
 
 from ahrsd import so3
 from ahrsd.mismatch.delay import delayed_gyro
-from ahrsd.mismatch.delays import usual_step
+from ahrsd.mismatch.delays import beyond_the_lag, usual_step
 from ahrsd.mismatch.track import Track
 
 
@@ -49,3 +52,26 @@ def test_steps_that_are_not_alike_have_no_half():
     assert usual_step(dt) == pytest.approx(0.025)
     kept = np.delete(t, np.arange(3, 4000, 7))
     assert usual_step(np.diff(kept, prepend=np.nan)) is None
+
+
+def test_a_low_pass_does_half_beyond_a_delay_of_what_it_does_to_the_delayed_field():
+    """LP(h) - h(t - tau) of a field that turns steadily: i w tau becomes 1 / (1 + i w tau)."""
+    tau, rate = 0.05, 1.5
+    t = 0.02 * np.arange(2000)
+    dt = np.diff(t, prepend=np.nan)
+    late = np.exp(1j * rate * (t - tau))
+    context, _ = moving(1, rows=len(t))
+    turning = np.tile([0.0, 0.0, -rate], (len(t), 1))
+    context = replace(
+        context,
+        track=replace(context.track, time_s=t, dt_s=dt),
+        field_b=np.column_stack([late.real, late.imag, np.zeros(len(t))]),
+        rate_b_rad_s=turning,
+        model=replace(context.model, soft_iron=np.eye(3)),
+    )
+    expected = np.exp(1j * rate * t) / (1 + 1j * rate * tau) - late
+    found = beyond_the_lag(context, tau).mag
+    assert found is not None
+    inner = slice(5, -5)
+    error = np.abs(found[inner, 0, 0] + 1j * found[inner, 1, 0] - expected[inner])
+    assert error.max() < 0.05 * np.abs(expected).max()

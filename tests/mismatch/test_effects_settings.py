@@ -43,6 +43,26 @@ def test_uneven_steps_give_the_same_filter():
     assert out == pytest.approx(passed - 0.8 * (1 - np.exp(-passed / 0.8)), abs=1e-12)
 
 
+@pytest.mark.parametrize("tau_s", [0.013, 0.1])
+def test_a_low_pass_quicker_than_the_samples_is_exact_on_a_curve(tau_s):
+    """Straight lines between the samples would put half a step's bend into it."""
+    time_s = 0.04 * np.arange(1000)
+    dt_s = np.diff(time_s, prepend=np.nan)
+    wave = np.sin(3.0 * time_s)[:, None]
+    expected = np.imag(np.exp(3j * time_s) / (1 + 3j * tau_s))
+    out = series.low_pass_of_curves(wave, time_s, dt_s, tau_s)[:, 0]
+    straight = series.low_pass(wave, dt_s, tau_s)[:, 0]
+    inner = slice(50, -1)
+    assert np.abs(out - expected)[inner].max() < 2e-5
+    assert np.abs(straight - expected)[inner].max() > 1e-3
+    jittered = np.sort(time_s + np.random.default_rng(0).uniform(-0.01, 0.01, 1000))
+    uneven = np.sin(3.0 * jittered)[:, None]
+    steps = np.diff(jittered, prepend=np.nan)
+    out = series.low_pass_of_curves(uneven, jittered, steps, tau_s)[:, 0]
+    expected = np.imag(np.exp(3j * jittered) / (1 + 3j * tau_s))
+    assert np.abs(out - expected)[inner].max() < 1e-3
+
+
 def test_a_delay_of_whole_steps_is_an_earlier_row():
     _, readings = moving(1, rows=200)
     back = series.delayed_field(readings, np.full(200, 0.15))

@@ -111,7 +111,8 @@ class MagLowPass(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """What the filter takes away, per second of its time constant."""
         tau0 = setting["time_constant_s"]
-        change = series.low_pass(readings.field_b, readings.dt_s, tau0) - readings.field_b
+        field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
+        change = series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
         return Columns(mag=np.asarray(change @ readings.soft_iron.T / tau0)[:, :, None])
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
