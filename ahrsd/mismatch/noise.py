@@ -124,7 +124,9 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
         stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
         spans, loud, quiet = _loud_spans(done, loud, quiet)
         filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
-        short = last < len(middle) and last - first <= _BURST_SHARE * len(middle)
+        # what lasts from the beginning or to the end changed once
+        amid = first > 0 and last < len(middle)
+        short = amid and last - first <= _BURST_SHARE * len(middle)
         if short or (len(spans) > 1 and filled < _FILLED):
             return [_burst(done, spans or [stretch], loud, quiet)]
         return [_level(done, stretch, loud, quiet)]
@@ -210,7 +212,9 @@ def _level(done: Filtered, stretch: tuple[float, float], loud: float, quiet: flo
     words = f"from {begin:.0f} to {end:.0f} s the noise is {ratio:.2g} times its usual level"
     where = Where(((begin, end),), ("x", "y", "z"), "noise")
     parameters = (Value("mag", sigma, sigma * 0.1, "gauss"),)
-    return Fact("noise_level", words, where, 0.95, parameters, {"onset_s": begin})
+    falls = begin < done.track.time_s[0] + _BLOCK_S / 2 and end < done.track.time_s[-1]
+    setting = {"onset_s": end if falls else begin}
+    return Fact("noise_level", words, where, 0.95, parameters, setting)
 
 
 def _centred(done: Filtered) -> Array:

@@ -103,6 +103,16 @@ def test_a_higher_level(onset: int) -> None:
     assert abs(fact.parameters[0].value / 1.5e-3 - 1) < 0.2
 
 
+def test_a_level_that_falls_is_no_burst_that_begins_with_the_recording() -> None:
+    extra = np.zeros((4000, 3))
+    extra[:1300] = 1.2e-3 * np.random.default_rng(8).standard_normal((1300, 3))
+    (fact,) = level_facts(_filtered(3, extra))
+    assert fact.effect == "noise_level"
+    assert abs(fact.setting["onset_s"] - 52) < 3
+    assert abs(fact.where.intervals_s[0][1] - 52) < 3
+    assert abs(fact.parameters[0].value / 1.2e-3 - 1) < 0.2
+
+
 def test_a_field_that_stands_still_bit_by_bit_has_no_noise_to_judge() -> None:
     done = _filtered(0)
     flat = replace(done.track, mag_b_gauss=np.tile(done.track.mag_b_gauss[:1], (4000, 1)))
