@@ -293,13 +293,15 @@ class PtyEmulator:
         line = self._line
         if line is None or not self._present:
             return
+        waiting = self._backlog
         if messages:
             host_baud = line.host_baud()
-            for baud, message in messages:
-                self._backlog += self._garbled(message, baud, host_baud)
-        if self._backlog:
-            del self._backlog[: line.write(bytes(self._backlog))]
-        excess = len(self._backlog) - OVERRUN_BYTES
+            heard = (self._garbled(message, baud, host_baud) for baud, message in messages)
+            waiting = bytearray().join([waiting, *heard])
+        if waiting:
+            del waiting[: line.write(bytes(waiting))]
+        excess = len(waiting) - OVERRUN_BYTES
         if excess > 0 and not self._lossless:
-            del self._backlog[OVERRUN_BYTES:]
+            del waiting[OVERRUN_BYTES:]
             self.overrun_bytes += excess
+        self._backlog = waiting  # no reader sees it longer than it may be
