@@ -18,6 +18,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 PROJECT = Path(__file__).parent.parent
 RECORDINGS = PROJECT.parent / "shared" / "recordings"
 
+#: what a test module has, or a test asks for, that opens ports, sockets and processes
+REAL = {"subprocess", "socket", "pty", "serial", "threading", "EmulatorProcess", "PtyEmulator"}
+REAL_FIXTURES = {"live", "emulated", "small_disk"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A second try, printed as RERUN, where a test runs on real ports, sockets and processes.
+
+    Their names and numbers belong to the machine: another worker may get the one that was let go.
+    What is computed has no second try.
+    """
+    for item in items:
+        module = vars(item.module) if isinstance(item, pytest.Function) else {}
+        if REAL & module.keys() or REAL_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.flaky(reruns=1))
+
 
 @pytest.fixture(scope="session")
 def recordings() -> Path:
