@@ -46,6 +46,20 @@ def test_help_lists_every_command_and_imports_nothing_heavy():
         assert f"\n  {name} " in done.stdout
 
 
+@pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
+def test_matrices_take_one_thread_unless_told_otherwise(given, used):
+    code = (
+        "import ahrsd.__main__, os, sys\n"
+        "assert 'numpy' not in sys.modules\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'])\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"} | given
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"{used}\n"
+
+
 def test_version(run, capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"ahrsd, version {__version__}\n"
