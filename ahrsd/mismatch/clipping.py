@@ -13,7 +13,7 @@ from ahrsd.samples import Array
 
 _AXES = ("x", "y", "z")
 _FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
-_PILED = 6.0  # times as many at the limit as in the same width just inside it
+_PILED = 6.0  # times as many at the limit as at each number just inside it
 _MARGIN, _NEAR = 3.0, 0.02  # noise levels, and share of the limit, at which it begins to act
 _TOP_STEPS = 1.5  # of coarse numbers, as many at the top as one step below are no limit
 _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
@@ -27,8 +27,10 @@ def clipping(track: Track) -> list[Fact]:
         ("mag_saturation", track.mag_b_gauss, mag_noise, "gauss", "sensor"),
         ("gyro_saturation", track.gyro_b_rad_s, gyro_noise, "rad/s", "gyro"),
     ):
+        fresh = np.r_[True, np.any(np.diff(values, axis=0) != 0, axis=1)]
         found = [
-            _flat_tops(column, max(noise, _TOP_STEPS * step_of(column))) for column in values.T
+            _flat_tops(column, fresh, max(noise, _TOP_STEPS * step_of(column)))
+            for column in values.T
         ]
         if not any(rows.any() for rows, _ in found):
             continue
@@ -64,24 +66,28 @@ def clipping(track: Track) -> list[Fact]:
     return out
 
 
-def _flat_tops(values: Array, noise: float) -> tuple[NDArray[np.bool], float]:
+def _flat_tops(
+    values: Array, fresh: NDArray[np.bool], noise: float
+) -> tuple[NDArray[np.bool], float]:
     """Rows at a limit of one axis, and that limit's size.
 
     At a limit readings are equal bit by bit, several in a row, and pile up: just inside it,
-    within the noise and the steps of the numbers, there are far fewer.
+    within the noise and the steps of the numbers, each number has far fewer, however long the
+    sensor points there.  Where no axis changes (not `fresh`) it is the sensor that repeats itself.
     """
     rows = np.zeros(len(values), dtype=bool)
     size = 0.0
     finite = values[np.isfinite(values)]
     for sign in (1.0, -1.0):
         top = float(np.max(sign * finite)) if len(finite) else 0.0
-        at = sign * values == top
+        at = (sign * values == top) & fresh
         if top <= 0 or np.count_nonzero(at) < max(_FEWEST, _SHARE * len(values)):
             continue
         longest = max(b - a for a, b in spans_of(at))
         width = noise or 1e-12
-        inside = int(np.count_nonzero((sign * finite < top) & (sign * finite > top - width)))
-        if longest >= 3 and np.count_nonzero(at) > _PILED * max(inside, 1):
+        inside = finite[(sign * finite < top) & (sign * finite > top - width)]
+        usual = len(inside) / max(len(np.unique(inside)), 1)
+        if longest >= 3 and np.count_nonzero(at) > _PILED * max(usual, 1.0):
             # of a sensor that lies still at its largest reading everything piles up
             if float(finite.max() - finite.min()) < 20 * width:
                 continue

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, recorded, track_of, true_model
 
+from ahrsd.mismatch.clipping import clipping
 from ahrsd.mismatch.facts import Fact, spans_of
 from ahrsd.mismatch.frames import ranked, windows
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
@@ -162,6 +163,25 @@ def test_doubled_samples(track: Track) -> None:
     assert fact.effect == "dropped_samples"
     assert fact.setting == {"doubled": True}
     assert abs(_value(fact) - 100 / 6000) < 2e-3
+
+
+def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
+    """A slow and small motion leaves many readings just below the limit, each of another number."""
+    rng = np.random.default_rng(5)
+    mag = 0.3 + 0.02 * np.sin(0.02 * track.time_s)[:, None] * np.array([1.0, 0.6, -0.4])
+    mag += 5e-4 * rng.standard_normal(mag.shape)
+    slow = replace(track, mag_b_gauss=mag, gyro_b_rad_s=1e-4 * rng.standard_normal(mag.shape))
+    assert clipping(slow) == []
+    ends = mag.copy()
+    ends[:, 0] = np.minimum(mag[:, 0], np.quantile(mag[:, 0], 0.97))
+    (fact,) = clipping(replace(slow, mag_b_gauss=ends))
+    assert fact.effect == "mag_saturation"
+    assert _value(fact) == ends[:, 0].max()
+    assert fact.where.axes == ("x",)
+    stuck = mag.copy()
+    at = int(np.argmax(mag[:, 0]))
+    stuck[at : at + 40] = mag[at]
+    assert clipping(replace(slow, mag_b_gauss=stuck)) == []
 
 
 def test_saturation_of_both_sensors(track: Track) -> None:
