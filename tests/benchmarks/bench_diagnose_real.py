@@ -1,6 +1,6 @@
 """What `diagnose` says of the real recordings, and of one with its cause taken away.
 
-    python tests/benchmarks/bench_diagnose_real.py [--only WORD ...]
+    python tests/benchmarks/bench_diagnose_real.py [--only WORD ...] [--out FILE.md]
 
 Per recording: findings with confidence, values and times, what no name explains, seconds of CPU.
 What is known of them independently: the current of MAG2 (-2.95, -5.18, 3.20) mG/A, none on MAG; the
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +51,12 @@ def correlation(track: Track, current_a: np.ndarray, course: Located) -> float:
 def told(finding: Finding) -> str:
     values = " ".join(f"{p.value:.4g}" for p in finding.parameters)
     spans = " ".join(f"{a:.1f}-{b:.1f}" for a, b in finding.where.intervals_s[:2])
-    return f"{finding.effect} {finding.confidence:.2f} [{values}] at {spans}"
+    held = finding.heldout
+    against = ""
+    if held is not None:
+        gain, placebo = held.nll_gain_per_sample, held.placebo_gain
+        against = f", held out {gain:+.4f}, moved in time {placebo:+.4f}"
+    return f"{finding.effect} {finding.confidence:.2f} [{values}] at {spans}{against}"
 
 
 def left(found: Diagnosis) -> str:
@@ -66,39 +72,50 @@ def left(found: Diagnosis) -> str:
     )
 
 
-def show(title: str, track: Track) -> Diagnosis | None:
+def answered(title: str, track: Track) -> tuple[Diagnosis | None, list[str]]:
+    """The diagnosis and its lines, the first with the name and the CPU seconds; printed too."""
     begin = time.process_time()
     try:
         found = diagnose(track)
+        said = [*map(told, found.findings), left(found)]
     except ValueError as why:
-        print(f"{title}: {why}", flush=True)
-        return None
-    print(f"{title} ({time.process_time() - begin:.1f} s)")
-    for finding in found.findings:
-        print(f"    {told(finding)}")
-    print(f"    {left(found)}", flush=True)
-    return found
+        found, said = None, [str(why)]
+    lines = [f"{title} ({time.process_time() - begin:.1f} s)", *said]
+    print("\n    ".join(lines), flush=True)
+    return found, lines
+
+
+def recording(name: str, path: Path) -> Iterator[list[str]]:
+    """Lines of a recording, and again without the columns in which its cause would show."""
+    track, _ = load_track(path)
+    yield answered(name, track)[1]
+    hidden = WITHHELD.get(name, ())
+    if not hidden:
+        return
+    kept = {k: v for k, v in track.covariates.items() if k not in hidden}
+    found, lines = answered(f"{name} without {' '.join(hidden)}", replace(track, covariates=kept))
+    if found is not None and found.drawn is not None and "motor_current_a" in hidden:
+        for course in found.drawn.courses:
+            both = correlation(track, track.covariates["motor_current_a"], course)
+            lines.append(f"course in {course.frame}: correlation with the current {both:.3f}")
+            print(f"    {lines[-1]}", flush=True)
+    yield lines
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="*", default=[""], help="parts of names")
-    wanted = parser.parse_args().only
+    parser.add_argument("--out", type=Path, help="the same as a table of Markdown")
+    given = parser.parse_args()
+    rows = ["| recording (CPU) | said |", "|---|---|"]
     for path in sorted(p for f in FOLDERS for p in (RECORDINGS / f).glob("*.csv.gz")):
         name = f"{path.parent.name}/{path.name.removesuffix('.csv.gz')}"
-        if ".gps" in name or "vnraw" in name or not any(word in name for word in wanted):
+        if ".gps" in name or "vnraw" in name or not any(word in name for word in given.only):
             continue
-        track, _ = load_track(path)
-        show(name, track)
-        hidden = WITHHELD.get(name, ())
-        if not hidden:
-            continue
-        kept = {k: v for k, v in track.covariates.items() if k not in hidden}
-        found = show(f"{name} without {' '.join(hidden)}", replace(track, covariates=kept))
-        if found is not None and found.drawn is not None and "motor_current_a" in hidden:
-            for course in found.drawn.courses:
-                both = correlation(track, track.covariates["motor_current_a"], course)
-                print(f"    course in {course.frame}: correlation with the current {both:.3f}")
+        for title, *said in recording(name, path):
+            rows.append(f"| {title} | {'<br>'.join(said)} |")
+    if given.out:
+        given.out.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
