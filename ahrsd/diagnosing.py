@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.mismatch.aligned import align, differing
@@ -23,7 +22,6 @@ from ahrsd.mismatch.model_file import RepairedModel, from_text
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.recording.opening import Kind, open_recording
 from ahrsd.recording.table import read_table
-from ahrsd.replay import replay
 from ahrsd.samples import Array, SampleBlock
 
 SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
@@ -57,6 +55,10 @@ def load_track(
 def _streamed(
     path: Path, rate_hz: float | None, progress: Callable[[int], None] | None
 ) -> tuple[list[SampleBlock], list[str]]:
+    # the daemon's whole pipeline, which a table does not need
+    from ahrsd.config import Config
+    from ahrsd.replay import replay
+
     seen: list[Event] = []
     done = replay(path, Config(), rate_hz=rate_hz, listeners=[seen.append], progress=progress)
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]

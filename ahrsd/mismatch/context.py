@@ -18,10 +18,10 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from scipy import ndimage, signal
-from scipy.spatial.transform import Rotation
 
+from ahrsd import so3
 from ahrsd.mismatch.innovation import Filtered
+from ahrsd.mismatch.recursive import both_ways, gaussian
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context
 from ahrsd.samples import Array
@@ -83,8 +83,8 @@ def _low_passed(values: Array, width: float) -> Array:
     if len(values) < 3:
         return values.copy()
     centre = values.mean(axis=0)
-    once = ndimage.gaussian_filter1d(values - centre, width, axis=0, mode="reflect")
-    twice = ndimage.gaussian_filter1d(once, width, axis=0, mode="reflect")
+    once = gaussian(values - centre, width)
+    twice = gaussian(once, width)
     return np.asarray(2 * once - twice + centre)
 
 
@@ -108,7 +108,7 @@ def _density(values: Array, segment: int) -> Array:
     cut = np.lib.stride_tricks.sliding_window_view(values, segment, axis=0)[
         :: segment - segment // 2
     ]
-    window = signal.windows.hann(segment, sym=False)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(segment) / segment)
     centred = cut - cut.mean(axis=2, keepdims=True)
     power = np.mean(np.abs(np.fft.rfft(centred * window, axis=2)) ** 2, axis=0)
     power[:, 1 : (segment + 1) // 2] *= 2.0
@@ -140,7 +140,7 @@ def _reference(track: Track, accel: Array | None) -> Array | None:
     q = np.column_stack([track.covariates[name] for name in _REFERENCE])
     if not np.isfinite(q).all() or np.any(np.linalg.norm(q, axis=1) < 0.5):
         return None
-    R_wb = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    R_wb = _rotations(q)
     if accel is None:
         return None
     up = np.einsum("nij,nj->ni", R_wb, accel).mean(axis=0)
@@ -149,16 +149,20 @@ def _reference(track: Track, accel: Array | None) -> Array | None:
     return R_wb if up[2] < -0.8 * np.linalg.norm(up) else None
 
 
+def _rotations(q: Array) -> Array:
+    """(N, 3, 3) of quaternions (N, 4), scalar first, of any length."""
+    w, v = q[:, :1, None], q[:, 1:]
+    K = so3.skew(v)
+    return np.asarray(np.eye(3) + 2.0 * (w * K + K @ K) / np.sum(q**2, axis=1)[:, None, None])
+
+
 def _carried(U: Array, vectors: Array, runs: Sequence[slice], width: float) -> Array:
     """Vectors in the carried frame, smoothed by exp(-|k| / width) within each run."""
     moved = np.einsum("nij,nj->ni", U, vectors)
     keep = np.exp(-1.0 / width)
     out = np.empty_like(moved)
     for run in runs:
-        rows = moved[run]
-        ahead = signal.lfilter([1.0], [1.0, -keep], rows, axis=0)
-        back = signal.lfilter([1.0], [1.0, -keep], rows[::-1], axis=0)[::-1]
-        out[run] = ahead + back - rows
+        out[run] = both_ways(moved[run], keep)
     return np.asarray(out)
 
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize
+from scipy import linalg
 
 from ahrsd.mismatch import locate
 from ahrsd.mismatch.evidence import SIZES, colour
@@ -247,7 +247,9 @@ def fitted(
     bounds = [(SMALLEST, LARGEST)] * count
     if named is not None:
         bounds[named] = (float(np.log(SIZES[0])), float(np.log(SIZES[-1])))
-    result = optimize.minimize(
+    from scipy.optimize import minimize  # dear to import, and needed beside a name only
+
+    result = minimize(
         loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS}
     )
     return float(-result.fun), np.asarray(result.x, float)

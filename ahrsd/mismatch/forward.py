@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.mismatch.context import build_context
@@ -23,6 +22,7 @@ from ahrsd.mismatch.effects.base import Effect, Readings, contribution, readings
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.noise import colour_of
+from ahrsd.mismatch.recursive import autoregression, both_ways
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, NullModel, Term
 from ahrsd.samples import Array
@@ -180,9 +180,7 @@ def _both_ways(values: Array, width_s: float, time_s: Array) -> Array:
         return values
     keep = np.exp(-float(np.median(np.diff(time_s))) / width_s)
     stacked = np.column_stack([values, np.ones(len(values))])
-    ahead = lfilter([1.0], [1.0, -keep], stacked, axis=0)
-    back = lfilter([1.0], [1.0, -keep], stacked[::-1], axis=0)[::-1]
-    total = np.asarray(ahead + back - stacked)
+    total = both_ways(stacked, keep)
     return np.asarray(total[:, :3] / total[:, 3:])
 
 
@@ -221,9 +219,8 @@ def _coloured(white: Array, colour: tuple[float, ...]) -> Array:
     """White noise (N, 3) of variance 1 with a colour, its variance 1 again."""
     if not colour:
         return white
-    taps = [1.0, *(-c for c in colour)]
-    response = np.asarray(lfilter([1.0], taps, np.eye(1, _RESPONSE)[0]))
+    taps = np.array(colour)[:, None]
+    response = autoregression(np.eye(_RESPONSE, 1), taps)
     # a stretch before the first row, so that the noise is settled there
     ahead = np.vstack([white[:_RESPONSE][::-1], white])
-    coloured = np.asarray(lfilter([1.0], taps, ahead, axis=0))[-len(white) :]
-    return coloured / float(np.sqrt(response @ response))
+    return autoregression(ahead, taps)[-len(white) :] / float(np.linalg.norm(response))

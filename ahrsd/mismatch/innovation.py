@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.mismatch.blocks import Layout, Recursion, layout_of, products_before
 from ahrsd.mismatch.gains import Gains, Linear, gains
+from ahrsd.mismatch.recursive import both_ways
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Columns, NullModel
 from ahrsd.samples import Array
@@ -199,14 +199,10 @@ def _nominal(
     size = float(np.median(np.linalg.norm(field[seen], axis=1))) if np.any(seen) else 1.0
     step = model.sigma_gyro_rad_s * float(np.median(dt_s)) * size / model.sigma_mag_gauss
     forget = np.clip(step * (np.sqrt(step**2 + 4) - step) / 2, 1e-4, 0.9)
-    stacked = np.column_stack([carried, seen.astype(float)])
     out = np.empty_like(carried)
     firsts = layout.starts[layout.opens]
     for first, last in zip(firsts, [*firsts[1:], len(field)], strict=True):
-        rows = stacked[first:last]
-        both = [lfilter([1.0], [1.0, forget - 1.0], side, axis=0) for side in (rows, rows[::-1])]
-        total = both[0] + both[1][::-1] - rows
-        out[first:last] = total[:, :3]
+        out[first:last] = both_ways(carried[first:last], 1.0 - forget)
     out *= size / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
     return np.asarray(np.einsum("nji,nj->ni", orientation, out))
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.stats import t as student
 
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact, spans_of
 from ahrsd.mismatch.innovation import Filtered
+from ahrsd.mismatch.probabilities import student_log_density
 from ahrsd.samples import Array
 
 _MOST = 12  # order of the autoregression
@@ -90,7 +90,7 @@ def tails_of(done: Filtered) -> Tails:
 def _freedom(z: Array) -> float:
     """Most likely freedom of the Student-t of values of variance 1; kurtosis says little of it."""
     tried = np.exp(np.linspace(np.log(2.2), np.log(60.0), 34))
-    nats = [float(np.sum(student.logpdf(z, v, scale=np.sqrt((v - 2) / v)))) for v in tried]
+    nats = [float(np.sum(student_log_density(z, v))) for v in tried]
     return float(tried[int(np.argmax(nats))])
 
 

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from ahrsd.mismatch.innovation import Filtered
+from ahrsd.mismatch.probabilities import chi2_above, chi2_below, kolmogorov_above
 from ahrsd.mismatch.values import Context
 from ahrsd.samples import Array
 
@@ -49,7 +49,7 @@ def omnibus(done: Filtered, context: Context | None = None) -> tuple[Test, ...]:
 def _level(rows: Array) -> Test:
     """Normalised innovation squared; 1 by construction where the noise was estimated."""
     total, freedom = float(np.sum(rows**2)), rows.size
-    tail = min(stats.chi2.sf(total, freedom), stats.chi2.cdf(total, freedom))
+    tail = min(chi2_above(total, freedom), chi2_below(total, freedom))
     return Test("normalised_innovation", total / freedom, 1.0, float(min(1.0, 2 * tail)), "level")
 
 
@@ -63,7 +63,7 @@ def _ljung_box(done: Filtered) -> Test:
         rho = np.sum(rows[lag:] * rows[:-lag], axis=0) / power
         q += float(np.sum(rho**2)) * count * (count + 2) / (count - lag)
     freedom = 3 * LAGS
-    return Test("ljung_box", q, freedom, float(stats.chi2.sf(q, freedom)), "whiteness over time")
+    return Test("ljung_box", q, freedom, chi2_above(q, freedom), "whiteness over time")
 
 
 def _periodogram(done: Filtered) -> Test:
@@ -74,7 +74,7 @@ def _periodogram(done: Filtered) -> Test:
     count = len(share)
     straight = np.arange(1, count + 1)[:, None] / count
     distance = float(np.max(np.abs(share - straight))) * np.sqrt(count)
-    p_value = float(min(1.0, 3 * stats.kstwobign.sf(distance)))
+    p_value = min(1.0, 3 * kolmogorov_above(distance))
     return Test("cumulative_periodogram", distance, 0.87, p_value, "whiteness over frequency")
 
 
@@ -84,7 +84,7 @@ def _normal(rows: Array) -> Test:
     skewness = np.mean(z**3, axis=0)
     kurtosis = np.mean(z**4, axis=0) - 3
     value = float(len(rows) * np.sum(skewness**2 / 6 + kurtosis**2 / 24))
-    return Test("normality", value, 6.0, float(stats.chi2.sf(value, 6)), "tails and skewness")
+    return Test("normality", value, 6.0, chi2_above(value, 6), "tails and skewness")
 
 
 def drivers(context: Context) -> dict[str, Array]:
@@ -120,6 +120,6 @@ def variance_test(done: Filtered, columns: Mapping[str, Array]) -> Test:
     left = y - X @ solution
     value = float(len(y) * (1.0 - (left @ left) / (y @ y)))
     alone = np.abs(X.T @ y)
-    p_value = float(stats.chi2.sf(value, int(rank)))
+    p_value = chi2_above(value, int(rank))
     most = names[int(np.argmax(alone))]
     return Test("variance", value, float(rank), p_value, f"scatter, most with {most}")

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from ahrsd.mismatch.locate import (
     FRAMES,
@@ -28,6 +27,7 @@ from ahrsd.mismatch.locate import (
     locate,
     segments,
 )
+from ahrsd.mismatch.probabilities import chi2_above
 from ahrsd.mismatch.regression import Base, group_gram
 from ahrsd.mismatch.unknown import FINE, Remainder
 from ahrsd.samples import Array
@@ -110,7 +110,7 @@ def sphericity(scores: Array) -> tuple[float, float, float]:
     cost = 0.5 * 5 * np.log(len(scores))  # Schwarz's price of the five further numbers
     return (
         statistic / 2 - float(cost),
-        float(stats.chi2.sf(statistic, 5)),
+        chi2_above(statistic, 5),
         float(power[2] / power.sum()),
     )
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from ahrsd.mismatch import forward
 from ahrsd.mismatch.diagnosis import Check
@@ -26,6 +25,7 @@ from ahrsd.mismatch.gains import Gains
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, sensitivities
 from ahrsd.mismatch.noise import colour_of, tails_of
 from ahrsd.mismatch.null import NullFit
+from ahrsd.mismatch.probabilities import student_quantile
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, Term
 from ahrsd.samples import Array
@@ -278,7 +278,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
 def _bands(found: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
     """Where one more simulation would be, for every statistic."""
     count, names = len(found), list(found[0])
-    reach = float(student.ppf(1 - _OUTSIDE / 2 / len(names), count - 1)) * np.sqrt(1 + 1 / count)
+    reach = student_quantile(1 - _OUTSIDE / 2 / len(names), count - 1) * np.sqrt(1 + 1 / count)
     out = {}
     for name in names:
         logs = np.log(np.maximum([one[name] for one in found], _LEAST))

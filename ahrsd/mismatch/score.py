@@ -17,9 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from ahrsd.mismatch.gram import RANK_SHARE, Gram
+from ahrsd.mismatch.probabilities import chi2_above, f_above
 from ahrsd.samples import Array
 
 #: 1 - leverage of a block is not taken smaller: a block that alone carries an effect proves little.
@@ -106,7 +106,7 @@ def score(gram: Gram, name: str, scale: Array, minimum_information: float = 1.0)
 
 def chi2_p(what: Score, colour: float = 1.0) -> float:
     """Probability of a larger score statistic under noise whose power is `colour` times white."""
-    return float(stats.chi2.sf(what.statistic / colour, what.rank)) if what.rank else 1.0
+    return chi2_above(what.statistic / colour, what.rank) if what.rank else 1.0
 
 
 def robust_p(what: Score, colour: float = 1.0) -> float:
@@ -128,10 +128,10 @@ def robust_p(what: Score, colour: float = 1.0) -> float:
         power = np.maximum(what.block_power, 1.0)
         usual = max(1.0, float(np.mean(power)))
         V = np.einsum("b,bij->ij", power, H) * max(1.0, colour / usual)
-        return float(stats.chi2.sf(whole @ np.linalg.pinv(V, hermitian=True) @ whole, r))
+        return chi2_above(float(whole @ np.linalg.pinv(V, hermitian=True) @ whole), r)
     u = _jackknifed(H, s)
     T = float(whole @ np.linalg.pinv(u.T @ u, hermitian=True) @ whole)
-    return float(stats.f.sf(T * (blocks - r) / (r * blocks), r, blocks - r))
+    return f_above(T * (blocks - r) / (r * blocks), r, blocks - r)
 
 
 def _jackknifed(H: Array, s: Array) -> Array:

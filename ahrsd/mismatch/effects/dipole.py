@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ahrsd.samples import Array
 
@@ -72,6 +71,8 @@ def found_place(
 
 def _lowest(cost: Callable[[Array], float], start: Array, evaluations: int) -> tuple[float, Array]:
     """The simplex's lowest cost and where it is."""
+    from scipy.optimize import minimize  # dear to import, and seldom needed
+
     done = minimize(
         cost,
         start,

@@ -9,13 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.mismatch.effects.base import Readings
+from ahrsd.mismatch.recursive import first_order
 from ahrsd.samples import Array
-
-_STEADY = 1.02  # steps that differ by less count as one length in the filters
 
 
 def runs(dt_s: Array) -> list[slice]:
@@ -98,15 +96,8 @@ def _low_pass(x: Array, step_s: Array, time_constant_s: float) -> Array:
     keep = np.exp(-step_s / time_constant_s)
     ratio = time_constant_s / step_s * (1 - keep)
     new, old = 1 - ratio, ratio - keep
-    if step_s.max() < _STEADY * step_s.min():
-        a, b0, b1 = (float(np.mean(c)) for c in (keep, new, old))
-        start = (b1 + a) * x[:1]  # state of the filter that has seen x[0] for ever
-        tail, _ = lfilter([b0, b1], [1.0, -a], x[1:], axis=0, zi=start)
-        return np.vstack([x[:1], np.asarray(tail)])
-    y = x.copy()
-    for k in range(1, len(x)):
-        y[k] = keep[k - 1] * y[k - 1] + new[k - 1] * x[k] + old[k - 1] * x[k - 1]
-    return y
+    driven = np.vstack([x[:1], new[:, None] * x[1:] + old[:, None] * x[:-1]])
+    return first_order(driven, keep)
 
 
 def low_pass_of_curves(values: Array, time_s: Array, dt_s: Array, time_constant_s: float) -> Array:
@@ -141,14 +132,7 @@ def _low_pass_of_curves(x: Array, slope: Array, step_s: Array, time_constant_s: 
         + I3[:, None] * (late + early - 2 * change)
     )
     first = x[:1] - time_constant_s * slope[:1]  # as after a long course of that slope
-    if step_s.max() < _STEADY * step_s.min():
-        mean = float(np.mean(keep))
-        tail, _ = lfilter([1.0], [1.0, -mean], new, axis=0, zi=mean * first)
-        return np.vstack([first, np.asarray(tail)])
-    y = np.vstack([first, new])
-    for k in range(1, len(x)):
-        y[k] += keep[k - 1] * y[k - 1]
-    return y
+    return first_order(np.vstack([first, new]), keep)
 
 
 def play(values: Array, radius: float) -> Array:
