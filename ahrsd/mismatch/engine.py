@@ -124,9 +124,12 @@ def _lost_beside(whole: Problem, fast: Quick) -> list[Fact]:
     A field that jumps looks like lost turns now and then, and hides those that are.
     """
     state = fast.state
-    track = delayed_gyro(whole.recorded, state.problem.lag_s)
-    fit = at_model(track, state.fit.model, state.fit.terms)
-    return missing_turns(fit.filtered, track.gyro_b_rad_s - fit.model.gyro_bias_rad_s)
+    fit = state.fit
+    if state.problem.recorded is not whole.recorded:
+        track = delayed_gyro(whole.recorded, state.problem.lag_s)
+        fit = at_model(track, fit.model, fit.terms)
+    rate = fit.filtered.track.gyro_b_rad_s - fit.model.gyro_bias_rad_s
+    return missing_turns(fit.filtered, rate)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

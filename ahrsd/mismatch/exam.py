@@ -57,7 +57,10 @@ def rest_of(state: State, basis: Base) -> Discrepancy | None:
     """What the model leaves, None where that is no more than noise."""
     if not state.named:
         return None
-    found = discrepancy(basis)
+    made = state.fit.made
+    if "rest" not in made:
+        made["rest"] = discrepancy(basis)
+    found: Discrepancy = made["rest"]
     return found if found.nats > state.problem.limits.unknown_nats else None
 
 

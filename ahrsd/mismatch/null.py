@@ -84,6 +84,7 @@ class NullFit:
     terms_mag, terms_gyro: (N, 3) what the terms contribute to the readings, None without terms;
                 the Earth's rotation, where it is known, is in the second
     cost:       half the sum of squares, priors included, at the end
+    made:       what was built from the fit, once
     """
 
     model: NullModel
@@ -95,6 +96,7 @@ class NullFit:
     terms_gyro: Array | None = None
     cost: float = 0.0
     iterations: int = 0
+    made: dict[str, Any] = field(default_factory=dict, init=False)
 
     @property
     def log_likelihood(self) -> float:
@@ -103,7 +105,10 @@ class NullFit:
 
     def context(self) -> Context:
         """What effects build their columns from."""
-        return build_context(self.filtered.track, self)
+        if "context" not in self.made:
+            self.made["context"] = build_context(self.filtered.track, self)
+        context: Context = self.made["context"]
+        return context
 
 
 def fit_null(

@@ -180,9 +180,13 @@ def best_settings(
 ) -> list[Candidate]:
     """Every effect that can be computed here, in its best setting; strongest evidence first."""
     found = []
+    offered: dict[str, tuple[Setting, ...]] = {}
     for name, effect in library.items():
         options = effect.settings(basis.context) if effect.kind == "mean" else ()
-        options = tuple(option for option in options if (name, option) not in taken)
+        offered[name] = tuple(option for option in options if (name, option) not in taken)
+    _summed(basis, [(library[name], o) for name, options in offered.items() for o in options])
+    for name, options in offered.items():
+        effect = library[name]
         if not options:
             continue
         best = max(_scan(basis, effect, options), key=lambda candidate: candidate.evidence)
@@ -233,11 +237,7 @@ def without_known(basis: Base, columns: Array) -> tuple[Array, Array]:
 def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candidate]:
     """Evidence of each setting, its choice paid for."""
     sums, kept = basis.sums, basis.kept
-    keys = [(effect.identifier, repr(option)) for option in options]
-    new = [k for k, key in enumerate(keys) if key not in sums.found]
-    columns = [effect.columns(basis.context, options[k]) for k in new]
-    for k, part in zip(new, basis.whitened(columns), strict=True):
-        sums.add(keys[k], part)
+    keys = _summed(basis, [(effect, option) for option in options])
     inverse = solve(sums.inner[np.ix_(kept, kept)], np.eye(len(kept)))
     known_e = (sums.seen + sums.inner @ basis.back)[kept]
     scale = np.array([parameter.scale for parameter in effect.parameters])
@@ -253,6 +253,22 @@ def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candi
         evidence = log_bayes(what, basis.colour) - cost if _possible(effect, what) else -np.inf
         out.append(Candidate(effect, option, len(options), evidence))
     return out
+
+
+def _summed(basis: Base, wanted: Sequence[tuple[Effect, Setting]]) -> list[tuple[str, str]]:
+    """Keys of effects in their settings among the basis's sums, which then has all of them."""
+    keys = [(effect.identifier, repr(option)) for effect, option in wanted]
+    batch: list[tuple[tuple[str, str], Columns]] = []
+    for number, (key, (effect, option)) in enumerate(zip(keys, wanted, strict=True), start=1):
+        if key not in basis.sums.found:
+            batch.append((key, effect.columns(basis.context, option)))
+        width = sum(_width(columns) for _, columns in batch)
+        if batch and (width >= BATCH_COLUMNS or number == len(keys)):
+            parts = basis.whitened([columns for _, columns in batch])
+            for (new, _), part in zip(batch, parts, strict=True):
+                basis.sums.add(new, part)
+            batch = []
+    return keys
 
 
 def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Candidate:

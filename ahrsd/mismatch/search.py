@@ -104,9 +104,13 @@ def term_group(number: int) -> str:
 
 def basis_of(state: State) -> Base:
     """Whitened columns of calibration and terms at the state's fit."""
-    context = state.fit.context()
-    terms = [(term_group(k), term.columns(context)) for k, term in enumerate(state.fit.terms)]
-    return base(context, state.fit.filtered, terms, state.problem.rate_hz)
+    fit = state.fit
+    if "basis" not in fit.made:
+        context = fit.context()
+        terms = [(term_group(k), term.columns(context)) for k, term in enumerate(fit.terms)]
+        fit.made["basis"] = base(context, fit.filtered, terms, state.problem.rate_hz)
+    basis: Base = fit.made["basis"]
+    return basis
 
 
 def survey(state: State, basis: Base | None = None) -> Survey:
