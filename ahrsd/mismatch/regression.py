@@ -89,14 +89,12 @@ class Base:
         at = 0
         while at < len(columns):
             end, width = at, 0
-            while end < len(columns) and (
-                end == at or width + _width(columns[end]) <= BATCH_COLUMNS
-            ):
-                width += _width(columns[end])
+            while end < len(columns) and (end == at or width + columns[end].width <= BATCH_COLUMNS):
+                width += columns[end].width
                 end += 1
             joined = _joined(columns[at:end], len(self.innovation))
             seen = sensitivities(self.filtered, joined)
-            edges = np.cumsum([0, *(_width(part) for part in columns[at:end])])
+            edges = np.cumsum([0, *(part.width for part in columns[at:end])])
             out += [seen[:, :, a:b] for a, b in itertools.pairwise(edges)]
             at = end
         return out
@@ -262,7 +260,7 @@ def _summed(basis: Base, wanted: Sequence[tuple[Effect, Setting]]) -> list[tuple
     for number, (key, (effect, option)) in enumerate(zip(keys, wanted, strict=True), start=1):
         if key not in basis.sums.found:
             batch.append((key, effect.columns(basis.context, option)))
-        width = sum(_width(columns) for _, columns in batch)
+        width = sum(columns.width for _, columns in batch)
         if batch and (width >= BATCH_COLUMNS or number == len(keys)):
             parts = basis.whitened([columns for _, columns in batch])
             for (new, _), part in zip(batch, parts, strict=True):
@@ -383,12 +381,6 @@ def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
     return score(one, "x", scale)
 
 
-def _width(columns: Columns) -> int:
-    if columns.mag is not None:
-        return int(columns.mag.shape[2])
-    return 0 if columns.gyro is None else int(columns.gyro.shape[2])
-
-
 def _joined(parts: Sequence[Columns], count: int) -> Columns:
     """Columns side by side; zeros on a side that only some of them have."""
 
@@ -396,7 +388,7 @@ def _joined(parts: Sequence[Columns], count: int) -> Columns:
         if all(value is None for value in values):
             return None
         filled = [
-            np.zeros((count, 3, _width(part))) if value is None else value
+            np.zeros((count, 3, part.width)) if value is None else value
             for part, value in zip(parts, values, strict=True)
         ]
         return np.concatenate(filled, axis=2)

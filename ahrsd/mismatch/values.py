@@ -46,6 +46,12 @@ class Columns:
     mag: Array | None = None
     gyro: Array | None = None
 
+    @property
+    def width(self) -> int:
+        """How many parameters, p."""
+        side = self.gyro if self.mag is None else self.mag
+        return 0 if side is None else int(side.shape[2])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Context:
