@@ -57,13 +57,13 @@ from ahrsd.mismatch.search import (
     Survey,
     at_rest,
     basis_of,
-    forward,
     pruned,
     settled,
     survey,
     swapped,
 )
-from ahrsd.mismatch.stand_ins import without_stand_ins
+from ahrsd.mismatch.selection import forward
+from ahrsd.mismatch.stand_ins import without_stand_ins, without_unlikely
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.mismatch.wandering import wandering
@@ -149,7 +149,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     state, first, last = forward(State(problem, start))
     slim, beside = examined(paired(pruned(state)))
     last = last if slim.names == state.names else survey(slim)
-    state, surveys, last = swapped(slim, last)
+    state, surveys, last = without_unlikely(*swapped(slim, last))
     state, surveys, left = wandering(*without_stand_ins(state, surveys, beside))
     if unknown.detected(left, problem.limits) or not bursts(basis_of(state)):
         left = with_one_source(left)

@@ -5,10 +5,12 @@ prior N(0, k^2) has
 
     log BF(k) = 1/2 sum_i s_i^2 / (l_i + k^-2) - 1/2 sum_i log(1 + k^2 l_i)
 
-averaged over the sizes k of `SIZES`: how large an effect is on a given vehicle is known to a
-decade only.  The second sum is the price of a parameter, by which the one-parameter time lag beats
-nine eddy-current coefficients that contain it.  Noise that is not white carries less information:
-l and s are divided by its colour, the power of the innovations at low frequency over the white one.
+averaged over the sizes k of `SIZES`: how large an effect is on a given vehicle is hardly known.
+The same field may be a hundredth of a usual coefficient per ampere (the motor draws fifty) and a
+third of one per turn of its shaft; the sizes reach far enough down that neither pays for its unit.
+The second sum is the price of a parameter, by which the one-parameter time lag beats nine
+eddy-current coefficients that contain it.  Noise that is not white carries less information: l and
+s are divided by its colour, the power of the innovations at low frequency over the white one.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import numpy as np
 from ahrsd.mismatch.score import Score
 from ahrsd.samples import Array
 
-SIZES = (0.1, 0.33, 1.0, 3.0)
+SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 
 
 def log_bayes(what: Score, colour: float = 1.0, sizes: Sequence[float] = SIZES) -> float:

@@ -51,8 +51,7 @@ def finding(
     beside: what the whole model leaves, if it is more than noise
     """
     judged, library = state.named[number], state.problem.library
-    lead = COUNTERPART_NATS if counterpart(state, number) is not None else 0.0
-    shares = _delay_shares(state, basis, number, beside) or _shares(judged, seen, last, lead)
+    shares = _delay_shares(state, basis, number, beside) or shares_of(state, number, seen, last)
     term = whole_term(state, basis, number, next(iter(shares)), beside)
     effect = library[term.identifier]
     alternatives = tuple(
@@ -245,12 +244,11 @@ def cost(basis: Base, number: int, value: Array) -> Cost:
     )
 
 
-def _shares(judged: Judged, seen: Survey, last: Survey, lead: float) -> dict[str, float]:
-    """Every name's share of the probability of being what the term explains.
-
-    lead: nats that the term's name has for other reasons
-    """
+def shares_of(state: State, number: int, seen: Survey, last: Survey) -> dict[str, float]:
+    """Every name's share of the probability of being what the term explains; the term's first."""
+    judged = state.named[number]
     mine = judged.candidate.name
+    lead = COUNTERPART_NATS if counterpart(state, number) is not None else 0.0
     evidence = {c.name: in_its_place(c, last) for c in seen.candidates if c.name != mine}
     own = [c.evidence for c in seen.candidates if c.name == mine]
     found = posterior({mine: lead + max([judged.evidence, *own]), **evidence}, {})

@@ -356,9 +356,7 @@ def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:
     best = start
     for _ in range(ONSET_PASSES):
         grid = best.setting["onset_s"] + reach_s * np.linspace(-1, 1, ONSET_STEPS + 1)
-        inside = grid[(grid > time_s[0]) & (grid < time_s[-1])]
-        if not len(inside):
-            break
+        inside = np.unique(np.clip(grid, time_s[0], time_s[-1]))
         closer = [{**best.setting, "onset_s": round(float(t), 4)} for t in inside]
         best = max(_scan(basis, best.effect, closer), key=lambda candidate: candidate.evidence)
         best = replace(best, tried=start.tried, evidence=best.evidence + np.log(len(closer)))

@@ -1,4 +1,4 @@
-"""Forward selection with a joint refit after each name, then pruning and swapping.
+"""Terms named one after the other with a joint refit after each, then pruning and swapping.
 
 A name changes what all the others explain, and outside the linear range (a misalignment of three
 degrees) an unrefitted model invents terms: so every accepted term is fitted together with the
@@ -15,6 +15,8 @@ import numpy as np
 
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.delays import DELAYS, plain
+from ahrsd.mismatch.effects.base import Setting
+from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.name import Judged, judge
@@ -26,14 +28,12 @@ from ahrsd.mismatch.regression import (
     base,
     best_settings,
     candidate_gram,
-    closest_onset,
     closest_scale,
     columns_of,
+    evidence_of,
     scale_of,
+    scaled,
 )
-from ahrsd.mismatch.score import Score
-from ahrsd.mismatch.unknown import course, detected, remainder
-from ahrsd.mismatch.validate import Gain
 from ahrsd.samples import Array
 
 #: candidates that are held against the gate in one round, strongest first
@@ -44,13 +44,16 @@ LOOSE = 30.0
 REST_SPREAD = 4e-3
 #: nats by which a frame must lead before steps in it are believed
 FRAME_LEAD = 10.0
-#: a jump in each frame, and how often its time is sought again in the joint fit
+#: a jump in each frame
 STEPS: Mapping[Frame, str] = {
     "sensor": "hard_iron_step",
     "world": "field_step",
     "gyro": "gyro_bias_step",
 }
-STEP_PASSES = 2
+#: nats by which another onset or scale must be better to be taken
+SHAPED_NATS, SHAPED_PASSES = 1.0, 5
+#: steps for the derivatives by both, and how far an onset may move at once, of the recording
+ONSET_STEP_S, SCALE_STEP, ONSET_SHARE = 0.5, 0.05, 0.05
 #: by how much a time constant's logarithm may still change in the joint fit
 SCALE_AGAIN = 0.3
 #: steps that cancel to this share are one thing that was put on and taken off again
@@ -140,90 +143,80 @@ def at_rest(fit: NullFit) -> bool:
     return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < REST_SPREAD)
 
 
-def forward(state: State) -> tuple[State, Survey, Survey]:
-    """Name one effect after the other until nothing passes; the first and the last survey.
-
-    Before a gyro bias that changes is given a name, the null may wander as an ordinary gyro does:
-    noise is no physics.
-    """
-    first = last = survey(state)
-    while len(state.named) < state.problem.limits.most_terms:
-        accepted = [judged for judged in last.judged if judged.accepted]
-        if not accepted:
-            more = stepped(state)
-            if more is state:
-                break
-            state, last = more, survey(more)
-            continue
-        if accepted[0].candidate.name in WANDERING and not state.walk:
-            state = refitted(replace(state, walk=True), state.named)
-        else:
-            state = added(state, accepted[0])
-        last = survey(state)
-    return state, first, last
-
-
-def stepped(state: State) -> State:
-    """Steps where the strongest frame's course changes, if a few of them explain nearly all of it.
-
-    A large jump, and more so one and back again, spoils the calibration so thoroughly that no test
-    of a single step sees it; the course does.  Fitted together, each must still prove itself.
-    """
-    left = remainder(basis_of(state), with_bins=False)
-    limits = state.problem.limits
-    effect = state.problem.library.get(STEPS[left.strongest.frame])
-    others = [one.evidence for one in left.located.values() if one is not left.strongest]
-    clear = left.strongest.evidence > max(others) + FRAME_LEAD
-    if effect is None or not clear or not detected(left, limits):
-        return state
-    seen = course(left)
-    if not 0 < len(seen.changes_s) <= limits.most_shaped or seen.covered < limits.coverage:
-        return state
-    scale = np.array([parameter.scale for parameter in effect.parameters])
-    named = tuple(
-        _unjudged(Candidate(effect, {"onset_s": time_s}, 1, 0.0), scale)
-        for time_s in seen.changes_s
-    )
-    tried = refitted(state, (*state.named, *named))
-    for _ in range(STEP_PASSES):
-        tried = _judged_again(tried, len(state.named))
-    kept = tuple(j for j in tried.named if j.accepted)
-    return refitted(tried, kept) if len(kept) > len(state.named) else state
-
-
-def _unjudged(candidate: Candidate, scale: Array) -> Judged:
-    nothing = np.zeros((0, 0))
-    what = Score(
-        np.zeros((len(scale), 0)), np.zeros(0), np.zeros(0), nothing, nothing, np.zeros(0), 1.0
-    )
-    return Judged(candidate, what, 0.0, 1.0, 1.0, Gain(0.0, 0.0), 0.0, 0.0, ("not judged",))
-
-
-def _judged_again(state: State, first: int) -> State:
-    """Terms from number `first` on with their onsets sought again, all fitted and judged."""
-    basis = basis_of(state)
-    named = list(state.named)
-    for k in range(first, len(named)):
-        left = basis.without(term_group(k), state.fit.terms[k].value)
-        at = named[k].candidate
-        near = closest_onset(left, at, 0.02 * state.problem.track.duration_s)
-        columns = columns_of(left, [near])
-        gram = candidate_gram(left, columns, state.problem.block_s)
-        named[k] = judge(near, gram, columns[near.name], left, 1, state.problem.limits)
-    return refitted(state, tuple(named))
-
-
 def added(state: State, judged: Judged) -> State:
     """The state with one more term, everything fitted together."""
     name = judged.candidate.name
     if name not in DELAYS:
-        return _scaled_again(refitted(state, (*state.named, judged)))
+        return shaped_again(_scaled_again(refitted(state, (*state.named, judged))), newest=False)
     step_s = float(np.nanmedian(state.problem.track.dt_s)) / 2
     lag_s = DELAYS[name] * float(judged.what.value[0])
     lag_s *= step_s if name == "gyro_integration" else 1.0
     effect = state.problem.library[plain(lag_s)]
     lag = replace(judged, candidate=replace(judged.candidate, effect=effect, setting={}))
-    return _lag_taken_out(state, lag, lag_s)
+    return shaped_again(_lag_taken_out(state, lag, lag_s), newest=False)
+
+
+def shaped_again(state: State, *, newest: bool) -> State:
+    """Every term's onset, time constant or radius sought anew beside the others; all fitted again.
+
+    newest: the last one's too.  What was named first was sought while the others were not there:
+    its onset may be far off, and what it then leaves would be named a second time.
+    """
+    last = len(state.named) - 1
+    for _ in range(SHAPED_PASSES):
+        basis, named = basis_of(state), list(state.named)
+        for k in range(last + newest):
+            left, at = without_term(state, k, basis), named[k].candidate
+            found = _sought_again(state, k, basis, left)
+            if found is not None and _unpaid(found) > evidence_of(left, at) + SHAPED_NATS:
+                named[k] = replace(named[k], candidate=found)
+        if all(new is old for new, old in zip(named, state.named, strict=True)):
+            break
+        state = refitted(state, tuple(named))
+    return state
+
+
+def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candidate | None:
+    """A term in its best setting; None where there is nothing to seek.
+
+    left: the basis without it.  What has an onset and a scale is moved along both at once: later
+    with a shorter time constant looks nearly the same.
+    """
+    at = state.named[number].candidate
+    key = scale_of(at)
+    if "place_m" in at.setting or (key is None and "onset_s" not in at.setting):
+        return None
+    if key is not None and "onset_s" in at.setting:
+        setting = _moved_together(basis, at, key, state.fit.terms[number].value)
+        found = replace(at, setting=setting)
+        return replace(found, tried=1, evidence=evidence_of(left, found))
+    taken = [(j.candidate.name, j.candidate.setting) for j in state.named if j.candidate is not at]
+    return next(iter(best_settings(left, {at.name: at.effect}, taken)), None)
+
+
+def _moved_together(basis: Base, at: Candidate, key: str, value: Array) -> Setting:
+    """The setting with onset and scale where the whole fit's linear model has them."""
+    time_s, step_s = basis.context.track.time_s, ONSET_STEP_S
+    onset_s = float(at.setting["onset_s"])
+    moved = [
+        {**at.setting, "onset_s": onset_s + step_s},
+        {**at.setting, "onset_s": onset_s - step_s},
+        scaled(at.setting, key, SCALE_STEP),
+        scaled(at.setting, key, -SCALE_STEP),
+    ]
+    columns = [at.effect.columns(basis.context, setting) for setting in moved]
+    later, earlier, longer, shorter = (part @ value for part in basis.whitened(columns))
+    D = np.stack([(later - earlier) / (2 * step_s), (longer - shorter) / (2 * SCALE_STEP)], axis=2)
+    Z = np.concatenate([basis.known, D], axis=2).reshape(-1, basis.known.shape[2] + 2)
+    change = solve(Z.T @ Z, (Z.T @ basis.innovation.ravel())[:, None])[-2:, 0]
+    reach_s = ONSET_SHARE * basis.context.track.duration_s
+    onset_s += float(np.clip(change[0], -reach_s, reach_s))
+    setting = scaled(at.setting, key, float(np.clip(change[1], -SCALE_AGAIN, SCALE_AGAIN)))
+    return {**setting, "onset_s": round(float(np.clip(onset_s, time_s[0], time_s[-1])), 4)}
+
+
+def _unpaid(candidate: Candidate) -> float:
+    return candidate.evidence + float(np.log(candidate.tried))
 
 
 def _scaled_again(state: State) -> State:
@@ -232,6 +225,8 @@ def _scaled_again(state: State) -> State:
     judged = state.named[last]
     if scale_of(judged.candidate) is None:
         return state
+    if "onset_s" in judged.candidate.setting:
+        return shaped_again(state, newest=True)
     left = basis_of(state).without(term_group(last), state.fit.terms[last].value)
     closer = closest_scale(left, judged.candidate, SCALE_AGAIN)
     if closer.setting == judged.candidate.setting:
@@ -325,21 +320,21 @@ def pruned(state: State) -> State:
 def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
     """Each term held against every other name for what it explains; surveys without each term.
 
-    A term gives way to another that explains the same better by the lead that makes a name
-    certain; the new one is fitted in its place.  last: the survey of the state, renewed if need be.
+    A term gives way to another that explains the same better; the new one is fitted in its place.
+    last: the survey of the state, renewed if need be.
     """
     surveys: list[Survey] = []
     for k in range(len(state.named)):
         name = state.named[k].candidate.name
         seen, mine = _without(state, k, last.basis)
-        least = mine + state.problem.limits.lead_nats
-        better = [
-            j
+        rivals = [
+            (in_its_place(j.candidate, last), j)
             for j in seen.judged
-            if j.accepted and j.candidate.name != name and in_its_place(j.candidate, last) > least
+            if j.accepted and j.candidate.name != name
         ]
-        if better and name not in DELAYS and counterpart(state, k) is None:
-            state = refitted(state, (*state.named[:k], better[0], *state.named[k + 1 :]))
+        most, best = max(rivals, key=lambda one: one[0], default=(mine, state.named[k]))
+        if most > mine and name not in DELAYS and counterpart(state, k) is None:
+            state = refitted(state, (*state.named[:k], best, *state.named[k + 1 :]))
             last = survey(state)
             seen, _ = _without(state, k, last.basis)
         surveys.append(seen)

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.bursts import bursts
-from ahrsd.mismatch.findings import added_value, where
+from ahrsd.mismatch.delays import DELAYS
+from ahrsd.mismatch.findings import added_value, shares_of, where
 from ahrsd.mismatch.locate import FRAMES, Frame
 from ahrsd.mismatch.regression import Base, evidence_of
 from ahrsd.mismatch.rivals import of_another_form
@@ -19,6 +20,7 @@ from ahrsd.mismatch.search import (
     basis_of,
     counterpart,
     refitted,
+    survey,
     term_group,
 )
 
@@ -28,10 +30,28 @@ TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
     "world": ("field_step", "geomagnetic_drift", "field_anomaly"),
     "gyro": ("gyro_bias_step", "gyro_startup", "gyro_bias_drift"),
 }
-
-
+#: share of the probability below which a name is not said
+LEAST_SHARE = 1 / 3
 #: a bump of the outside field
 BUMP = "field_anomaly"
+
+
+def without_unlikely(
+    state: State, surveys: list[Survey], last: Survey
+) -> tuple[State, list[Survey], Survey]:
+    """The state without the names that hold less than a third of the probability.
+
+    What holds more could not pass the gate: then there is no name to say.
+    """
+    kept = [
+        k
+        for k, name in enumerate(state.names)
+        if name in DELAYS or shares_of(state, k, surveys[k], last)[name] > LEAST_SHARE
+    ]
+    if len(kept) == len(state.named):
+        return state, surveys, last
+    state = refitted(state, tuple(state.named[k] for k in kept))
+    return state, [surveys[k] for k in kept], survey(state)
 
 
 def without_stand_ins(

@@ -90,6 +90,16 @@ def test_a_smaller_family_wins_over_one_that_contains_it():
     assert one > four + 3 > 20
 
 
+def test_a_coefficient_pays_nothing_for_its_unit():
+    """A field per ampere of a motor that draws fifty, and one per thousand turns of its shaft."""
+    whole, _, _ = regression(np.random.default_rng(9), theta=0.03)
+    small = score(whole, "x", np.full(3, 1.0))  # a value of 3 % of the usual one
+    usual = score(whole, "x", np.full(3, 0.1))
+    assert small.value == pytest.approx(usual.value)
+    assert log_bayes(small) == pytest.approx(log_bayes(usual), abs=0.6)
+    assert log_bayes(small, 1.0, (0.1, 0.33, 1.0, 3.0)) < log_bayes(usual) - 1.5
+
+
 def test_a_wandering_course_is_likelier_as_a_walk_than_as_independent_segments():
     rng = np.random.default_rng(9)
     walk = np.cumsum(rng.standard_normal((30, 3)), axis=0) * 0.2

@@ -30,3 +30,21 @@ def test_a_bias_that_swings_is_no_walk(track):
     assert "gyro_bias_drift" not in [one.effect for one in found.findings]
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "gyro"
+
+
+def test_a_step_and_a_start_up_are_no_walk(track):
+    """Both explain in three numbers what a walk needs all its freedom for."""
+    onset_s = 0.4 * (track.time_s[0] + track.time_s[-1])
+    jump = np.where(track.time_s > onset_s, 1.0, 0.0)[:, None] * np.array([4e-4, -3e-4, 2e-4])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + jump))
+    assert [one.effect for one in found.findings] == ["gyro_bias_step"]
+    assert found.findings[0].where.intervals_s[0][0] == pytest.approx(onset_s, abs=3.0)
+    warm = np.exp(-(track.time_s - track.time_s[0]) / 30.0)[:, None] * np.array([9e-4, 6e-4, -6e-4])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + warm))
+    assert [one.effect for one in found.findings] == ["gyro_startup"]
+
+
+def test_an_ordinary_walk_has_no_cause(track):
+    steps = np.random.default_rng(4).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 5e-6 * np.cumsum(steps, axis=0))
+    assert {one.effect for one in diagnose(walked).findings} <= {"gyro_bias_drift"}

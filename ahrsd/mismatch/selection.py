@@ -1,0 +1,136 @@
+"""Forward selection: which name is next, when a bias that changes is noise, steps seen together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.mismatch import noise_fit
+from ahrsd.mismatch.name import Judged, judge
+from ahrsd.mismatch.null import at_model
+from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, columns_of
+from ahrsd.mismatch.score import Score
+from ahrsd.mismatch.search import (
+    FRAME_LEAD,
+    STEPS,
+    WANDERING,
+    State,
+    Survey,
+    added,
+    basis_of,
+    refitted,
+    shaped_again,
+    survey,
+    term_group,
+)
+from ahrsd.mismatch.unknown import course, detected, remainder
+from ahrsd.mismatch.validate import Gain
+from ahrsd.samples import Array
+
+#: names of a changing gyro bias that have a cause or a moment, which a random walk has not
+CAUSED = ("gyro_startup", "gyro_bias_temperature", "gyro_bias_step")
+#: how often the times of steps are sought again in the joint fit
+STEP_PASSES = 2
+
+
+def forward(state: State) -> tuple[State, Survey, Survey]:
+    """Name one effect after the other until nothing passes; the first and the last survey.
+
+    Before a gyro bias that changes is given a name, the null may wander as an ordinary gyro does:
+    noise is no physics, unless a cause is far more likely.
+    """
+    first = last = survey(state)
+    closer = 0  # names for which the shapes have been sought again before one came twice
+    while len(state.named) < state.problem.limits.most_terms:
+        accepted = [judged for judged in last.judged if judged.accepted]
+        if not accepted:
+            more = stepped(state)
+            if more is state:
+                break
+            state, last = more, survey(more)
+            continue
+        if accepted[0].candidate.name in state.names and closer < len(state.named):
+            state, closer = shaped_again(state, newest=True), len(state.named)
+        elif accepted[0].candidate.name in WANDERING and not state.walk:
+            state = _noise_or_cause(state, accepted[0], last)
+        else:
+            state = added(state, accepted[0])
+        last = survey(state)
+    return state, first, last
+
+
+def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
+    """The state with a bias that wanders, or with its cause where that is likelier by far.
+
+    A walk is free to follow any cause, and then none is needed.  Nor is one where the few modes of
+    a walk explain nearly as much.
+    """
+    noisy = refitted(replace(state, walk=True), state.named)
+    limits = state.problem.limits
+    walk = max((c.evidence for c in seen.candidates if c.name == WANDERING[0]), default=0.0)
+    lead = judged.candidate.evidence - walk
+    if judged.candidate.name not in CAUSED or lead < 2 * limits.lead_nats:
+        return noisy
+    named = added(state, judged)
+    largest = replace(noisy.fit.model, gyro_walk_rad_s_sqrt_s=noise_fit.WALK_CAP_RAD_S_SQRT_S)
+    wider = replace(noisy, fit=at_model(state.problem.track, largest, noisy.fit.terms))
+    best = max(_likelihood(noisy), _likelihood(wider))
+    return named if _likelihood(named) > best + limits.unknown_nats else noisy
+
+
+def _likelihood(state: State) -> float:
+    """Log likelihood of a fit with its noise scaled to what it leaves, nats."""
+    fit = state.fit
+    size, count = fit.filtered.normalised_innovation, 3 * np.count_nonzero(fit.filtered.used)
+    return fit.log_likelihood + 0.5 * float(count * (size - 1.0 - np.log(max(size, 1e-12))))
+
+
+def stepped(state: State) -> State:
+    """Steps where the strongest frame's course changes, if a few of them explain nearly all of it.
+
+    A large jump, and more so one and back again, spoils the calibration so thoroughly that no test
+    of a single step sees it; the course does.  Fitted together, each must still prove itself.
+    """
+    left = remainder(basis_of(state), with_bins=False)
+    limits = state.problem.limits
+    effect = state.problem.library.get(STEPS[left.strongest.frame])
+    others = [one.evidence for one in left.located.values() if one is not left.strongest]
+    clear = left.strongest.evidence > max(others) + FRAME_LEAD
+    if effect is None or not clear or not detected(left, limits):
+        return state
+    seen = course(left)
+    if not 0 < len(seen.changes_s) <= limits.most_shaped or seen.covered < limits.coverage:
+        return state
+    scale = np.array([parameter.scale for parameter in effect.parameters])
+    named = tuple(
+        _unjudged(Candidate(effect, {"onset_s": time_s}, 1, 0.0), scale)
+        for time_s in seen.changes_s
+    )
+    tried = refitted(state, (*state.named, *named))
+    for _ in range(STEP_PASSES):
+        tried = _judged_again(tried, len(state.named))
+    kept = tuple(j for j in tried.named if j.accepted)
+    return refitted(tried, kept) if len(kept) > len(state.named) else state
+
+
+def _unjudged(candidate: Candidate, scale: Array) -> Judged:
+    nothing = np.zeros((0, 0))
+    what = Score(
+        np.zeros((len(scale), 0)), np.zeros(0), np.zeros(0), nothing, nothing, np.zeros(0), 1.0
+    )
+    return Judged(candidate, what, 0.0, 1.0, 1.0, Gain(0.0, 0.0), 0.0, 0.0, ("not judged",))
+
+
+def _judged_again(state: State, first: int) -> State:
+    """Terms from number `first` on with their onsets sought again, all fitted and judged."""
+    basis = basis_of(state)
+    named = list(state.named)
+    for k in range(first, len(named)):
+        left = basis.without(term_group(k), state.fit.terms[k].value)
+        at = named[k].candidate
+        near = closest_onset(left, at, 0.02 * state.problem.track.duration_s)
+        columns = columns_of(left, [near])
+        gram = candidate_gram(left, columns, state.problem.block_s)
+        named[k] = judge(near, gram, columns[near.name], left, 1, state.problem.limits)
+    return refitted(state, tuple(named))
