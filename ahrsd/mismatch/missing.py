@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
@@ -24,6 +25,7 @@ from ahrsd.samples import Array
 _AVERAGED = ((3, 7.0), (12, 5.0))
 _NEAR = 0.3  # of a whole number
 _FEWEST = 5
+_SURE_NATS = 12.0  # by which they must be whole steps rather than noise: others have 160 and more
 #: deviations of a mean that no noise jumps by, and the part of such a jump that is across the turn,
 #: more than a lost one has
 _CLEAR, _ACROSS = 8.0, 0.5
@@ -45,7 +47,9 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
         if len(track) < 10 * samples:
             break
         found = _jumps(done, rate_b_rad_s, samples, least)
-        if len(found.forward) >= _FEWEST + 3 * len(found.backward) + found.others:
+        enough = len(found.forward) >= _FEWEST + 3 * len(found.backward) + found.others
+        jumps = found.forward
+        if enough and whole_nats(found.steps[jumps], found.scatter[jumps]) > _SURE_NATS:
             return [_fact(track, found)]
     return []
 
@@ -54,10 +58,12 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
 class _Jumps:
     """steps (N,) by which the field is ahead;  tell (N,) where that can be said;  rows of jumps.
 
+    scatter (N,): deviation of `steps` that noise makes
     others: how many jumps there are that no lost turn makes
     """
 
     steps: Array
+    scatter: Array
     tell: NDArray[np.bool]
     forward: NDArray[np.intp]
     backward: NDArray[np.intp]
@@ -92,11 +98,22 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
         across[max(0, k - 2 * samples) : k + 2 * samples] = False
     return _Jumps(
         steps,
+        sigma / np.maximum(size, 1e-300),
         tell,
         forward,
         _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
         len(_peaks(across, far, samples)),
     )
+
+
+def whole_nats(steps: Array, scatter: Array) -> float:
+    """Nats by which forward jumps (n,) of so much `scatter` are whole steps and no tail of noise.
+
+    Whole steps lie about their number; of noise only the tail counts as a jump, most of it hardly.
+    """
+    whole = -0.5 * ((steps - np.round(steps)) / scatter) ** 2
+    tail = -0.5 * (steps / scatter) ** 2 - log_ndtr(-(1 - _NEAR) / scatter)
+    return float(np.sum(whole - tail))
 
 
 def _scatter(done: Filtered, jump: Array, samples: int) -> float:
@@ -126,7 +143,7 @@ def _fact(track: Track, found: _Jumps) -> Fact:
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
     setting = {"hidden": True}
-    return Fact("dropped_samples", words, where, 0.9, parameters, setting, turned=turned)
+    return Fact("dropped_samples", words, where, 0.98, parameters, setting, turned=turned)
 
 
 def _peaks(rows: NDArray[np.bool], size: Array, samples: int) -> NDArray[np.intp]:

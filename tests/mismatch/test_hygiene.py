@@ -13,7 +13,7 @@ from ahrsd.mismatch.facts import Fact, spans_of
 from ahrsd.mismatch.frames import ranked, windows
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
-from ahrsd.mismatch.missing import missing_turns
+from ahrsd.mismatch.missing import missing_turns, whole_nats
 from ahrsd.mismatch.stamps import regular
 from ahrsd.mismatch.track import Track
 
@@ -182,6 +182,20 @@ def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
     at = int(np.argmax(mag[:, 0]))
     stuck[at : at + 40] = mag[at]
     assert clipping(replace(slow, mag_b_gauss=stuck)) == []
+
+
+def test_the_tail_of_noise_is_no_whole_step() -> None:
+    rng = np.random.default_rng(3)
+    scatter = np.full(9, 0.18)
+    whole = 1.0 + 0.18 * rng.standard_normal(9)
+    noise = 0.18 * rng.standard_normal(400_000)
+    tail = noise[noise > 0.7][:9]
+    assert len(tail) == 9
+    assert whole_nats(whole, scatter) > 12.0
+    assert whole_nats(tail, scatter) < 0.0
+    assert whole_nats(np.array([2.0, 1.0]), np.full(2, 0.1)) > whole_nats(
+        np.array([0.75, 0.8]), np.full(2, 0.1)
+    )
 
 
 def test_saturation_of_both_sensors(track: Track) -> None:
