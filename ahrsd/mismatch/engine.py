@@ -105,7 +105,7 @@ def diagnose(
     facts = (*facts, *lost)
     if at_rest(done.start):
         notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
-    return _told(recording, problem, done, fast, facts, notes)
+    return _told(recording, problem, done, fast, facts, (*notes, *problem.notes))
 
 
 def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.mismatch.coning import with_delta_angles
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.limits import Limits
@@ -19,6 +20,9 @@ BLOCKS = 80
 BLOCK_S = (2.0, 10.0)
 #: samples per working row from which the gyro's noise is taken from the recorded rate
 OVERSAMPLED = 5
+MEAN_RATES = (
+    "the gyro's values are means of the rate: how its axis turned within a step (coning) is put in"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +33,7 @@ class Problem:
     lag_s:    lag of the magnetometer that is already taken out of the track
     averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
               is read more seldom than the gyro
+    notes:    what a person should know of how the rates were read
     """
 
     track: Track
@@ -40,6 +45,7 @@ class Problem:
     cold: NullModel
     lag_s: float = 0.0
     averaged: float = 1.0
+    notes: tuple[str, ...] = ()
 
     @property
     def rate_hz(self) -> float:
@@ -62,6 +68,9 @@ def problem_of(
 ) -> tuple[Problem, NullModel]:
     """The recording at working rate, and a calibration to start from."""
     cold = cold_start(track, spec)
+    told = with_delta_angles(track, cold)
+    notes = () if told is track else (MEAN_RATES,)
+    track = told
     m = working_factor(track)
     work = thinned(track, m, cold)
     averaged = _readings(track) / max(_readings(work), 1)
@@ -75,7 +84,8 @@ def problem_of(
         # the gyro's differences at the working rate would be its motion
         known = replace(spec, sigma_gyro_rad_s=cold.sigma_gyro_rad_s)
     known = noise_of_thinned(known, averaged, m)
-    return Problem(work, known, library, limits, track, m, cold, averaged=averaged), start
+    made = Problem(work, known, library, limits, track, m, cold, averaged=averaged, notes=notes)
+    return made, start
 
 
 def noise_of_thinned(spec: Spec, mag: float, gyro: float) -> Spec:
