@@ -2,7 +2,8 @@
 
 The steps of a good clock are multiples of one step.  Stamps that a host made of a regular stream
 scatter, and a late stamp makes one step longer and the next shorter: neighbouring steps are
-correlated by -1/2.  Samples taken irregularly and stamped well do not show that.
+correlated by -1/2.  So are those of samples that were taken early and late and stamped well: there
+the field turns by the rate times the step as stamped, elsewhere by the rate times the usual step.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ _REGULAR = 0.1  # scatter of the steps over the step, below which multiples can 
 _MISSING_SHARE = 1e-3
 _JITTER = 0.03  # of the step
 _OPPOSED = -0.25  # correlation of neighbouring steps
+_TRUE_NATS = 5.0  # for steps as stamped, against steps of a regular clock
+_OUTLIER = 5.0  # deviations
 _CLOCK = 2e-4  # relative rate between two clocks that is worth a word
 #: other clocks that a recording may carry
 CLOCKS = ("host_time_s", "host_s", "time_host_s", "device_time_s", "time_startup_s", "time_gps_s")
@@ -79,13 +82,46 @@ def _jitter(track: Track) -> list[Fact]:
         return []
     opposed = float(np.mean(off[1:] * off[:-1])) / variance
     jitter = float(np.sqrt(variance / 2))
-    if jitter < _JITTER * usual or opposed > _OPPOSED:
+    if jitter < _JITTER * usual or opposed > _OPPOSED or _stamped_well(track) > _TRUE_NATS:
         return []
     where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
     words = f"the time stamps scatter by {1e3 * jitter:.2g} ms about a regular clock"
     deviation = jitter / float(np.sqrt(len(steps)))
     parameters = (Value("jitter", jitter, deviation, "s"),)
     return [Fact("timestamp_jitter", words, where, 0.95, parameters, {"step_s": usual})]
+
+
+def _stamped_well(track: Track) -> float:
+    """Nats for the field's changes over steps as stamped, against steps of a regular clock.
+
+    A change is -A (w x h) dt, with h = C (m - b): linear in rate x reading, rate and reading, in
+    any units and axes.
+    """
+    stamped = track.dt_s
+    even = np.where(np.isnan(stamped), np.nan, np.diff(regular(track), prepend=np.nan))
+    change = np.diff(track.mag_b_gauss, axis=0, prepend=np.nan)
+    middle = track.mag_b_gauss - change / 2
+    rate = track.gyro_b_rad_s
+    both = (rate[:, :, None] * middle[:, None, :]).reshape(len(rate), 9)
+    known = np.isfinite(change).all(axis=1) & np.isfinite(stamped)
+    moved = np.concatenate([both, rate, middle], axis=1)[known]
+
+    def rest(step_s: Array) -> Array:
+        columns = moved * step_s[known, None]
+        fitted = np.linalg.lstsq(columns, change[known], rcond=None)[0]
+        return np.asarray(change[known] - columns @ fitted)
+
+    first, second = rest(stamped), rest(even)
+    size = np.maximum(np.abs(first), np.abs(second))
+    usual = 1.4826 * np.median(np.abs(first), axis=0)
+    quiet = (size <= _OUTLIER * usual).all(axis=1)
+    if np.count_nonzero(quiet) < 100:
+        return 0.0
+    # neighbouring differences share a reading: half of what they say is said twice
+    ratio = np.sum(second[quiet] ** 2, axis=0) / np.maximum(
+        np.sum(first[quiet] ** 2, axis=0), 1e-300
+    )
+    return float(np.count_nonzero(quiet) / 4 * np.sum(np.log(np.maximum(ratio, 1e-300))))
 
 
 def regular(track: Track) -> Array:
