@@ -21,6 +21,8 @@ from ahrsd.mismatch.probabilities import student_log_density
 from ahrsd.samples import Array
 
 _MOST = 12  # order of the autoregression
+_FREQUENCIES = 4096  # of a spectrum
+_FLOOR = 1e-6  # white part of a colour, at least
 _BLOCK_S = 2.0
 _FINE_S, _PASSES = 1.0, 4  # in which bursts are told apart
 _SURE_NATS = 3.0  # by which a burst is one
@@ -43,6 +45,12 @@ class Colour:
     def order(self) -> int:
         """How many samples back it reaches."""
         return len(self.coefficients)
+
+    @property
+    def power(self) -> Array:
+        """(_FREQUENCIES / 2 + 1,) spectral density, per row."""
+        taps = np.concatenate([[1.0], -self.coefficients])
+        return np.asarray(self.variance / np.abs(np.fft.rfft(taps, _FREQUENCIES)) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +80,18 @@ def colour_of(done: Filtered) -> Colour:
         if value < best_value - 2.0:
             best, best_value, variance = np.asarray(a), value, left
     return Colour(best, float(variance))
+
+
+def before(wanted: Colour, found: Colour) -> tuple[Colour, float]:
+    """The colour that becomes `wanted` where `wanted` became `found`, and its relative deviation.
+
+    A filter takes a part of slow noise for motion, so that innovations are whiter than the noise.
+    """
+    r = np.fft.irfft(wanted.power**2 / found.power)[: _MOST + 1]
+    r[0] *= 1.0 + _FLOOR
+    a = np.asarray(solve_toeplitz(r[:-1], r[1:]))
+    whole = float(np.fft.irfft(wanted.power)[0])
+    return Colour(a, float(r[0] - a @ r[1:])), float(np.sqrt(r[0] / whole))
 
 
 def tails_of(done: Filtered) -> Tails:

@@ -23,7 +23,7 @@ from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.gains import Gains
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, sensitivities
-from ahrsd.mismatch.noise import colour_of, tails_of
+from ahrsd.mismatch.noise import before, colour_of, tails_of
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.probabilities import student_quantile
 from ahrsd.mismatch.track import Track
@@ -31,6 +31,7 @@ from ahrsd.mismatch.values import Context, Term
 from ahrsd.samples import Array
 
 COPIES = 16
+_TRIED, _TRIAL_SEED = 8, 2  # simulations by which the noise's colour is found
 _OUTSIDE = 0.01
 _SEGMENT_S = 20.0
 _LAGS = 50
@@ -54,7 +55,7 @@ def checks(
     loud: where the noise was found to be at another level, seconds.  Value and band are the
     repaired model's.  Deterministic.
     """
-    noise = noise_law(repaired, loud)
+    noise = noise_law(repaired, loud, terms, library)
     before = _compared(null, noise, (), library, copies, seed)
     after = _compared(repaired, noise, terms, library, copies, seed + 1) if terms else before
     return {
@@ -63,14 +64,20 @@ def checks(
     }
 
 
-def noise_law(fit: NullFit, loud: Sequence[tuple[float, float]] = ()) -> forward.Noise:
+def noise_law(
+    fit: NullFit,
+    loud: Sequence[tuple[float, float]] = (),
+    terms: Sequence[Term] = (),
+    library: Mapping[str, Effect] = EFFECTS,
+) -> forward.Noise:
     """The noise of a fit as it is: levels, colour, and Student's tails where they are heavy.
 
     loud: spans in seconds that have a level of their own, each relative to the filter's.
     What stays for 20 s in the sensor's axes or the world's, more than the colour of the rest makes
-    of it, is no noise and left out.
+    of it, is no noise and left out.  The colour is such that innovations of simulations have the
+    recording's.
     """
-    done, quick = fit.filtered, replace(fit.filtered, whitened=_quick(fit))
+    done, quick = fit.filtered, _quick(fit, fit.filtered.whitened)
     slow = done.normalised_innovation - quick.normalised_innovation
     if slow > _BEYOND * _slow_power(quick, segments_of(done.track)):
         done = quick
@@ -84,10 +91,18 @@ def noise_law(fit: NullFit, loud: Sequence[tuple[float, float]] = ()) -> forward
             if np.any(rows & done.used):
                 level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
     even = replace(done, whitened=done.whitened / level[:, None])
-    return replace(law, freedom=tails_of(even).freedom, level=level)
+    law = replace(law, freedom=tails_of(even).freedom, level=level)
+    if not law.colour:
+        return law
+    made = _innovations(fit, law, terms, library, _TRIED, _TRIAL_SEED)
+    seen = [_quick(fit, e) if done is quick else replace(done, whitened=e) for e in made]
+    stacked = np.concatenate([one.whitened for one in seen])
+    found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
+    colour, louder = before(colour_of(done), found)
+    return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
 
 
-def _quick(fit: NullFit) -> Array:
+def _quick(fit: NullFit, whitened: Array) -> Filtered:
     """Whitened innovations (N, 3) less their means over segments, in both frames."""
     context, used = fit.context(), fit.filtered.used
     segment = segments_of(context.track)
@@ -97,8 +112,9 @@ def _quick(fit: NullFit) -> Array:
         means = np.column_stack([np.bincount(segment, weights=column) for column in values.T])
         return np.where(used[:, None], values - (means / count)[segment], 0.0)
 
-    in_world = np.einsum("nij,nj->ni", context.R_nb, centred(fit.filtered.whitened))
-    return np.asarray(np.einsum("nji,nj->ni", context.R_nb, centred(in_world)))
+    in_world = np.einsum("nij,nj->ni", context.R_nb, centred(whitened))
+    left = np.einsum("nji,nj->ni", context.R_nb, centred(in_world))
+    return replace(fit.filtered, whitened=left)
 
 
 def _slow_power(quick: Filtered, segment: NDArray[np.intp]) -> float:
@@ -125,16 +141,27 @@ def _compared(
     scene = scene_of(context)
     found = _Fitted.of(fit, context)
     value = statistics(found.left(fit.filtered.whitened), scene)
-    truth = forward.truth_along(context)
+    made = _innovations(fit, noise, terms, library, copies, seed)
+    bands = _bands([statistics(found.left(e), scene) for e in made])
+    return {name: (value[name], bands[name]) for name in value}
+
+
+def _innovations(
+    fit: NullFit,
+    noise: forward.Noise,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+    copies: int,
+    seed: int,
+) -> list[Array]:
+    """Whitened innovations (N, 3) of simulations along the recording's motion."""
+    truth = forward.truth_along(fit.context())
     made = [
         forward.track_of(forward.simulated(truth, terms, noise, 1000 * seed + k, library))
         for k in range(copies)
     ]
-    rows = len(scene.segment)
-    whole = [track for track in made if len(track) == rows]
-    simulated = _filtered(whole, fit)
-    bands = _bands([statistics(found.left(e), scene) for e in np.split(simulated, len(whole))])
-    return {name: (value[name], bands[name]) for name in value}
+    whole = [track for track in made if len(track) == len(fit.filtered.track)]
+    return np.split(_filtered(whole, fit), len(whole))
 
 
 def _inside(value: float, band: tuple[float, float]) -> bool:

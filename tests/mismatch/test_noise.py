@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch.innovation import Filtered, run_filter
-from ahrsd.mismatch.noise import colour_of, level_facts, levels, tails_of
+from ahrsd.mismatch.noise import Colour, before, colour_of, level_facts, levels, tails_of
 from ahrsd.samples import Array
 
 
@@ -138,3 +138,16 @@ def test_a_slow_field_is_no_noise() -> None:
     assert level_facts(done, spec_given=True) == []
     _, variance, _ = levels(done)
     assert variance.max() < 2
+
+
+def test_the_colour_before_a_filter_is_told_from_what_the_filter_made_of_it():
+    wanted = Colour(np.array([0.6]), 1.0)
+    found = Colour(np.array([0.3]), 0.9)
+    colour, louder = before(wanted, found)
+    expected = wanted.power**2 / found.power
+    np.testing.assert_allclose(colour.power, expected, rtol=0.02)
+    # variances are the means of the densities
+    assert louder**2 == pytest.approx(expected.mean() / wanted.power.mean(), rel=0.01)
+    same, factor = before(wanted, wanted)
+    np.testing.assert_allclose(same.power, wanted.power, rtol=1e-4)
+    assert factor == pytest.approx(1.0, abs=1e-5)
