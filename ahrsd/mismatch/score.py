@@ -24,8 +24,9 @@ from ahrsd.samples import Array
 
 #: 1 - leverage of a block is not taken smaller: a block that alone carries an effect proves little.
 MINIMUM_FREEDOM = 0.05
-#: effective blocks beyond the rank that T^2 needs
-FEW_BLOCKS = 6
+#: effective blocks beyond the rank that T^2 needs: with fewer degrees of freedom its tail is so
+#: heavy that nothing reaches a family-wise probability
+FEW_BLOCKS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
