@@ -219,7 +219,7 @@ def _burst(done: Filtered, spans: list[tuple[float, float]], loud: float, quiet:
         "noise_burst",
         words,
         Where(tuple(spans), ("x", "y", "z"), "noise"),
-        0.95,
+        0.98,
         (Value("burst", sigma, sigma * 0.1, "gauss"),),
         {"onset_s": begin, "length_s": end - begin},
     )
@@ -234,7 +234,7 @@ def _level(done: Filtered, stretch: tuple[float, float], loud: float, quiet: flo
     parameters = (Value("mag", sigma, sigma * 0.1, "gauss"),)
     falls = begin < done.track.time_s[0] + _BLOCK_S / 2 and end < done.track.time_s[-1]
     setting = {"onset_s": end if falls else begin}
-    return Fact("noise_level", words, where, 0.95, parameters, setting)
+    return Fact("noise_level", words, where, 0.98, parameters, setting)
 
 
 def _centred(done: Filtered) -> Array:

@@ -88,7 +88,7 @@ def _jitter(track: Track) -> list[Fact]:
     words = f"the time stamps scatter by {1e3 * jitter:.2g} ms about a regular clock"
     deviation = jitter / float(np.sqrt(len(steps)))
     parameters = (Value("jitter", jitter, deviation, "s"),)
-    return [Fact("timestamp_jitter", words, where, 0.95, parameters, {"step_s": usual})]
+    return [Fact("timestamp_jitter", words, where, 0.99, parameters, {"step_s": usual})]
 
 
 def _stamped_well(track: Track) -> float:

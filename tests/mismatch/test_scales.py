@@ -23,13 +23,14 @@ def test_a_compensation_on_board_is_named_once_with_its_part() -> None:
     track, readings = _quiet(3)
     effect = EFFECTS["onboard_calibration_active"]
     setting = {"onset_s": float(track.time_s[0]), "time_constant_s": 105.0}
-    changed = effect.simulate(readings, np.array([0.3]), setting).mag_b_gauss
+    changed = effect.simulate(readings, np.array([0.3, 0.02]), setting).mag_b_gauss
     answer = diagnose(
         replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
     )
     assert [one.effect for one in answer.findings] == ["onboard_calibration_active"]
     found = answer.findings[0]
     assert abs(found.parameters[0].value - 0.3) < 0.02
+    assert abs(found.parameters[1].value - 0.02) < 0.005
     assert abs(found.setting["time_constant_s"] / 105.0 - 1) < 0.15
     assert found.where.frame == "sensor"
 

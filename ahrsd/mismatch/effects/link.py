@@ -276,15 +276,20 @@ class UnitError(Discrete):
 
 
 class OnboardCalibrationActive(Effect):
-    """F1: the reading creeps from raw to the device's own correction C (m - b)."""
+    """F1: the reading creeps from raw to the device's own correction (1 + gain) C (m - b).
+
+    gain: what is corrected has the size of the device's reference field, not of the raw reading.
+    """
 
     identifier = "onboard_calibration_active"
     code = "F1"
     family = "link"
     words = "the device's own hard and soft iron compensation is running and applied"
-    equation = "m += s(t) (A^-1 (m - b) - m), s ~ 1 - exp(-(t - t0)/tau) from t0 on, k at the end"
-    parameters = (Parameter("part", "1", 1.0, 2.0),)
-    typical = (0.8,)
+    equation = (
+        "m += s(t) (k (h - m) + g h), h = A^-1 (m - b), s ~ 1 - exp(-(t - t0)/tau), 1 at the end"
+    )
+    parameters = (Parameter("part", "1", 1.0, 2.0), Parameter("gain", "1", 0.1, 0.5))
+    typical = (0.8, 0.0)
     frame = "sensor"
     signature = "hard and soft iron creep or jump with no cause outside"
     confusers = (
@@ -308,13 +313,16 @@ class OnboardCalibrationActive(Effect):
     def columns(self, context: Context, setting: Setting) -> Columns:
         """From the raw reading to the corrected one."""
         readings = readings_of(context)
-        change = _converged(readings, setting)[:, None] * _correction(readings)
-        return Columns(mag=change[:, :, None])
+        corrected = _corrected(readings)
+        both = np.stack([corrected - readings.mag_b_gauss, corrected], axis=2)
+        return Columns(mag=_converged(readings, setting)[:, None, None] * both)
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """A convergence with a time constant, as of a filter that sees more and more attitudes."""
-        part = float(value[0]) * _converged(readings, setting)
-        change = part[:, None] * _correction(readings)
+        part, gain = value
+        corrected = _corrected(readings)
+        change = part * (corrected - readings.mag_b_gauss) + gain * corrected
+        change *= _converged(readings, setting)[:, None]
         return replace(readings, mag_b_gauss=readings.mag_b_gauss + change)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -331,12 +339,11 @@ def _converged(readings: Readings, setting: Setting) -> Array:
     return np.asarray(np.expm1(-since) / min(np.expm1(-since[-1]), -1e-6))
 
 
-def _correction(readings: Readings) -> Array:
-    """(N, 3) gauss that the whole of hard and soft iron compensation changes in a reading."""
+def _corrected(readings: Readings) -> Array:
+    """(N, 3) gauss, the readings with the whole of hard and soft iron compensated."""
     induced = readings.field_b @ readings.soft_iron.T
     hard_iron = np.mean(readings.mag_b_gauss - induced, axis=0)
-    corrected = np.linalg.solve(readings.soft_iron, (readings.mag_b_gauss - hard_iron).T).T
-    return np.asarray(corrected - readings.mag_b_gauss)
+    return np.linalg.solve(readings.soft_iron, (readings.mag_b_gauss - hard_iron).T).T
 
 
 def _within(time_s: Array, setting: Setting) -> Array:
