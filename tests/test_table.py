@@ -132,6 +132,38 @@ def shortened(rows: int):
     return change
 
 
+def doubled(*rows: int):
+    def change(values: dict[str, list[str]]) -> None:
+        for cells in values.values():
+            for row in sorted(rows, reverse=True):
+                cells.insert(row, cells[row])
+
+    return change
+
+
+def test_rows_written_twice_are_left_out_and_said(tmp_path):
+    values = columns()
+    doubled(7, 7, 30)(values)
+    table = read_table(save(tmp_path / "t.csv", values))
+    np.testing.assert_allclose(table.rows.time_s, 0.02 * np.arange(ROWS))
+    np.testing.assert_allclose(table.rows.covariates["temperature_c"], 0.11 * np.arange(1, 51))
+    assert "3 rows repeat the row before them, time and all: left out, first row 10" in table.notes
+
+
+def test_a_row_after_doubled_ones_is_named_by_its_number_in_the_file(tmp_path):
+    values = columns()
+    cell("time_s", 9, "0.160")(values)
+    doubled(3)(values)
+    with pytest.raises(RecordingError, match="row 12, column time_s: time stands still"):
+        read_table(save(tmp_path / "t.csv", values))
+
+
+def test_one_row_written_many_times_is_too_short(tmp_path):
+    values = {name: [cells[0]] * ROWS for name, cells in columns().items()}
+    with pytest.raises(RecordingError, match="has 1 rows"):
+        read_table(save(tmp_path / "t.csv", values))
+
+
 def renamed(old: str, new: str):
     def change(values: dict[str, list[str]]) -> None:
         values[new] = values.pop(old)

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
+from numpy.typing import NDArray
 
 from ahrsd.errors import RecordingError
 from ahrsd.recording.bytestream import read_chunks
@@ -95,19 +96,24 @@ def read_table(path: Path, *, check_units: bool = True) -> Table:
     """
     parquet = path.suffix == ".parquet"
     table = _read_parquet(path) if parquet else _read_csv(path)
-    if table.num_rows < MINIMUM_ROWS:
-        raise RecordingError(
-            path, f"has {table.num_rows} rows, {MINIMUM_ROWS} are needed", "record longer"
-        )
+    _check_length(path, table.num_rows)
     first_row = 1 if parquet else 2  # a CSV's header is row 1, as editors count
     columns = {name: _numbers(path, table, name, first_row) for name in _REQUIRED}
+    doubles = _doubles(list(columns.values()))
+    if doubles.any():
+        table = table.filter(pyarrow.array(~doubles))
+        columns = {name: values[~doubles] for name, values in columns.items()}
+        _check_length(path, table.num_rows)
     covariates, text = _covariates(table)
     notes = [f"column {name} is text and was left out" for name in text]
+    if doubles.any():
+        words = f"{np.count_nonzero(doubles)} rows repeat the row before them, time and all"
+        notes.append(f"{words}: left out, first row {np.flatnonzero(doubles)[0] + first_row}")
     accel, missing = _accel(covariates, table.num_rows)
     if missing and len(missing) < len(_ACCEL):
         notes.append(f"column {missing[0]} is missing, so the acceleration was left out")
     time_s = columns["time_s"]
-    _check_time(path, time_s, first_row)
+    _check_time(path, time_s, np.flatnonzero(~doubles) + first_row)
     mag, gyro = (np.column_stack([columns[name] for name in names]) for names in (_MAG, _GYRO))
     for vectors, limits in zip((mag, gyro), _RANGES if check_units else (), strict=check_units):
         _check_units(path, vectors, limits)
@@ -225,7 +231,22 @@ def _accel(covariates: dict[str, Array], rows: int) -> tuple[Array, list[str]]:
     return np.column_stack([found[name] for name in _ACCEL]), []
 
 
-def _check_time(path: Path, time_s: Array, first_row: int) -> None:
+def _check_length(path: Path, rows: int) -> None:
+    if rows < MINIMUM_ROWS:
+        raise RecordingError(path, f"has {rows} rows, {MINIMUM_ROWS} are needed", "record longer")
+
+
+def _doubles(columns: list[Array]) -> NDArray[np.bool]:
+    """(N,) rows that have the same time and readings as the row before."""
+    same = np.ones(len(columns[0]), dtype=bool)
+    same[0] = False
+    for values in columns:
+        same[1:] &= values[1:] == values[:-1]
+    return same
+
+
+def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
+    """numbers (N,): of the rows in the file."""
     step_s = np.diff(time_s)
     wrong = np.flatnonzero(step_s <= 0.0)
     if len(wrong):
@@ -233,7 +254,7 @@ def _check_time(path: Path, time_s: Array, first_row: int) -> None:
         word = "stands still" if step_s[row] == 0.0 else "goes back"
         raise RecordingError(
             path,
-            f"row {row + 1 + first_row}, column time_s: time {word} "
+            f"row {numbers[row + 1]}, column time_s: time {word} "
             f"({time_s[row]:g} to {time_s[row + 1]:g} s; {len(wrong)} such rows)",
             "sort by time and remove double rows, or split the file where the clock was reset",
         )
