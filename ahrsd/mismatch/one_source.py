@@ -1,10 +1,11 @@
-"""One source with one direction, in stretches of a few seconds.
+"""One source with one direction, whose course changes within seconds.
 
 A current that nobody logged goes on and off within seconds: to coefficients of twenty seconds it is
-noise, and it counts as the noise's colour.  But it always points the same way.  Noise, white or
-coloured, has no direction: the scores of short stretches, each made white by its own information,
-are alike on all axes.  Mauchly's test of sphericity says how unlikely theirs are (Anderson,
-Multivariate Statistical Analysis, 10.7), in the sensor's axes and in the world's.
+noise, and it counts as the noise's colour.  But it always points the same way: one course times one
+direction, against three courses that have nothing to do with each other, which is what slow noise
+of the magnetometer is.  Both have the same prior, a Gaussian course that forgets within times from
+one stretch to half a minute, of any size: the ratio of their evidences is what the direction alone
+says, and noise of whatever colour has none.
 
 One direction noise does have: the filter remembers the field's size for good and its direction for
 seconds, so slow noise stays along the field.  Where that hardly turns in a frame, in the world
@@ -13,33 +14,40 @@ never, a source along it is none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ahrsd.mismatch.locate import (
     FRAMES,
+    UNITS,
     Frame,
-    Located,
-    Segments,
     frame_columns,
     group_name,
     locate,
     segments,
 )
-from ahrsd.mismatch.probabilities import chi2_above
 from ahrsd.mismatch.regression import Base, group_gram
 from ahrsd.mismatch.unknown import FINE, Remainder
 from ahrsd.samples import Array
 
 #: stretches are no shorter than the colour of ordinary noise is long
 SHORTEST_S = 3.0
-#: and no fewer than this, or their covariance says little
+#: and no fewer than this, or they say little of a direction
 FEWEST = 20
-#: share of the strongest direction of a single source
-SINGLE = 0.6
+#: odds of 1000 to 1 (Markov's inequality: noise has them once in 1000 recordings at most)
+NATS = float(np.log(1000.0))
 #: mean square of the cosine between the source and the field, at most
 ALONG = 0.5
+#: times within which a course forgets, in stretches
+TIMES = (0.25, 1.0, 2.5, 6.0)
+#: of a prior course's modes, those kept
+MODES, LEAST_MODE = 60, 1e-3
+#: sizes of a course over which the evidence is averaged, in units of its frame
+SIZES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+DIRECTIONS = 48
+#: steps in which the noise's power is tried
+POWER_STEP = 2.0
 _SMALLEST = 1e-9
 
 
@@ -50,32 +58,81 @@ def with_one_source(left: Remainder) -> Remainder:
     if count < FEWEST:
         return left
     cut = segments(basis.context.track.time_s, count)
-    found = {frame: _directed(basis, frame, cut) for frame in FRAMES[:2]}
-    best = max(found.values(), key=lambda one: one.share)
-    frame = best.located.frame
-    if best.share < SINGLE or best.located.evidence < left.located[frame].evidence:
+    columns = {group_name(frame): frame_columns(basis.context, frame, cut) for frame in FRAMES[:2]}
+    gram = group_gram(basis, columns)
+    found: dict[Frame, float] = {}
+    for frame in FRAMES[:2]:
+        where = gram.groups[group_name(frame)]
+        information, score = gram.total[where, where], gram.total[where, -1]
+        unit = UNITS[frame]
+        nats, direction = directed(information, score, unit, basis.colour)
+        if along_field(_field_in(basis, frame), direction) <= ALONG:
+            found[frame] = nats
+    frame = max(found, key=lambda one: found[one], default=FRAMES[0])
+    nats = found.get(frame, -np.inf)
+    if nats < NATS:
         return left
-    return replace(left, located={**left.located, frame: best.located})
+    one = left.located[frame]
+    if one.evidence < nats:
+        seen = locate(gram, frame, cut, basis.colour)
+        one = replace(seen, evidence=nats, p_value=float(np.exp(-nats)))
+    return replace(left, located={**left.located, frame: one}, one_source=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Directed:
-    """A frame judged by its direction alone, and the share of the strongest direction."""
+def directed(information: Array, score: Array, unit: float, most: float) -> tuple[float, Array]:
+    """Nats by which one direction is likelier than three, and none at all; the direction (3,).
 
-    located: Located
-    share: float
+    information (3 J, 3 J) and score (3 J,), stretch-major, of white noise of unit power.
+    most: power of the noise, at most: a quick source counts as its colour, so less is tried too
+    """
+    count = len(score) // 3
+    sizes = unit * np.asarray(SIZES)
+    blocks, scores = information.reshape(count, 3, count, 3), score.reshape(count, 3)
+    directions = half_sphere(DIRECTIONS)
+    powers = np.geomspace(1.0, most, max(1, round(np.log(most) / np.log(POWER_STEP)) + 1))
+    noise = _likelihood(information, score, powers)
+    free, single = [], []
+    for time in TIMES:
+        root = course_root(count, time)
+        inner = np.einsum("jr,jakb,ks->rasb", root, blocks, root, optimize=True)
+        turned = root.T @ scores
+        width = turned.size
+        free.append(_evidence(inner.reshape(width, width), turned.ravel(), sizes, powers) + noise)
+        along = np.einsum("rasb,da,db->drs", inner, directions, directions, optimize=True)
+        pairs = zip(along, directions, strict=True)
+        single.append([_evidence(G, turned @ u, sizes, powers) + noise for G, u in pairs])
+    likely = np.asarray(single)
+    best = directions[np.unravel_index(int(np.argmax(likely)), likely.shape)[1]]
+    return _mean(likely) - max(_mean(noise), _mean(np.asarray(free))), best
 
 
-def _directed(basis: Base, frame: Frame, cut: Segments) -> _Directed:
-    gram = group_gram(basis, {group_name(frame): frame_columns(basis.context, frame, cut)})
-    where = gram.groups[group_name(frame)]
-    scores = whitened_scores(gram.total[where, where], gram.total[where, -1])
-    scores = scores @ _even(basis)
-    nats, p_value, share = sphericity(scores)
-    if along_field(_field_in(basis, frame), scores) > ALONG:
-        share = 0.0
-    one = locate(gram, frame, cut, basis.colour)
-    return _Directed(replace(one, evidence=nats, p_value=p_value), share)
+def course_root(count: int, time: float) -> Array:
+    """(J, r) root of the covariance of a course of unit size that forgets within `time` stretches.
+
+    Of zero mean: a constant is the calibration's.
+    """
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    centred = np.exp(-apart / time)
+    centred = centred - centred.mean(0) - centred.mean(1)[:, None] + centred.mean()
+    values, vectors = np.linalg.eigh(centred)
+    kept = values > LEAST_MODE * values[-1]
+    kept[:-MODES] = False
+    root = vectors[:, kept] * np.sqrt(values[kept])
+    return np.asarray(root * np.sqrt(count / np.sum(root**2)))
+
+
+def half_sphere(count: int) -> Array:
+    """(count, 3) directions spread evenly over half a sphere, a spiral of golden sections."""
+    k = np.arange(count) + 0.5
+    height, angle = k / count, np.pi * (1 + np.sqrt(5.0)) * k
+    radius = np.sqrt(1 - height**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+
+
+def along_field(field: Array, direction: Array) -> float:
+    """Mean square of the cosine between a field (N, 3) and a direction (3,)."""
+    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
+    return float(np.mean((unit @ direction) ** 2))
 
 
 def _field_in(basis: Base, frame: Frame) -> Array:
@@ -85,38 +142,23 @@ def _field_in(basis: Base, frame: Frame) -> Array:
     return np.asarray(np.einsum("nij,nj->ni", context.R_nb, context.field_b))
 
 
-def along_field(field: Array, scores: Array) -> float:
-    """Mean square of the cosine between a field (N, 3) and the strongest direction of (J, 3)."""
-    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
-    strongest = np.linalg.eigh(scores.T @ scores)[1][:, -1]
-    return float(np.mean((unit @ strongest) ** 2))
+def _evidence(information: Array, score: Array, sizes: Array, powers: Array) -> Array:
+    """(sizes, powers) log Bayes factor of unit coefficients of each size in noise of each power."""
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    values = np.maximum(values, 0.0) / powers[:, None]
+    square = ((vectors.T @ score) / powers[:, None]) ** 2
+    variance = sizes[:, None, None] ** 2
+    gained = square / (values + 1.0 / variance) - np.log1p(variance * values)
+    return np.asarray(0.5 * np.sum(gained, axis=2))
 
 
-def whitened_scores(information: Array, score: Array) -> Array:
-    """(J, 3) scores of stretches, each of unit covariance under the null; (3 J, 3 J) and (3 J,)."""
-    count = len(score) // 3
-    own = information.reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count), :]
-    values, vectors = np.linalg.eigh(own)
-    values = np.maximum(values, _SMALLEST * max(float(values.max()), _SMALLEST))
-    turned = np.einsum("jik,ji->jk", vectors, score.reshape(count, 3)) / np.sqrt(values)
-    return np.asarray(np.einsum("jik,jk->ji", vectors, turned))
+def _likelihood(information: Array, score: Array, powers: Array) -> Array:
+    """(powers,) log likelihood of the score under noise alone."""
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    kept = values > _SMALLEST * values[-1]
+    square = float(np.sum((vectors.T @ score)[kept] ** 2 / values[kept]))
+    return np.asarray(-0.5 * (square / powers + np.count_nonzero(kept) * np.log(powers)))
 
 
-def sphericity(scores: Array) -> tuple[float, float, float]:
-    """Nats by which scores (J, 3) have a direction, the probability of as many, and its share."""
-    power = np.linalg.eigvalsh(scores.T @ scores / len(scores))
-    power = np.maximum(power, _SMALLEST * max(float(power.max()), _SMALLEST))
-    statistic = len(scores) * float(3 * np.log(power.mean()) - np.log(power).sum())
-    cost = 0.5 * 5 * np.log(len(scores))  # Schwarz's price of the five further numbers
-    return (
-        statistic / 2 - float(cost),
-        chi2_above(statistic, 5),
-        float(power[2] / power.sum()),
-    )
-
-
-def _even(basis: Base) -> Array:
-    """(3, 3) that makes the innovations' quick part alike on all axes: one axis may be noisier."""
-    quick = np.diff(basis.innovation, axis=0)
-    values, vectors = np.linalg.eigh(quick.T @ quick / len(quick))
-    return np.asarray(vectors @ np.diag(1 / np.sqrt(np.maximum(values, _SMALLEST))) @ vectors.T)
+def _mean(nats: Array) -> float:
+    return float(np.logaddexp.reduce(nats.ravel()) - np.log(nats.size))

@@ -69,7 +69,8 @@ class Base:
     innovation (N, 3): whitened;  rate_hz: rows per second;
     colour: power of the innovation at low frequency over white;
     sums: of the fit with all its terms, of whose columns `kept` (q,) are known here and of which
-    `back` (all of them,) was put back into the innovation.
+    `back` (all of them,) was put back into the innovation;
+    weight: (N, 3, 3) of the rows, in all of these (`weighed`).
     """
 
     context: Context
@@ -82,6 +83,7 @@ class Base:
     sums: Sums
     kept: NDArray[np.intp]
     back: Array
+    weight: Array | None = None
 
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
         """The columns (N, 3, p) as the innovation sees them, several at a time."""
@@ -94,6 +96,7 @@ class Base:
                 end += 1
             joined = _joined(columns[at:end], len(self.innovation))
             seen = sensitivities(self.filtered, joined)
+            seen = seen if self.weight is None else self.weight @ seen
             edges = np.cumsum([0, *(part.width for part in columns[at:end])])
             out += [seen[:, :, a:b] for a, b in itertools.pairwise(edges)]
             at = end

@@ -14,7 +14,9 @@ import numpy as np
 
 from ahrsd.mismatch import intervals, locate, regime
 from ahrsd.mismatch.diagnosis import Heldout, Suspect, Unexplained, Where
+from ahrsd.mismatch.directions import by_direction
 from ahrsd.mismatch.evidence import log_bayes
+from ahrsd.mismatch.gram import Gram, gram
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import FRAMES, Frame, Located
 from ahrsd.mismatch.regime import Regime
@@ -38,6 +40,7 @@ class Remainder:
     bins: (regime, evidence, p-value), the strongest first
     free: the strongest frame with its course as a joint fit has it (`free_course`)
     stood_in: the frame of a name that was taken out again though the tests show nothing there
+    one_source: whether a quick source of one direction is among them (`one_source`)
     """
 
     basis: Base
@@ -45,6 +48,7 @@ class Remainder:
     bins: tuple[tuple[Regime, float, float], ...]
     free: Located | None = None
     stood_in: Frame | None = None
+    one_source: bool = False
 
     @property
     def strongest(self) -> Located:
@@ -79,16 +83,16 @@ def remainder(basis: Base, with_bins: bool = True) -> Remainder:
         (locate.locate(loud, frame, cut, basis.colour) for frame in FRAMES),
         key=lambda one: one.statistic,
     )
-    strongest = groups[locate.group_name(first.frame)]
-    quiet = quieter(basis, basis.whitened([strongest])[0])
+    strongest = basis.whitened([groups[locate.group_name(first.frame)]])[0]
+    quiet = by_direction(quieter(basis, strongest), strongest)
     found = regime.regimes(basis.context) if with_bins else ()
     groups |= {one.group: regime.regime_columns(one) for one in found}
-    gram = group_gram(quiet, groups)
-    located = {frame: locate.locate(gram, frame, cut, quiet.colour) for frame in FRAMES}
+    whole = group_gram(quiet, groups)
+    located = {frame: locate.locate(whole, frame, cut, quiet.colour) for frame in FRAMES}
     bins = []
     for one in found:
-        width = gram.groups[one.group].stop - gram.groups[one.group].start
-        what = score(gram, one.group, np.full(width, locate.UNITS["sensor"]), 1e-3)
+        width = whole.groups[one.group].stop - whole.groups[one.group].start
+        what = score(whole, one.group, np.full(width, locate.UNITS["sensor"]), 1e-3)
         bins.append((one, log_bayes(what, quiet.colour, locate.SPAN), chi2_p(what, quiet.colour)))
     return Remainder(quiet, located, tuple(sorted(bins, key=lambda item: -item[1])))
 
@@ -113,21 +117,21 @@ def course(left: Remainder) -> Course:
     basis, frame = left.basis, left.strongest.frame
     name = locate.group_name(frame)
     cut = locate.segments(basis.context.track.time_s, FINE)
-    gram = group_gram(basis, {name: locate.frame_columns(basis.context, frame, cut)})
-    where = gram.groups[name]
-    total = gram.total / basis.colour
+    whole = group_gram(basis, {name: locate.frame_columns(basis.context, frame, cut)})
+    where = whole.groups[name]
+    total = whole.total / basis.colour
     G, s = total[where, where], total[where, -1]
     changes = intervals.change_points(G, s)
-    fine = locate.locate(gram, frame, cut, basis.colour)
+    fine = locate.locate(whole, frame, cut, basis.colour)
     level = intervals.levels(fine.course, fine.deviation, changes)
-    found = intervals.departures(cut.edges_s, level, fine.deviation)
-    whole = [(float(cut.edges_s[0]), float(cut.edges_s[-1]))]
+    found = intervals.departures(cut.edges_s, level, fine.deviation, fine.course)
+    always = [(float(cut.edges_s[0]), float(cut.edges_s[-1]))]
     return Course(
         fine,
         tuple(float(cut.edges_s[k]) for k in changes),
         intervals.explained(G, s, changes) / max(left.strongest.statistic / basis.colour, 1e-300),
         level,
-        tuple(found or whole),
+        tuple(found or always),
     )
 
 
@@ -138,7 +142,7 @@ def detected(left: Remainder, limits: Limits) -> bool:
     by_bin = any(
         evidence > limits.unknown_nats and p < limits.unknown_p for _, evidence, p in left.bins
     )
-    return by_time or by_bin or left.stood_in is not None
+    return by_time or by_bin or left.stood_in is not None or left.one_source
 
 
 def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
@@ -197,22 +201,33 @@ def _heldout(left: Remainder, block_s: float) -> Heldout:
     Placebo: the same course held against the innovations of another time.
     """
     best, basis = left.strongest, left.basis
-    gain = _course_gain(best, basis, block_s)
+    columns = basis.whitened([locate.frame_columns(basis.context, best.frame, best.cut)])[0]
+    gain = _course_gain(best, basis, columns, block_s)
     count = len(basis.innovation)
     moved = [basis.moved(count * k // (SHIFTS + 1)) for k in range(1, SHIFTS + 1)]
-    usual = max(_course_gain(best, other, block_s).nats_per_sample for other in moved)
+    usual = max(_course_gain(best, one, columns, block_s).nats_per_sample for one in moved)
     rms = innovation_rms(basis)
     after = rms * float(np.sqrt(max(gain.after, 0.0) / max(gain.before, 1e-12)))
     return Heldout(rms, after, gain.nats_per_sample, usual)
 
 
-def _course_gain(best: Located, basis: Base, block_s: float) -> Gain:
+def _course_gain(best: Located, basis: Base, columns: Array, block_s: float) -> Gain:
+    """columns (N, 3, p): whitened, of the frame's course."""
     name = locate.group_name(best.frame)
-    columns = locate.frame_columns(basis.context, best.frame, best.cut)
-    gram = group_gram(basis, {name: columns}, min(block_s, best.cut.length_s / 4))
-    width = gram.groups[name].stop - gram.groups[name].start
-    scale = np.full(width, max(float(np.std(best.course)), 1e-3 * locate.UNITS[best.frame]))
-    return heldout(gram, [], name, scale, alternating)
+    halves = _halves(basis, name, columns, min(block_s, best.cut.length_s / 4))
+    spread = max(float(np.std(best.course)), 1e-3 * locate.UNITS[best.frame])
+    return heldout(halves, [], name, np.full(columns.shape[2], spread), alternating)
+
+
+def _halves(basis: Base, name: str, columns: Array, length_s: float) -> Gram:
+    """The columns' Gram in two parts: every second stretch of this length, and the others."""
+    time_s = basis.context.track.time_s
+    second = (time_s - time_s[0]) // length_s % 2 == 1
+    order = np.argsort(second, kind="stable")
+    groups = {known: basis.known[order][:, :, where] for known, where in basis.groups.items()}
+    edges = [0, int(np.count_nonzero(~second)), len(time_s)]
+    whole = gram({**groups, name: columns[order]}, basis.innovation[order], time_s[order], edges)
+    return whole.project(list(basis.groups))
 
 
 def innovation_rms(basis: Base) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.mismatch.intervals import change_points, departures, explained, levels, spans
+from ahrsd.mismatch.intervals import change_points, departures, explained, levels, reaching, spans
 from ahrsd.mismatch.locate import segments
 
 
@@ -40,11 +40,11 @@ def test_departures_are_from_the_level_that_holds_for_longest():
     course = np.zeros((40, 3))
     course[12:20] = 2.0
     level = levels(course, np.full(40, 0.1), [12, 20])
-    assert departures(edges, level, np.full(40, 0.1)) == [(120.0, 200.0)]
+    assert departures(edges, level, np.full(40, 0.1), course) == [(120.0, 200.0)]
     course[20:] = 1.0
     course[:12] = -1.0
     level = levels(course, np.full(40, 0.1), [12, 20])
-    assert departures(edges, level, np.full(40, 0.1)) == [(0.0, 200.0)]
+    assert departures(edges, level, np.full(40, 0.1), course) == [(0.0, 200.0)]
 
 
 def test_neighbouring_segments_join():
@@ -59,3 +59,15 @@ def test_segments_cover_every_sample_once():
     assert counts.sum() == 1001
     assert counts.max() - counts.min() <= 1
     assert cut.middle_s[0] == pytest.approx(3.0 + 100 / 14)
+
+
+def test_what_comes_and_goes_slowly_is_told_as_long_as_it_shows():
+    """Its levels miss the slopes; beyond them there is noise."""
+    rng = np.random.default_rng(2)
+    course = 0.1 * rng.standard_normal((40, 3))
+    course[10:18, 0] += 1.5 * np.sin(np.pi * (np.arange(8) + 0.5) / 8) ** 2 + 0.15
+    inside = np.zeros(40, bool)
+    inside[12:16] = True
+    found = np.flatnonzero(reaching(inside, course, np.full(40, 0.1)))
+    assert (found[0], found[-1]) in {(10, 17), (10, 16), (11, 17), (11, 16)}
+    assert np.array_equal(found, np.arange(found[0], found[-1] + 1))

@@ -3,48 +3,77 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from ahrsd.mismatch.one_source import ALONG, along_field, sphericity, whitened_scores
+from ahrsd.mismatch.one_source import (
+    ALONG,
+    NATS,
+    along_field,
+    course_root,
+    directed,
+    half_sphere,
+)
+
+COUNT, UNIT = 80, 1e-3
+
+
+def measured(rng, truth, noise=0.3e-3):
+    """Information and score of a course (80, 3) whose stretches are known unequally well."""
+    size = rng.uniform(0.5, 2.0, (COUNT, 3)) / noise
+    information = np.diag(size.ravel() ** 2)
+    return information, information @ truth.ravel() + size.ravel() * rng.standard_normal(3 * COUNT)
+
+
+def levels(rng, longest=5):
+    """A course (80,) of zero mean, of levels that hold for one to `longest` stretches."""
+    lengths = rng.integers(1, longest + 1, COUNT)
+    course = np.repeat(rng.uniform(0.0, 1.0, COUNT), lengths)[:COUNT]
+    return course - course.mean()
 
 
 def test_noise_has_no_direction_however_coloured() -> None:
     rng = np.random.default_rng(3)
-    p_values = np.array([sphericity(7.0 * rng.standard_normal((80, 3)))[1] for _ in range(400)])
-    assert p_values.min() > 1e-4
-    assert 0.4 < np.mean(p_values) < 0.6
+    for forgets in (0.25, 2.0, 8.0):
+        root = course_root(COUNT, forgets)
+        slow = [root @ rng.standard_normal((root.shape[1], 3)) for _ in range(20)]
+        told = [directed(*measured(rng, 5e-4 * course), UNIT, 1.0)[0] for course in slow]
+        assert max(told) < NATS
 
 
-def test_a_source_has_one() -> None:
+def test_a_source_has_one_and_it_is_found() -> None:
     rng = np.random.default_rng(4)
-    scores = rng.standard_normal((80, 3)) + np.outer(
-        4.0 * rng.standard_normal(80), [0.6, 0.0, -0.8]
-    )
-    nats, p_value, share = sphericity(scores)
-    assert nats > 40.0
-    assert p_value < 1e-12
-    assert 0.8 < share < 1.0
+    direction = np.array([0.6, 0.0, -0.8])
+    course = 1.2e-3 * levels(rng)
+    nats, found = directed(*measured(rng, np.outer(course, direction)), UNIT, 1.0)
+    assert nats > 2 * NATS
+    assert abs(found @ direction) > 0.9
+    assert directed(*measured(rng, np.outer(course, direction)), UNIT, 30.0)[0] > NATS
+    weak = 1e-5 * levels(rng)
+    assert directed(*measured(rng, np.outer(weak, direction)), UNIT, 1.0)[0] < NATS
 
 
-def test_scores_are_made_white_by_their_own_information() -> None:
-    rng = np.random.default_rng(5)
-    count = 4000
-    root = np.array([[3.0, 0.0, 0.0], [1.0, 0.2, 0.0], [0.5, 0.1, 5.0]])
-    own = root @ root.T
-    score = rng.standard_normal((count, 3)) @ root.T
-    information = np.zeros((3 * 40, 3 * 40))
-    for k in range(40):
-        information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = own
-    parts = [whitened_scores(information, score[k : k + 40].ravel()) for k in range(0, count, 40)]
-    white = np.concatenate(parts)
-    assert np.abs(white.T @ white / count - np.eye(3)).max() < 0.08
+def test_a_prior_course_has_unit_size_and_no_mean() -> None:
+    root = course_root(COUNT, 1.0)
+    power = np.sum(root**2, axis=1)
+    assert np.abs(root.sum(axis=0)).max() < 1e-9
+    assert power.mean() == pytest.approx(1.0, abs=0.05)
+
+
+def test_directions_cover_half_a_sphere_evenly() -> None:
+    directions = half_sphere(48)
+    assert np.linalg.norm(directions, axis=1) == pytest.approx(1.0)
+    rng = np.random.default_rng(1)
+    anywhere = rng.standard_normal((2000, 3))
+    anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
+    nearest = np.abs(anywhere @ directions.T).max(axis=1)
+    assert nearest.min() > np.cos(np.radians(20.0))
+    assert directions.T @ directions / 48 == pytest.approx(np.eye(3) / 3, abs=0.02)
 
 
 def test_slow_noise_along_a_steady_field_is_told_from_a_source() -> None:
     rng = np.random.default_rng(6)
     field = np.array([0.2, 0.0, 0.4]) + 0.02 * rng.standard_normal((500, 3))
-    noise = rng.standard_normal((80, 3)) + np.outer(3 * rng.standard_normal(80), [0.45, 0.0, 0.89])
-    source = rng.standard_normal((80, 3)) + np.outer(3 * rng.standard_normal(80), [0.0, 1.0, 0.0])
-    assert along_field(field, noise) > 0.9
-    assert along_field(field, source) < 0.1
+    assert along_field(field, np.array([0.45, 0.0, 0.89])) > 0.9
+    assert along_field(field, np.array([0.0, 1.0, 0.0])) < 0.1
     turning = rng.standard_normal((500, 3))
-    assert along_field(turning, noise) < 0.4 < ALONG
+    assert along_field(turning, np.array([0.0, 0.0, 1.0])) < 0.4 < ALONG
