@@ -36,7 +36,7 @@ def test_rates_are_those_of_the_earlier_instants(tau):
     inner = slice(5, -5)
     before = np.abs(track.gyro_b_rad_s - expected)[inner].max()
     after = np.abs(moved - expected)[inner].max()
-    assert after < 0.02 * before
+    assert after < 0.002 * before
 
 
 def test_no_delay_is_the_same_track():
