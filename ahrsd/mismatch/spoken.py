@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ahrsd.mismatch.diagnosis import Diagnosis, Finding, Limit, Unexplained, Value, Where
 
 _FRAMES = {
@@ -12,6 +14,13 @@ _FRAMES = {
     "noise": "in the noise",
 }
 _MG = 1e3
+#: units in which a person thinks of small effects, of those in which they are reckoned
+_SPOKEN_UNITS = {
+    "gauss": ("mG", 1e3),
+    "s": ("ms", 1e3),
+    "rad": ("deg", 180 / math.pi),
+    "1": ("%", 100.0),
+}
 _LIMITS_SHOWN = 6
 _FAILED = 1e-4
 
@@ -130,12 +139,19 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
     return out
 
 
+def _small(value: float, unit: str) -> str:
+    """`1.5 ms` for 0.0015 s, `0.3 mG/A` for 3e-4 gauss/A, `0.69 %` for 0.0069."""
+    first, *rest = unit.split("/")
+    spoken, factor = _SPOKEN_UNITS.get(first, (first, 1.0))
+    return f"{value * factor:.2g} {'/'.join([spoken, *rest])}"
+
+
 def sensitivity(limits: tuple[Limit, ...]) -> str:
     """The smallest effects that would have been seen, one parameter an effect."""
     seen: dict[str, str] = {}
     for limit in limits:
         if limit.smallest is not None and limit.effect not in seen:
-            seen[limit.effect] = f"{limit.effect} above {limit.smallest:.2g} {limit.unit}"
+            seen[limit.effect] = f"{limit.effect} above {_small(limit.smallest, limit.unit)}"
     texts = list(seen.values())
     more = f", and {len(texts) - _LIMITS_SHOWN} more" if len(texts) > _LIMITS_SHOWN else ""
     return ", ".join(texts[:_LIMITS_SHOWN]) + more

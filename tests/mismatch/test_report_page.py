@@ -111,11 +111,17 @@ def test_nothing_found_says_what_would_have_been_seen():
     limits = (
         Limit("mag_time_lag", "lag", 1.5e-3, "s"),
         Limit("gyro_scale", "scale_x", None, "1"),
+        Limit("clock_rate", "rate_error", 0.0069, "1"),
+        Limit("motor_current_field", "field_per_ampere_x", 3e-4, "gauss/A"),
+        Limit("gyro_g_sensitivity", "g_xx", 1.7453e-3, "rad/s/g"),
     )
     none = Unexplained(False)
     said = lines(diagnosis(mismatch=False, findings=(), unexplained=none, sensitivity=limits))
     assert said[0] == "dive <7>.csv: recording and model agree"
-    assert said[2] == "this recording would have shown: mag_time_lag above 0.0015 s"
+    assert said[2] == (
+        "this recording would have shown: mag_time_lag above 1.5 ms, clock_rate above 0.69 %, "
+        "motor_current_field above 0.3 mG/A, gyro_g_sensitivity above 0.1 deg/s/g"
+    )
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
