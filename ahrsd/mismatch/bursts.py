@@ -1,13 +1,15 @@
 """Bursts of a second or so that come and go: too short for the segments of the agnostic frames.
 
 The mean of what is left over a second is held against its own scatter there, so that noise that is
-louder for a while is no burst.  Two bursts at least: beside a step whose time is a little off there
+louder for a while is no burst.  Where a burst begins and ends is where a box or half a wave
+explains most of it.  Two bursts at least: beside a step whose time is a little off there
 is one.  Their frame is the one in which a constant per burst explains most.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ahrsd.mismatch import locate
@@ -19,19 +21,26 @@ from ahrsd.samples import Array
 
 _WINDOW_S = 1.0
 _LOUD = 44.0  # chi-squared of three: 1 in 1e9 windows by chance
+_BESIDE = 25.0  # of further ones beside these: 1 in 60000 windows by chance
 _FEWEST = 2
+_TIE_NATS = 3.0  # frames that no turn tells apart: most of what comes and goes is on the vehicle
 _MOST_SHARE = 0.3  # of the recording; beyond, it is no burst
+_LEAST_ROWS = 3
+_LONG = 10  # windows; what lasts longer has no shape of its own
 _AXES = ("x", "y", "z")
 
 
 def bursts(basis: Base) -> Unexplained | None:
     """What the names leave, if it is bursts; None where there are fewer than two."""
     time_s = basis.context.track.time_s
-    rows = loud_rows(residual(basis.known, basis.innovation), basis.rate_hz, basis.colour)
+    left = residual(basis.known, basis.innovation)
+    rows = loud_rows(left, basis.rate_hz, basis.colour)
     gap = round(_WINDOW_S * basis.rate_hz)
     spans = spans_of(rows, gap)
     if len(spans) < _FEWEST or np.mean(rows) > _MOST_SHARE:
         return None
+    spans = spans_of(loud_rows(left, basis.rate_hz, basis.colour, _BESIDE), gap)
+    spans = [closest(left, a, b) if b - a < _LONG * gap else (a, b) for a, b in spans]
     cut = _cut(time_s, spans)
     columns = {
         locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
@@ -40,13 +49,16 @@ def bursts(basis: Base) -> Unexplained | None:
     gram = group_gram(basis, columns)
     best = max(
         (locate.locate(gram, frame, cut, basis.colour) for frame in FRAMES),
-        key=lambda one: one.evidence,
+        key=lambda one: one.evidence + (_TIE_NATS if one.frame == "sensor" else 0.0),
     )
     return _described(best, [(float(time_s[a]), float(time_s[b - 1])) for a, b in spans])
 
 
-def loud_rows(left: Array, rate_hz: float, colour: float) -> NDArray[np.bool]:
-    """(N,) rows of windows in which the mean of (N, 3) is away from zero beyond all doubt."""
+def loud_rows(left: Array, rate_hz: float, colour: float, least: float = _LOUD) -> NDArray[np.bool]:
+    """(N,) rows of windows in which the mean of (N, 3) is away from zero, by default beyond doubt.
+
+    least: statistic of a window, chi-squared of three
+    """
     width = max(4, round(_WINDOW_S * rate_hz))
     if len(left) < 4 * width:
         return np.zeros(len(left), dtype=bool)
@@ -54,9 +66,26 @@ def loud_rows(left: Array, rate_hz: float, colour: float) -> NDArray[np.bool]:
     scatter = np.sum(_moving_sum(left**2, width) - sums**2 / width, axis=1) / (3 * (width - 1))
     statistic = np.sum(sums**2, axis=1) / width / np.maximum(scatter, colour)
     rows = np.zeros(len(left), dtype=bool)
-    for first in np.flatnonzero(statistic > _LOUD):
+    for first in np.flatnonzero(statistic > least):
         rows[first : first + width] = True
     return rows
+
+
+def closest(left: Array, start: int, end: int) -> tuple[int, int]:
+    """Rows between `start` and `end` that a box or half a wave covers when it explains most.
+
+    left (N, 3); never fewer than `_LEAST_ROWS`.
+    """
+    best, found = 0.0, (start, end)
+    for width in range(_LEAST_ROWS, end - start + 1):
+        windows = sliding_window_view(left[start:end], width, axis=0)
+        wave = np.sin(np.pi * (np.arange(width) + 0.5) / width)
+        for shape in (np.ones(width), wave):
+            explained = np.sum((windows @ shape) ** 2, axis=1) / np.sum(shape**2)
+            first = int(np.argmax(explained))
+            if explained[first] > best:
+                best, found = float(explained[first]), (start + first, start + first + width)
+    return found
 
 
 def _moving_sum(values: Array, width: int) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.mismatch.bursts import loud_rows
+from ahrsd.mismatch.bursts import closest, loud_rows
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.track import Track
 
@@ -24,6 +24,15 @@ def test_a_mean_is_loud_and_noise_that_is_louder_is_not() -> None:
     rows = np.flatnonzero(loud_rows(pushed, 10.0, 1.0))
     assert 990 <= rows.min() <= 1002
     assert 1008 <= rows.max() <= 1022
+
+
+@pytest.mark.parametrize("shape", [np.ones(15), np.sin(np.pi * (np.arange(15) + 0.5) / 15)])
+def test_a_burst_is_told_from_its_beginning_to_its_end(shape: np.ndarray) -> None:
+    left = np.random.default_rng(3).standard_normal((400, 3))
+    left[200:215] += np.outer(shape, [6.0, -5.0, 0.0])
+    start, end = closest(left, 188, 226)
+    assert abs(start - 200) <= 1
+    assert abs(end - 215) <= 1
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +51,8 @@ def test_bursts_are_located_and_not_named(quiet: Track) -> None:
     assert where is not None
     assert where.frame == "sensor"
     assert len(where.intervals_s) == 6
-    middles = np.array([(a + b) / 2 for a, b in where.intervals_s])
-    assert np.abs(middles - times).max() < 0.5
+    ends = np.array(where.intervals_s)
+    assert np.abs(ends - times[:, None] - [-0.6, 0.6]).max() < 0.25
     assert answer.omnibus["normality"].p_before < 1e-6
 
 
