@@ -57,6 +57,7 @@ from ahrsd.mismatch.search import (
     Survey,
     at_rest,
     basis_of,
+    formed_basis_of,
     pruned,
     settled,
     survey,
@@ -151,7 +152,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = without_unlikely(*swapped(slim, last))
     state, surveys, left = wandering(*without_stand_ins(state, surveys, beside))
-    if unknown.detected(left, problem.limits) or not bursts(basis_of(state)):
+    if unknown.detected(left, problem.limits) or not bursts(formed_basis_of(state)):
         left = with_one_source(left)
     if unknown.detected(left, problem.limits):
         left = with_free_course(state, of_the_rate(left))

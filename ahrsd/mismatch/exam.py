@@ -12,8 +12,8 @@ from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
     STEPS,
     State,
-    basis_of,
     counterpart,
+    formed_basis_of,
     refitted,
     term_group,
     without_term,
@@ -32,7 +32,7 @@ def examined(state: State) -> tuple[State, bool]:
     """
     limits = state.problem.limits
     while state.named:
-        basis = basis_of(state)
+        basis = formed_basis_of(state)
         found = rest_of(state, basis)
         if found is None:
             return state, False

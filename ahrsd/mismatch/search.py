@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from ahrsd.mismatch import noise_fit
-from ahrsd.mismatch.delays import DELAYS, plain
+from ahrsd.mismatch.delays import DELAYS, beyond_the_lag, plain
 from ahrsd.mismatch.effects.base import Setting
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.late import in_time
@@ -54,6 +54,8 @@ STEPS: Mapping[Frame, str] = {
 SHAPED_NATS, SHAPED_PASSES = 1.0, 5
 #: steps for the derivatives by both, and how far an onset may move at once, of the recording
 ONSET_STEP_S, SCALE_STEP, ONSET_SHARE = 0.5, 0.05, 0.05
+#: group of what a low-pass does beyond a delay
+FORM = "form of the delay"
 #: by how much a time constant's logarithm may still change in the joint fit
 SCALE_AGAIN = 0.3
 #: steps that cancel to this share are one thing that was put on and taken off again
@@ -116,10 +118,26 @@ def basis_of(state: State) -> Base:
     return basis
 
 
+def formed_basis_of(state: State) -> Base:
+    """The same with what a low-pass does beyond a delay known too, where one was found.
+
+    Which of the two it is, is told in the end (`delays`): until then the difference is no physics
+    of its own, which a filter of 100 ms would leave for others to explain.
+    """
+    basis, lag_s = basis_of(state), state.problem.lag_s
+    if lag_s <= 0.0 or not any(name in DELAYS for name in state.names):
+        return basis
+    if "formed" not in state.fit.made:
+        form = basis.whitened([beyond_the_lag(basis.context, lag_s)])[0]
+        state.fit.made["formed"] = basis.beside(FORM, form)
+    formed: Base = state.fit.made["formed"]
+    return formed
+
+
 def survey(state: State, basis: Base | None = None) -> Survey:
     """Every effect in its best setting, and the strongest of them held against the gate."""
     problem = state.problem
-    basis = basis or basis_of(state)
+    basis = basis or formed_basis_of(state)
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
     library = problem.library
     if at_rest(state.fit):
@@ -164,7 +182,7 @@ def shaped_again(state: State, *, newest: bool) -> State:
     """
     last = len(state.named) - 1
     for _ in range(SHAPED_PASSES):
-        basis, named = basis_of(state), list(state.named)
+        basis, named = formed_basis_of(state), list(state.named)
         for k in range(last + newest):
             left, at = without_term(state, k, basis), named[k].candidate
             found = _sought_again(state, k, basis, left)
@@ -227,7 +245,7 @@ def _scaled_again(state: State) -> State:
         return state
     if "onset_s" in judged.candidate.setting:
         return shaped_again(state, newest=True)
-    left = basis_of(state).without(term_group(last), state.fit.terms[last].value)
+    left = formed_basis_of(state).without(term_group(last), state.fit.terms[last].value)
     closer = closest_scale(left, judged.candidate, SCALE_AGAIN)
     if closer.setting == judged.candidate.setting:
         return state
@@ -301,7 +319,7 @@ def fitted_term(candidate: Candidate, value: Array) -> FittedTerm:
 def pruned(state: State) -> State:
     """Terms that the others have made superfluous taken out, one at a time."""
     while len(state.named) > 1:
-        basis = basis_of(state)
+        basis = formed_basis_of(state)
         evidence = []
         for k, judged in enumerate(state.named):
             left = without_term(state, k, basis)
@@ -363,7 +381,7 @@ def in_its_place(candidate: Candidate, last: Survey) -> float:
 
 def without_term(state: State, number: int, basis: Base | None = None) -> Base:
     """The basis with one term left out and all that it explains put back."""
-    basis = basis or basis_of(state)
+    basis = basis or formed_basis_of(state)
     value = state.fit.terms[number].value
     if state.named[number].candidate.name in DELAYS:
         value = np.array([state.lag_s(number)])

@@ -18,7 +18,7 @@ from ahrsd.mismatch.search import (
     State,
     Survey,
     added,
-    basis_of,
+    formed_basis_of,
     refitted,
     shaped_again,
     survey,
@@ -92,7 +92,7 @@ def stepped(state: State) -> State:
     A large jump, and more so one and back again, spoils the calibration so thoroughly that no test
     of a single step sees it; the course does.  Fitted together, each must still prove itself.
     """
-    left = remainder(basis_of(state), with_bins=False)
+    left = remainder(formed_basis_of(state), with_bins=False)
     limits = state.problem.limits
     effect = state.problem.library.get(STEPS[left.strongest.frame])
     others = [one.evidence for one in left.located.values() if one is not left.strongest]
@@ -124,7 +124,7 @@ def _unjudged(candidate: Candidate, scale: Array) -> Judged:
 
 def _judged_again(state: State, first: int) -> State:
     """Terms from number `first` on with their onsets sought again, all fitted and judged."""
-    basis = basis_of(state)
+    basis = formed_basis_of(state)
     named = list(state.named)
     for k in range(first, len(named)):
         left = basis.without(term_group(k), state.fit.terms[k].value)

@@ -17,8 +17,8 @@ from ahrsd.mismatch.search import (
     STEPS,
     State,
     Survey,
-    basis_of,
     counterpart,
+    formed_basis_of,
     refitted,
     survey,
     term_group,
@@ -65,10 +65,10 @@ def without_stand_ins(
     form, unless so much is `beside` the names that no form of theirs can be seen.
     """
     limits = state.problem.limits
-    left = unknown.remainder(basis_of(state))
+    left = unknown.remainder(formed_basis_of(state))
     if not state.walk and left.strongest.frame == "gyro" and unknown.detected(left, limits):
         state = refitted(replace(state, walk=True), state.named)
-        left = unknown.remainder(basis_of(state))
+        left = unknown.remainder(formed_basis_of(state))
     for frame, names in TIME_SHAPED.items():
         shaped = [k for k, name in enumerate(state.names) if name in names]
         doubtful = shaped if len(shaped) > limits.most_shaped else []
@@ -91,7 +91,7 @@ def without_stand_ins(
 
 def _of_another_form(state: State) -> list[int]:
     """Terms that come and go as nothing in the library does, or are of another form."""
-    basis = basis_of(state)
+    basis = formed_basis_of(state)
     # a magnet is put on and taken off again; a gyro's bias does not come back
     back = [k for k, name in enumerate(state.names) if name == STEPS["gyro"]]
     back = [k for k in back if counterpart(state, k) is not None]
@@ -107,7 +107,7 @@ def _bumps(state: State, left: unknown.Remainder) -> tuple[list[int], bool]:
     bumps = [k for k, name in enumerate(state.names) if name == BUMP]
     if not bumps:
         return [], False
-    basis = basis_of(state)
+    basis = formed_basis_of(state)
     once = [
         k for k in bumps if len(where(state.named[k], added_value(state, k), basis).intervals_s) < 2
     ]
@@ -146,7 +146,7 @@ def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remain
 
 def _bare(state: State, terms: list[int]) -> Base:
     """The basis without these terms, what they explain put back."""
-    bare = basis_of(state)
+    bare = formed_basis_of(state)
     for k in terms:
         bare = bare.without(term_group(k), added_value(state, k))
     return bare
@@ -160,7 +160,7 @@ def _dropped(
     kept = [k for k in range(len(state.named)) if k not in terms]
     before = unknown.remainder(_bare(state, terms))
     state = refitted(state, tuple(state.named[k] for k in kept))
-    after = unknown.remainder(basis_of(state))
+    after = unknown.remainder(formed_basis_of(state))
     # without the names, what they stood for may have become noise
     left = after if unknown.detected(after, state.problem.limits) else before
     return state, [surveys[k] for k in kept], left

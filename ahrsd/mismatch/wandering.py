@@ -23,8 +23,8 @@ from ahrsd.mismatch.search import (
     WANDERING,
     State,
     Survey,
-    basis_of,
     fitted_term,
+    formed_basis_of,
     survey,
 )
 
@@ -54,7 +54,7 @@ def wandering(
         start = replace(state.fit.model, gyro_walk_rad_s_sqrt_s=factor * size)
         fit = fit_null(problem.track, problem.spec, start, terms, noise=False)
         found = replace(state, fit=fit, named=(*state.named, mine), walk=True)
-        rest = unknown.remainder(basis_of(found))
+        rest = unknown.remainder(formed_basis_of(found))
         if not unknown.detected(rest, problem.limits):
             return found, [*surveys, seen], rest
     return state, surveys, left

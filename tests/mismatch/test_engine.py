@@ -37,6 +37,12 @@ def test_a_lag_is_named_with_its_size_and_told_apart_from_a_low_pass():
     assert not found.unexplained.detected
 
 
+def test_a_slow_low_pass_is_one_name_and_leaves_nothing_for_others():
+    found, _ = answer(("mag_low_pass", 3.0))
+    assert [one.effect for one in found.findings] == ["mag_low_pass"]
+    assert found.findings[0].parameters[0].value == pytest.approx(0.09, abs=1e-3)
+
+
 def test_two_effects_are_both_named_and_nothing_else():
     found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0))
     assert sorted(x.effect for x in found.findings) == ["gyro_scale", "hard_iron_step"]
