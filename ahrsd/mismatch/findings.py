@@ -11,7 +11,7 @@ from ahrsd.mismatch.delays import DELAYS, time_constant_less_lag, usual_step, we
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
 from ahrsd.mismatch.discrepancy import Discrepancy
 from ahrsd.mismatch.effects.base import Effect
-from ahrsd.mismatch.evidence import posterior
+from ahrsd.mismatch.evidence import SHARPER, posterior
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.innovation import TRACELESS
@@ -251,7 +251,8 @@ def shares_of(state: State, number: int, seen: Survey, last: Survey) -> dict[str
     lead = COUNTERPART_NATS if counterpart(state, number) is not None else 0.0
     evidence = {c.name: in_its_place(c, last) for c in seen.candidates if c.name != mine}
     own = [c.evidence for c in seen.candidates if c.name == mine]
-    found = posterior({mine: lead + max([judged.evidence, *own]), **evidence}, {})
+    evidence = {mine: lead + max([judged.evidence, *own]), **evidence}
+    found = posterior({name: SHARPER * nats for name, nats in evidence.items()}, {})
     rest = {k: v for k, v in sorted(found.items(), key=lambda item: -item[1]) if k != mine}
     return {mine: found[mine], **rest}
 
