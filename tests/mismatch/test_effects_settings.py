@@ -197,3 +197,20 @@ def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_h
     at = [line["frequency_hz"] for line in lines(residual, time_s, dt_s)]
     assert len(at) == 2
     assert any(abs(one - frequency_hz) < 2e-3 for one in at) == found
+
+
+def test_a_gain_with_temperature_is_of_the_field_within_the_iron_of_the_reading_or_of_the_field():
+    context, readings = moving(3, rows=120)
+    effect = EFFECTS["mag_scale_temperature"]
+    forms = {setting["of"]: setting for setting in effect.settings(context)}
+    seen = {
+        "field": readings.field_b @ readings.soft_iron.T,
+        "reading": readings.mag_b_gauss,
+        "outside": readings.field_b,
+    }
+    assert set(forms) == set(seen)
+    gain = np.array([1e-3, -2e-3, 5e-4])
+    for of, setting in forms.items():
+        warmer = readings.covariates[setting["covariate"]] - setting["reference"]
+        made = effect.simulate(readings, gain, setting).mag_b_gauss - readings.mag_b_gauss
+        assert made == pytest.approx(gain * warmer[:, None] * seen[of], abs=1e-12)

@@ -71,13 +71,13 @@ class AcInterference(Linear):
 
 
 class MagScaleTemperature(Linear):
-    """M11: of the field alone, or of all that the element sees, hard iron included."""
+    """M11: of the field alone, within the iron or without, or of all that the element sees."""
 
     identifier = "mag_scale_temperature"
     code = "M11"
     family = "sensor"
     words = "the magnetometer's sensitivity follows temperature"
-    equation = "m_i += k_i (T - T0) (A h)_i, or k_i (T - T0) (A h + b)_i"
+    equation = "m_i += k_i (T - T0) x_i, x = A h, A h + b or h"
     parameters = shapes.vector("gain_per_degree", "1/K", 1e-3, 2e-2)
     typical = (1e-3, 0.8e-3, 1.2e-3)
     needs = ("temperature",)
@@ -91,10 +91,10 @@ class MagScaleTemperature(Linear):
     source = "HMC5883L sheet; EGUsphere 2023-588 (dossier M11)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Per thermometer, both forms."""
+        """Per thermometer, each form."""
         return tuple(
             setting
-            for of in ("field", "reading")
+            for of in ("field", "reading", "outside")
             for setting in shapes.per_covariate(readings, "temperature", of=of)
         )
 
@@ -103,6 +103,8 @@ class MagScaleTemperature(Linear):
         seen = readings.mag_b_gauss
         if setting["of"] == "field":
             seen = readings.field_b @ readings.soft_iron.T
+        elif setting["of"] == "outside":
+            seen = readings.field_b
         gain = shapes.course_of(readings, setting) * seen
         return Columns(mag=np.asarray(gain[:, :, None] * np.eye(3)))
 
