@@ -179,6 +179,8 @@ def _told(
         for k, seen in enumerate(fast.surveys, start=fast.known)
     ]
     noise = _noise_facts(problem, fast, facts)
+    if unknown.detected(done.left, limits):  # what no name explains is noise to this fit
+        noise = [fact for fact in noise if fact.effect != "noise_level"]
     lesser = tuple(fact.words for fact in facts if not matters(fact))
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
