@@ -24,6 +24,9 @@ from ahrsd.samples import Array
 _QUIETEST_RAD_S, _LOST = 1e-4, 10.0
 _RESOLVED = 3.0  # deviations that 0 and 1 must be apart to be told
 _OFF = 4.0  # deviations from 1 beyond which f is something else
+#: change of the rate from step to step over the rate, root mean squares, beyond which the product
+#: of neighbours says nothing of what was between them
+_UNRESOLVED = 0.5
 
 
 def with_delta_angles(track: Track, model: NullModel) -> Track:
@@ -32,6 +35,8 @@ def with_delta_angles(track: Track, model: NullModel) -> Track:
     As it is where its rates are that, or where the motion does not tell and it makes no difference.
     model: a calibration to start from.
     """
+    if not _resolved(track.gyro_b_rad_s - model.gyro_bias_rad_s):
+        return track
     product = _half_turns(track, model.gyro_bias_rad_s)
     if float(np.sum((product - product.mean(axis=0)) ** 2)) < _LOST * _QUIETEST_RAD_S**2:
         return track
@@ -40,6 +45,12 @@ def with_delta_angles(track: Track, model: NullModel) -> Track:
     if deviation * _RESOLVED > 1.0 or part < 0.5 or part > 1.0 + _OFF * deviation + 0.5:
         return track
     return mended
+
+
+def _resolved(rate_b_rad_s: Array) -> bool:
+    """Whether the samples follow the motion."""
+    change = np.diff(rate_b_rad_s, axis=0)
+    return bool(np.mean(change**2) < _UNRESOLVED**2 * np.mean(rate_b_rad_s**2))
 
 
 def _half_turns(track: Track, bias_rad_s: Array) -> Array:

@@ -71,3 +71,11 @@ def test_a_gyro_of_the_wrong_scale_is_not_taken_for_mean_rates() -> None:
     _, exact, field = _tumbling(1.0)
     track = _track(exact * np.array([1.02, 0.99, 1.01]), field)
     assert _told(track) is track
+
+
+def test_rates_that_do_not_follow_the_motion_are_left_alone() -> None:
+    """A body that shakes between the samples: the neighbours say nothing of a step."""
+    mean, _, field = _tumbling(1.0)
+    shaken = mean + np.random.default_rng(2).normal(0, 1.0, mean.shape)
+    track = _track(shaken, field)
+    assert _told(track) is track
