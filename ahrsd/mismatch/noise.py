@@ -150,12 +150,19 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
         if short or (len(spans) > 1 and filled < _FILLED):
             return [_burst(done, spans or [stretch], loud, quiet)]
         return [_level(done, stretch, loud, quiet)]
-    overall = float(np.average(variance, weights=weight))
+    # a few outliers are the power of a louder noise, but the level of most readings is the spec's
+    overall = min(float(np.average(variance, weights=weight)), _middle_variance(done))
     spec_given = spec_given and _is_noise(done, middle)
     if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 / weight.sum()):
         whole = (float(middle[0] - _BLOCK_S / 2), float(middle[-1] + _BLOCK_S / 2))
         return [_level(done, whole, overall, 1.0)]
     return []
+
+
+def _middle_variance(done: Filtered) -> float:
+    """White variance of the whitened innovations from the middle of their differences."""
+    d = np.diff(done.whitened, axis=0)[done.used[1:] & done.used[:-1]]
+    return float((1.4826 * np.median(np.abs(d))) ** 2 / 2) if len(d) else 0.0
 
 
 def _is_noise(done: Filtered, blocks: Array) -> bool:

@@ -103,6 +103,16 @@ def test_a_higher_level(onset: int) -> None:
     assert abs(fact.parameters[0].value / 1.5e-3 - 1) < 0.2
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_few_outliers_are_no_level_above_the_data_sheet(seed: int) -> None:
+    rng = np.random.default_rng([seed, 8])
+    extra = np.where(rng.random((4000, 1)) < 0.003, 15e-3 * rng.standard_normal((4000, 3)), 0.0)
+    done = _filtered(seed, extra)
+    _, variance, size = levels(done)
+    assert np.average(variance, weights=size) > 1.3  # the power is well above
+    assert level_facts(done, spec_given=True) == []
+
+
 def test_a_level_that_falls_is_no_burst_that_begins_with_the_recording() -> None:
     extra = np.zeros((4000, 3))
     extra[:1300] = 1.2e-3 * np.random.default_rng(8).standard_normal((1300, 3))
