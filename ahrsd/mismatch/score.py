@@ -26,7 +26,7 @@ from ahrsd.samples import Array
 MINIMUM_FREEDOM = 0.05
 #: effective blocks beyond the rank that T^2 needs: with fewer degrees of freedom its tail is so
 #: heavy that nothing reaches a family-wise probability
-FEW_BLOCKS = 12
+FEW_BLOCKS = 7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
