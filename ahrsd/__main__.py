@@ -17,8 +17,8 @@ from ahrsd import __version__, logs
 from ahrsd.commands import LazyGroup
 from ahrsd.errors import EXIT_DONE, EXIT_INTERNAL, AhrsdError
 
-# Before numpy is loaded. The matrices here are small: further threads spin on a busy machine (five
-# times the processor time of `diagnose` was measured) and change the last digits from run to run.
+# Before numpy is loaded. The matrices here are small: further threads spin on a busy machine and
+# change the last digits from run to run.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _INTERRUPTED = 130  # 128 + SIGINT, as every shell reports it

@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch.evidence import colour
-from ahrsd.mismatch.regression import Base, residual
-from ahrsd.mismatch.sums import Sums
+from ahrsd.mismatch.regression import Base, based, residual
 from ahrsd.samples import Array
 
 #: colours closer than this are one: an estimate scatters by that much
@@ -47,15 +46,7 @@ def weighed(basis: Base, weight: Array) -> Base:
     """The basis with its rows weighed by (N, 3, 3)."""
     known = weight @ basis.known
     innovation = np.einsum("nij,nj->ni", weight, basis.innovation)
-    return replace(
-        basis,
-        weight=weight,
-        known=known,
-        innovation=innovation,
-        sums=Sums.of(known, innovation),
-        kept=np.arange(known.shape[2]),
-        back=np.zeros(known.shape[2]),
-    )
+    return replace(based(basis, basis.groups, known, innovation), weight=weight)
 
 
 def mean_colour(innovation: Array, rate_hz: float) -> float:

@@ -178,9 +178,7 @@ def _told(
         finding(fast.state, fast.last.basis, k, seen, fast.last)
         for k, seen in enumerate(fast.surveys, start=fast.known)
     ]
-    noise = _noise_facts(problem, fast, facts)
-    if unknown.detected(done.left, limits):  # what no name explains is noise to this fit
-        noise = [fact for fact in noise if fact.effect != "noise_level"]
+    noise = _noise_facts(problem, fast, facts, unknown.detected(done.left, limits))
     lesser = tuple(fact.words for fact in facts if not matters(fact))
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
@@ -214,12 +212,18 @@ def _told(
     )
 
 
-def _noise_facts(problem: Problem, fast: Quick, facts: Sequence[Fact]) -> list[Fact]:
-    """What is to be said of the noise's level; coarse numbers scatter by themselves."""
+def _noise_facts(
+    problem: Problem, fast: Quick, facts: Sequence[Fact], beside_unknown: bool
+) -> list[Fact]:
+    """What is to be said of the noise's level; coarse numbers scatter by themselves.
+
+    beside_unknown: to the fit, what no name explains is noise, so that its level says nothing
+    """
     if any(fact.effect == "mag_quantisation" for fact in facts):
         return []
     given = problem.spec.sigma_mag_gauss is not None
-    return level_facts(fast.state.fit.filtered, spec_given=given)
+    found = level_facts(fast.state.fit.filtered, spec_given=given)
+    return [fact for fact in found if not (beside_unknown and fact.effect == "noise_level")]
 
 
 def _doubted(one: Finding, sure: float) -> Finding:

@@ -107,7 +107,7 @@ class Base:
         widths = [(k, where.stop - where.start) for k, where in self.groups.items()]
         groups = slices([*widths, (name, columns.shape[2])])
         known = np.concatenate([self.known, columns], axis=2)
-        return _based(self, groups, known, self.innovation)
+        return based(self, groups, known, self.innovation)
 
     def without(self, name: str, value: Array) -> Base:
         """The same with one named term left out, what it explains put back; value (p,)."""
@@ -126,7 +126,7 @@ class Base:
 
     def moved(self, rows: int) -> Base:
         """The same with the innovations of another time, `rows` later."""
-        return _based(self, self.groups, self.known, np.roll(self.innovation, rows, axis=0))
+        return based(self, self.groups, self.known, np.roll(self.innovation, rows, axis=0))
 
 
 def base(
@@ -150,7 +150,7 @@ def base(
     )
 
 
-def _based(basis: Base, groups: Mapping[str, slice], known: Array, innovation: Array) -> Base:
+def based(basis: Base, groups: Mapping[str, slice], known: Array, innovation: Array) -> Base:
     """A base with other columns or innovations, against which nothing was held yet."""
     return replace(
         basis,

@@ -72,8 +72,7 @@ def test_the_motor_current_is_not_named_on_the_outer_compass() -> None:
 def test_a_current_that_nobody_logged_is_a_source_fixed_to_the_vehicle() -> None:
     name, channels = "arducopter/log171_MAG2_10hz.csv.gz", ("motor_current_a", "throttle")
     found = diagnosed(name, *channels, "battery_v")
-    names = [one.effect for one in found.findings]
-    assert [name for name in names if not name.startswith("noise_")] == ["mag_time_lag"]
+    assert [one.effect for one in found.findings] == ["mag_time_lag"]
     left = found.unexplained
     assert left.detected
     assert left.where is not None
