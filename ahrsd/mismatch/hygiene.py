@@ -173,7 +173,7 @@ def would_have_shown(track: Track) -> tuple[str, ...]:
     step = track.step_s
     found = windows(track)
     shown = [
-        f"a magnetometer stuck for 1 s while turning by {1e3 * 8 * mag:.2g} mG",
+        f"a magnetometer stuck while the field turns by {1e3 * 8 * mag:.2g} mG",
         f"readings in steps above {1e3 * 2 * mag:.2g} mG (noise {1e3 * mag:.2g} mG, "
         f"{1e3 * gyro:.2g} mrad/s)",
         f"time stamps that jitter by {1e3 * 0.03 * step:.2g} ms",

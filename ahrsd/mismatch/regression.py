@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch.effects.base import Effect, Setting
+from ahrsd.mismatch.effects.world import moved_object
 from ahrsd.mismatch.evidence import colour, log_bayes
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.mismatch.objects import closest_object
 from ahrsd.mismatch.score import Score, score
 from ahrsd.mismatch.sums import Sums
 from ahrsd.mismatch.values import Columns, Context
@@ -34,9 +36,9 @@ ONSET_PASSES = 2
 SCALES = ("time_constant_s", "radius_gauss", "length_s")
 ANGLES = ("turn_deg",)
 SCALE_CHOICES = 3
-#: steps in which an object's place is sought, in parts of its distance, and the turn in radians
-PLACE_SHARES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.03)
 WORTH_NATS = 4.0
+#: best places of an object from which it is sought more closely
+PLACES = 3
 #: an onset of the coarse grid that says less than this against its effect is sought more closely
 NEAR_NATS = -3.0
 
@@ -287,18 +289,24 @@ def _with_onset(basis: Base, best: Candidate, options: Sequence[Setting]) -> Can
 def _with_scale(basis: Base, best: Candidate, options: Sequence[Setting]) -> Candidate:
     """The candidate with its time constant, radius or length sought between those of the grid.
 
-    A grid of factors of three leaves coefficients off by many of their deviations.
+    A grid of factors of three leaves coefficients off by many of their deviations.  The place of
+    an object is sought from the best few, also where something else is better as long as they
+    are guesses.
     """
-    key = scale_of(best)
+    key, finer = scale_of(best), []
     values = {float(option[key]) for option in options if key in option} if key else set()
-    if len(values) < 2:
-        return best
-    ends = [np.radians(v) if key in ANGLES else np.log(v) for v in (min(values), max(values))]
-    finer = closest_scale(basis, best, float(ends[1] - ends[0]) / (len(values) - 1) / 3)
-    paid = finer.evidence - float(np.log(len(options) * SCALE_CHOICES))
-    if paid <= best.evidence:
-        return best
-    return replace(finer, tried=len(options) * SCALE_CHOICES, evidence=paid)
+    if len(values) >= 2 and "place_m" not in best.setting:
+        ends = [np.radians(v) if key in ANGLES else np.log(v) for v in (min(values), max(values))]
+        finer = [closest_scale(basis, best, float(ends[1] - ends[0]) / (len(values) - 1) / 3)]
+    places = [option for option in options if "place_m" in option]
+    if places:
+        found = sorted(_scan(basis, best.effect, places), key=lambda one: -one.evidence)
+        finer.append(_closest_place(basis, found[:PLACES]))
+    cost = float(np.log(len(options) * SCALE_CHOICES))
+    for one in finer:
+        if one.evidence - cost > best.evidence:
+            best = replace(one, tried=len(options) * SCALE_CHOICES, evidence=one.evidence - cost)
+    return best
 
 
 def scale_of(candidate: Candidate) -> str | None:
@@ -323,7 +331,7 @@ def closest_scale(basis: Base, start: Candidate, reach: float) -> Candidate:
     if key is None:
         return start
     if "place_m" in start.setting:
-        return _closest_place(basis, start)
+        return _closest_place(basis, [start])
     for share in (1.0, 1 / 3, 1 / 9):
         steps = [scaled(best.setting, key, k * share * reach) for k in (-1, 0, 1)]
         found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
@@ -331,26 +339,18 @@ def closest_scale(basis: Base, start: Candidate, reach: float) -> Candidate:
     return best
 
 
-def _closest_place(basis: Base, start: Candidate) -> Candidate:
-    """An object's place and the turn of the positions' frame, sought one after the other."""
-    best = replace(start, evidence=evidence_of(basis, start))
-    for share in PLACE_SHARES:
-        reach_m = share * float(start.setting["distance_m"])
-        for axis in range(4):
-            steps = [_displaced(best.setting, axis, reach_m, share, k) for k in (-1, 0, 1)]
-            found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
-            best = replace(
-                found, tried=start.tried, evidence=found.evidence + float(np.log(len(steps)))
-            )
-    return best
+def _closest_place(basis: Base, starts: Sequence[Candidate]) -> Candidate:
+    """An object's place and the turn of the positions' frame sought together; unpaid for."""
+    effect, context, setting = starts[0].effect, basis.context, starts[0].setting
 
+    def seen(places: Sequence[Array]) -> list[Array]:
+        moved = [moved_object(context, setting, place) for place in places]
+        return basis.whitened([effect.columns(context, one) for one in moved])
 
-def _displaced(setting: Setting, axis: int, reach_m: float, turn_rad: float, k: int) -> Setting:
-    """The setting with its place moved along north, east or down, or (3) its frame turned."""
-    if axis == 3:
-        return scaled(setting, "turn_deg", k * turn_rad)
-    place = [x + k * reach_m * (n == axis) for n, x in enumerate(setting["place_m"])]
-    return {**setting, "place_m": [round(x, 4) for x in place]}
+    at = [np.append(one.setting["place_m"], one.setting["turn_deg"]) for one in starts]
+    found = closest_object(seen, basis.known, basis.innovation, at)
+    best = replace(starts[0], setting=moved_object(context, setting, found))
+    return replace(best, evidence=evidence_of(basis, best))
 
 
 def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:

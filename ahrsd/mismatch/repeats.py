@@ -17,7 +17,8 @@ from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
 _AXES = ("x", "y", "z")
-_STUCK_S = 1.0
+#: rows that a stuck reading lasts at least, and so many times as long as a reading usually does
+_STUCK_ROWS, _LONGER = 8, 5.0
 _MOVED = 8.0  # noise levels by which the field must have turned during the repetition
 _STEPS = 3.0  # steps of coarse numbers by which the field must turn to have a new reading
 _HELD_SHARE = 0.4  # of the moving samples that repeat the one before
@@ -72,16 +73,19 @@ def _step(track: Track) -> float:
 
 
 def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[np.bool]]:
+    """What repeats too long.  Where it was stuck while it turned, so it was where it did not, if
+    the numbers are fine enough to show the noise of a sensor at rest."""
     bad = np.zeros(len(track), dtype=bool)
     intervals: list[tuple[float, float]] = []
-    least = _MOVED * _resolution(track)
-    for first, last in spans_of(again):
-        begin = float(track.time_s[first - 1])
-        length = float(track.time_s[last - 1]) - begin
-        if length < _STUCK_S or _turned(track, first, last) < least:
-            continue
-        bad[first:last] = True
-        intervals.append((begin, begin + length))
+    usual = float(np.median(np.diff(np.flatnonzero(~again), append=len(again))))
+    least = max(_STUCK_ROWS, _LONGER * usual)
+    long = [(first, last) for first, last in spans_of(again) if last - first >= least]
+    turned = [_turned(track, *span) >= _MOVED * _resolution(track) for span in long]
+    fine = any(turned) and _step(track) == 0.0
+    for (first, last), moved in zip(long, turned, strict=True):
+        if moved or fine:
+            bad[first:last] = True
+            intervals.append((float(track.time_s[first - 1]), float(track.time_s[last - 1])))
     if not intervals:
         return [], bad
     total = sum(b - a for a, b in intervals)

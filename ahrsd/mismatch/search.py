@@ -202,8 +202,10 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
     """
     at = state.named[number].candidate
     key = scale_of(at)
-    if "place_m" in at.setting or (key is None and "onset_s" not in at.setting):
+    if key is None and "onset_s" not in at.setting:
         return None
+    if "place_m" in at.setting:
+        return replace(closest_scale(left, at, SCALE_AGAIN), tried=1)
     if key is not None and "onset_s" in at.setting:
         setting = _moved_together(basis, at, key, state.fit.terms[number].value)
         found = replace(at, setting=setting)

@@ -320,3 +320,19 @@ def test_spans() -> None:
     assert spans_of(rows) == [(1, 3), (4, 5), (7, 8)]
     assert spans_of(rows, 1) == [(1, 5), (7, 8)]
     assert spans_of(rows[:1]) == []
+
+
+def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(track: Track) -> None:
+    """Ten readings alike are no chance; a second stop at rest is told by the first."""
+    mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
+    mag[2000:2012], mag[3000:3012] = mag[2000], mag[3000]
+    gyro[3000:3012] = np.median(gyro, axis=0)
+    fact = _only(hygiene(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro)))
+    assert fact.effect == "stuck_magnetometer"
+    assert [begin for begin, _ in fact.where.intervals_s] == [
+        track.time_s[2000],
+        track.time_s[3000],
+    ]
+    at_rest = track.mag_b_gauss.copy()
+    at_rest[3000:3012] = at_rest[3000]
+    assert hygiene(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()

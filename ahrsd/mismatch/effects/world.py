@@ -23,7 +23,9 @@ _NED = ("position_north_m", "position_east_m", "position_down_m")
 _DECLINATIONS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
 _BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
 _BUMPS = 2
-_DISTANCES_M = (0.7, 2.0)
+_DISTANCES_M = (1.0, 3.0)
+_SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+_NEAREST_M = 0.2
 _CLEAR = 4.0  # usual departures of the size from which an object is sought
 #: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
 _GRADIENT = ("nn", "ee", "ne", "nd", "ed")
@@ -127,7 +129,7 @@ class FieldAnomaly(Linear):
         place = position_m(readings)
         if place is None:
             return ({"onset_s": shapes.middle_s(readings), "length_s": 12.0},)
-        return (_dipole(place[len(place) // 2], 2.0),)
+        return (_object(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Its field for unit sources along the world's axes."""
@@ -290,7 +292,7 @@ def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
 def _dipoles(
     context: Context, readings: Readings, size: Array, rows: list[int]
 ) -> tuple[Setting, ...]:
-    """Objects near the way, sought where the size clearly departs, guessed below it elsewhere."""
+    """Objects near the way, sought where the size clearly departs, and guessed all around it."""
     place = position_m(readings) if context.world_levelled else None
     if place is None:
         return ()
@@ -303,10 +305,20 @@ def _dipoles(
             best = found_place(size, place, field_n, row)
             if best is not None:
                 nearest = float(np.linalg.norm(place - best[0], axis=1).min())
-                found.append(_object(best[0], max(nearest, 0.2), float(np.degrees(best[1]))))
-                continue
-        found += [_dipole(place[row], distance) for distance in _DISTANCES_M]
+                found.append(_object(best[0], max(nearest, _NEAREST_M), np.degrees(best[1])))
+        around = product(_DISTANCES_M, _SIDES)
+        found += [_object(place[row] + far * np.array(side), far) for far, side in around]
     return tuple(found)
+
+
+def moved_object(context: Context, setting: Setting, place_and_turn: Array) -> Setting:
+    """The setting of an object (3 m, 1 deg) elsewhere, its distance that to the nearest place."""
+    way = position_m(readings_of(context))
+    if way is None:
+        return setting
+    nearest = float(np.linalg.norm(way - place_and_turn[:3], axis=1).min())
+    at = _object(place_and_turn[:3], max(nearest, _NEAREST_M), float(place_and_turn[3]))
+    return {**setting, **at}
 
 
 def _seen(readings: Readings, field_n: Array) -> Array:
@@ -314,14 +326,9 @@ def _seen(readings: Readings, field_n: Array) -> Array:
     return np.asarray(readings.soft_iron @ np.swapaxes(readings.R_nb, 1, 2) @ field_n)
 
 
-def _dipole(at: Array, distance: float) -> Setting:
-    """An object that far below a point of the way."""
-    return _object(at + np.array([0.0, 0.0, distance]), distance)
-
-
 def _object(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
     return {
-        "place_m": [round(float(x), 3) for x in place],
+        "place_m": [round(float(x), 4) for x in place],
         "distance_m": round(distance, 3),
-        "turn_deg": round(turn_deg, 2),
+        "turn_deg": round(float(turn_deg) % 360.0, 3),
     }
