@@ -64,6 +64,7 @@ from ahrsd.mismatch.search import (
     swapped,
 )
 from ahrsd.mismatch.selection import forward
+from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.stand_ins import without_stand_ins, without_unlikely
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
@@ -135,7 +136,10 @@ def _lost_beside(whole: Problem, fast: Quick) -> list[Fact]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Searched:
-    """The null fit, the state with all names, the surveys without each of them, what is left."""
+    """The null fit, the state with all names, the surveys without each of them, what is left.
+
+    short: bursts, where they are what is left
+    """
 
     start: NullFit
     state: State
@@ -143,6 +147,7 @@ class _Searched:
     first: Survey
     last: Survey
     left: unknown.Remainder
+    short: Unexplained | None = None
 
 
 def _searched(problem: Problem, model: NullModel) -> _Searched:
@@ -152,8 +157,12 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     last = last if slim.names == state.names else survey(slim)
     state, surveys, last = without_unlikely(*swapped(slim, last))
     state, surveys, left = wandering(*without_stand_ins(state, surveys, beside))
-    if unknown.detected(left, problem.limits) or not bursts(formed_basis_of(state)):
+    short = bursts(formed_basis_of(state))
+    if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)
+    left = with_spells(left)
+    if short is not None and short.evidence_nats > left.strongest.evidence:
+        return _Searched(start, settled(state), surveys, first, last, left, short)
     if unknown.detected(left, problem.limits):
         left = with_free_course(state, of_the_rate(left))
     return _Searched(start, settled(state), surveys, first, last, left)
@@ -186,7 +195,7 @@ def _told(
         *(of_fact(fact, library) for fact in noise),
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
-    left = _left(done, problem, basis)
+    left = _left(done, problem)
     terms = tuple(whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(named))
     quick_terms = tuple(
         whole_term(fast.state, fast.last.basis, k, one.effect)
@@ -232,11 +241,13 @@ def _doubted(one: Finding, sure: float) -> Finding:
     return replace(one, confidence=one.confidence * sure, alternatives=others)
 
 
-def _left(done: _Searched, problem: Problem, basis: Base) -> Unexplained:
+def _left(done: _Searched, problem: Problem) -> Unexplained:
     """What no name explains."""
+    if done.short is not None:
+        return done.short
     if unknown.detected(done.left, problem.limits):
         return unknown.described(done.left, problem.block_s, problem.limits)
-    return bursts(basis) or Unexplained(False)
+    return Unexplained(False)
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

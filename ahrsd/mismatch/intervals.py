@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.mismatch.gram import solve
 from ahrsd.samples import Array
@@ -111,7 +112,7 @@ def reaching(inside: Array, course: Array, deviation: Array) -> Array:
     return out
 
 
-def spans(edges_s: Array, inside: Array) -> list[tuple[float, float]]:
+def spans(edges_s: Array, inside: NDArray[np.bool] | Array) -> list[tuple[float, float]]:
     """Joined (start, end) of the segments that are inside."""
     padded = np.concatenate([[False], np.asarray(inside, bool), [False]]).astype(int)
     starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)

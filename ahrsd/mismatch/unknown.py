@@ -41,6 +41,7 @@ class Remainder:
     free: the strongest frame with its course as a joint fit has it (`free_course`)
     stood_in: the frame of a name that was taken out again though the tests show nothing there
     one_source: whether a quick source of one direction is among them (`one_source`)
+    spells_s: (begin, end) where a course that comes and goes is away (`spells`)
     """
 
     basis: Base
@@ -49,6 +50,7 @@ class Remainder:
     free: Located | None = None
     stood_in: Frame | None = None
     one_source: bool = False
+    spells_s: tuple[tuple[float, float], ...] = ()
 
     @property
     def strongest(self) -> Located:
@@ -166,7 +168,7 @@ def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
     return Unexplained(
         detected=True,
         where=Where(
-            whole if by_bin else seen.spans,
+            whole if by_bin else left.spells_s or seen.spans,
             tuple(AXES[k] for k in range(3) if spread[k] > 0.3 * spread.max()),
             "sensor" if by_bin else best.frame,
             words,
