@@ -16,6 +16,7 @@ RIGHT, IN_SET, MISSED, WRONG, ADDED = "right", "in the set", "missed", "wrong na
 FALSE, UNKNOWN, PARTLY, NONE, QUIET = "false name", "unknown", "one of two", "no answer", "quiet"
 #: order of the report, misses first
 ORDER = (NONE, FALSE, WRONG, MISSED, ADDED, PARTLY, UNKNOWN, IN_SET, QUIET, RIGHT)
+DELAYED = {"mag_time_lag": "mag", "mag_low_pass": "mag", "gyro_time_lag": "gyro"}
 SHORT_PART = 0.95  # an interval that covers more of the recording than this locates nothing
 
 
@@ -205,14 +206,20 @@ def _unidentifiable(case: str, truth: Json, answer: Answer) -> Verdict:
 
 
 def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) -> Verdict:
-    """Judged by what is said beyond the answer to the untouched recording."""
+    """Judged by what is said beyond the answer to the untouched recording of the same variant.
+
+    A name that the control has too, first or among its alternatives, is neither right nor false;
+    one of the right names is right if it moved by what was injected.
+    """
     effect = truth["effects"][0]
     right = effect["right"]
+    if answer.failure is not None:  # refused, and rightly
+        return Verdict(case, truth, answer, RIGHT, False, _least([effect]), True, True, True, True)
     before = control.findings if control is not None else ()
-    own = {f.effect for f in before}
+    own = control.everything if control is not None else frozenset()
     found = next((f for f in answer.findings if f.effect in right), None)
     earlier = next((f for f in before if f.effect in right), None)
-    pulls, relative = compare(effect["parameters"], found, earlier)
+    pulls, relative = compare(effect["parameters"], found, earlier, str(effect["effect"]))
     hit = found is not None and (earlier is None or (relative is not None and relative < 0.25))
     others = [n for n in answer.names if n not in right and n not in own]
     if hit:
@@ -221,6 +228,11 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
         word = IN_SET
     else:
         word = WRONG if others else UNKNOWN if answer.unexplained else MISSED
+    was = control.unexplained_frame if control is not None and control.unexplained else None
+    detected = word not in (UNKNOWN, MISSED) or (
+        answer.unexplained and (answer.unexplained_frame or "yes") != was
+    )
+    new = [n for n in answer.names if n not in own or (hit and n in right)]
     return Verdict(
         case,
         truth,
@@ -228,9 +240,10 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
         word,
         error=not hit,
         multiple=_least([effect]),
-        detected=answer.mismatch,
-        first_right=hit,
-        in_set=any(n in right for n in answer.everything),
+        detected=detected,
+        first_right=new[:1] != [] and new[0] in right if detected else None,
+        strict=new[:1] == [effect["effect"]] if detected else None,
+        in_set=word in (RIGHT, ADDED, IN_SET) if detected else None,
         onset_error_s=_onset_error(effect, found),
         pulls=pulls,
         relative=relative,
@@ -296,30 +309,42 @@ def _onset_error(effect: Json, found: Finding | None) -> float | None:
 
 
 def compare(
-    true: Sequence[Json], found: Finding | None, earlier: Finding | None = None
+    true: Sequence[Json],
+    found: Finding | None,
+    earlier: Finding | None = None,
+    planted: str | None = None,
 ) -> tuple[tuple[float, ...], float | None]:
     """Pulls of the coefficients that can be compared, and the relative error of them together.
 
     A coefficient is compared with the one of the same unit and name, or of the same unit and axis
     (`_x`, `_y`, `_z`), or with the only one of its unit.  earlier: what was there before; it is
-    taken off.
+    taken off.  planted: the true name, where a delay of the other sensor is to count as negative.
     """
     if found is None or not true:
         return (), None
     pulls: list[float] = []
     miss = size = 0.0
+    sign, sign_before = _sense(planted, found), _sense(planted, earlier)
     for entry in true:
         said = _partner(entry, found.parameters)
         if said is None:
             return (), None
         before = None if earlier is None else _partner(entry, earlier.parameters)
         scale = normal(said.unit)[1] / normal(str(entry["unit"]))[1]
-        value = scale * (said.value - (before.value if before is not None else 0.0))
+        own = sign_before * before.value if before is not None else 0.0
+        value = scale * (sign * said.value - own)
         error = value - float(entry["value"])
         miss, size = miss + error**2, size + float(entry["value"]) ** 2
         if said.std:
             pulls.append(error / (scale * said.std))
     return tuple(pulls), (miss / size) ** 0.5 if size > 0 else None
+
+
+def _sense(planted: str | None, found: Finding | None) -> float:
+    """-1 where a delay is told of the other sensor than that which was delayed."""
+    if planted not in DELAYED or found is None or found.effect not in DELAYED:
+        return 1.0
+    return 1.0 if DELAYED[planted] == DELAYED[found.effect] else -1.0
 
 
 def _partner(entry: Json, said: Sequence[Parameter]) -> Parameter | None:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-from ahrsd.challenge.judge import RIGHT, Verdict
+from ahrsd.challenge.judge import ADDED, RIGHT, WRONG, Verdict
 
 _Z = 1.959964  # 95 %
 STRONG = 2.0  # limits
@@ -194,9 +194,25 @@ def _of_unknowns(by_kind: dict[str, list[Verdict]]) -> list[Score]:
 
 
 def _of_semireal(semireal: Sequence[Verdict]) -> list[Score]:
+    strong = [v for v in semireal if (v.multiple or 0.0) >= STRONG]
+    named, false = [not v.error for v in semireal], (WRONG, ADDED)
     return [
-        share("semi-real: named", [not v.error for v in semireal], least=0.97),
+        share("semi-real: named", named, least=0.97),
         share("semi-real: named, nothing added", [v.word == RIGHT for v in semireal]),
+        share("semi-real: named, 2 x limit and more", [not v.error for v in strong], least=0.97),
+        share(
+            "semi-real: detected, 2 x limit and more",
+            _said(strong, lambda v: v.detected),
+            least=0.99,
+        ),
+        share("semi-real: detected, all strengths", _said(semireal, lambda v: v.detected)),
+        share(
+            "semi-real: first name right, all detected",
+            _said(semireal, lambda v: v.first_right),
+            least=0.97,
+        ),
+        share("semi-real: truth in the set", _said(semireal, lambda v: v.in_set), least=0.99),
+        share("semi-real: a name that is not true", [v.word in false for v in semireal], most=0.01),
         middle("semi-real: coefficient error, median", _numbers(semireal, "relative"), most=0.1),
         middle("semi-real: onset error, median, s", _numbers(semireal, "onset_error_s"), most=1.0),
     ]

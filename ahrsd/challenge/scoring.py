@@ -89,6 +89,7 @@ def _json(result: Result) -> dict[str, Any]:
                 "mistake": v.error,
                 "planted": [effect["source"] for effect in v.truth["effects"]],
                 "multiple": v.multiple,
+                "ideal_snr": [effect["snr"] for effect in v.truth["effects"]],
                 "named": list(v.answer.names),
                 "unexplained": v.answer.unexplained,
                 "confidence": v.confidence,

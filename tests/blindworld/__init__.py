@@ -11,5 +11,7 @@ is judged here cannot win by sharing a discretisation, a regressor or a sign wit
     limits      published detection limits, and the physical unit of each strength
     ideal       what an ideal observer could have seen: signal to noise with calibration removed
     noise       noise laws
-    rings       which cases there are;  cases: one case;  semireal: real recordings
+    rings       which cases there are;  cases: one case
+    semireal    real recordings with an effect added: bases, injected
+    remainder   what a real recording has left of its own, and what stands out of it
 """

@@ -1,217 +1,77 @@
 """Real recordings with an exactly known effect on top: real motion, real noise, true key.
 
-Every real recording also has effects of its own (a lag of 11.5 ms in all of BROAD, for one). So
-each one appears once untouched, as a control, and a tool is judged by what it says beyond that.
+Every real recording also has effects of its own (a lag of some 12 ms in all of BROAD, for one).
+So each variant appears once untouched, as a control, and a tool is judged by what it says beyond
+the answer to the control of the same variant: rows and machines are the same but for the effect.
+
+A limit is the strength that stands out of this recording's own remainder with a signal to noise of
+7 (`remainder`), or the table's where that is more.  An effect that would have to be stronger than
+physics allows is replaced by another one.  A delay that goes against the recording's own has to
+make up for that first.
 """
 
 from __future__ import annotations
 
-import gzip
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from blindworld.chain import Planted, Rows, xyz
+from blindworld import remainder
+from blindworld.bases import BASES, Variant, add_machines, read_rows, thinned
+from blindworld.cases import SEEN
+from blindworld.injected import INJECTED
 from blindworld.limits import FRAMES
-from blindworld.motion import DEG
-from blindworld.on_link import signed_permutations
-from blindworld.rotations import direction, turned
 
-#: file -> every how many samples a row is kept; the gyro is averaged over them
-BASES = {
-    "broad/01_undisturbed_slow_rotation_A.csv.gz": 5,
-    "broad/02_undisturbed_slow_rotation_B.csv.gz": 5,
-    "broad/21_undisturbed_fast_combined.csv.gz": 5,
-    "vn100/hand_2023_thumatti.csv.gz": 1,
-    "vn100/circles_2022_rahul.csv.gz": 1,
-    "vn100/punch_2024_shaked.csv.gz": 1,
-    "vn100_distorters/clearIMU.csv.gz": 1,
-}
-_SENSORS = ("mag_{}_gauss", "gyro_{}_rad_s", "accel_{}_m_s2")
-
-
-@dataclass(frozen=True)
-class Injected:
-    """A row of the table: least and largest strength, drawn log-uniform."""
-
-    key: str
-    least: float
-    most: float
-    unit: str
-    apply: object
-    right: tuple[str, ...]
-
-
-def read_rows(folder, name):
-    """A real recording at full rate, with the sensors' columns only."""
-    with gzip.open(Path(folder) / name, "rt") as file:
-        header = file.readline().strip().split(",")
-        wanted = ["time_s", *(column.format(a) for column in _SENSORS for a in "xyz")]
-        data = np.loadtxt(file, delimiter=",", usecols=[header.index(w) for w in wanted])
-    return Rows(data[:, 0], data[:, 1:4], data[:, 4:7], data[:, 7:10], {})
-
-
-def thinned(rows, every):
-    """One row of `every`; its gyro is the mean over the step that ends there."""
-    if every == 1:
-        return rows
-    K = len(rows.time_s) // every
-    last = np.arange(1, K + 1) * every - 1
-    out = rows.kept(last)
-    out.gyro = rows.gyro[: K * every].reshape(K, every, 3).mean(axis=1)
-    return out
-
-
-def add_machines(rows, rng):
-    """Columns of machines that were not there: only an injected effect makes them matter."""
-    t = rows.time_s
-    throttle, lamp, at, on = np.empty_like(t), np.zeros_like(t), t[0], False
-    while at <= t[-1]:
-        length = rng.uniform(4, 15)
-        inside = (t >= at) & (t < at + length)
-        throttle[inside], lamp[inside] = rng.uniform(0.1, 1), float(on)
-        at, on = at + length, not on
-    tau = rng.uniform(0.3, 0.6) * t[-1]
-    rows.columns = {
-        "temperature_c": np.round(15 + 8 * (1 - np.exp(-(t - t[0]) / tau)), 2),
-        "motor_current_a": 10 * throttle**1.5,
-        "lamp_on": lamp,
-    }
-    return rows
-
-
-def _moment(rows, rng):
-    return float(rows.time_s[0] + rng.uniform(0.3, 0.7) * np.ptp(rows.time_s))
-
-
-def _lag(rows, strength, rng):
-    spline = CubicSpline(rows.time_s, rows.mag, axis=0)
-    rows.mag = spline(np.maximum(rows.time_s - strength, rows.time_s[0]))
-    return Planted("sensor", (("lag", strength, "s"),))
-
-
-def _misalign(rows, strength, rng):
-    angle = direction(rng) * strength
-    rows.mag = turned(rows.mag, angle)
-    return Planted("sensor", xyz("angle", angle, "rad"))
-
-
-def _scale(rows, strength, rng):
-    scale = direction(rng) * strength
-    rows.gyro = rows.gyro * (1 + scale)
-    return Planted("gyro", xyz("scale", scale, "1"))
-
-
-def _stepped(rows, t0, frame, parameters):
-    return Planted(frame, parameters, t0, ((t0, float(rows.time_s[-1])),))
-
-
-def _iron_step(rows, strength, rng):
-    t0, step = _moment(rows, rng), direction(rng) * strength
-    rows.mag = rows.mag + (rows.time_s >= t0)[:, None] * step
-    return _stepped(rows, t0, "sensor", xyz("step", step, "gauss"))
-
-
-def _gyro_step(rows, strength, rng):
-    t0, step = _moment(rows, rng), direction(rng) * strength
-    rows.gyro = rows.gyro + (rows.time_s >= t0)[:, None] * step
-    return _stepped(rows, t0, "gyro", xyz("step", step, "rad/s"))
-
-
-def _follows(column, unit):
-    def apply(rows, strength, rng):
-        signal = rows.columns[column]
-        signal = signal - signal.min() * (column == "temperature_c")
-        per_unit = direction(rng) * strength / np.max(signal)
-        rows.mag = rows.mag + signal[:, None] * per_unit
-        return Planted("sensor", xyz("field", per_unit, unit))
-
-    return apply
-
-
-def _swapped(rows, strength, rng):
-    order, signs = signed_permutations()[rng.integers(47)]
-    rows.gyro = rows.gyro[:, order] * signs
-    return Planted("link")
-
-
-_LAGS = ("mag_time_lag", "gyro_time_lag", "gyro_integration", "mag_low_pass")
-_ROWS = (
-    Injected("mag_time_lag", 4e-3, 60e-3, "s", _lag, _LAGS),
-    Injected("mag_gyro_misalignment", 0.6 * DEG, 5 * DEG, "rad", _misalign,
-             ("mag_gyro_misalignment",)),
-    Injected("gyro_scale", 0.01, 0.06, "1", _scale, ("gyro_scale", "clock_rate")),
-    Injected("hard_iron_step", 4e-3, 60e-3, "gauss", _iron_step, ("hard_iron_step",)),
-    Injected("gyro_bias_step", 0.06 * DEG, 0.8 * DEG, "rad/s", _gyro_step, ("gyro_bias_step",)),
-    Injected("motor_current_field", 4e-3, 60e-3, "gauss", _follows("motor_current_a", "gauss/A"),
-             ("motor_current_field",)),
-    Injected("switched_device", 4e-3, 60e-3, "gauss", _follows("lamp_on", "gauss"),
-             ("switched_device",)),
-    Injected("mag_bias_temperature", 4e-3, 60e-3, "gauss",
-             _follows("temperature_c", "gauss/degC"), ("mag_bias_temperature",)),
-    Injected("frame_error", 1.0, 1.0, "1", _swapped, ("frame_error",)),
-)  # fmt: skip
-
-
-INJECTED = {row.key: row for row in _ROWS}
+_A_VARIANT = 6  # cases, its control among them
+_MULTIPLES = (0.5, 8.0)
+_SMALL = 0.05  # of the table's limit: there every effect is in proportion
+_WHOLE = ("frame_error", "unit_error_gyro", "unit_error_mag")  # nothing else can be told beside
 
 
 def plan(cases, seed):
-    """(base, key of INJECTED or None) for every case; each base is there once untouched."""
+    """(Variant, keys of INJECTED by preference) for every case; a control has no keys."""
     rng = np.random.default_rng([seed, 4712])
-    bases = list(BASES)
-    used = [bases[k] for k in rng.permutation(len(bases))][: max(1, min(len(bases), cases // 3))]
-    out = [(base, None) for base in used]
-    pairs = [(base, key) for key in INJECTED for base in used]
-    while len(out) < cases:
-        out += [pairs[k] for k in rng.permutation(len(pairs))]
-    out = out[:cases]
+    count = max(1, round(cases / _A_VARIANT))
+    bases = _cycle(rng, BASES, count)
+    variants = [
+        Variant(base, int(rng.choice(base.every)), int(rng.integers(2**31))) for base in bases
+    ]
+    out = [(variant, ()) for variant in variants][:cases]
+    keys = _cycle(rng, tuple(INJECTED), cases - len(out))
+    for n, key in enumerate(keys):
+        rest = [k for k in _cycle(rng, tuple(INJECTED), len(INJECTED)) if k != key]
+        out.append((variants[n % count], (key, *(k for k in rest if k not in _WHOLE))))
     rng.shuffle(out)
     return out
 
 
-def make_semireal(folder, base, key, entropy):
-    """(Rows, spec, truth) of a real recording with an effect, or without one."""
-    rng = np.random.default_rng(entropy)
-    rows = read_rows(folder, base)
-    machines = np.random.default_rng(rng.integers(2**32))
-    rows = add_machines(rows, machines)
-    effects = []
-    if key is not None:
-        row = INJECTED[key]
-        strength = float(np.exp(rng.uniform(np.log(row.least), np.log(row.most))))
-        planted = row.apply(rows, strength, rng)
-        effects.append(
-            {
-                "effect": row.key,
-                "source": row.key,
-                "frame": planted.frame,
-                "frames": [planted.frame, *FRAMES.get(row.key, ())],
-                "either_half": False,
-                "strength": strength,
-                "unit": row.unit,
-                "limit": row.least,
-                "multiple": strength / row.least,
-                "snr": None,
-                "right": list(row.right),
-                "parents": [],
-                "parameters": [
-                    {"name": n, "value": v, "unit": u} for n, v, u in planted.parameters
-                ],
-                "onset_s": planted.onset_s,
-                "intervals_s": [list(span) for span in planted.intervals_s],
-            }
-        )
-    rows = thinned(rows, BASES[base])
+def _cycle(rng, items, count):
+    """`count` items, each as often as the others, in random order."""
+    out = []
+    while len(out) < count:
+        out += [items[k] for k in rng.permutation(len(items))]
+    return out[:count]
+
+
+def make_semireal(folder, variant, keys, entropy):
+    """(Rows, spec, truth) of a variant with the first effect of `keys` that it can show."""
+    plain = read_rows(folder, variant)
+    add_machines(plain, np.random.default_rng([variant.seed, 2]))
+    few = thinned(plain, variant.every)
+    own = remainder.fit(few.time_s, few.mag, few.gyro)
+    rows, effects = few, []
+    for n, key in enumerate(keys):
+        made = _injected(plain, few, own, variant, INJECTED[key], [*entropy, n])
+        if made is not None:
+            rows, effects = made[0], [made[1]]
+            break
     step = float(np.median(np.diff(rows.time_s)))
     truth = {
-        "kind": "control" if key is None else "semireal",
+        "kind": "semireal" if effects else "control",
         "noise_law": "real",
-        "noise": {},
+        "noise": {"own_delay_s": own.own_delay_s},
         "allowed": [],
-        "motion": base,
+        "motion": variant.name,
         "rate_hz": 1 / step,
         "duration_s": float(np.ptp(rows.time_s)),
         "withheld": None,
@@ -220,3 +80,58 @@ def make_semireal(folder, base, key, entropy):
         "oracle_gain_nats_per_sample": None,
     }
     return rows, {"rate_hz": round(1 / step, 3)}, truth
+
+
+def _injected(plain, few, own, variant, row, entropy):
+    """(Rows, entry of the key), or None where the recording cannot show the effect."""
+
+    def with_effect(strength, apply=row.apply):
+        rows = replace(plain)
+        planted = apply(rows, strength, np.random.default_rng([*entropy, 2]))
+        return thinned(rows, variant.every), planted
+
+    limit, seen, against = row.least, None, 0.0
+    if row.scaled:
+        reference = _SMALL * row.least
+        rows, _ = with_effect(reference, row.shown or row.apply)
+        seen = own.signal_to_noise(rows.mag - few.mag, rows.gyro - few.gyro) / reference
+        limit = max(row.least, SEEN / max(seen, 1e-12))
+        against = max(0.0, -row.own * own.own_delay_s)
+    if row.key == "frame_error" and not _turns(few):
+        return None
+    if limit + against > row.most:
+        return None
+    draw = np.random.default_rng([*entropy, 1]).uniform(*np.log(_MULTIPLES))
+    multiple = float(np.exp(draw))
+    strength = min(limit * multiple + against, row.most)
+    if row.key in _WHOLE:
+        strength = 1.0
+    rows, planted = with_effect(strength)
+    return rows, _entry(row, strength, limit, against, seen, planted)
+
+
+def _turns(rows):
+    """Whether it turns about every axis, so that no two of the gyro's can be taken for another."""
+    spread = np.linalg.eigvalsh(np.cov(rows.gyro.T))
+    return spread[0] > 0.05 * spread[2]
+
+
+def _entry(row, strength, limit, against, seen, planted):
+    names = row.names
+    return {
+        "effect": row.key if row.key in names else names[0],
+        "source": row.key,
+        "frame": planted.frame,
+        "frames": [planted.frame, *FRAMES.get(names[0], ())],
+        "either_half": False,
+        "strength": strength,
+        "unit": row.unit,
+        "limit": limit,
+        "multiple": (strength - against) / limit,
+        "snr": None if seen is None else seen * (strength - against),
+        "right": list(names),
+        "parents": [],
+        "parameters": [{"name": n, "value": v, "unit": u} for n, v, u in planted.parameters],
+        "onset_s": planted.onset_s,
+        "intervals_s": [list(span) for span in planted.intervals_s],
+    }

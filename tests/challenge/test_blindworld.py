@@ -9,12 +9,11 @@ from pathlib import Path
 import grimp
 import numpy as np
 import pytest
-from blindworld import cases, chain, curves, ideal, limits, motion, rings, semireal, world
+from blindworld import cases, chain, curves, ideal, limits, motion, rings, world
 from blindworld.__main__ import csv_bytes, make_ring
 from scipy.spatial.transform import Rotation
 
 PROJECT = Path(__file__).parents[2]
-RECORDINGS = PROJECT.parent / "shared" / "recordings"
 RATE_HZ = 25.0
 
 
@@ -237,20 +236,3 @@ def test_a_withheld_column_is_not_there():
     )
     assert np.allclose(table["mag_x_gauss"], made.rows.mag[:, 0], atol=1e-7)
     assert len(table) == made.truth["duration_s"] * made.truth["rate_hz"] + 1
-
-
-def test_injections_on_real_recordings_are_exact():
-    if not RECORDINGS.is_dir():
-        pytest.skip("no real recordings beside the project")
-    base = "vn100/circles_2022_rahul.csv.gz"
-    plain, _, truth = semireal.make_semireal(RECORDINGS, base, None, [1])
-    assert truth["kind"] == "control" and truth["effects"] == []
-    rows, _, truth = semireal.make_semireal(RECORDINGS, base, "motor_current_field", [1])
-    per_ampere = [p["value"] for p in truth["effects"][0]["parameters"]]
-    added = np.outer(rows.columns["motor_current_a"], per_ampere)
-    assert np.allclose(rows.mag - plain.mag, added, atol=1e-12)
-    assert np.array_equal(rows.gyro, plain.gyro)
-    late, _, truth = semireal.make_semireal(RECORDINGS, base, "mag_time_lag", [2])
-    lag = truth["effects"][0]["strength"]
-    moved = np.interp(plain.time_s - lag, plain.time_s, plain.mag[:, 2])
-    assert np.std(late.mag[5:, 2] - moved[5:]) < 0.2 * np.std(np.diff(plain.mag[:, 2]))

@@ -168,6 +168,40 @@ def test_semireal_is_judged_beyond_the_control():
     assert (unmoved.word, unmoved.error) == (j.MISSED, True)
 
 
+def test_what_the_control_says_too_is_no_false_name():
+    case = truth("semireal", effect("gyro_scale"))
+    control = said(finding("mag_time_lag", "mag_low_pass"))
+    both = said(finding("gyro_scale"), finding("mag_low_pass"))
+    assert judge(case, both, control).word == j.RIGHT
+    assert judge(case, both, said()).word == j.ADDED
+    again = judge(case, said(finding("mag_low_pass"), unexplained=True, frame="gyro"), control)
+    assert (again.word, again.detected, again.first_right) == (j.UNKNOWN, True, False)
+    as_before = judge(case, said(finding("mag_low_pass")), control)
+    assert (as_before.word, as_before.detected, as_before.first_right) == (j.MISSED, False, None)
+    wrong = judge(case, said(finding("eddy_current")), control)
+    assert (wrong.word, wrong.detected, wrong.in_set) == (j.WRONG, True, False)
+
+
+def test_an_unknown_of_the_control_is_no_detection():
+    case, room = truth("semireal", effect("gyro_scale")), said(unexplained=True, frame="world")
+    assert judge(case, room, room).detected is False
+    assert judge(case, said(unexplained=True, frame="gyro"), room).detected is True
+    assert judge(case, room, said()).detected is True
+
+
+def test_a_delay_of_the_other_sensor_counts_against_the_controls():
+    lag = effect("gyro_time_lag", right=["gyro_time_lag", "mag_time_lag"])
+    case = truth("semireal", lag | {"parameters": [{"name": "lag", "value": 0.03, "unit": "s"}]})
+
+    def of(name, value):
+        return said(finding(name, parameters=(Parameter("lag", value, 1e-3, "s"),)))
+
+    own = of("mag_time_lag", 0.012)
+    turned = judge(case, of("gyro_time_lag", 0.018), own)
+    assert (turned.word, turned.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
+    assert judge(case, of("mag_time_lag", 0.018), own).word == j.MISSED
+
+
 def test_overlap_of_unions():
     assert overlap([(0, 10)], [(5, 15)]) == pytest.approx(5 / 15)
     assert overlap([(0, 2), (4, 6)], [(0, 6)]) == pytest.approx(4 / 6)
