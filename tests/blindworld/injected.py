@@ -21,6 +21,7 @@ class Injected:
     most:   physically largest strength
     right:  names for the very same signal
     own:    what the recording may have of the same kind, +1 or -1 times its own delay
+    timed:  whether it has an instant or a course that could have been another one
     shown:  another way to the same signal, which does not move the noise with it
     """
 
@@ -32,6 +33,7 @@ class Injected:
     right: tuple[str, ...] = ()
     scaled: bool = True  # whether its signal to noise can be said
     own: int = 0
+    timed: bool = False
     shown: object = None
 
     @property
@@ -152,13 +154,15 @@ _ROWS = (
     Injected("mag_gyro_misalignment", 0.6 * DEG, 10 * DEG, "rad", _misalign),
     Injected("gyro_scale", 0.01, 0.2, "1", _scale, ("gyro_scale", "clock_rate")),
     Injected("gyro_g_sensitivity", 3 * _G, 40 * _G, "rad/s/(m/s^2)", _g_sensitivity),
-    Injected("hard_iron_step", 4e-3, 0.3, "gauss", _iron_step),
-    Injected("gyro_bias_step", 0.06 * DEG, 2 * DEG, "rad/s", _gyro_step),
-    Injected("gyro_bias_temperature", 0.02 * DEG, 0.3 * DEG, "rad/s/degC", _bias_of_temperature),
-    Injected("motor_current_field", 4e-3, 0.3, "gauss", _field_of("motor_current_a", "gauss/A")),
-    Injected("switched_device", 4e-3, 0.3, "gauss", _field_of("lamp_on", "gauss")),
+    Injected("hard_iron_step", 4e-3, 0.3, "gauss", _iron_step, timed=True),
+    Injected("gyro_bias_step", 0.06 * DEG, 2 * DEG, "rad/s", _gyro_step, timed=True),
+    Injected("gyro_bias_temperature", 0.02 * DEG, 0.3 * DEG, "rad/s/degC",
+             _bias_of_temperature, timed=True),
+    Injected("motor_current_field", 4e-3, 0.3, "gauss",
+             _field_of("motor_current_a", "gauss/A"), timed=True),
+    Injected("switched_device", 4e-3, 0.3, "gauss", _field_of("lamp_on", "gauss"), timed=True),
     Injected("mag_bias_temperature", 4e-3, 0.1, "gauss",
-             _field_of("temperature_c", "gauss/degC")),
+             _field_of("temperature_c", "gauss/degC"), timed=True),
     Injected("mag_saturation", 0.01, 0.1, "1", _clipped, scaled=False),
     Injected("frame_error", 1.0, 1.0, "1", _swapped, scaled=False),
     Injected("unit_error_gyro", 1.0, 1.0, "1", _gyro_unit, ("unit_error",), scaled=False),

@@ -20,6 +20,10 @@ All that is taken as noise, and measured: two spectra, across the field and alon
   projected out: the root of  min over columns N of  sum_k w_k |D_k - N_k z|^2.  For D:
       u changes by R M dm + x cross u,    x_k = sum_(j<=k) R_j dw_j dt.
 
+* What a spectrum does not say.  A remainder that is not stationary (a room walked through, iron
+  that creeps) looks more like a step than noise of its spectrum does.  `score` measures that with
+  the same effect at other times and in other directions, which nobody injected.
+
 The observer knows shape, spectrum and when; it is told nothing else.
 """
 
@@ -132,7 +136,7 @@ class Remainder:
     """A fitted recording.
 
     turn (K, 3, 3), inverse soft iron (3, 3), reading in the world (K, 3), noise power (K - 1, 3),
-    the calibration's columns (K - 1, 3, 12), steps (K,) s, own delay of the magnetometer in s
+    the calibration's columns (K - 1, 3, 11), steps (K,) s, own delay of the magnetometer in s
     """
 
     turn: np.ndarray
@@ -145,6 +149,19 @@ class Remainder:
 
     def signal_to_noise(self, mag, gyro):
         """Of differences (K, 3) in gauss and rad/s, the calibration projected out."""
+        return float(np.linalg.norm(self._shown(mag, gyro)))
+
+    def score(self, mag, gyro):
+        """How much of such differences the recording has itself, in standard deviations.
+
+        About 1 in the mean square where the remainder is what its spectrum says and no more.
+        """
+        shown = self._shown(mag, gyro)
+        left = (_transformed(self.world) / np.sqrt(self.power)).ravel()
+        return float(shown @ left / np.linalg.norm(shown))
+
+    def _shown(self, mag, gyro):
+        """Differences in units of the noise, without what a calibration would take up."""
         turned = np.cumsum(np.einsum("kij,kj->ki", self.turn, gyro * self.steps_s[:, None]), axis=0)
         seen = np.einsum("kij,jl,kl->ki", self.turn, self.inverse, mag)
         seen = seen + np.cross(turned, self.world)
@@ -152,7 +169,7 @@ class Remainder:
         left = (weight * _transformed(seen)).ravel()
         N = (weight[:, :, None] * self.columns).reshape(len(left), -1)
         N = N / np.linalg.norm(N, axis=0)
-        return float(np.linalg.norm(left - N @ np.linalg.lstsq(N, left, rcond=1e-9)[0]))
+        return left - N @ np.linalg.lstsq(N, left, rcond=1e-9)[0]
 
 
 def _columns(turn, mag, inverse, world, steps_s):
@@ -210,5 +227,4 @@ def fit(time_s, mag, gyro):
         if number >= len(_FIRST_HZ) - 1:
             taken = np.einsum("ij,jk,ik->i", C_w, np.linalg.inv(G), C_w).reshape(power.shape)
             power = spectrum(left + C @ step, 1 - taken)
-    whole = np.concatenate([C[:, :, :11], _transformed(world)[:, :, None]], axis=2)
-    return Remainder(turn, inverse, world, power, whole, steps, delay)
+    return Remainder(turn, inverse, world, power, C[:, :, :11], steps, delay)

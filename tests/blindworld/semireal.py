@@ -5,9 +5,10 @@ So each variant appears once untouched, as a control, and a tool is judged by wh
 the answer to the control of the same variant: rows and machines are the same but for the effect.
 
 A limit is the strength that stands out of this recording's own remainder with a signal to noise of
-7 (`remainder`), or the table's where that is more.  An effect that would have to be stronger than
-physics allows is replaced by another one.  A delay that goes against the recording's own has to
-make up for that first.
+7 (`remainder`), or the table's where that is more.  Where the recording has more of such an effect
+at other times than its spectrum says, the noise is taken to be that much larger.  An effect that
+would have to be stronger than physics allows is replaced by another one.  A delay that goes
+against the recording's own has to make up for that first.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from blindworld.limits import FRAMES
 _A_VARIANT = 6  # cases, its control among them
 _MULTIPLES = (0.5, 8.0)
 _SMALL = 0.05  # of the table's limit: there every effect is in proportion
+_PLACEBOS = 12
 _WHOLE = ("frame_error", "unit_error_gyro", "unit_error_mag")  # nothing else can be told beside
 
 
@@ -95,6 +97,7 @@ def _injected(plain, few, own, variant, row, entropy):
         reference = _SMALL * row.least
         rows, _ = with_effect(reference, row.shown or row.apply)
         seen = own.signal_to_noise(rows.mag - few.mag, rows.gyro - few.gyro) / reference
+        seen /= _excess(few, own, row) if row.timed else 1.0
         limit = max(row.least, SEEN / max(seen, 1e-12))
         against = max(0.0, -row.own * own.own_delay_s)
     if row.key == "frame_error" and not _turns(few):
@@ -108,6 +111,16 @@ def _injected(plain, few, own, variant, row, entropy):
         strength = 1.0
     rows, planted = with_effect(strength)
     return rows, _entry(row, strength, limit, against, seen, planted)
+
+
+def _excess(few, own, row):
+    """How much more of an effect the recording has by itself than noise of its spectrum has."""
+    scores = []
+    for n in range(_PLACEBOS):
+        rows = add_machines(replace(few), np.random.default_rng([n, 1]))
+        row.apply(rows, _SMALL * row.least, np.random.default_rng([n, 2]))
+        scores.append(own.score(rows.mag - few.mag, rows.gyro - few.gyro))
+    return max(1.0, float(np.sqrt(np.mean(np.square(scores)))))
 
 
 def _turns(rows):

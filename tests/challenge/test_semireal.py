@@ -94,6 +94,16 @@ def test_a_calibration_does_not_stand_out_and_axes_do_not_matter(simulated):
     assert there == pytest.approx(own.signal_to_noise(mag, gyro), rel=0.02)
 
 
+def test_what_the_recording_has_itself_is_about_one_where_its_noise_is_stationary(simulated):
+    own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
+    none = np.zeros_like(simulated.mag)
+    late = (simulated.at > np.mean(simulated.at))[:, None]
+    steps = [late * step for step in 1e-3 * np.eye(3)]
+    assert np.sqrt(np.mean([own.score(step, none) ** 2 for step in steps])) < 2
+    moved = remainder.fit(simulated.at, simulated.mag + 20 * steps[2], simulated.gyro)
+    assert moved.score(steps[2], none) > 5
+
+
 def test_a_delay_of_its_own_is_found_and_is_no_noise(simulated):
     own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
     late = np.array(
@@ -138,7 +148,7 @@ def test_injections_on_real_recordings_are_exact(variant):
     assert np.array_equal(rows.gyro, plain.gyro)
     own = remainder.fit(plain.time_s, plain.mag, plain.gyro)
     seen = own.signal_to_noise(rows.mag - plain.mag, rows.gyro - plain.gyro)
-    assert effect["snr"] == pytest.approx(seen, rel=1e-6)
+    assert 0.4 * seen < effect["snr"] <= seen * (1 + 1e-9)
     at_limit = effect["snr"] / effect["multiple"]
     assert at_limit == pytest.approx(cases.SEEN) or effect["limit"] == 4e-3
     assert 0.5 <= effect["multiple"] <= 8
