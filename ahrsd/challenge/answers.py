@@ -32,6 +32,7 @@ class Finding:
     parameters: tuple[Parameter, ...]
     gain: float | None
     separate_from: str | None
+    shares: tuple[float, ...] = ()  # confidence of each alternative
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -89,19 +90,21 @@ def read_answer(record: Json) -> Answer:
 
 def _finding(entry: Json) -> Finding:
     where, heldout = _object(entry.get("where")), _object(entry.get("heldout"))
+    others = [
+        other
+        for other in _list(entry.get("alternatives"))
+        if isinstance(other, dict) and "effect" in other
+    ]
     return Finding(
         effect=str(entry.get("effect")),
         confidence=_number(entry.get("confidence")),
-        alternatives=tuple(
-            str(other["effect"])
-            for other in _list(entry.get("alternatives"))
-            if isinstance(other, dict) and "effect" in other
-        ),
+        alternatives=tuple(str(other["effect"]) for other in others),
         frame=_text(where.get("frame")),
         spans_s=_spans(where.get("intervals_s")),
         parameters=tuple(_parameters(entry.get("parameters"))),
         gain=_number(heldout.get("nll_gain_per_sample")),
         separate_from=_text(entry.get("separate_from")),
+        shares=tuple(_number(other.get("confidence")) or 0.0 for other in others),
     )
 
 

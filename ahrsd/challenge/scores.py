@@ -218,11 +218,32 @@ def _of_semireal(semireal: Sequence[Verdict]) -> list[Score]:
     ]
 
 
+def _stated(verdict: Verdict, right: dict[str, set[str]]) -> float | None:
+    """The confidence that the first name counts as right.
+
+    Its own, and that of each alternative for whose signal it counts as right too.
+    """
+    if verdict.confidence is None:
+        return None
+    first = verdict.answer.findings[0]
+    alike = [
+        share
+        for name, share in zip(first.alternatives, first.shares, strict=False)
+        if first.effect in right.get(name, ())
+    ]
+    return min(1.0, verdict.confidence + sum(alike))
+
+
 def _of_all(verdicts: Sequence[Verdict]) -> list[Score]:
-    stated = [
-        (v.confidence, v.word == RIGHT or bool(v.first_right))
+    right = {
+        str(effect["effect"]): set(effect["right"])
         for v in verdicts
-        if v.confidence is not None and v.kind in ("null", "single", "pair")
+        for effect in v.truth["effects"]
+    }
+    stated = [
+        (confidence, v.word == RIGHT or bool(v.first_right))
+        for v in verdicts
+        if v.kind in ("null", "single", "pair") and (confidence := _stated(v, right)) is not None
     ]
     error = calibration_error(stated)
     seconds = [v.answer.seconds for v in verdicts if v.answer.seconds is not None]

@@ -277,6 +277,16 @@ def test_wilson_interval_is_the_textbooks():
     assert (low, high) == (pytest.approx(0.9155, abs=1e-4), pytest.approx(0.9897, abs=1e-4))
 
 
+def test_alternatives_for_the_very_same_signal_share_the_confidence():
+    names = ("mag_time_lag", "mag_low_pass")
+    either = [truth("single", effect(name, right=list(names))) for name in names]
+    found = Finding(
+        names[0], 0.7, (names[1], "eddy_current"), "sensor", (), (), None, None, (0.2, 0.1)
+    )
+    rows = {row.name: row for row in scores([judge(case, said(found)) for case in either])}
+    assert rows["calibration error of the confidence"].value == pytest.approx(0.1)
+
+
 def test_calibration_error_of_an_honest_and_of_a_boasting_tool():
     honest = [(0.8, n % 5 != 0) for n in range(50)]
     boasting = [(1.0, n % 2 == 0) for n in range(50)]
