@@ -39,10 +39,17 @@ def plan(cases, seed):
         Variant(base, int(rng.choice(base.every)), int(rng.integers(2**31))) for base in bases
     ]
     out = [(variant, ()) for variant in variants][:cases]
-    keys = _cycle(rng, tuple(INJECTED), cases - len(out))
-    for n, key in enumerate(keys):
-        rest = [k for k in _cycle(rng, tuple(INJECTED), len(INJECTED)) if k != key]
-        out.append((variants[n % count], (key, *(k for k in rest if k not in _WHOLE))))
+    queue, had = [], [[] for _ in variants]
+    for n in range(cases - len(out)):
+        before = had[n % count]
+        if not set(queue) - set(before):
+            queue += _cycle(rng, tuple(INJECTED), len(INJECTED))
+        key = next((k for k in queue if k not in before), queue[0])
+        queue.remove(key)
+        before.append(key)
+        rest = [k for k in _cycle(rng, tuple(INJECTED), len(INJECTED)) if k not in _WHOLE]
+        rest.sort(key=before.count)  # what the variant has not had yet comes first
+        out.append((variants[n % count], (key, *(k for k in rest if k != key))))
     rng.shuffle(out)
     return out
 

@@ -121,8 +121,11 @@ def test_every_variant_has_its_control_and_the_seed_decides():
     variants = {variant for variant, _ in plan}
     assert {variant for variant, keys in plan if not keys} == variants
     assert len({variant.name for variant in variants}) == len(variants) == 10
-    first = [keys[0] for _, keys in plan if keys]
-    assert set(first) == set(injected.INJECTED)
+    first = [(variant.name, keys[0]) for variant, keys in plan if keys]
+    assert {key for _, key in first} == set(injected.INJECTED)
+    assert len(set(first)) == len(first) == 50  # none twice in a variant
+    counts = [[key for _, key in first].count(key) for key in injected.INJECTED]
+    assert max(counts) - min(counts) <= 2
     assert semireal.plan(60, 5) == plan != semireal.plan(60, 6)
 
 
