@@ -18,7 +18,7 @@ the one without it.  Where nothing is left the variances are zero and nothing ch
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ from scipy import linalg
 from ahrsd.mismatch import locate
 from ahrsd.mismatch.evidence import SIZES, colour
 from ahrsd.mismatch.gram import RANK_SHARE, solve
-from ahrsd.mismatch.regression import Base, residual
+from ahrsd.mismatch.regression import Base, based, residual
+from ahrsd.mismatch.rest import Rest
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -62,6 +63,20 @@ class Discrepancy:
     sizes: Array
     nats: float
     unknown: float
+
+    def softened(self) -> Base:
+        """The basis with the random effects of these sizes whitened out of it."""
+        size = np.exp(self.sizes)[self.group]
+        kept = size > 2 * np.exp(SMALLEST)
+        scaled = self.columns.reshape(-1, len(self.group))[:, kept] * size[kept]
+        U, d, _ = np.linalg.svd(scaled, full_matrices=False)
+        rest = Rest(U, np.sqrt(self.noise / (self.noise + d**2)), self.noise)
+        known, innovation = (rest.whitened(v) for v in (self.basis.known, self.basis.innovation))
+        return replace(
+            based(self.basis, self.basis.groups, known, innovation),
+            rest=rest,
+            colour=colour(innovation, self.basis.rate_hz),
+        )
 
     def refined(self, name: str) -> tuple[Array, Array]:
         """What is left to change in a known group's value (p,) beside them, and its deviation."""

@@ -28,7 +28,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.exam import examined, paired, rest_of
+from ahrsd.mismatch.exam import examined, paired, pruned, rest_of
 from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
     contribution,
@@ -58,7 +58,6 @@ from ahrsd.mismatch.search import (
     at_rest,
     basis_of,
     formed_basis_of,
-    pruned,
     settled,
     survey,
     swapped,
@@ -317,7 +316,7 @@ def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ..
     projected = gram.project(list(basis.groups))
     out = []
     for candidate in first.candidates:
-        what = score(projected, candidate.name, candidate.scale)
+        what = score(projected, candidate.name, candidate.scale, candidate.effect.least_information)
         sigma = np.sqrt(np.diag(what.covariance)) if what.rank else np.zeros(len(candidate.scale))
         hidden = _hidden(what.basis, candidate.scale)
         for k, parameter in enumerate(candidate.effect.parameters):

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
-from ahrsd.mismatch.regression import Base, evidence_of
+from ahrsd.mismatch.name import judge
+from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
     STEPS,
@@ -22,6 +24,41 @@ from ahrsd.samples import Array
 
 #: names of iron and metal that remember or follow the turns: half of any unlogged course looks so
 IMITATORS = ("viscous_magnetisation", "hysteresis", "eddy_current")
+
+#: names with a delay among their combinations
+WIDER_THAN_A_DELAY = ("eddy_current",)
+
+
+def pruned(state: State) -> State:
+    """Terms that the others have made superfluous taken out, one at a time."""
+    while len(state.named) > 1:
+        basis = formed_basis_of(state)
+        evidence = []
+        for k, judged in enumerate(state.named):
+            left = without_wider(state, k, without_term(state, k, basis))
+            columns = columns_of(left, [judged.candidate])
+            gram = candidate_gram(left, columns, state.problem.block_s)
+            own = columns[judged.candidate.name]
+            again = judge(judged.candidate, gram, own, left, 1, state.problem.limits)
+            evidence.append(again.evidence)
+        weakest = int(np.argmin(evidence))
+        if evidence[weakest] > state.problem.limits.evidence_nats:
+            break
+        state = refitted(state, tuple(j for k, j in enumerate(state.named) if k != weakest))
+    return state
+
+
+def without_wider(state: State, number: int, left: Base) -> Base:
+    """`left` without the other names that contain this one: beside them it never has any worth.
+
+    Eddy currents alike in all directions are a delay; that one does not make the delay superfluous.
+    """
+    if state.named[number].candidate.name not in DELAYS:
+        return left
+    for k, name in enumerate(state.names):
+        if k != number and name in WIDER_THAN_A_DELAY:
+            left = left.without(term_group(k), state.fit.terms[k].value)
+    return left
 
 
 def examined(state: State) -> tuple[State, bool]:
@@ -90,7 +127,8 @@ def _worth(state: State, basis: Base, found: Discrepancy, number: int) -> float:
     bounds = np.array([parameter.bound for parameter in judged.candidate.effect.parameters])
     if np.any(np.abs(state.fit.terms[number].value) > bounds):
         return -np.inf
-    left, columns = without_term(state, number, basis), _columns(basis, number)
+    left = without_wider(state, number, without_term(state, number, basis))
+    columns = _columns(basis, number)
     scale = judged.candidate.scale
     other = counterpart(state, number)
     if other is not None:

@@ -27,6 +27,7 @@ class Limits:
     beyond_share:   and in parts of what the random effects are worth themselves: what is a small
                     part of the unknown is not known; of real recordings the names that are known
                     to be right have a fifth at least, those that are not a seventh at most
+    beside_nats:    and where it is found with the remainder whitened out of everything
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
     doubt:          share of names with all of the evidence that are wrong: 4 of 101 in one sealed
@@ -45,6 +46,7 @@ class Limits:
     most_shaped: int = 3
     beyond_nats: float = 60.0
     beyond_share: float = 0.15
+    beside_nats: float = 35.0
     unknown_nats: float = 12.0
     unknown_p: float = 1e-6
     doubt: float = 0.02

@@ -72,7 +72,10 @@ def judge(
     """
     known = list(basis.groups)
     what = score(
-        gram.select([*known, candidate.name]).project(known), candidate.name, candidate.scale
+        gram.select([*known, candidate.name]).project(known),
+        candidate.name,
+        candidate.scale,
+        candidate.effect.least_information,
     )
     evidence = log_bayes(what, basis.colour) - float(np.log(candidate.tried))
     tests = tried * candidate.tried

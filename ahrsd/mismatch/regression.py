@@ -20,7 +20,8 @@ from ahrsd.mismatch.evidence import colour, log_bayes
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.objects import closest_object
-from ahrsd.mismatch.score import Score, score
+from ahrsd.mismatch.rest import Rest
+from ahrsd.mismatch.score import Score, total_score
 from ahrsd.mismatch.sums import Sums
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
@@ -30,8 +31,7 @@ CALIBRATION = "calibration"
 BATCH_COLUMNS = 96
 #: effects whose parameters cannot be negative
 ONE_SIDED = ("mag_time_lag", "gyro_time_lag", "mag_low_pass", "mag_sample_hold")
-ONSET_STEPS = 12
-ONSET_PASSES = 2
+ONSET_STEPS, ONSET_PASSES = 12, 2
 #: settings that are a size, sought between the values of their grid, and what that choice costs
 SCALES = ("time_constant_s", "radius_gauss", "length_s")
 ANGLES = ("turn_deg",)
@@ -70,9 +70,9 @@ class Base:
     known (N, 3, q): whitened columns of the calibration and of the named terms, in `groups` order;
     innovation (N, 3): whitened;  rate_hz: rows per second;
     colour: power of the innovation at low frequency over white;
-    sums: of the fit with all its terms, of whose columns `kept` (q,) are known here and of which
-    `back` (all of them,) was put back into the innovation;
-    weight: (N, 3, 3) of the rows, in all of these (`weighed`).
+    sums: of the fit with all its terms: of its columns `kept` (q,) are known here, and `back` (all
+    of them,) was put back into the innovation;
+    weight (N, 3, 3) of the rows (`weighed`), rest: noise of its own; in all of these.
     """
 
     context: Context
@@ -86,6 +86,7 @@ class Base:
     kept: NDArray[np.intp]
     back: Array
     weight: Array | None = None
+    rest: Rest | None = None
 
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
         """The columns (N, 3, p) as the innovation sees them, several at a time."""
@@ -99,6 +100,7 @@ class Base:
             joined = _joined(columns[at:end], len(self.innovation))
             seen = sensitivities(self.filtered, joined)
             seen = seen if self.weight is None else self.weight @ seen
+            seen = seen if self.rest is None else self.rest.whitened(seen)
             edges = np.cumsum([0, *(part.width for part in columns[at:end])])
             out += [seen[:, :, a:b] for a, b in itertools.pairwise(edges)]
             at = end
@@ -251,7 +253,7 @@ def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candi
         M = inverse @ cross
         G = XX - cross.T @ M
         s = Xe + whole.T @ basis.back - M.T @ known_e
-        what = total_score(G, s, np.diag(XX), scale)
+        what = total_score(G, s, np.diag(XX), scale, effect.least_information)
         cost = np.log(len(options)) + np.log(float(option.get("searched", 1)))
         evidence = log_bayes(what, basis.colour) - cost if _possible(effect, what) else -np.inf
         out.append(Candidate(effect, option, len(options), evidence))
@@ -372,14 +374,6 @@ def _possible(effect: Effect, what: Score) -> bool:
     if effect.identifier not in ONE_SIDED or what.rank == 0:
         return True
     return bool(np.all(what.value > -2.0 * np.sqrt(np.diag(what.covariance))))
-
-
-def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
-    """The score of one group from its projected information (p, p) and score (p,)."""
-    whole = np.zeros((1, len(s) + 1, len(s) + 1))
-    whole[0, :-1, :-1], whole[0, :-1, -1], whole[0, -1, :-1] = G, s, s
-    one = Gram({"x": slice(0, len(s))}, whole, np.ones(1), np.zeros((1, 2)), information)
-    return score(one, "x", scale)
 
 
 def _joined(parts: Sequence[Columns], count: int) -> Columns:

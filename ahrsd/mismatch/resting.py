@@ -22,7 +22,7 @@ from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.evidence import log_bayes, posterior
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.limits import Limits
-from ahrsd.mismatch.regression import total_score
+from ahrsd.mismatch.score import total_score
 from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S
 from ahrsd.mismatch.values import Context
 from ahrsd.samples import Array

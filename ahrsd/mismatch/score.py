@@ -105,6 +105,16 @@ def score(gram: Gram, name: str, scale: Array, minimum_information: float = 1.0)
     )
 
 
+def total_score(
+    G: Array, s: Array, information: Array, scale: Array, minimum_information: float = 1.0
+) -> Score:
+    """The score of one group from its projected information (p, p) and score (p,)."""
+    whole = np.zeros((1, len(s) + 1, len(s) + 1))
+    whole[0, :-1, :-1], whole[0, :-1, -1], whole[0, -1, :-1] = G, s, s
+    one = Gram({"x": slice(0, len(s))}, whole, np.ones(1), np.zeros((1, 2)), information)
+    return score(one, "x", scale, minimum_information)
+
+
 def chi2_p(what: Score, colour: float = 1.0) -> float:
     """Probability of a larger score statistic under noise whose power is `colour` times white."""
     return chi2_above(what.statistic / colour, what.rank) if what.rank else 1.0

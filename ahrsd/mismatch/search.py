@@ -318,25 +318,6 @@ def fitted_term(candidate: Candidate, value: Array) -> FittedTerm:
     )
 
 
-def pruned(state: State) -> State:
-    """Terms that the others have made superfluous taken out, one at a time."""
-    while len(state.named) > 1:
-        basis = formed_basis_of(state)
-        evidence = []
-        for k, judged in enumerate(state.named):
-            left = without_term(state, k, basis)
-            columns = columns_of(left, [judged.candidate])
-            gram = candidate_gram(left, columns, state.problem.block_s)
-            own = columns[judged.candidate.name]
-            again = judge(judged.candidate, gram, own, left, 1, state.problem.limits)
-            evidence.append(again.evidence)
-        weakest = int(np.argmin(evidence))
-        if evidence[weakest] > state.problem.limits.evidence_nats:
-            break
-        state = refitted(state, tuple(j for k, j in enumerate(state.named) if k != weakest))
-    return state
-
-
 def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
     """Each term held against every other name for what it explains; surveys without each term.
 

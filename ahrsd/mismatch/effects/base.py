@@ -17,6 +17,9 @@ Kind = Literal["mean", "variance", "discrete"]
 #: what a non-linear choice of an effect is made of: onset, time constant, covariate's name ...
 Setting = dict[str, Any]
 
+#: deviations that a coefficient at its physical bound must be for a direction to be observable
+BOUND_DEVIATIONS = 3.0
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -84,6 +87,16 @@ class Effect(ABC):
     kind: Kind = "mean"
     after_noise: bool = False
     frame: str | None = None
+
+    @property
+    def least_information(self) -> float:
+        """Of a direction of its coefficients, in prior deviations, for it to count as observable.
+
+        A coefficient at its physical bound must be three of its own deviations there; one of usual
+        size may be less: on a noisy recording only a large one shows, but that one does.
+        """
+        reach = min((one.bound / one.scale for one in self.parameters), default=1.0)
+        return float(min(1.0, (BOUND_DEVIATIONS / reach) ** 2))
 
     @abstractmethod
     def settings(self, context: Context) -> tuple[Setting, ...]:

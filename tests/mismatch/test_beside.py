@@ -1,0 +1,73 @@
+"""Names held against what is left when the remainder is whitened out; delays beside wider names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+from tracks import experiment, track_of
+
+from ahrsd.mismatch.discrepancy import discrepancy
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.exam import pruned
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.regression import base
+from ahrsd.mismatch.score import total_score
+from ahrsd.mismatch.search import State, added, survey
+from ahrsd.mismatch.track import Spec, Track
+
+
+def room(samples: int = 4000) -> Track:
+    """A recording in whose remainder a field in sensor axes changes every eight seconds."""
+    track = track_of(experiment("wam", motion="rov", samples=samples))
+    pieces = np.floor(track.time_s / 8.0).astype(int)
+    values = np.random.default_rng(8).normal(0.0, 4e-3, (pieces.max() + 1, 3))
+    return replace(track, mag_b_gauss=track.mag_b_gauss + values[pieces])
+
+
+def test_the_remainder_is_whitened_out_of_innovation_and_columns():
+    track = room()
+    fit = fit_null(track, walk=False)
+    basis = base(fit.context(), fit.filtered, [], 25.0)
+    soft = discrepancy(basis).softened()
+    assert basis.colour > 3.0
+    assert soft.colour < 0.5 * basis.colour
+    effect = EFFECTS["hard_iron_step"]
+    columns = effect.columns(basis.context, {"onset_s": 80.0})
+    seen = soft.whitened([columns])[0]
+    # V^-1/2 applied twice is V^-1: the products with the innovation are those of one application
+    rest = soft.rest
+    assert rest is not None
+    np.testing.assert_allclose(seen, rest.whitened(basis.whitened([columns])[0]), atol=1e-12)
+    U, d2 = rest.directions, rest.noise * (rest.kept**-2.0 - 1.0)
+    values = basis.innovation.ravel()
+    inverse = values / rest.noise - U @ ((d2 / (d2 + rest.noise)) * (U.T @ values)) / rest.noise
+    twice = rest.whitened(rest.whitened(basis.innovation))
+    np.testing.assert_allclose(twice.ravel(), inverse, atol=1e-9)
+
+
+def test_eddy_currents_do_not_make_a_delay_superfluous():
+    trial = Trial(4, (("mag_time_lag", 0.6), ("eddy_current", 0.6)), samples=4000)
+    problem, cold = problem_of(made(trial).track, Spec(), EFFECTS, LIMITS)
+    state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    for name in ("mag_time_lag", "eddy_current"):
+        seen = survey(state)
+        state = added(state, next(one for one in seen.judged if one.candidate.name == name))
+    assert state.names == ("mag_time_lag", "eddy_current")
+    assert pruned(state).names == ("mag_time_lag", "eddy_current")
+
+
+def test_a_direction_counts_where_a_coefficient_at_its_bound_would_show():
+    effect = EFFECTS["mag_bias_temperature"]
+    assert effect.least_information == pytest.approx((3 / 50) ** 2)
+    scale = np.array([one.scale for one in effect.parameters])
+    G = np.diag([0.1, 0.1, 1e-4]) / np.outer(scale, scale)
+    s = np.array([3.0, 0.0, 0.0]) / scale
+    assert total_score(G, s, np.diag(G), scale).rank == 0
+    what = total_score(G, s, np.diag(G), scale, effect.least_information)
+    assert what.rank == 2
+    np.testing.assert_allclose(what.value, [30 * scale[0], 0.0, 0.0], atol=1e-12)
