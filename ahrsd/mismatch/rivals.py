@@ -9,11 +9,13 @@ every name is compared with
     rate      an error of the gyro that depends on the rates in any way
     memory    a field in sensor axes that depends on where the field has been: relays (Preisach's
               model of hysteresis) in directions all over the sphere
+    matrix    a mount, soft iron or scales that change slowly: a matrix on the field, any in time
 
 each a random effect whose size is found by marginal likelihood, which makes it pay for its
 coefficients.  Where a free form is more likely than the name, or is there beside it and takes most
 of what it explained, the name only stood in for it.  A course in time has its own test
-(`stand_ins`).
+(`stand_ins`).  Where more is left than the names explain, any form finds something of it beside
+them: there it must be more likely by itself, and a coefficient may jump.
 """
 
 from __future__ import annotations
@@ -49,25 +51,32 @@ OWN_SHARE = 0.5
 PARTS = 6
 #: where relays flip, in parts of the field's range along their direction
 RELAYS = (0.3, 0.55)
+#: half waves in time with which a matrix may change
+SLOW = 3
 _SMALL = -5.0  # logarithm of a deviation to begin with: next to nothing
 
 
-def of_another_form(state: State, basis: Base, courses: Sequence[str]) -> list[int]:
+def of_another_form(
+    state: State, basis: Base, courses: Sequence[str], *, beside: bool = False
+) -> list[int]:
     """Numbers of the terms whose names only stand in for something of another form.
 
     courses: names that are a course in time and nothing else
+    beside: whether more is left than the names explain
     """
-    noise = max(1.0, basis.colour)
-    columns = basis.whitened([by_rate(basis.context), by_memory(basis.context)])
-    free = [part * unit for part, unit in zip(columns, (UNIT_RAD_S, UNIT_GAUSS), strict=True)]
+    noise, context = max(1.0, basis.colour), basis.context
+    columns = basis.whitened([by_rate(context), by_memory(context), by_matrix(context)])
+    units = (UNIT_RAD_S, UNIT_GAUSS, UNIT_GAUSS)
+    free = [part * unit for part, unit in zip(columns, units, strict=True)]
     out = []
     for k, name in enumerate(state.names):
         scale = state.named[k].candidate.scale
         mine = basis.known[:, :, basis.groups[term_group(k)]] * scale
         left = without_term(state, k, basis)
         own = [] if name in courses else _varied(mine, added_value(state, k) / scale)
+        own = own[:1] if beside else own
         if any(_rivals(left, mine, part, noise, 1.0) for part in own) or any(
-            _rivals(left, mine, part, noise, OWN_SHARE) for part in free
+            _rivals(left, mine, part, noise, OWN_SHARE, alone=beside) for part in free
         ):
             out.append(k)
     return out
@@ -76,8 +85,9 @@ def of_another_form(state: State, basis: Base, courses: Sequence[str]) -> list[i
 def of_the_rate(left: Remainder) -> Remainder:
     """The remainder, told of the gyro where an error that depends on the rates explains it best.
 
-    Best: more than the strongest frame's free course, of which little is left beside it. What moves
-    a vehicle draws a current, so that a course may look as if it followed the rates.
+    Best: by itself more than the strongest frame's course, of which little is left beside it.
+    What moves a vehicle draws a current, so that a course may look as if it followed the rates; and
+    beside a course of a real recording, an error by the rates finds something of its own.
     """
     basis, best = left.basis, left.strongest
     if left.stood_in is not None or best.frame == "gyro":
@@ -85,7 +95,9 @@ def of_the_rate(left: Remainder) -> Remainder:
     course = frame_columns(basis.context, best.frame, best.cut)
     mine, rate = basis.whitened([course, by_rate(basis.context)])
     noise = max(1.0, basis.colour)
-    if _rivals(basis, mine * UNIT_GAUSS, rate * UNIT_RAD_S, noise, OWN_SHARE):
+    name, form, both = compared(basis, mine * UNIT_GAUSS, rate * UNIT_RAD_S, noise)
+    name = max(name, best.evidence)
+    if form > name + _more(name) and both - form < OWN_SHARE * name:
         return replace(left, stood_in="gyro")
     return left
 
@@ -102,11 +114,21 @@ def compared(left: Base, mine: Array, other: Array, noise: float) -> tuple[float
     return name, form, max(fitted(G, s, group, noise, start)[0] for start in starts)
 
 
-def _rivals(left: Base, mine: Array, other: Array, noise: float, share: float) -> bool:
-    """Whether a free form is more than the name, which keeps less than `share` beside it."""
+def _rivals(
+    left: Base, mine: Array, other: Array, noise: float, share: float, *, alone: bool = False
+) -> bool:
+    """Whether a free form is more than the name, which keeps less than `share` beside it.
+
+    alone: the form without the name
+    """
     name, form, both = compared(left, mine, other, noise)
-    more = MORE_NATS + MORE_SHARE * max(name, 0.0)
-    return max(form, both) > name + more and both - form < share * name
+    most = form if alone else max(form, both)
+    return most > name + _more(name) and both - form < share * name
+
+
+def _more(name: float) -> float:
+    """Nats by which a form must be more than a name of so many."""
+    return MORE_NATS + MORE_SHARE * max(name, 0.0)
 
 
 def _varied(columns: Array, value: Array) -> list[Array]:
@@ -132,3 +154,11 @@ def _relay(along: Array, part: float) -> Array:
     sign = np.where(along > middle + half, 1.0, np.where(along < middle - half, -1.0, 0.0))
     last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(sign)), 0))
     return np.asarray(sign[last])
+
+
+def by_matrix(context: Context) -> Columns:
+    """The field times a matrix that changes slowly with time."""
+    phase = np.linspace(0.0, np.pi, len(context.field_b))
+    slow = np.cos(phase[:, None] * np.arange(1, SLOW + 1))
+    values = slow[:, :, None] * context.field_b[:, None, :]
+    return every_direction(values.reshape(len(phase), -1))

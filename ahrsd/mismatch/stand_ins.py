@@ -62,7 +62,7 @@ def without_stand_ins(
     Steps, drifts and bumps can imitate any course roughly.  They may stay where they explain nearly
     all of what their frame's own coefficients explain, and where a few of them do.  A gyro whose
     bias wanders as an ordinary one's does is noise.  Every name is held against what has another
-    form, unless so much is `beside` the names that no form of theirs can be seen.
+    form; beside: whether more is left than the names explain.
     """
     limits = state.problem.limits
     left = unknown.remainder(formed_basis_of(state))
@@ -79,8 +79,8 @@ def without_stand_ins(
     state, surveys, left = _dropped(state, surveys, bumps, left)
     if one_course:
         left = replace(left, stood_in="world")
-    if state.named and not beside:
-        wrong = _of_another_form(state)
+    if state.named:
+        wrong = _of_another_form(state, beside)
         if wrong:
             frame = _frame_of(state, wrong[0])
             state, surveys, left = _dropped(state, surveys, wrong, left)
@@ -89,14 +89,14 @@ def without_stand_ins(
     return state, surveys, left
 
 
-def _of_another_form(state: State) -> list[int]:
+def _of_another_form(state: State, beside: bool) -> list[int]:
     """Terms that come and go as nothing in the library does, or are of another form."""
     basis = formed_basis_of(state)
     # a magnet is put on and taken off again; a gyro's bias does not come back
     back = [k for k, name in enumerate(state.names) if name == STEPS["gyro"]]
     back = [k for k in back if counterpart(state, k) is not None]
     courses = [name for names in TIME_SHAPED.values() for name in names]
-    return sorted({*back, *of_another_form(state, basis, courses)})
+    return sorted({*back, *of_another_form(state, basis, courses, beside=beside)})
 
 
 def _bumps(state: State, left: unknown.Remainder) -> tuple[list[int], bool]:
