@@ -209,22 +209,27 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
     """Judged by what is said beyond the answer to the untouched recording of the same variant.
 
     A name that the control has too, first or among its alternatives, is neither right nor false;
-    one of the right names is right if it moved by what was injected.
+    one of the right names is right if it moved by what was injected.  So is one that the key allows
+    because the recording has it of its own.
     """
     effect = truth["effects"][0]
     right = effect["right"]
     if answer.failure is not None:  # refused, and rightly
         return Verdict(case, truth, answer, RIGHT, False, _least([effect]), True, True, True, True)
     before = control.findings if control is not None else ()
-    own = control.everything if control is not None else frozenset()
+    said_before = control.everything if control is not None else frozenset()
+    own = said_before | frozenset(truth["allowed"])
     found = next((f for f in answer.findings if f.effect in right), None)
     earlier = next((f for f in before if f.effect in right), None)
-    pulls, relative = compare(effect["parameters"], found, earlier, str(effect["effect"]))
-    hit = found is not None and (earlier is None or (relative is not None and relative < 0.25))
+    was_there = earlier or _own_delay(truth, effect)
+    pulls, relative = compare(effect["parameters"], found, was_there, str(effect["effect"]))
+    # what no control said is an estimate: then nearer to what was injected than to nothing
+    close = 0.25 if earlier is not None else 0.5
+    hit = found is not None and (was_there is None or (relative is not None and relative < close))
     others = [n for n in answer.names if n not in right and n not in own]
     if hit:
         word = ADDED if others else RIGHT
-    elif any(n in right for n in answer.everything - own):
+    elif any(n in right and n not in said_before for n in answer.everything):
         word = IN_SET
     else:
         word = WRONG if others else UNKNOWN if answer.unexplained else MISSED
@@ -248,6 +253,15 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
         pulls=pulls,
         relative=relative,
     )
+
+
+def _own_delay(truth: Json, effect: Json) -> Finding | None:
+    """The delay that a real recording has of its own, as if the control had said it."""
+    delay = truth["noise"].get("own_delay_s")
+    if delay is None or effect["effect"] not in DELAYED:
+        return None
+    told = (Parameter("lag", float(delay), None, "s"),)
+    return Finding("mag_time_lag", None, (), None, (), told, None, None)
 
 
 def _measured(truth: Json, effect: Json, found: Finding | None) -> dict[str, Any]:

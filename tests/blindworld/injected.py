@@ -146,11 +146,11 @@ def _clipped(rows, strength, rng):
     return Planted("sensor", (("limit", limit, "gauss"),))
 
 
-_LAGS = ("mag_time_lag", "gyro_time_lag", "gyro_integration", "mag_low_pass")
+LAGS = ("mag_time_lag", "gyro_time_lag", "gyro_integration", "mag_low_pass")
 _G = 0.05 * DEG / 9.81
 _ROWS = (
-    Injected("mag_time_lag", 4e-3, 80e-3, "s", _mag_lag, _LAGS, own=1, shown=_gyro_lag),
-    Injected("gyro_time_lag", 4e-3, 80e-3, "s", _gyro_lag, _LAGS, own=-1),
+    Injected("mag_time_lag", 4e-3, 80e-3, "s", _mag_lag, LAGS, own=1, shown=_gyro_lag),
+    Injected("gyro_time_lag", 4e-3, 80e-3, "s", _gyro_lag, LAGS, own=-1),
     Injected("mag_gyro_misalignment", 0.6 * DEG, 10 * DEG, "rad", _misalign),
     Injected("gyro_scale", 0.01, 0.2, "1", _scale, ("gyro_scale", "clock_rate")),
     Injected("gyro_g_sensitivity", 3 * _G, 40 * _G, "rad/s/(m/s^2)", _g_sensitivity),

@@ -20,7 +20,7 @@ import numpy as np
 from blindworld import remainder
 from blindworld.bases import BASES, Variant, add_machines, read_rows, thinned
 from blindworld.cases import SEEN
-from blindworld.injected import INJECTED
+from blindworld.injected import INJECTED, LAGS
 from blindworld.limits import FRAMES
 
 _A_VARIANT = 6  # cases, its control among them
@@ -79,7 +79,7 @@ def make_semireal(folder, variant, keys, entropy):
         "kind": "semireal" if effects else "control",
         "noise_law": "real",
         "noise": {"own_delay_s": own.own_delay_s},
-        "allowed": [],
+        "allowed": list(LAGS) if abs(own.own_delay_s) >= INJECTED["mag_time_lag"].least else [],
         "motion": variant.name,
         "rate_hz": 1 / step,
         "duration_s": float(np.ptp(rows.time_s)),

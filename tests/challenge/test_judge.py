@@ -36,6 +36,7 @@ def truth(kind, *effects, **changes):
         "id": "00000001",
         "kind": kind,
         "noise_law": "white",
+        "noise": {},
         "allowed": [],
         "motion": "wam",
         "duration_s": 400.0,
@@ -200,6 +201,17 @@ def test_a_delay_of_the_other_sensor_counts_against_the_controls():
     turned = judge(case, of("gyro_time_lag", 0.018), own)
     assert (turned.word, turned.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
     assert judge(case, of("mag_time_lag", 0.018), own).word == j.MISSED
+    silent = case | {"noise": {"own_delay_s": 0.012}}
+    alone = judge(silent, of("gyro_time_lag", 0.018), said())
+    assert (alone.word, alone.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
+    assert judge(silent, of("mag_time_lag", 0.010), said()).error
+
+
+def test_what_the_recording_truly_has_is_no_false_name():
+    case = truth("semireal", effect("gyro_scale"), allowed=["mag_time_lag"])
+    both = said(finding("gyro_scale"), finding("mag_time_lag"))
+    assert judge(case, both, said()).word == j.RIGHT
+    assert judge(case, said(finding("mag_time_lag")), said()).word == j.MISSED
 
 
 def test_overlap_of_unions():
