@@ -21,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.mismatch.gram import Gram
+from ahrsd.mismatch.evidence import log_bayes
+from ahrsd.mismatch.gram import RANK_SHARE, Gram
 from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import (
     FRAMES,
@@ -36,6 +37,7 @@ from ahrsd.mismatch.locate import (
     segments_between,
 )
 from ahrsd.mismatch.regression import Base, group_gram
+from ahrsd.mismatch.score import total_score
 from ahrsd.mismatch.unknown import Remainder
 from ahrsd.samples import Array
 
@@ -45,6 +47,8 @@ COUNT, SHORTEST_S = 100, 1.0
 ZOOM, AROUND = 48, 1.5
 #: what is below this share of the largest departure is the usual level
 LEAST = 0.01
+#: information below which a coefficient is not known at all, in units of its frame
+LEAST_KNOWN = 1e-3
 MOST_BOXES, ROUNDS = 20, 20
 #: powers of half a wave: a box, half a wave, a whole one; and the shortest, in stretches
 SHAPES, SHORTEST = (0, 1, 2), 3
@@ -90,17 +94,16 @@ class _Course:
         self.gram, self.frame = gram, frame
         self.G, self.s = gram.total[where, where] / colour, gram.total[where, -1] / colour
         self.count = len(self.s) // 3
-        self.sizes = UNITS[frame] * np.asarray(SPAN)
-        self.ridge = np.eye(3) / self.sizes[-1] ** 2
+        self.known = gram.information[where] / colour  # before anything was taken out
+        unseen = RANK_SHARE * float(self.known.sum()) / 3  # of one axis, all stretches together
+        self.ridge = np.eye(3) * (unseen + (SPAN[-1] * UNITS[frame]) ** -2)
         self.change = float(np.log(self.count))  # what a change costs
 
     def nats(self, X: Array) -> float:
         """Evidence of coefficients on columns X (3 J, p), averaged over their sizes."""
-        values, vectors = np.linalg.eigh(X.T @ self.G @ X)
-        values, square = np.maximum(values, 0.0), (vectors.T @ (X.T @ self.s)) ** 2
-        k2 = self.sizes[:, None] ** 2
-        terms = 0.5 * np.sum(square / (values + 1 / k2) - np.log1p(k2 * values), axis=1)
-        return float(np.logaddexp.reduce(terms) - np.log(len(terms)))
+        scale = np.full(X.shape[1], UNITS[self.frame])
+        what = total_score(X.T @ self.G @ X, X.T @ self.s, self.known @ X**2, scale, LEAST_KNOWN)
+        return log_bayes(what, 1.0, SPAN)
 
     def two_states(self) -> tuple[float, NDArray[np.bool]]:
         """Evidence of one vector that is on or off, and (J,) where it is away from the usual."""
