@@ -14,6 +14,7 @@ from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import SHARPER, posterior
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.gram import solve
+from ahrsd.mismatch.heldout import gain_of
 from ahrsd.mismatch.innovation import TRACELESS
 from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import segments
@@ -21,6 +22,7 @@ from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of, scaled
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
+    WANDERING,
     State,
     Survey,
     counterpart,
@@ -68,7 +70,7 @@ def finding(
         alternatives=tuple(a for a in alternatives if a.confidence > SMALLEST_SHARE),
         where=where(judged, added_value(state, number), basis),
         parameters=parameters,
-        heldout=_heldout(_with_all_else(judged, seen), basis, state.problem.thin),
+        heldout=_heldout(state, basis, number, _with_all_else(judged, seen)),
         cost_if_left_out=cost(basis, number, added_value(state, number)),
         separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
@@ -209,7 +211,7 @@ def where(judged: Judged, value: Array, basis: Base) -> Where:
         ]
     )
     setting = judged.candidate.setting
-    if "onset_s" in setting:
+    if "onset_s" in setting and "length_s" not in setting:
         found = [(float(setting["onset_s"]), float(setting.get("end_s", track.time_s[-1])))]
     else:
         found = spans(cut.edges_s, size > 0.15 * size.max())
@@ -263,16 +265,18 @@ def _with_all_else(judged: Judged, seen: Survey) -> Judged:
     return next(mine, judged)
 
 
-def _heldout(judged: Judged, basis: Base, thin: int) -> Heldout:
-    """Gains per recorded sample, of which `thin` are one of the search's."""
-    rms = innovation_rms(basis)
-    ratio = judged.gain.before / max(judged.gain.after, 1e-12)
-    return Heldout(
-        rms * float(np.sqrt(max(ratio, 0.0))),
-        rms,
-        judged.gain.nats_per_sample / thin,
-        judged.placebo_gain / thin,
-    )
+def _heldout(state: State, basis: Base, number: int, judged: Judged) -> Heldout:
+    """Gains per recorded sample, of which `thin` are one of the search's.
+
+    Of fifths of the recording; where those know too little of each other the gate's own gain.
+    """
+    wanders = state.walk and judged.candidate.name in WANDERING
+    value, scale = added_value(state, number), judged.candidate.scale
+    gain = gain_of(state.fit, number, value, scale, wanders=wanders) or judged.gain
+    rms, thin = innovation_rms(basis), state.problem.thin
+    ratio = gain.before / max(gain.after, 1e-12)
+    before = rms * float(np.sqrt(max(ratio, 0.0)))
+    return Heldout(before, rms, gain.nats_per_sample / thin, judged.placebo_gain / thin)
 
 
 def _regime(judged: Judged, basis: Base, added: Array) -> str | None:

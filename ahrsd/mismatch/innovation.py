@@ -39,6 +39,8 @@ TRACELESS[0, [0, 2], [0, 2]] = TRACELESS[1, [1, 2], [1, 2]] = 1.0, -1.0
 for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
     TRACELESS[_at, _i, _j] = TRACELESS[_at, _j, _i] = 1.0
 TRACELESS.flags.writeable = False
+#: of the field's direction where it is not taken from the first reading
+_UNSURE_RAD = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,11 +82,14 @@ def run_filter(
     *,
     held: Filtered | None = None,
     sensitive: bool = True,
+    strength_known: bool = False,
 ) -> Filtered:
     """Filter a track.  terms_*: (N, 3) contributions of the named terms, subtracted first.
 
     held:      take gains and nominal field of this earlier run (same track), not the model's own
     sensitive: false where only innovations are wanted, not what `sensitivities` needs
+    strength_known: the field is as strong as the nominal one; else every run finds its strength as
+               it goes (not with `held`)
     Rows whose reading is not finite are passed over.  ValueError where a run has no rows.
     """
     field = _readings(track, model, terms_mag)
@@ -97,10 +102,15 @@ def run_filter(
     orientation = np.swapaxes(_carried(layout, turned), 1, 2)
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
-        found = gains(_linear(model, motion, nominal, opens, blind), layout)
+        linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
+        found = gains(linear, layout)
+        if strength_known:
+            found.gain[opens] = 0.0
     else:
         nominal, found = held.nominal_b, held.gains
     state = _transition(motion, nominal, opens, model)
+    if strength_known:
+        field = np.where(opens[:, None], nominal, field)
     predicted = _predicted(
         layout, state, found, model.soft_iron, np.where(blind[:, None], 0, field)
     )
@@ -235,10 +245,12 @@ def _linear(
     nominal: Array,
     opens: NDArray[np.bool],
     blind: NDArray[np.bool],
+    *,
+    strength_known: bool,
 ) -> Linear:
     transition = _transition(motion, nominal, opens, model)
     before = np.einsum("nij,nj->ni", motion.turn, np.roll(nominal, 1, axis=0))
-    middle = nominal + before
+    middle = nominal + np.where(opens[:, None], nominal, before)
     size = np.linalg.norm(nominal, axis=1, keepdims=True)
     middle *= size / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-300)
     tangent = np.eye(3) * (size**2)[:, :, None] - middle[:, :, None] * middle[:, None, :]
@@ -248,6 +260,8 @@ def _linear(
         process[:, [3, 4, 5], [3, 4, 5]] = model.gyro_walk_rad_s_sqrt_s**2 * motion.dt_s[:, None]
     C = np.linalg.inv(model.soft_iron)
     process[opens, :3, :3] = model.sigma_mag_gauss**2 * C @ C.T
+    if strength_known:
+        process[opens, :3, :3] = _UNSURE_RAD**2 * tangent[opens]
     return Linear(transition, process, model.soft_iron, model.sigma_mag_gauss**2, opens, blind)
 
 

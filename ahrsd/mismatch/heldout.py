@@ -1,0 +1,120 @@
+"""What a named term gains on parts of the recording that nothing was fitted to.
+
+Fifths of the recording in turn, each filtered on its own: calibration, strength of the field and
+the other terms are fitted to the other four, without the term and with it.  A slow effect bends the
+calibration of four fifths, and it shows in the fifth.
+
+The filter of a diagnosis finds the field's strength as it goes, in what is held out as well; here
+the strength is a parameter.  A gyro bias that wanders is held against one that stays, in a filter
+in which it stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.mismatch.effects import series
+from ahrsd.mismatch.gram import Gram, block_edges, gram
+from ahrsd.mismatch.innovation import nuisance_columns, run_filter, sensitivities
+from ahrsd.mismatch.null import NullFit
+from ahrsd.mismatch.regression import CALIBRATION
+from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.validate import FOLDS, PRIOR, Gain, heldout, one_by_one
+from ahrsd.mismatch.values import Columns
+from ahrsd.samples import Array
+
+#: twice the nats that may be lost per parameter because the other fifths do not know it exactly;
+#: where all five know as much of it they are 1.25
+_LOST = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """A whole model, all its terms taken out, as the filter of the fifths sees it.
+
+    fifths: of calibration and terms;  scatter: logarithm of the innovations' deviations, summed
+    over the axes, mean of the rows
+    """
+
+    fifths: Gram
+    scatter: float
+
+
+def gain_of(
+    fit: NullFit, number: int, value: Array, scale: Array, *, wanders: bool = False
+) -> Gain | None:
+    """The held-out gain of a term of a fit.
+
+    value (p,): the whole of it;  scale (p,): its prior deviations
+    wanders: it is a bias that may walk in the fit, and would not without it
+    None where a fifth says what the others do not know.  The noise is as loud as the fit leaves it.
+    """
+    name = _name(number)
+    after = _seen(fit, fit.model.gyro_walk_rad_s_sqrt_s)
+    blocks = _put_back(after.fifths, name, value)
+    known = [group for group in blocks.groups if group != name]
+    if not wanders and _alone(blocks, known, name, value, scale):
+        return None
+    level = fit.filtered.normalised_innovation
+    gain = heldout(blocks, known, name, scale, one_by_one)
+    before, scatter = gain.before, 0.0
+    if wanders:
+        still = _seen(fit, 0.0)
+        left = _put_back(still.fifths, name, value)
+        before = heldout(left, known, name, scale, one_by_one).before
+        scatter = still.scatter - after.scatter
+    return Gain(before / level, gain.after / level, scatter)
+
+
+def _name(number: int) -> str:
+    return f"term {number}"
+
+
+def _seen(fit: NullFit, walk_rad_s_sqrt_s: float) -> _Seen:
+    key = f"fifths at {walk_rad_s_sqrt_s}"
+    if key not in fit.made:
+        model = replace(fit.model, gyro_walk_rad_s_sqrt_s=walk_rad_s_sqrt_s)
+        track, edges = _cut(fit.filtered.track)
+        done = run_filter(track, model, fit.terms_mag, fit.terms_gyro, strength_known=True)
+        strength = Columns(mag=(done.predicted_b @ model.soft_iron.T)[:, :, None])
+        own = [sensitivities(done, part) for part in (nuisance_columns(done), strength)]
+        groups = {CALIBRATION: np.concatenate(own, axis=2)}
+        context = fit.context()
+        for number, term in enumerate(fit.terms):
+            groups[_name(number)] = sensitivities(done, term.columns(context))
+        nats = done.log_likelihood + 0.5 * np.sum(done.whitened**2, axis=1)
+        blocks = gram(groups, done.whitened, track.time_s, edges)
+        fit.made[key] = _Seen(blocks, -float(np.mean(nats[done.used])))
+    seen: _Seen = fit.made[key]
+    return seen
+
+
+def _cut(track: Track) -> tuple[Track, list[int]]:
+    """The track with runs of their own in every fifth, and the fifths' edges."""
+    edges = block_edges(track.time_s, track.duration_s / FOLDS)
+    dt_s = track.dt_s.copy()
+    dt_s[edges[:-1]] = np.nan
+    return replace(track, dt_s=dt_s, runs=tuple(series.runs(dt_s))), edges
+
+
+def _put_back(blocks: Gram, name: str, value: Array) -> Gram:
+    """The blocks with what a group of that value explains back in the innovation."""
+    turn = np.eye(blocks.blocks.shape[1])
+    turn[blocks.groups[name], -1] = value
+    return replace(blocks, blocks=turn.T @ blocks.blocks @ turn)
+
+
+def _alone(blocks: Gram, known: list[str], name: str, value: Array, scale: Array) -> bool:
+    """Whether a fifth says much more of a group than the others know, too little for a gain."""
+    lost = won = 0.0
+    for training, test in one_by_one(len(blocks)):
+        others = blocks.rows(training)
+        seen = others.project(known)
+        where = seen.groups[name]
+        information = seen.total[where, where] + np.diag(1.0 / (PRIOR * scale) ** 2)
+        there = blocks.rows(test).project(known, others.total).total[where, where]
+        lost += float(np.trace(np.linalg.solve(information, there)))
+        won += float(value @ there @ value)
+    return lost > _LOST * len(scale) and lost > won / 2
