@@ -16,6 +16,7 @@ _FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
 _PILED = 6.0  # times as many at the limit as at each number just inside it
 _MARGIN, _NEAR = 3.0, 0.02  # noise levels, and share of the limit, at which it begins to act
 _TOP_STEPS = 1.5  # of coarse numbers, as many at the top as one step below are no limit
+_FINE = 0.5  # share of the readings that differ from all others, where numbers are fine
 _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
 
 
@@ -88,8 +89,9 @@ def _flat_tops(
         inside = finite[(sign * finite < top) & (sign * finite > top - width)]
         usual = len(inside) / max(len(np.unique(inside)), 1)
         if longest >= 3 and np.count_nonzero(at) > _PILED * max(usual, 1.0):
-            # of a sensor that lies still at its largest reading everything piles up
-            if float(finite.max() - finite.min()) < 20 * width:
+            # coarse numbers of a sensor that lies still pile up at its largest reading
+            coarse = len(np.unique(finite)) < _FINE * len(finite)
+            if coarse and float(finite.max() - finite.min()) < 20 * width:
                 continue
             rows |= at
             size = max(size, top)

@@ -28,7 +28,7 @@ from ahrsd.mismatch.diagnosis import (
 )
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.exam import examined, paired, pruned, rest_of
+from ahrsd.mismatch.exam import rest_of
 from ahrsd.mismatch.facts import Fact, matters
 from ahrsd.mismatch.findings import (
     contribution,
@@ -59,12 +59,9 @@ from ahrsd.mismatch.search import (
     basis_of,
     formed_basis_of,
     settled,
-    survey,
-    swapped,
 )
-from ahrsd.mismatch.selection import forward
+from ahrsd.mismatch.sought import sought
 from ahrsd.mismatch.spells import with_spells
-from ahrsd.mismatch.stand_ins import without_stand_ins, without_unlikely
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.mismatch.wandering import wandering
@@ -151,11 +148,8 @@ class _Searched:
 
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
-    state, first, last = forward(State(problem, start))
-    slim, beside = examined(paired(pruned(state)))
-    last = last if slim.names == state.names else survey(slim)
-    state, surveys, last = without_unlikely(*swapped(slim, last))
-    state, surveys, left = wandering(*without_stand_ins(state, surveys, beside))
+    done = wandering(sought(State(problem, start)))
+    state, surveys, first, last, left = done.state, done.surveys, done.first, done.last, done.left
     short = bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)
@@ -231,7 +225,20 @@ def _noise_facts(
         return []
     given = problem.spec.sigma_mag_gauss is not None
     found = level_facts(fast.state.fit.filtered, spec_given=given)
-    return [fact for fact in found if not (beside_unknown and fact.effect == "noise_level")]
+    lost = [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
+    return [
+        fact
+        for fact in found
+        if not (beside_unknown and fact.effect == "noise_level") and not _all_within(fact, lost)
+    ]
+
+
+def _all_within(fact: Fact, lost: Sequence[tuple[float, float]]) -> bool:
+    """Whether each span of a burst has a lost turn in it: it is what that has left."""
+    spans = fact.where.intervals_s if fact.effect == "noise_burst" else ()
+    return bool(spans) and all(
+        any(a <= end and begin <= b for begin, end in lost) for a, b in spans
+    )
 
 
 def _doubted(one: Finding, sure: float) -> Finding:

@@ -42,6 +42,8 @@ def log_bayes_walk(G: Array, s: Array, axes: int, deviations: Array, colour: flo
     deviations: of one coefficient from its mean over the recording, natural units, averaged over.
     """
     J = len(s) // axes
+    if J < 2:  # one segment has no deviation from its own mean
+        return 0.0
     walk = np.minimum.outer(np.arange(1, J + 1), np.arange(1, J + 1)) / J
     centred = walk - walk.mean(0) - walk.mean(1)[:, None] + walk.mean()
     centred /= np.mean(np.diag(centred))

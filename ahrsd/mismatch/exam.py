@@ -30,8 +30,11 @@ WIDER_THAN_A_DELAY = ("eddy_current",)
 
 
 def pruned(state: State) -> State:
-    """Terms that the others have made superfluous taken out, one at a time."""
-    while len(state.named) > 1:
+    """Terms that the others have made superfluous taken out, one at a time.
+
+    A single one, too, where the bias may wander: it may have been named before it could.
+    """
+    while len(state.named) > (state.walk == 0.0):
         basis = formed_basis_of(state)
         evidence = []
         for k, judged in enumerate(state.named):

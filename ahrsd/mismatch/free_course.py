@@ -45,8 +45,8 @@ def with_free_course(state: State, left: Remainder) -> Remainder:
         problem.spec,
         state.fit.model,
         (*state.fit.terms, term),
-        noise=not state.walk,
-        walk=state.walk,
+        noise=state.walk == 0.0,
+        walk=state.walk > 0.0,
     )
     found = fit.terms[-1]
     course = found.value.reshape(-1, 3)

@@ -30,9 +30,9 @@ class Limits:
     beside_nats:    and where it is found with the remainder whitened out of everything
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
-    doubt:          share of names with all of the evidence that are wrong: 4 of 101 in one sealed
-                    ring, 0 of 86 in the next, with the causes of those mended; what noise model and
-                    library do not know, by which every confidence is less
+    doubt:          share of names with all of the evidence that are wrong: 5 of 526 in four sealed
+                    rings; what noise model and library do not know, by which every confidence is
+                    less
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 
@@ -49,7 +49,7 @@ class Limits:
     beside_nats: float = 35.0
     unknown_nats: float = 12.0
     unknown_p: float = 1e-6
-    doubt: float = 0.02
+    doubt: float = 0.01
     most_terms: int = 5
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from ahrsd.mismatch.delay import delayed_gyro
+from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.problem import Problem, model_at_rate, noise_of_thinned
 from ahrsd.mismatch.search import State, Survey, refitted, survey
@@ -51,13 +52,23 @@ def quick(state: State, whole: Problem) -> Quick:
     surveys: list[Survey] = []
     last = survey(full)
     while len(full.named) < whole.limits.most_terms:
-        accepted = [judged for judged in last.judged if judged.accepted]
+        accepted = [j for j in last.judged if j.accepted and not _of_its_pulses(j, full)]
         if not accepted:
             break
         surveys.append(last)
         full = refitted(full, (*full.named, accepted[0]))
         last = survey(full)
     return Quick(full, len(state.named), tuple(surveys), last)
+
+
+def _of_its_pulses(judged: Judged, state: State) -> bool:
+    """Whether a line is a multiple of the rate of named pulses: what their form leaves."""
+    at = judged.candidate.setting.get("frequency_hz")
+    periods = [one.candidate.setting.get("period_s") for one in state.named]
+    resolution_hz = 1.0 / state.problem.track.duration_s
+    return at is not None and any(
+        abs(at - round(at * period) / period) < resolution_hz for period in periods if period
+    )
 
 
 def cleaned(found: Quick, whole: Problem) -> Problem:

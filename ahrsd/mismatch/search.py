@@ -74,13 +74,14 @@ WANDERING = ("gyro_bias_drift", "gyro_bias_step", "gyro_startup", "gyro_bias_tem
 class State:
     """A fit with its named terms, in the order in which they were named.
 
-    problem: with the lag that is taken out;  walk: whether the gyro's bias may wander
+    problem: with the lag that is taken out
+    walk: rad/s per root second by which the gyro's bias may wander; 0: it stays
     """
 
     problem: Problem
     fit: NullFit
     named: tuple[Judged, ...] = ()
-    walk: bool = False
+    walk: float = 0.0
 
     def lag_s(self, number: int) -> float:
         """The whole delay that a delay's term stands for, in the term's own sign."""
@@ -266,11 +267,10 @@ def refitted(state: State, named: tuple[Judged, ...]) -> State:
         term = fitted_term(judged.candidate, value)
         fitted.append(known.get((term.identifier, str(term.setting)), term))
     start, problem = state.fit.model, state.problem
-    if state.walk:
-        start = replace(start, gyro_walk_rad_s_sqrt_s=ORDINARY_WALK_RAD_S_SQRT_S)
-    fit = fit_null(
-        problem.track, problem.spec, start, tuple(fitted), noise=not state.walk, walk=state.walk
-    )
+    walks = state.walk > 0.0
+    if walks:
+        start = replace(start, gyro_walk_rad_s_sqrt_s=state.walk)
+    fit = fit_null(problem.track, problem.spec, start, tuple(fitted), noise=not walks, walk=walks)
     return replace(state, fit=fit, named=named)
 
 

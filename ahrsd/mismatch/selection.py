@@ -13,6 +13,7 @@ from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, 
 from ahrsd.mismatch.score import Score
 from ahrsd.mismatch.search import (
     FRAME_LEAD,
+    ORDINARY_WALK_RAD_S_SQRT_S,
     STEPS,
     WANDERING,
     State,
@@ -66,7 +67,7 @@ def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
     A walk is free to follow any cause, and then none is needed.  Nor is one where the few modes of
     a walk explain nearly as much.
     """
-    noisy = refitted(replace(state, walk=True), state.named)
+    noisy = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), state.named)
     limits = state.problem.limits
     walk = max((c.evidence for c in seen.candidates if c.name == WANDERING[0]), default=0.0)
     lead = judged.candidate.evidence - walk

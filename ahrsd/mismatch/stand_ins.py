@@ -14,6 +14,7 @@ from ahrsd.mismatch.locate import FRAMES, Frame
 from ahrsd.mismatch.regression import Base, evidence_of
 from ahrsd.mismatch.rivals import of_another_form
 from ahrsd.mismatch.search import (
+    ORDINARY_WALK_RAD_S_SQRT_S,
     STEPS,
     State,
     Survey,
@@ -67,7 +68,7 @@ def without_stand_ins(
     limits = state.problem.limits
     left = unknown.remainder(formed_basis_of(state))
     if not state.walk and left.strongest.frame == "gyro" and unknown.detected(left, limits):
-        state = refitted(replace(state, walk=True), state.named)
+        state = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), state.named)
         left = unknown.remainder(formed_basis_of(state))
     for frame, names in TIME_SHAPED.items():
         shaped = [k for k, name in enumerate(state.names) if name in names]

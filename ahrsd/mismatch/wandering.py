@@ -14,54 +14,93 @@ import numpy as np
 
 from ahrsd.mismatch import locate, unknown
 from ahrsd.mismatch.evidence import log_bayes, log_bayes_walk
-from ahrsd.mismatch.null import fit_null
-from ahrsd.mismatch.regression import group_gram
+from ahrsd.mismatch.findings import shares_of
+from ahrsd.mismatch.limits import Limits
+from ahrsd.mismatch.name import judge
+from ahrsd.mismatch.regression import candidate_gram, columns_of, group_gram
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     FRAME_LEAD,
     ORDINARY_WALK_RAD_S_SQRT_S,
     WANDERING,
     State,
-    Survey,
-    fitted_term,
-    formed_basis_of,
+    refitted,
+    settled,
     survey,
+    without_term,
 )
+from ahrsd.mismatch.sought import Sought, sought
+from ahrsd.mismatch.stand_ins import LEAST_SHARE
 
 NAME = "gyro_bias_drift"
 #: of that size, which are tried
 FACTORS = (1.0, 2.0)
 
 
-def wandering(
-    state: State, surveys: list[Survey], left: unknown.Remainder
-) -> tuple[State, list[Survey], unknown.Remainder]:
-    """The state with the name where it is that, else as it was."""
-    problem, gyro = state.problem, left.located["gyro"]
+def wandering(found: Sought) -> Sought:
+    """What was found with the name where it is that, else as it was.
+
+    A bias that wanders hides what is small beside it: everything is sought once more beside it.
+    """
+    state, left, limits = found.state, found.left, found.state.problem.limits
+    gyro = left.located["gyro"]
     others = [one.evidence for frame, one in left.located.items() if frame != "gyro"]
     clear = gyro.evidence > max(others) + FRAME_LEAD
-    if not clear or not unknown.detected(left, problem.limits) or _named(state):
-        return state, surveys, left
-    nats, size = _walks(left)
-    if size < ORDINARY_WALK_RAD_S_SQRT_S or nats < problem.limits.lead_nats:
-        return state, surveys, left
-    seen = survey(state)
-    mine = next((j for j in seen.judged if j.candidate.name == NAME), None)
-    if mine is None:
-        return state, surveys, left
-    terms = (*state.fit.terms, fitted_term(mine.candidate, mine.what.value))
+    if not clear or not unknown.detected(left, limits) or _named(state):
+        return found
+    size = max(_size(left, limits), _size(_without_the_walk(found.before), limits))
+    if size < ORDINARY_WALK_RAD_S_SQRT_S:
+        return found
     for factor in FACTORS:
-        start = replace(state.fit.model, gyro_walk_rad_s_sqrt_s=factor * size)
-        fit = fit_null(problem.track, problem.spec, start, terms, noise=False)
-        found = replace(state, fit=fit, named=(*state.named, mine), walk=True)
-        rest = unknown.remainder(formed_basis_of(found))
-        if not unknown.detected(rest, problem.limits):
-            return found, [*surveys, seen], rest
-    return state, surveys, left
+        wider = settled(refitted(replace(state, walk=factor * size), ()))
+        beside = sought(wider)
+        if not unknown.detected(beside.left, limits) and not _named(beside.state):
+            named = _with_its_name(beside)
+            return found if named is None else replace(named, first=found.first)
+    return found
+
+
+def _with_its_name(found: Sought) -> Sought | None:
+    """The bias that wanders in the filter named, as it is judged where it wanders less.
+
+    None where another name is likelier there.
+    """
+    names = found.state.named
+    ordinary = refitted(replace(found.state, walk=ORDINARY_WALK_RAD_S_SQRT_S), names)
+    seen = survey(ordinary)
+    mine = next(c for c in seen.candidates if c.name == NAME)
+    columns = columns_of(seen.basis, [mine])
+    gram = candidate_gram(seen.basis, columns, found.state.problem.block_s)
+    judged = judge(
+        mine, gram, columns[NAME], seen.basis, len(seen.candidates), found.state.problem.limits
+    )
+    state = refitted(found.state, (*names, judged))
+    if shares_of(state, len(names), seen, found.last)[NAME] <= LEAST_SHARE:
+        return None
+    return replace(found, state=state, surveys=[*found.surveys, seen])
 
 
 def _named(state: State) -> bool:
     return any(name in WANDERING for name in state.names)
+
+
+def _without_the_walk(state: State) -> unknown.Remainder | None:
+    """What the names leave with the walk's first modes put back, where it was named.
+
+    Other names beside it may have been taken out again for what is left of it.
+    """
+    if NAME not in state.names:
+        return None
+    k = state.names.index(NAME)
+    return unknown.remainder(without_term(state, k), with_bins=False)
+
+
+def _size(left: unknown.Remainder | None, limits: Limits) -> float:
+    """Size of the walk that the gyro's course is, rad/s per root second; 0 where it is none."""
+    if left is None:
+        return 0.0
+    nats, size = _walks(left)
+    return size if nats >= limits.lead_nats else 0.0
 
 
 def _walks(left: unknown.Remainder) -> tuple[float, float]:

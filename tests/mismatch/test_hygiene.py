@@ -336,3 +336,13 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
     at_rest = track.mag_b_gauss.copy()
     at_rest[3000:3012] = at_rest[3000]
     assert hygiene(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()
+
+
+def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
+    """Fine numbers repeat at a limit only."""
+    rate = 0.02 * np.sin(track.time_s)[:, None] * np.array([1.0, 0.5, 0.2])
+    noisy = rate + 0.005 * np.random.default_rng(4).standard_normal(rate.shape)
+    fact = _only(clipping(replace(track, gyro_b_rad_s=np.clip(noisy, -0.024, 0.024))))
+    assert fact.effect == "gyro_saturation"
+    assert _value(fact) == 0.024
+    assert clipping(replace(track, gyro_b_rad_s=noisy)) == []

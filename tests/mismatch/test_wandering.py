@@ -48,3 +48,12 @@ def test_an_ordinary_walk_has_no_cause(track):
     steps = np.random.default_rng(4).normal(size=(len(track), 3)) * np.sqrt(0.04)
     walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 5e-6 * np.cumsum(steps, axis=0))
     assert {one.effect for one in diagnose(walked).findings} <= {"gyro_bias_drift"}
+
+
+def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
+    steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    scaled = track.gyro_b_rad_s * np.array([1.004, 0.997, 1.005])
+    walked = replace(track, gyro_b_rad_s=scaled + 4e-5 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert {one.effect for one in found.findings} == {"gyro_bias_drift", "gyro_scale"}
+    assert all(one.confidence > 0.5 for one in found.findings)

@@ -1,0 +1,40 @@
+"""All names of one state: named one after the other, pruned, examined, swapped, held to their form.
+
+forward -> prune -> examine -> swap -> stand-ins; the same again beside a bias that wanders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ahrsd.mismatch.exam import examined, paired, pruned
+from ahrsd.mismatch.search import State, Survey, survey, swapped
+from ahrsd.mismatch.selection import forward
+from ahrsd.mismatch.stand_ins import without_stand_ins, without_unlikely
+from ahrsd.mismatch.unknown import Remainder
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sought:
+    """The state with all names, the surveys without each of them, what is left.
+
+    first, last: the surveys before and after the names
+    before: the state before any name was taken out again
+    """
+
+    state: State
+    surveys: list[Survey]
+    first: Survey
+    last: Survey
+    left: Remainder
+    before: State
+
+
+def sought(state: State) -> Sought:
+    """Every name that the state's fit allows beside what it has."""
+    more, first, last = forward(state)
+    slim, beside = examined(paired(pruned(more)))
+    last = last if slim.names == more.names else survey(slim)
+    named, surveys, last = without_unlikely(*swapped(slim, last))
+    named, surveys, left = without_stand_ins(named, surveys, beside)
+    return Sought(named, surveys, first, last, left, more)
