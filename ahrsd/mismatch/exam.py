@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
 from ahrsd.mismatch.name import judge
+from ahrsd.mismatch.nested import without_wider
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
@@ -24,9 +24,6 @@ from ahrsd.samples import Array
 
 #: names of iron and metal that remember or follow the turns: half of any unlogged course looks so
 IMITATORS = ("viscous_magnetisation", "hysteresis", "eddy_current")
-
-#: names with a delay among their combinations
-WIDER_THAN_A_DELAY = ("eddy_current",)
 
 
 def pruned(state: State) -> State:
@@ -49,19 +46,6 @@ def pruned(state: State) -> State:
             break
         state = refitted(state, tuple(j for k, j in enumerate(state.named) if k != weakest))
     return state
-
-
-def without_wider(state: State, number: int, left: Base) -> Base:
-    """`left` without the other names that contain this one: beside them it never has any worth.
-
-    Eddy currents alike in all directions are a delay; that one does not make the delay superfluous.
-    """
-    if state.named[number].candidate.name not in DELAYS:
-        return left
-    for k, name in enumerate(state.names):
-        if k != number and name in WIDER_THAN_A_DELAY:
-            left = left.without(term_group(k), state.fit.terms[k].value)
-    return left
 
 
 def examined(state: State) -> tuple[State, bool]:
@@ -131,6 +115,8 @@ def _worth(state: State, basis: Base, found: Discrepancy, number: int) -> float:
     if np.any(np.abs(state.fit.terms[number].value) > bounds):
         return -np.inf
     left = without_wider(state, number, without_term(state, number, basis))
+    if "onset_s" in judged.candidate.setting:
+        left = found.of_places(left)
     columns = _columns(basis, number)
     scale = judged.candidate.scale
     other = counterpart(state, number)

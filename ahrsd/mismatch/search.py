@@ -267,11 +267,13 @@ def refitted(state: State, named: tuple[Judged, ...]) -> State:
         term = fitted_term(judged.candidate, value)
         fitted.append(known.get((term.identifier, str(term.setting)), term))
     start, problem = state.fit.model, state.problem
+    if problem.lag_s != 0.0 and not any(one.candidate.name in DELAYS for one in named):
+        problem = problem.lagging(0.0)  # what nobody names is not taken out of the track
     walks = state.walk > 0.0
     if walks:
         start = replace(start, gyro_walk_rad_s_sqrt_s=state.walk)
     fit = fit_null(problem.track, problem.spec, start, tuple(fitted), noise=not walks, walk=walks)
-    return replace(state, fit=fit, named=named)
+    return replace(state, problem=problem, fit=fit, named=named)
 
 
 def settled(state: State) -> State:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.name import Judged, judge
+from ahrsd.mismatch.nested import simplest
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, columns_of
 from ahrsd.mismatch.score import Score
@@ -51,12 +52,13 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
                 break
             state, last = more, survey(more)
             continue
-        if accepted[0].candidate.name in state.names and closer < len(state.named):
+        best = simplest(accepted)
+        if best.candidate.name in state.names and closer < len(state.named):
             state, closer = shaped_again(state, newest=True), len(state.named)
-        elif accepted[0].candidate.name in WANDERING and not state.walk:
-            state = _noise_or_cause(state, accepted[0], last)
+        elif best.candidate.name in WANDERING and not state.walk:
+            state = _noise_or_cause(state, best, last)
         else:
-            state = added(state, accepted[0])
+            state = added(state, best)
         last = survey(state)
     return state, first, last
 
