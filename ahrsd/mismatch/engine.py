@@ -29,7 +29,7 @@ from ahrsd.mismatch.diagnosis import (
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import rest_of
-from ahrsd.mismatch.facts import Fact, matters
+from ahrsd.mismatch.facts import Fact, around_lost_turns, matters
 from ahrsd.mismatch.findings import (
     contribution,
     finding,
@@ -225,20 +225,12 @@ def _noise_facts(
         return []
     given = problem.spec.sigma_mag_gauss is not None
     found = level_facts(fast.state.fit.filtered, spec_given=given)
-    lost = [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
+    level_says_nothing = ("noise_level",) if beside_unknown else ()
     return [
         fact
         for fact in found
-        if not (beside_unknown and fact.effect == "noise_level") and not _all_within(fact, lost)
+        if fact.effect not in level_says_nothing and not around_lost_turns(fact, facts)
     ]
-
-
-def _all_within(fact: Fact, lost: Sequence[tuple[float, float]]) -> bool:
-    """Whether each span of a burst has a lost turn in it: it is what that has left."""
-    spans = fact.where.intervals_s if fact.effect == "noise_burst" else ()
-    return bool(spans) and all(
-        any(a <= end and begin <= b for begin, end in lost) for a, b in spans
-    )
 
 
 def _doubted(one: Finding, sure: float) -> Finding:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,6 +51,14 @@ def matters(fact: Fact) -> bool:
     if fact.effect == "timestamp_jitter" and not fact.stops:
         return fact.parameters[0].value > JITTER_SHARE * float(fact.setting["step_s"])
     return True
+
+
+def around_lost_turns(burst: Fact, facts: Sequence[Fact]) -> bool:
+    """Whether every span of a burst of noise has a lost turn in it: then it is what that leaves."""
+    lost = [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
+    spans = burst.where.intervals_s if burst.effect == "noise_burst" else ()
+    beside = [any(a <= end and begin <= b for begin, end in lost) for a, b in spans]
+    return bool(beside) and all(beside)
 
 
 def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:

@@ -270,7 +270,7 @@ def _heldout(state: State, basis: Base, number: int, judged: Judged) -> Heldout:
 
     Of fifths of the recording; where those know too little of each other the gate's own gain.
     """
-    wanders = state.walk and judged.candidate.name in WANDERING
+    wanders = state.walk > 0.0 and judged.candidate.name in WANDERING
     value, scale = added_value(state, number), judged.candidate.scale
     gain = gain_of(state.fit, number, value, scale, wanders=wanders) or judged.gain
     rms, thin = innovation_rms(basis), state.problem.thin

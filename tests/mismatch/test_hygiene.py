@@ -9,13 +9,15 @@ import pytest
 from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd.mismatch.clipping import clipping
-from ahrsd.mismatch.facts import Fact, spans_of
+from ahrsd.mismatch.diagnosis import Where
+from ahrsd.mismatch.facts import Fact, around_lost_turns, spans_of
 from ahrsd.mismatch.frames import ranked, windows
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.missing import missing_turns, whole_nats
 from ahrsd.mismatch.stamps import regular
 from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
 
 CLEAN = (
     "broad/01_undisturbed_slow_rotation_A",
@@ -346,3 +348,16 @@ def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
     assert fact.effect == "gyro_saturation"
     assert _value(fact) == 0.024
     assert clipping(replace(track, gyro_b_rad_s=noisy)) == []
+
+
+def test_a_burst_around_a_lost_turn_is_what_that_leaves() -> None:
+    def told(effect: str, *spans: tuple[float, float], turned: Array | None = None) -> Fact:
+        return Fact(effect, "", Where(spans, ("x",), "link"), 1.0, turned=turned)
+
+    lost = told("dropped_samples", (20.0, 20.04), (313.1, 313.14), turned=np.ones(3))
+    assert around_lost_turns(told("noise_burst", (313.0, 314.0)), [lost])
+    assert not around_lost_turns(told("noise_burst", (313.0, 314.0), (400.0, 402.0)), [lost])
+    assert not around_lost_turns(told("noise_level", (0.0, 400.0)), [lost])
+    assert not around_lost_turns(
+        told("noise_burst", (313.0, 314.0)), [told("stuck_magnetometer", (313.0, 314.0))]
+    )

@@ -54,6 +54,14 @@ def test_unlogged_pulses_are_named(quiet: Track) -> None:
     assert abs(found[0].parameters[0].value - 2e-3) < 5e-4
 
 
+def test_what_the_form_of_pulses_leaves_is_no_line(quiet: Track) -> None:
+    """Pulses that swell and fade, held for a box, leave multiples of their rate."""
+    part = np.minimum(((quiet.time_s - 0.4) % 1.0661) / 0.12, 1.0)
+    swell = np.sin(np.pi * part)[:, None] ** 2
+    pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 1e-2 * swell * np.array([0.6, 0, 0.8]))
+    assert [one.effect for one in diagnose(pulsed).findings] == ["sync_pulses"]
+
+
 def test_a_line_above_the_working_rate_is_named_at_its_frequency(quiet: Track) -> None:
     phase = 2 * np.pi * 13.217 * quiet.time_s[:, None]
     added = 0.8e-3 * np.cos(phase) * np.array([0.48, 0.6, -0.64])
