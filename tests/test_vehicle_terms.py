@@ -17,9 +17,8 @@ from ahrsd.core import Core
 from ahrsd.errors import ConfigError
 from ahrsd.inputs import Columns, RegistersKnown, Samples, Stop, TermsKnown
 from ahrsd.mismatch.column_terms import follows_a_column
-from ahrsd.mismatch.forward import Noise
 from ahrsd.mismatch.model_file import RepairedModel, to_text
-from ahrsd.mismatch.values import NullModel, Term
+from ahrsd.mismatch.values import Noise, NullModel, Term
 from ahrsd.samples import SampleBlock
 from ahrsd.settings import core_settings, terms_text
 from ahrsd.simulation import Settings, simulate

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ahrsd.mismatch.locate import Located
-from ahrsd.mismatch.values import NullModel, Term
+from ahrsd.mismatch.values import Noise, NullModel, Term
 from ahrsd.samples import Array
 
 SCHEMA = "ahrsd.diagnosis/1"
@@ -176,7 +176,10 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
-    """The whole answer."""
+    """The whole answer.
+
+    model, noise, terms: the repaired model, of single samples
+    """
 
     recording: str
     baseline: Baseline | None
@@ -188,6 +191,7 @@ class Diagnosis:
     sensitivity: tuple[Limit, ...] = ()
     notes: tuple[str, ...] = ()
     model: NullModel | None = None
+    noise: Noise | None = None
     terms: tuple[Term, ...] = ()
     drawn: Drawn | None = None
     omnibus: dict[str, Whiteness] = field(default_factory=dict)

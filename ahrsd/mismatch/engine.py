@@ -34,6 +34,7 @@ from ahrsd.mismatch.findings import (
     contribution,
     finding,
     of_fact,
+    rounding,
     whole_term,
 )
 from ahrsd.mismatch.free_course import with_free_course
@@ -45,7 +46,7 @@ from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, at_model, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.one_source import with_one_source
-from ahrsd.mismatch.predictive import checks
+from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
@@ -197,6 +198,7 @@ def _told(
     seen = (*state.named, *fast.state.named[fast.known :])
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
     something = bool(found) or left.detected
+    added = _in_track((*terms, *quick_terms), fast.state)
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),
@@ -204,11 +206,14 @@ def _told(
         p_value=_p_value(seen, found, done.left),
         findings=found,
         unexplained=left,
-        posterior_predictive=_checked(done, fast, (*terms, *quick_terms), library, noise),
+        posterior_predictive=_checked(
+            done, fast, (*terms, *quick_terms), library, (*facts, *noise)
+        ),
         sensitivity=() if something else _limits(problem, basis, done.first, fast),
         notes=(*notes, *lesser, *(() if something else would_have_shown(problem.recorded))),
         model=model_at_rate(state.fit.model, problem),
-        terms=(*terms, *quick_terms),
+        noise=usual_noise(fast.state.fit, _loud(noise), (*added, *rounding(facts)), library),
+        terms=(*terms, *quick_terms, *rounding(facts)),
         drawn=_drawn(done, basis),
         omnibus=_whiteness(done),
     )
@@ -288,24 +293,35 @@ def _checked(
     fast: Quick,
     terms: tuple[Term, ...],
     library: Mapping[str, Effect],
-    noise: Sequence[Fact],
+    facts: Sequence[Fact],
 ) -> dict[str, Check]:
     """Posterior predictive checks; a delay that is out of the track stays out of the model.
 
     At the working rate, unless something was found that only the recorded rate shows.
     """
     state, null = done.state, done.start
-    if fast:
+    steps = rounding(facts)
+    if fast or steps:
         state = fast.state
         null = fit_null(state.problem.track, state.problem.spec, done.start.model, walk=False)
     elif state.problem.lag_s != 0.0:
         null = fit_null(state.problem.track, state.problem.spec, null.model, walk=False)
-    kept = [
+    kept = (*_in_track(terms, state), *steps)
+    return checks(null, state.fit, kept, library=library, loud=_loud(facts))
+
+
+def _in_track(terms: Sequence[Term], state: State) -> tuple[Term, ...]:
+    """The terms as they are in the state's track, out of which its delay was taken."""
+    return tuple(
         replace(term, value=fitted.value) if fitted.identifier in DELAYS else term
         for term, fitted in zip(terms, state.fit.terms, strict=True)
-    ]
-    loud = [span for fact in noise for span in fact.where.intervals_s]
-    return checks(null, state.fit, kept, library=library, loud=loud)
+    )
+
+
+def _loud(facts: Sequence[Fact]) -> list[tuple[float, float]]:
+    """Where the noise is at another level, seconds."""
+    levels = ("noise_burst", "noise_level")
+    return [span for fact in facts if fact.effect in levels for span in fact.where.intervals_s]
 
 
 def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -95,6 +95,19 @@ def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
         words=fact.words,
         equation="" if effect is None else effect.equation,
         setting=fact.setting,
+    )
+
+
+def rounding(facts: Sequence[Fact]) -> tuple[Term, ...]:
+    """The coarse steps of the readings, where they were counted, as a term of the model."""
+    return tuple(
+        Term(
+            fact.effect,
+            np.array([value.value for value in fact.parameters]),
+            np.array([value.std for value in fact.parameters]),
+        )
+        for fact in facts
+        if fact.effect == "mag_quantisation"
     )
 
 

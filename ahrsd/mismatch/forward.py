@@ -11,7 +11,7 @@ rate says.  What the gyro's noise did to that attitude counts as motion: a body 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,37 +24,11 @@ from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.noise import colour_of
 from ahrsd.mismatch.recursive import autoregression, both_ways
 from ahrsd.mismatch.track import Track
-from ahrsd.mismatch.values import Context, NullModel, Term
+from ahrsd.mismatch.values import Context, Noise, NullModel, Term
 from ahrsd.samples import Array
 
 DRIFT_S = 3.0  # shorter follows the field, longer the gyro; a gyro sampled at 10 Hz needs 3 s
 _RESPONSE = 4000  # rows after which a colour has died away
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Scatter of the sensors, standard deviations per sample.
-
-    gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias
-    colour:  autoregression of the magnetometer's noise, e_k = sum_j colour_j e_(k-j) + white;
-             empty: white.  mag_gauss is the deviation of e whatever its colour
-    freedom: of Student's t, which the magnetometer's white noise follows; inf: normal
-    level:   (N,) of the magnetometer's noise row by row, in parts of mag_gauss; None: 1
-    """
-
-    mag_gauss: float
-    gyro_rad_s: float
-    gyro_walk_rad_s_sqrt_s: float = 0.0
-    colour: tuple[float, ...] = ()
-    freedom: float = float("inf")
-    level: Array | None = field(default=None, compare=False)
-
-    def __post_init__(self) -> None:
-        """Raises ValueError where a deviation is negative or the colour grows without end."""
-        if min(self.mag_gauss, self.gyro_rad_s, self.gyro_walk_rad_s_sqrt_s) < 0:
-            raise ValueError("noise: a deviation is negative")
-        if len(self.colour) and np.abs(np.roots([1.0, *(-c for c in self.colour)])).max() >= 1:
-            raise ValueError("noise: the colour's autoregression is not stable")
 
 
 def noise_of(model: NullModel, filtered: Filtered | None = None) -> Noise:
@@ -93,9 +67,10 @@ def context_along(
         if missing not in (None, "accel", *track.covariates):
             raise ValueError(f"{term.identifier} needs the column {missing}")
     context = build_context(track, Given(run_filter(track, model, sensitive=False), None))
-    if not terms:
+    added = [term for term in terms if library[term.identifier].kind == "mean"]
+    if not added:
         return context
-    parts = [contribution(library[t.identifier], context, t.value, t.setting) for t in terms]
+    parts = [contribution(library[t.identifier], context, t.value, t.setting) for t in added]
     mag, gyro = (np.sum([part[side] for part in parts], axis=0) for side in (0, 1))
     return build_context(track, Given(run_filter(track, model, mag, gyro, sensitive=False), gyro))
 

@@ -15,11 +15,12 @@ import numpy as np
 from ahrsd.mismatch.diagnosis import Diagnosis
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.forward import Noise, noise_of
-from ahrsd.mismatch.values import NullModel, Term
+from ahrsd.mismatch.forward import noise_of
+from ahrsd.mismatch.values import Noise, NullModel, Term
 from ahrsd.samples import Array
 
 SCHEMA = "ahrsd.model/1"
+_LEAST_FREEDOM = 2.0  # of Student's t: with less it has no deviation
 _LEVELS = ("mag_gauss", "gyro_rad_s", "gyro_walk_rad_s_sqrt_s")
 
 
@@ -45,7 +46,7 @@ def to_text(model: RepairedModel, library: Mapping[str, Effect] = EFFECTS) -> st
             "hard_iron_gauss": calibration.hard_iron_gauss.tolist(),
             "gyro_bias_rad_s": calibration.gyro_bias_rad_s.tolist(),
         },
-        "noise": {name: getattr(model.noise, name) for name in (*_LEVELS, "colour")},
+        "noise": _noise_json(model.noise),
         "terms": [_term_json(term, library[term.identifier]) for term in model.terms],
     }
     return json.dumps(body, indent=1, allow_nan=False) + "\n"
@@ -86,7 +87,14 @@ def of_diagnosis(found: Diagnosis) -> RepairedModel:
     """The repaired model of a diagnosis.  ValueError where it has none."""
     if found.model is None:
         raise ValueError("the diagnosis has no model: the recording could not be fitted")
-    return RepairedModel(found.model, noise_of(found.model), found.terms, found.recording)
+    noise = found.noise or noise_of(found.model)
+    return RepairedModel(found.model, noise, found.terms, found.recording)
+
+
+def _noise_json(noise: Noise) -> dict[str, object]:
+    """Levels and colour; the freedom of heavy tails only where there are any."""
+    out = {name: getattr(noise, name) for name in (*_LEVELS, "colour")}
+    return out | ({"freedom": noise.freedom} if np.isfinite(noise.freedom) else {})
 
 
 def _noise(body: dict[str, Any]) -> Noise:
@@ -95,7 +103,11 @@ def _noise(body: dict[str, Any]) -> Noise:
     if not isinstance(colour, list):
         raise ValueError("noise.colour must be a list of numbers")
     by_row = {str(k): value for k, value in enumerate(colour)}
-    return Noise(mag, gyro, walk, tuple(_finite(by_row, key, "noise.colour") for key in by_row))
+    taps = tuple(_finite(by_row, key, "noise.colour") for key in by_row)
+    freedom = _number(body, "noise", "freedom") if "freedom" in body["noise"] else float("inf")
+    if freedom <= _LEAST_FREEDOM:
+        raise ValueError(f"noise.freedom: more than {_LEAST_FREEDOM:g} is needed")
+    return Noise(mag, gyro, walk, taps, freedom)
 
 
 def _term_json(term: Term, effect: Effect) -> dict[str, object]:

@@ -4,8 +4,9 @@ The fitted null and the repaired model are simulated along the recording's own m
 and gaps, some copies each, and all of them go through the null's filter as the recording did.  Both
 have the repaired model's noise: the null's own would hold what was left out as noise.
 Every statistic below is chosen before anything is looked at.  Its band covers a simulation with
-95 % for all statistics together (Bonferroni; normal in the logarithm, the copies' own mean and
-deviation, Student's t).
+99 % for all statistics together (Bonferroni; normal in the logarithm, the copies' own mean and
+deviation, Student's t).  What looks for the largest of many differences has a band from zero on:
+that less is to be seen than in a simulation is no difference.
 """
 
 from __future__ import annotations
@@ -27,15 +28,20 @@ from ahrsd.mismatch.noise import before, colour_of, tails_of
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.probabilities import student_quantile
 from ahrsd.mismatch.track import Track
-from ahrsd.mismatch.values import Context, Term
+from ahrsd.mismatch.values import Context, Noise, Term
 from ahrsd.samples import Array
 
 COPIES = 16
-_TRIED, _TRIAL_SEED = 8, 2  # simulations by which the noise's colour is found
+# simulations by which the noise's colour is found, and how many rows are enough
+_TRIED, _TRIED_ROWS, _TRIAL_SEED = 8, 40_000, 2
 _OUTSIDE = 0.01
 _SEGMENT_S = 20.0
 _LAGS = 50
 _LEAST = 1e-12
+_TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
+_ROUNDED = "mag_quantisation"
+_PASSES = 3
+_QUIETEST = 0.1  # of the noise that is seen: what is left at least where most of it is rounding
 _BEYOND = 2.0  # times what noise has in means over segments
 
 
@@ -69,10 +75,11 @@ def noise_law(
     loud: Sequence[tuple[float, float]] = (),
     terms: Sequence[Term] = (),
     library: Mapping[str, Effect] = EFFECTS,
-) -> forward.Noise:
+) -> Noise:
     """The noise of a fit as it is: levels, colour, and Student's tails where they are heavy.
 
     loud: spans in seconds that have a level of their own, each relative to the filter's.
+    Readings in coarse steps (a term) are rounded after the noise.
     What stays for 20 s in the sensor's axes or the world's, more than the colour of the rest makes
     of it, is no noise and left out.  The colour is such that innovations of simulations have the
     recording's.
@@ -86,20 +93,57 @@ def noise_law(
         within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
     law = forward.noise_of(fit.model, done)
     level = np.ones(len(within))
-    if loud or law.colour:
-        for rows in (within, ~within):
-            if np.any(rows & done.used):
-                level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
-    even = replace(done, whitened=done.whitened / level[:, None])
-    law = replace(law, freedom=tails_of(even).freedom, level=level)
+    for rows in (within, ~within):
+        if np.any(rows & done.used):
+            level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
+    if steps := [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]:
+        return _before_rounding(fit, replace(law, colour=(), level=level), steps[0], terms, library)
+    tails = tails_of(replace(done, whitened=done.whitened / level[:, None]))
+    law = replace(law, freedom=tails.freedom, level=level)
     if not law.colour:
         return law
-    made = _innovations(fit, law, terms, library, _TRIED, _TRIAL_SEED)
+    tried = int(np.clip(_TRIED_ROWS // len(level), 1, _TRIED))
+    made = _innovations(fit, law, terms, library, tried, _TRIAL_SEED)
     seen = [_quick(fit, e) if done is quick else replace(done, whitened=e) for e in made]
     stacked = np.concatenate([one.whitened for one in seen])
     found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
     colour, louder = before(colour_of(done), found)
     return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
+
+
+def usual_noise(
+    fit: NullFit,
+    loud: Sequence[tuple[float, float]] = (),
+    terms: Sequence[Term] = (),
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Noise:
+    """The noise law of a fit at one level, that of most rows."""
+    law = noise_law(fit, loud, terms, library)
+    usual = 1.0 if law.level is None else float(np.median(law.level))
+    return replace(law, mag_gauss=law.mag_gauss * usual, level=None)
+
+
+def _before_rounding(
+    fit: NullFit,
+    seen: Noise,
+    step_gauss: float,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+) -> Noise:
+    """The noise of readings before they were rounded to such steps.
+
+    seen: with what rounding adds, which has bounds, and a colour that follows the motion: it is
+    simulated, not drawn.  About a twelfth of the step's square; so much that simulations are as
+    loud as the recording.
+    """
+    whole = np.ones(len(fit.filtered.track)) if seen.level is None else seen.level**2
+    left = whole - step_gauss**2 / 12 / seen.mag_gauss**2
+    law = seen
+    for _ in range(_PASSES):
+        law = replace(seen, level=np.sqrt(np.maximum(left, _QUIETEST**2 * whole)))
+        made = _innovations(fit, law, terms, library, 1, _TRIAL_SEED)[0][fit.filtered.used]
+        left = left + fit.filtered.normalised_innovation - float(np.mean(made**2))
+    return law
 
 
 def _quick(fit: NullFit, whitened: Array) -> Filtered:
@@ -126,7 +170,7 @@ def _slow_power(quick: Filtered, segment: NDArray[np.intp]) -> float:
 
 def _compared(
     fit: NullFit,
-    noise: forward.Noise,
+    noise: Noise,
     terms: Sequence[Term],
     library: Mapping[str, Effect],
     copies: int,
@@ -148,7 +192,7 @@ def _compared(
 
 def _innovations(
     fit: NullFit,
-    noise: forward.Noise,
+    noise: Noise,
     terms: Sequence[Term],
     library: Mapping[str, Effect],
     copies: int,
@@ -305,12 +349,15 @@ def _joined(tracks: Sequence[Track]) -> Track:
 def _bands(found: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
     """Where one more simulation would be, for every statistic."""
     count, names = len(found), list(found[0])
-    reach = student_quantile(1 - _OUTSIDE / 2 / len(names), count - 1) * np.sqrt(1 + 1 / count)
     out = {}
     for name in names:
+        sides = 2 if name in _TWO_SIDED else 1
+        reach = student_quantile(1 - _OUTSIDE / sides / len(names), count - 1)
         logs = np.log(np.maximum([one[name] for one in found], _LEAST))
-        middle, width = float(np.mean(logs)), reach * float(np.std(logs, ddof=1))
-        out[name] = (float(np.exp(middle - width)), float(np.exp(middle + width)))
+        middle = float(np.mean(logs))
+        width = reach * np.sqrt(1 + 1 / count) * float(np.std(logs, ddof=1))
+        low = float(np.exp(middle - width)) if sides == 2 else 0.0
+        out[name] = (low, float(np.exp(middle + width)))
     return out
 
 

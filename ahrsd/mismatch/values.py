@@ -14,8 +14,36 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Scatter of the sensors, standard deviations per sample.
+
+    gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias
+    colour:  autoregression of the magnetometer's noise, e_k = sum_j colour_j e_(k-j) + white;
+             empty: white.  mag_gauss is the deviation of e whatever its colour
+    freedom: of Student's t, which the magnetometer's white noise follows; inf: normal
+    level:   (N,) of the magnetometer's noise row by row, in parts of mag_gauss; None: 1
+    """
+
+    mag_gauss: float
+    gyro_rad_s: float
+    gyro_walk_rad_s_sqrt_s: float = 0.0
+    colour: tuple[float, ...] = ()
+    freedom: float = float("inf")
+    level: Array | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where a deviation is negative or the colour grows without end."""
+        if min(self.mag_gauss, self.gyro_rad_s, self.gyro_walk_rad_s_sqrt_s) < 0:
+            raise ValueError("noise: a deviation is negative")
+        if len(self.colour) and np.abs(np.roots([1.0, *(-c for c in self.colour)])).max() >= 1:
+            raise ValueError("noise: the colour's autoregression is not stable")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

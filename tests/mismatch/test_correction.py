@@ -11,10 +11,10 @@ from tracks import experiment, track_of, true_model
 from ahrsd.mismatch.correction import without
 from ahrsd.mismatch.effects import profiles
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.forward import Noise, context_along, simulated, truth_along
+from ahrsd.mismatch.forward import context_along, simulated, truth_along
 from ahrsd.mismatch.forward import track_of as track_from
 from ahrsd.mismatch.model_file import RepairedModel, to_text
-from ahrsd.mismatch.values import Term
+from ahrsd.mismatch.values import Noise, Term
 
 LEFT = ("mag_quantisation", "dropped_samples", "noise_level")
 UNDONE = (  # share of the effect that may stay: its contribution is taken along the measured motion

@@ -14,7 +14,7 @@ from ahrsd.mismatch import forward
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.model_file import RepairedModel, from_text, to_text
-from ahrsd.mismatch.values import Term
+from ahrsd.mismatch.values import Noise, Term
 
 
 def terms(readings, *names):
@@ -76,7 +76,7 @@ def test_simulated_noise_is_what_the_filter_expects():
 def test_coloured_noise_is_made_and_found_again():
     context, _ = moving(4, rows=6000)
     model = context.model
-    noise = forward.Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, 0.0, (0.5, 0.2))
+    noise = Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, 0.0, (0.5, 0.2))
     made = forward.simulated(forward.truth_along(context), noise=noise, seed=1)
     left = made.mag_b_gauss - context.field_b @ SOFT_IRON.T - HARD_IRON
     assert left.std() == pytest.approx(noise.mag_gauss, rel=0.05)
@@ -91,13 +91,13 @@ def test_coloured_noise_is_made_and_found_again():
 )
 def test_noise_that_cannot_be(values, said):
     with pytest.raises(ValueError, match=said):
-        forward.Noise(*values)
+        Noise(*values)
 
 
 def test_terms_come_before_the_noise_and_clipping_behind_it():
     context, _ = moving(5)
     truth = forward.truth_along(context)
-    noise = forward.Noise(1e-3, 1e-3)
+    noise = Noise(1e-3, 1e-3)
     wanted = terms(truth, "mag_saturation", "motor_current_field")
     made = forward.simulated(truth, wanted, noise, seed=2)
     assert np.abs(made.mag_b_gauss).max() == 0.4
@@ -112,7 +112,7 @@ def test_terms_come_before_the_noise_and_clipping_behind_it():
 def test_a_model_file_reads_back_as_it_was_written():
     context, readings = moving(6)
     named = terms(readings, *(name for name, e in EFFECTS.items() if e.kind == "mean"))
-    noise = forward.Noise(1e-3, 5e-4, 1e-6, (0.3, -0.1))
+    noise = Noise(1e-3, 5e-4, 1e-6, (0.3, -0.1), 3.5)
     model = RepairedModel(context.model, noise, named, "x.csv")
     back = from_text(to_text(model))
     assert back.recording == "x.csv"
@@ -138,6 +138,7 @@ def test_a_model_file_reads_back_as_it_was_written():
         (lambda body: body["noise"].update(colour=[2.0]), "autoregression is not stable"),
         (lambda body: body["noise"].update(colour=["red"]), "noise.colour.0: 'red' is no finite"),
         (lambda body: body["noise"].pop("colour"), "noise.colour must be a list"),
+        (lambda body: body["noise"].update(freedom=1.0), "noise.freedom: more than 2"),
         (lambda body: body["calibration"].update(soft_iron=[[1, 2], [3]]), "calibration.soft_iron"),
         (lambda body: body["terms"][0].update(effect="magic"), "terms[0]: no effect 'magic'"),
         (lambda body: body["terms"][0].update(parameters=[]), "terms[0]: the parameters of"),
@@ -151,7 +152,7 @@ def test_a_model_file_reads_back_as_it_was_written():
 def test_a_bad_model_file_is_one_line(change, said):
     context, readings = moving(6)
     named = terms(readings, "motor_current_field")
-    body = json.loads(to_text(RepairedModel(context.model, forward.Noise(1e-3, 5e-4), named)))
+    body = json.loads(to_text(RepairedModel(context.model, Noise(1e-3, 5e-4), named)))
     change(body)
     with pytest.raises(ValueError) as caught:
         from_text(json.dumps(body))

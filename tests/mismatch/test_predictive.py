@@ -124,6 +124,27 @@ def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
     assert [name for name, check in known.items() if not check.inside_after] == []
 
 
+def test_readings_in_coarse_steps_are_simulated_so_and_their_noise_is_what_was_there_before():
+    context, _ = moving(11, rows=3000)
+    model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
+    steps = Term("mag_quantisation", np.array([6e-3]), np.array([1e-6]))
+    noise = forward.noise_of(model)
+    track = forward.track_of(forward.simulated(forward.truth_along(context), [steps], noise, 3))
+    fit = fit_null(track, start=model, walk=False)
+    law = predictive.usual_noise(fit, terms=[steps])
+    assert law.mag_gauss == pytest.approx(model.sigma_mag_gauss, rel=0.2)
+    found = predictive.checks(fit, fit, [steps])
+    assert [name for name, check in found.items() if not check.inside_after] == []
+
+
+def test_the_largest_of_many_differences_may_be_as_small_as_it_likes():
+    null, _, _ = recorded(rows=600)
+    bands = {name: check.band[0] for name, check in predictive.checks(null, null, ()).items()}
+    assert {name for name, low in bands.items() if low > 0} == {
+        "normalised_innovation", "autocorrelation", "tail",
+    }  # fmt: skip
+
+
 def test_the_same_question_has_the_same_answer():
     null, _, _ = recorded(rows=600)
     assert predictive.checks(null, null, ()) == predictive.checks(null, null, ())
