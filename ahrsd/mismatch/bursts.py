@@ -20,8 +20,9 @@ from ahrsd.mismatch.regression import Base, group_gram, residual
 from ahrsd.samples import Array
 
 _WINDOW_S = 1.0
+_WIDTHS_S = (0.5, 1.0, 2.0)  # in which further ones are sought
 _LOUD = 44.0  # chi-squared of three: 1 in 1e9 windows by chance
-_BESIDE = 25.0  # of further ones beside these: 1 in 60000 windows by chance
+_BESIDE = 25.0  # of further ones beside these: 1 in 60000 windows by chance, of any width
 _FEWEST = 2
 _TIE_NATS = 3.0  # frames that no turn tells apart: most of what comes and goes is on the vehicle
 _MOST_SHARE = 0.3  # of the recording; beyond, it is no burst
@@ -39,7 +40,8 @@ def bursts(basis: Base) -> Unexplained | None:
     spans = spans_of(rows, gap)
     if len(spans) < _FEWEST or np.mean(rows) > _MOST_SHARE:
         return None
-    spans = spans_of(loud_rows(left, basis.rate_hz, basis.colour, _BESIDE), gap)
+    near = [loud_rows(left, basis.rate_hz, basis.colour, _BESIDE, width) for width in _WIDTHS_S]
+    spans = spans_of(np.any(near, axis=0), gap)
     spans = [closest(left, a, b) if b - a < _LONG * gap else (a, b) for a, b in spans]
     cut = _cut(time_s, spans)
     columns = {
@@ -54,12 +56,14 @@ def bursts(basis: Base) -> Unexplained | None:
     return _described(best, [(float(time_s[a]), float(time_s[b - 1])) for a, b in spans])
 
 
-def loud_rows(left: Array, rate_hz: float, colour: float, least: float = _LOUD) -> NDArray[np.bool]:
+def loud_rows(
+    left: Array, rate_hz: float, colour: float, least: float = _LOUD, window_s: float = _WINDOW_S
+) -> NDArray[np.bool]:
     """(N,) rows of windows in which the mean of (N, 3) is away from zero, by default beyond doubt.
 
     least: statistic of a window, chi-squared of three
     """
-    width = max(4, round(_WINDOW_S * rate_hz))
+    width = max(4, round(window_s * rate_hz))
     if len(left) < 4 * width:
         return np.zeros(len(left), dtype=bool)
     sums = _moving_sum(left, width)
