@@ -42,6 +42,13 @@ def test_a_mount_that_bends_more_and_more_has_none(track: Track) -> None:
     assert found.unexplained.where.frame in ("sensor", "gyro")
 
 
+def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Track) -> None:
+    warmth = 1.0 - np.exp(-3.0 * np.linspace(0.0, 1.0, len(track)))[:, None]
+    found = diagnose(turned(track, warmth * np.array([12e-3, -8e-3, 10e-3])))
+    assert found.findings == ()
+    assert found.unexplained.detected
+
+
 def test_a_gyro_bias_that_comes_and_goes_is_no_pair_of_steps(track: Track) -> None:
     phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
     bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([6e-4, -5e-4, 7e-4])
