@@ -38,9 +38,10 @@ UNIT_GAUSS, UNIT_RAD_S = 1e-3, 1e-4
 SMALLEST, LARGEST = -6.0, 8.0
 #: standing: slower than this for longer than that; it takes a moment to get away from a place
 STILL_RAD_S, STILL_S = 0.05, 2.0
-LEAVING_S = (4.0, 2.0, 1.0, 0.5)  # the way from a place, the farther parts first
-MOST_RESTS = 12
+LEAVING_S = (4.0, 3.5, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5)  # parts of the way from a place
+MOST_RESTS = 6
 PLACES = 5  # number of their group
+LARGEST_PLACE = 4.0  # logarithm: fields of two places in a room differ by 50 mG; a magnet's by more
 ITERATIONS = 40
 
 
@@ -64,25 +65,16 @@ class Discrepancy:
     nats: float
     unknown: float
 
-    def of_places(self, basis: Base) -> Base:
-        """A basis of the same rows beside which any field wherever the vehicle stands is known.
-
-        A step that comes where a rest begins and lasts as long as it is another place.
-        """
-        known = self.group == PLACES
-        return basis.beside("places", self.columns[:, :, known]) if known.any() else basis
-
     def softened(self) -> Base:
-        """`of_places` with the random effects of these sizes whitened out of it."""
+        """The basis with the random effects of these sizes whitened out of it."""
         size = np.exp(self.sizes)[self.group]
         kept = size > 2 * np.exp(SMALLEST)
         scaled = self.columns.reshape(-1, len(self.group))[:, kept] * size[kept]
         U, d, _ = np.linalg.svd(scaled, full_matrices=False)
         rest = Rest(U, np.sqrt(self.noise / (self.noise + d**2)), self.noise)
-        basis = self.of_places(self.basis)
-        known, innovation = (rest.whitened(v) for v in (basis.known, basis.innovation))
+        known, innovation = (rest.whitened(v) for v in (self.basis.known, self.basis.innovation))
         return replace(
-            based(basis, basis.groups, known, innovation),
+            based(self.basis, self.basis.groups, known, innovation),
             rest=rest,
             colour=colour(innovation, self.basis.rate_hz),
         )
@@ -268,7 +260,7 @@ def fitted(
         slope = [float(pull[group == k].sum()) for k in range(count)]
         return -nats, -np.asarray(slope)
 
-    bounds = [(SMALLEST, LARGEST)] * count
+    bounds = [(SMALLEST, LARGEST_PLACE if k == PLACES else LARGEST) for k in range(count)]
     if named is not None:
         bounds[named] = (float(np.log(SIZES[0])), float(np.log(SIZES[-1])))
     from scipy.optimize import minimize  # dear to import, and needed beside a name only

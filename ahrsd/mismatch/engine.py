@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch import roles, unknown
+from ahrsd.mismatch.beside import named_beside
 from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS
@@ -150,7 +151,8 @@ class _Searched:
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     done = wandering(sought(State(problem, start)))
-    state, surveys, first, last, left = done.state, done.surveys, done.first, done.last, done.left
+    first, last = done.first, done.last
+    state, surveys, left = named_beside(done.state, done.surveys, done.left)
     short = bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)

@@ -22,7 +22,7 @@ import numpy as np
 from ahrsd.mismatch.score import Score
 from ahrsd.samples import Array
 
-SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0, 10.0)
+SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 
 
 def log_bayes(what: Score, colour: float = 1.0, sizes: Sequence[float] = SIZES) -> float:

@@ -115,8 +115,6 @@ def _worth(state: State, basis: Base, found: Discrepancy, number: int) -> float:
     if np.any(np.abs(state.fit.terms[number].value) > bounds):
         return -np.inf
     left = without_wider(state, number, without_term(state, number, basis))
-    if "onset_s" in judged.candidate.setting:
-        left = found.of_places(left)
     columns = _columns(basis, number)
     scale = judged.candidate.scale
     other = counterpart(state, number)

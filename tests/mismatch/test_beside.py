@@ -11,6 +11,7 @@ from tracks import experiment, track_of
 
 from ahrsd.mismatch.discrepancy import discrepancy
 from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.exam import pruned
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
@@ -27,6 +28,12 @@ def room(samples: int = 4000) -> Track:
     pieces = np.floor(track.time_s / 8.0).astype(int)
     values = np.random.default_rng(8).normal(0.0, 4e-3, (pieces.max() + 1, 3))
     return replace(track, mag_b_gauss=track.mag_b_gauss + values[pieces])
+
+
+def switched(track: Track) -> np.ndarray:
+    """(N,) a lamp that is on for a few seconds now and then."""
+    seconds = np.floor(track.time_s / 3.0).astype(int)
+    return np.random.default_rng(9).integers(0, 2, seconds.max() + 1)[seconds].astype(float)
 
 
 def test_the_remainder_is_whitened_out_of_innovation_and_columns():
@@ -48,6 +55,26 @@ def test_the_remainder_is_whitened_out_of_innovation_and_columns():
     inverse = values / rest.noise - U @ ((d2 / (d2 + rest.noise)) * (U.T @ values)) / rest.noise
     twice = rest.whitened(rest.whitened(basis.innovation))
     np.testing.assert_allclose(twice.ravel(), inverse, atol=1e-9)
+
+
+def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
+    track = room()
+    value = np.array([5e-3, -3e-3, 4e-3])
+    lit = switched(track)
+    reading = track.mag_b_gauss + lit[:, None] * value
+    found = diagnose(replace(track, mag_b_gauss=reading, covariates={"lamp_on": lit}))
+    lamp = next(one for one in found.findings if one.effect == "switched_device")
+    for parameter, true in zip(lamp.parameters, value, strict=True):
+        assert abs(parameter.value - true) < 4 * parameter.std < 6e-3
+    assert [one.effect for one in found.findings] == ["switched_device"]
+    assert found.unexplained.detected
+
+
+def test_a_room_alone_gets_no_name():
+    track = room()
+    found = diagnose(replace(track, covariates={"lamp_on": switched(track)}))
+    assert found.findings == ()
+    assert found.unexplained.detected
 
 
 def test_eddy_currents_do_not_make_a_delay_superfluous():
