@@ -26,6 +26,7 @@ _BUMPS = 2
 _DISTANCES_M = (1.0, 3.0)
 _SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 _NEAREST_M = 0.2
+_WAY = 5  # places along the way around which it is sought, too
 _CLEAR = 4.0  # usual departures of the size from which an object is sought
 #: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
 _GRADIENT = ("nn", "ee", "ne", "nd", "ed")
@@ -308,6 +309,9 @@ def _dipoles(
                 found.append(_object(best[0], max(nearest, _NEAREST_M), np.degrees(best[1])))
         around = product(_DISTANCES_M, _SIDES)
         found += [_object(place[row] + far * np.array(side), far) for far, side in around]
+    far = _DISTANCES_M[-1]
+    along = place[:: max(len(place) // _WAY, 1)]
+    found += [_object(at + far * np.array(side), far) for at, side in product(along, _SIDES)]
     return tuple(found)
 
 
