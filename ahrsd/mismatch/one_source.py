@@ -45,7 +45,7 @@ TIMES = (0.25, 1.0, 2.5, 6.0)
 MODES, LEAST_MODE = 60, 1e-3
 #: sizes of a course over which the evidence is averaged, in units of its frame
 SIZES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
-DIRECTIONS = 48
+DIRECTIONS, COARSE = 48, 12
 #: steps in which the noise's power is tried
 POWER_STEP = 2.0
 _SMALLEST = 1e-9
@@ -88,22 +88,35 @@ def directed(information: Array, score: Array, unit: float, most: float) -> tupl
     count = len(score) // 3
     sizes = unit * np.asarray(SIZES)
     blocks, scores = information.reshape(count, 3, count, 3), score.reshape(count, 3)
-    directions = half_sphere(DIRECTIONS)
     powers = np.geomspace(1.0, most, max(1, round(np.log(most) / np.log(POWER_STEP)) + 1))
     noise = _likelihood(information, score, powers)
-    free, single = [], []
+    free, inners = [], []
     for time in TIMES:
         root = course_root(count, time)
         inner = np.einsum("jr,jakb,ks->rasb", root, blocks, root, optimize=True)
         turned = root.T @ scores
         width = turned.size
         free.append(_evidence(inner.reshape(width, width), turned.ravel(), sizes, powers) + noise)
-        along = np.einsum("rasb,da,db->drs", inner, directions, directions, optimize=True)
-        pairs = zip(along, directions, strict=True)
-        single.append([_evidence(G, turned @ u, sizes, powers) + noise for G, u in pairs])
-    likely = np.asarray(single)
+        inners.append((inner, turned))
+    other = max(_mean(noise), _mean(np.asarray(free)))
+    for number in (COARSE, DIRECTIONS):
+        directions = half_sphere(number)
+        likely = np.asarray([_along(*one, directions, sizes, powers) for one in inners]) + noise
+        # any direction is within some 20 degrees of a coarse one, a ninth of what it explains
+        if float(likely.max()) - other < NATS / 2:
+            break
     best = directions[np.unravel_index(int(np.argmax(likely)), likely.shape)[1]]
-    return _mean(likely) - max(_mean(noise), _mean(np.asarray(free))), best
+    return _mean(likely) - other, best
+
+
+def _along(inner: Array, turned: Array, directions: Array, sizes: Array, powers: Array) -> Array:
+    """(directions, sizes, powers) evidence of courses (r modes) along one direction each.
+
+    inner (r, 3, r, 3) information and turned (r, 3) score of the modes' coefficients
+    """
+    along = np.einsum("rasb,da,db->drs", inner, directions, directions, optimize=True)
+    pairs = zip(along, directions, strict=True)
+    return np.asarray([_evidence(G, turned @ u, sizes, powers) for G, u in pairs])
 
 
 def course_root(count: int, time: float) -> Array:
