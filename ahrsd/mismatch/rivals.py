@@ -98,7 +98,9 @@ def of_the_rate(left: Remainder) -> Remainder:
     name, form, both = compared(basis, mine * UNIT_GAUSS, rate * UNIT_RAD_S, noise)
     name = max(name, best.evidence)
     if form > name + _more(name) and both - form < OWN_SHARE * name:
-        return replace(left, stood_in="gyro")
+        gyro = replace(left.located["gyro"], evidence=form)
+        located = {**left.located, "gyro": gyro}
+        return replace(left, located=located, stood_in="gyro", spells_s=())
     return left
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ahrsd.mismatch.evidence import log_bayes
 from ahrsd.mismatch.gram import RANK_SHARE, Gram
 from ahrsd.mismatch.intervals import spans
+from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.locate import (
     FRAMES,
     SPAN,
@@ -58,11 +59,17 @@ Span = tuple[float, float]
 
 
 def with_spells(left: Remainder) -> Remainder:
-    """The remainder with the frame whose course comes and goes, where that is the likeliest."""
+    """The remainder with the frame whose course comes and goes, where that is the likeliest.
+
+    What the free courses show by themselves keeps its frame: of a real recording a few jumps, on
+    the ground before and after a flight, are not the source that runs all the time.
+    """
     basis = left.basis
     count = min(COUNT, int(basis.context.track.duration_s / SHORTEST_S))
     cut = segments(basis.context.track.time_s, count)
-    frames = FRAMES if left.stood_in is None else (left.stood_in,)
+    plain = left.one_source or left.strongest.evidence > LIMITS.unknown_nats
+    known = left.strongest.frame if plain else left.stood_in
+    frames = FRAMES if known is None else (known,)
     courses = [_course(basis, frame, cut) for frame in frames]
     found = [(kind, one) for one in courses for kind in (one.two_states(), one.boxes())]
     (nats, inside), course = max(found, key=lambda each: each[0][0])

@@ -154,7 +154,7 @@ def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
     words = None
     if left.bins and left.bins[0][1] > limits.unknown_nats:
         words = _bin_words(left.bins[0][0], basis)
-    by_bin = bool(left.bins) and left.bins[0][1] > best.evidence
+    by_bin = bool(left.bins) and left.bins[0][1] > best.evidence and left.stood_in is None
     time_s = basis.context.track.time_s
     whole = ((float(time_s[0]), float(time_s[-1])),)
     free = left.free or best
