@@ -156,11 +156,13 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     short = bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)
+    if unknown.detected(left, problem.limits):
+        left = of_the_rate(left)
     left = with_spells(left)
     if short is not None and short.evidence_nats > left.strongest.evidence:
         return _Searched(start, settled(state), surveys, first, last, left, short)
     if unknown.detected(left, problem.limits):
-        left = with_free_course(state, of_the_rate(left))
+        left = with_free_course(state, left)
     return _Searched(start, settled(state), surveys, first, last, left)
 
 
