@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +16,12 @@ RIGHT, IN_SET, MISSED, WRONG, ADDED = "right", "in the set", "missed", "wrong na
 FALSE, UNKNOWN, PARTLY, NONE, QUIET = "false name", "unknown", "one of two", "no answer", "quiet"
 #: order of the report, misses first
 ORDER = (NONE, FALSE, WRONG, MISSED, ADDED, PARTLY, UNKNOWN, IN_SET, QUIET, RIGHT)
-DELAYED = {"mag_time_lag": "mag", "mag_low_pass": "mag", "gyro_time_lag": "gyro"}
+DELAYED = {
+    "mag_time_lag": "mag",
+    "mag_low_pass": "mag",
+    "gyro_integration": "mag",
+    "gyro_time_lag": "gyro",
+}
 SHORT_PART = 0.95  # an interval that covers more of the recording than this locates nothing
 
 
@@ -219,8 +224,9 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
     before = control.findings if control is not None else ()
     said_before = control.everything if control is not None else frozenset()
     own = said_before | frozenset(truth["allowed"])
-    found = next((f for f in answer.findings if f.effect in right), None)
-    earlier = next((f for f in before if f.effect in right), None)
+    rate_hz = float(truth["rate_hz"])
+    found = next((_delay(f, rate_hz) for f in answer.findings if f.effect in right), None)
+    earlier = next((_delay(f, rate_hz) for f in before if f.effect in right), None)
     was_there = earlier or _own_delay(truth, effect)
     pulls, relative = compare(effect["parameters"], found, was_there, str(effect["effect"]))
     # what no control said is an estimate: then nearer to what was injected than to nothing
@@ -253,6 +259,19 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
         pulls=pulls,
         relative=relative,
     )
+
+
+def _delay(found: Finding, rate_hz: float) -> Finding:
+    """A rate that stands for its interval's middle or end told as the delay that it is."""
+    if found.effect != "gyro_integration":
+        return found
+    half_s = 0.5 / rate_hz
+    told = tuple(
+        Parameter("lag", p.value * half_s, None if p.std is None else p.std * half_s, "s")
+        for p in found.parameters
+        if p.name == "half_steps"
+    )
+    return replace(found, parameters=told or found.parameters)
 
 
 def _own_delay(truth: Json, effect: Json) -> Finding | None:

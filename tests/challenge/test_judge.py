@@ -39,6 +39,7 @@ def truth(kind, *effects, **changes):
         "noise": {},
         "allowed": [],
         "motion": "wam",
+        "rate_hz": 40.0,
         "duration_s": 400.0,
         "withheld": None,
         "effects": list(effects),
@@ -205,6 +206,15 @@ def test_a_delay_of_the_other_sensor_counts_against_the_controls():
     alone = judge(silent, of("gyro_time_lag", 0.018), said())
     assert (alone.word, alone.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
     assert judge(silent, of("mag_time_lag", 0.010), said()).error
+
+
+def test_half_a_step_is_the_delay_that_it_is():
+    lag = effect("mag_time_lag", right=["mag_time_lag", "gyro_integration"])
+    case = truth("semireal", lag | {"parameters": [{"name": "lag", "value": 0.01, "unit": "s"}]})
+    half = said(finding("gyro_integration", parameters=(Parameter("half_steps", 1.0, 0.1, "1"),)))
+    late = said(finding("mag_time_lag", parameters=(Parameter("lag", 0.0225, 1e-3, "s"),)))
+    verdict = judge(case, late, half)
+    assert (verdict.word, verdict.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
 
 
 def test_what_the_recording_truly_has_is_no_false_name():
