@@ -9,7 +9,8 @@ calibration and the other names leave):
     sensor, world, gyro   a free value in every twenty-fourth of the recording
     attitude              a field in sensor axes by the field's and gravity's direction
     rate                  an error of the gyro by the size and the products of its rates
-    rest                  a field in sensor axes wherever the vehicle stands: that is one place
+    rest, way             a field in sensor axes wherever the vehicle stands, which is one place,
+                          and on the way to and from it
 
 A name is worth what it explains beyond them: the maximum of the marginal likelihood with it, over
 the one without it.  Where nothing is left the variances are zero and nothing changes.
@@ -40,7 +41,8 @@ SMALLEST, LARGEST = -6.0, 8.0
 STILL_RAD_S, STILL_S = 0.05, 2.0
 LEAVING_S = (4.0, 3.5, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5)  # parts of the way from a place
 MOST_RESTS = 6
-PLACES = 5  # number of their group
+PARTS = 2 * len(LEAVING_S) + 1  # of a place, itself the last
+PLACES, WAYS = 5, 6  # numbers of their groups
 LARGEST_PLACE = 4.0  # logarithm: fields of two places in a room differ by 50 mG; a magnet's by more
 ITERATIONS = 40
 
@@ -103,11 +105,11 @@ def discrepancy(basis: Base) -> Discrepancy:
     left = _left(basis, together, G, s)
     noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
     nats, sizes = fitted(G, s, group, noise, np.zeros(len(parts)))
-    known = group == PLACES
+    known = group >= PLACES
     by_place = 0.0
     if known.any():
-        rest = np.zeros(np.count_nonzero(known), dtype=np.intp)
-        by_place, _ = fitted(G[np.ix_(known, known)], s[known], rest, noise, np.zeros(1))
+        at = G[np.ix_(known, known)], s[known], group[known] - PLACES
+        by_place, _ = fitted(*at, noise, np.zeros(2))
     return Discrepancy(basis, together, group, noise, sizes, nats, nats - by_place)
 
 
@@ -143,7 +145,11 @@ def _random_effects(context: Context) -> list[tuple[Callable[[Context], Columns]
     ]
     rests = places(context)
     if len(rests):
-        out.append((lambda _: locate.frame_columns(context, "sensor", rests), UNIT_GAUSS))
+        itself = np.repeat(np.arange(len(rests)) % PARTS == PARTS - 1, 3)
+        mag = locate.frame_columns(context, "sensor", rests).mag
+        if mag is not None:
+            standing, leaving = Columns(mag=mag[:, :, itself]), Columns(mag=mag[:, :, ~itself])
+            out += [(lambda _: standing, UNIT_GAUSS), (lambda _: leaving, UNIT_GAUSS)]
     return out
 
 
@@ -260,7 +266,7 @@ def fitted(
         slope = [float(pull[group == k].sum()) for k in range(count)]
         return -nats, -np.asarray(slope)
 
-    bounds = [(SMALLEST, LARGEST_PLACE if k == PLACES else LARGEST) for k in range(count)]
+    bounds = [(SMALLEST, LARGEST_PLACE if k in (PLACES, WAYS) else LARGEST) for k in range(count)]
     if named is not None:
         bounds[named] = (float(np.log(SIZES[0])), float(np.log(SIZES[-1])))
     from scipy.optimize import minimize  # dear to import, and needed beside a name only

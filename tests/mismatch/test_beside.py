@@ -77,15 +77,20 @@ def test_a_room_alone_gets_no_name():
     assert found.unexplained.detected
 
 
-def test_eddy_currents_do_not_make_a_delay_superfluous():
-    trial = Trial(4, (("mag_time_lag", 0.6), ("eddy_current", 0.6)), samples=4000)
+@pytest.mark.parametrize(
+    ("eddy", "kept"), [(0.1, ("mag_time_lag", "eddy_current")), (1.0, ("eddy_current",))]
+)
+def test_a_delay_stays_beside_eddy_currents_that_hardly_differ_from_it(eddy, kept):
+    trial = Trial(4, (("mag_time_lag", 0.7), ("eddy_current", eddy)), samples=4000)
     problem, cold = problem_of(made(trial).track, Spec(), EFFECTS, LIMITS)
     state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
     for name in ("mag_time_lag", "eddy_current"):
         seen = survey(state)
         state = added(state, next(one for one in seen.judged if one.candidate.name == name))
-    assert state.names == ("mag_time_lag", "eddy_current")
-    assert pruned(state).names == ("mag_time_lag", "eddy_current")
+    assert state.problem.lag_s == pytest.approx(0.014, abs=0.008)
+    state = pruned(state)
+    assert state.names == kept
+    assert (state.problem.lag_s > 0.0) == ("mag_time_lag" in kept)
 
 
 def test_a_direction_counts_where_a_coefficient_at_its_bound_would_show():
