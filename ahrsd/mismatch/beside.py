@@ -15,7 +15,7 @@ from ahrsd.mismatch.discrepancy import beyond, discrepancy
 from ahrsd.mismatch.exam import IMITATORS
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.search import State, Survey, added, formed_basis_of, survey
-from ahrsd.mismatch.stand_ins import TIME_SHAPED
+from ahrsd.mismatch.stand_ins import TIME_SHAPED, wrong_in_form
 
 #: what a room or an unlogged source does from place to place and from minute to minute, and what a
 #: sensor does that is not quite linear: beside a rest such names say no more than the rest does
@@ -39,7 +39,10 @@ def named_beside(
         found = _standing_out(state)
         if found is None:
             break
-        state = added(state, found[0])
+        more = added(state, found[0])
+        if len(state.named) in wrong_in_form(more, beside=True):
+            break  # a mount that bends is no misalignment, not even a part of one
+        state = more
         surveys = [*surveys, found[1]]
         left = unknown.remainder(formed_basis_of(state))
     return state, surveys, left

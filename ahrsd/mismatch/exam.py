@@ -25,6 +25,10 @@ from ahrsd.samples import Array
 #: names of iron and metal that remember or follow the turns: half of any unlogged course looks so
 IMITATORS = ("viscous_magnetisation", "hysteresis", "eddy_current")
 
+#: fields that a room has by itself: of several names that are too weak these go first, beside which
+#: a magnet that comes as the vehicle moves off may have looked no larger than they
+OF_A_ROOM = ("field_step", "field_anomaly", "geomagnetic_drift")
+
 
 def pruned(state: State) -> State:
     """Terms that the others have made superfluous taken out, one at a time.
@@ -61,12 +65,13 @@ def examined(state: State) -> tuple[State, bool]:
         if found is None:
             return state, False
         worth = [_worth(state, basis, found, k) for k in range(len(state.named))]
-        weakest = int(np.argmin(worth))
-        if worth[weakest] > max(limits.beyond_nats, limits.beyond_share * found.unknown):
-            poor = [k for k in range(len(worth)) if _imitates(state.names[k], worth[k], found)]
-            if not poor:
-                break
-            weakest = min(poor, key=lambda k: worth[k])
+        bar = max(limits.beyond_nats, limits.beyond_share * found.unknown)
+        poor = [k for k in range(len(worth)) if worth[k] <= bar]
+        poor = [k for k in poor if state.names[k] in OF_A_ROOM] or poor
+        poor = poor or [k for k in range(len(worth)) if _imitates(state.names[k], worth[k], found)]
+        if not poor:
+            break
+        weakest = min(poor, key=lambda k: worth[k])
         kept = tuple(judged for k, judged in enumerate(state.named) if k != weakest)
         state = refitted(state, kept)
     return state, True

@@ -81,7 +81,7 @@ def without_stand_ins(
     if one_course:
         left = replace(left, stood_in="world")
     if state.named:
-        wrong = _of_another_form(state, beside)
+        wrong = wrong_in_form(state, beside)
         if wrong:
             frame = _frame_of(state, wrong[0])
             state, surveys, left = _dropped(state, surveys, wrong, left)
@@ -90,7 +90,7 @@ def without_stand_ins(
     return state, surveys, left
 
 
-def _of_another_form(state: State, beside: bool) -> list[int]:
+def wrong_in_form(state: State, beside: bool) -> list[int]:
     """Terms that come and go as nothing in the library does, or are of another form."""
     basis = formed_basis_of(state)
     # a magnet is put on and taken off again; a gyro's bias does not come back
