@@ -112,16 +112,11 @@ def evaluate(
     calibrations, without = sources.read_calibrations(calibration_path, method)
     world = sources.place_and_date(position, date, model)  # type: ignore[arg-type]
     track, said = sources.read_track(recording, Config(), rate_hz, progress)
-    gps = reference_path or sources.gps_beside(recording)
-    fixes = None
-    if gps is not None and sources.is_gps(gps):
-        fixes, place = sources.read_fixes(gps)
-        if world is None and date is not None:
-            world = sources.place_and_date(place, date, model)  # type: ignore[arg-type]
-            said.append(f"the position is that of the middle GPS fix: {place}")
-    elif gps is not None:
-        track = sources.with_columns_of(track, gps)
-    fixes = fixes or fixes_of_track(track)
+    beside, fixes, place = _beside(reference_path or sources.gps_beside(recording), track)
+    if place is not None and world is None and date is not None:
+        world = sources.place_and_date(place, date, model)  # type: ignore[arg-type]
+        said.append(f"the position is that of the middle GPS fix: {place}")
+    track, fixes = beside, fixes or fixes_of_track(beside)
     references, more = _references(track, fixes, heading_column, least_speed_m_s)
     found = [
         judge(
@@ -136,6 +131,18 @@ def evaluate(
         for calibration in calibrations
     ]
     return found, without
+
+
+def _beside(path: Path | None, track: Track) -> tuple[Track, Fixes | None, str | None]:
+    """The track with the columns of another file, or its fixes and the place of the middle one."""
+    from ahrsd.commands import evaluate_sources as sources
+
+    if path is None:
+        return track, None, None
+    if not sources.is_gps(path):
+        return sources.with_columns_of(track, path), None, None
+    fixes, place = sources.read_fixes(path)
+    return track, fixes, place
 
 
 def _references(

@@ -177,32 +177,20 @@ def _told(
     """Everything that was found, in the contract's form."""
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
-    beside = rest_of(state, basis)
-    named = [
-        finding(state, basis, k, seen, done.last, beside) for k, seen in enumerate(done.surveys)
-    ]
-    quickly = [
-        finding(fast.state, fast.last.basis, k, seen, fast.last)
-        for k, seen in enumerate(fast.surveys, start=fast.known)
-    ]
+    named, terms = _names(done, fast)
     noise = _noise_facts(problem, fast, facts, unknown.detected(done.left, limits))
-    lesser = tuple(fact.words for fact in facts if not matters(fact))
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
-        *sorted((*named, *quickly), key=_least_gain),
+        *sorted(named, key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
     left = _left(done, problem)
-    terms = tuple(whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(named))
-    quick_terms = tuple(
-        whole_term(fast.state, fast.last.basis, k, one.effect)
-        for k, one in enumerate(quickly, start=fast.known)
-    )
     seen = (*state.named, *fast.state.named[fast.known :])
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
     something = bool(found) or left.detected
-    added = _in_track((*terms, *quick_terms), fast.state)
+    steps = rounding(facts)
+    lesser = (fact.words for fact in facts if not matters(fact))
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),
@@ -210,17 +198,36 @@ def _told(
         p_value=_p_value(seen, found, done.left),
         findings=found,
         unexplained=left,
-        posterior_predictive=_checked(
-            done, fast, (*terms, *quick_terms), library, (*facts, *noise)
-        ),
+        posterior_predictive=_checked(done, fast, terms, library, (*facts, *noise)),
         sensitivity=() if something else _limits(problem, basis, done.first, fast),
         notes=(*notes, *lesser, *(() if something else would_have_shown(problem.recorded))),
         model=model_at_rate(state.fit.model, problem),
-        noise=usual_noise(fast.state.fit, _loud(noise), (*added, *rounding(facts)), library),
-        terms=(*terms, *quick_terms, *rounding(facts)),
+        noise=usual_noise(
+            fast.state.fit, _loud(noise), (*_in_track(terms, fast.state), *steps), library
+        ),
+        terms=(*terms, *steps),
         drawn=_drawn(done, basis),
         omnibus=_whiteness(done),
     )
+
+
+def _names(done: _Searched, fast: Quick) -> tuple[list[Finding], tuple[Term, ...]]:
+    """Findings and whole terms of the search's names, then of what only the recorded rate shows."""
+    state, basis, last = done.state, basis_of(done.state), fast.last.basis
+    beside = rest_of(state, basis)
+    slow = [
+        finding(state, basis, k, seen, done.last, beside) for k, seen in enumerate(done.surveys)
+    ]
+    quickly = [
+        finding(fast.state, last, k, seen, fast.last)
+        for k, seen in enumerate(fast.surveys, start=fast.known)
+    ]
+    terms = [whole_term(state, basis, k, one.effect, beside) for k, one in enumerate(slow)]
+    terms += [
+        whole_term(fast.state, last, k, one.effect)
+        for k, one in enumerate(quickly, start=fast.known)
+    ]
+    return [*slow, *quickly], tuple(terms)
 
 
 def _noise_facts(
@@ -234,11 +241,11 @@ def _noise_facts(
         return []
     given = problem.spec.sigma_mag_gauss is not None
     found = level_facts(fast.state.fit.filtered, spec_given=given)
-    level_says_nothing = ("noise_level",) if beside_unknown else ()
     return [
         fact
         for fact in found
-        if fact.effect not in level_says_nothing and not around_lost_turns(fact, facts)
+        if not (beside_unknown and fact.effect == "noise_level")
+        and not around_lost_turns(fact, facts)
     ]
 
 

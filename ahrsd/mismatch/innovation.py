@@ -95,26 +95,21 @@ def run_filter(
     field = _readings(track, model, terms_mag)
     motion = _motion(track, model, terms_gyro)
     layout = layout_of(track.runs or (slice(0, len(track)),))
-    opens = np.zeros(len(track), dtype=bool)
-    opens[layout.starts[layout.opens]] = True
-    blind = ~_complete(field)
+    opens, blind = _opening(layout, len(track)), ~_complete(field)
     turned = np.where(opens[:, None, None], np.eye(3), motion.turn)
     orientation = np.swapaxes(_carried(layout, turned), 1, 2)
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
         linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
         found = gains(linear, layout)
-        if strength_known:
-            found.gain[opens] = 0.0
     else:
         nominal, found = held.nominal_b, held.gains
-    state = _transition(motion, nominal, opens, model)
     if strength_known:
+        found.gain[opens] = 0.0
         field = np.where(opens[:, None], nominal, field)
-    predicted = _predicted(
-        layout, state, found, model.soft_iron, np.where(blind[:, None], 0, field)
-    )
-    used = ~(opens | blind)
+    state = _transition(motion, nominal, opens, model)
+    readings, used = np.where(blind[:, None], 0, field), ~(opens | blind)
+    predicted = _predicted(layout, state, found, model.soft_iron, readings)
     innovation = np.where(used[:, None], (field - predicted) @ model.soft_iron, 0.0)
     root = _inverse_root(found.innovation_covariance) * used[:, None, None]
     whitened = np.einsum("nij,nj->ni", root, innovation)
@@ -134,6 +129,13 @@ def run_filter(
         if sensitive
         else None,
     )
+
+
+def _opening(layout: Layout, count: int) -> NDArray[np.bool]:
+    """(count,) the rows with which a run opens."""
+    opens = np.zeros(count, dtype=bool)
+    opens[layout.starts[layout.opens]] = True
+    return opens
 
 
 def _log_likelihood(whitened: Array, root: Array) -> Array:

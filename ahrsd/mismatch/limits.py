@@ -30,9 +30,9 @@ class Limits:
     beside_nats:    and where it is found with the remainder whitened out of everything
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
-    doubt:          share of names with all of the evidence that are wrong: 5 of 526 in four sealed
-                    rings; what noise model and library do not know, by which every confidence is
-                    less
+    doubt:          what noise model and library do not know, by which every confidence is less:
+                    about the share of names with all of the evidence that sealed rings found wrong
+                    (docs/challenge.md, "calibration error of the confidence")
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 

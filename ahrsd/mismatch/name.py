@@ -7,7 +7,7 @@ it: on a real drone log the score test alone would name four terms, this gate on
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,15 +49,6 @@ class Judged:
         return not self.refused
 
 
-def rank(candidates: Sequence[Candidate], projected: Gram, colour: float) -> dict[str, float]:
-    """Evidence of every candidate, its setting paid for, strongest first, nats."""
-    found = {
-        c.name: log_bayes(score(projected, c.name, c.scale), colour) - np.log(c.tried)
-        for c in candidates
-    }
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
-
-
 def judge(
     candidate: Candidate,
     gram: Gram,
@@ -86,9 +77,7 @@ def judge(
         *without_known(basis, columns), round(MINIMUM_SHIFT_SHARE * len(columns))
     )
     beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
-    outside = candidate.effect.family == "world"
-    outside &= candidate.setting.get("length_s", np.inf) > LONELY_S
-    lonely = outside and what.effective_blocks < LONELY_BLOCKS and evidence > LONELY_NATS
+    lonely = _lonely(candidate, what, evidence)
     bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
     checks = (
         ("family-wise probability", family < limits.family_p),
@@ -110,6 +99,13 @@ def judge(
         max(0.0, (usual - what.rank) / (2.0 * len(columns))),
         tuple(name for name, passed in checks if not passed),
     )
+
+
+def _lonely(candidate: Candidate, what: Score, evidence: float) -> bool:
+    """Whether a field outside shows in so few blocks that no others can know it, beyond doubt."""
+    outside = candidate.effect.family == "world"
+    outside &= candidate.setting.get("length_s", np.inf) > LONELY_S
+    return bool(outside and what.effective_blocks < LONELY_BLOCKS and evidence > LONELY_NATS)
 
 
 def confusable(evidence: Mapping[str, float], name: str, lead_nats: float) -> dict[str, float]:
