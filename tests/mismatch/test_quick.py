@@ -40,6 +40,17 @@ def test_a_train_of_pulses_is_found_with_period_phase_and_width() -> None:
     assert found["searched"] > 1000
 
 
+def test_strong_pulses_leave_no_edge_of_theirs_behind() -> None:
+    """A period that is off by half a ten-thousandth misses a sample at either end of 300 s."""
+    rng = np.random.default_rng(2)
+    time_s = np.arange(15_000) / 50.0
+    truth = {"start_s": 0.0, "period_s": 1.40335, "phase_s": 1.241, "width_s": 0.06}
+    pulses = train(time_s, truth)[:, None] * 9e-3 * np.array([0.1, 0.6, 0.79])
+    (found,) = trains(1e-3 * rng.standard_normal((15_000, 3)) + pulses, time_s, 0.02)
+    assert abs(found["period_s"] - 1.40335) < 1e-5
+    assert np.count_nonzero(train(time_s, found) != train(time_s, truth)) <= 2
+
+
 def test_a_short_recording_holds_no_train() -> None:
     assert trains(np.zeros((200, 3)), np.arange(200) / RATE_HZ, 1 / RATE_HZ) == ()
 

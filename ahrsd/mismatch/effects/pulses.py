@@ -18,6 +18,7 @@ _LONGEST_S = 0.25
 _PADDING = 4
 _PERIODS = 4  # of the best by their lines that are folded
 _CLOSER = 6  # steps to either side in which a period is refined
+_BINS, _FINE_BINS = 2, 16  # to a sample, when trains are folded, and when the best is refined
 _FEWEST = 20  # periods in a recording
 
 
@@ -31,15 +32,14 @@ def trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]
     quick = _quick(residual, round(0.5 / step_s))
     periods, tried = _periods(quick, step_s, span_s, longest_s)
     best = max(
-        (_folded(quick, time_s, period_s, step_s) for period_s in periods),
+        (_folded(quick, time_s, period_s, step_s / _BINS) for period_s in periods),
         key=lambda found: found[0],
     )
     for reach in (1.0, 1.0 / _CLOSER):
         shift = reach * best[1] ** 2 / (_PADDING * span_s * _HIGHEST_HZ) / _CLOSER
         near = best[1] + shift * np.arange(-_CLOSER, _CLOSER + 1)
-        best = max(
-            (_folded(quick, time_s, float(p), step_s) for p in near), key=lambda found: found[0]
-        )
+        folded = (_folded(quick, time_s, float(p), step_s / _FINE_BINS) for p in near)
+        best = max(folded, key=lambda found: found[0])
     _, period_s, phase_s, width_s = best
     return (
         {
@@ -93,10 +93,10 @@ def _periods(quick: Array, step_s: float, span_s: float, longest_s: float) -> tu
 
 
 def _folded(
-    quick: Array, time_s: Array, period_s: float, step_s: float
+    quick: Array, time_s: Array, period_s: float, bin_s: float
 ) -> tuple[float, float, float, float]:
     """Power of the best window of the folded residual: (power, period, its phase, its width)."""
-    bins = max(8, round(2.0 * period_s / step_s))
+    bins = max(8, round(period_s / bin_s))
     at = np.minimum((time_s % period_s / period_s * bins).astype(np.intp), bins - 1)
     count = np.bincount(at, minlength=bins).astype(float)
     sums = np.stack([np.bincount(at, weights=axis, minlength=bins) for axis in quick.T])
