@@ -15,8 +15,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtbtrs
 
 from ahrsd.samples import Array
+
+#: columns up to which one triangular system with a band is quicker than the blocks
+NARROW = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,28 +87,52 @@ class Recursion:
     """x_k = S_k x_(k-1) + U_k z_k from x = 0, with outputs y_k = Y_k x_(k-1) + V_k z_k.
 
     matrix: (N, 3 + s, s + z) the rows [Y V; S U]; z is 6: what is driven by gyro (3), mag (3)
-    reach:  (N, 3, s) Y_k times the product of S since the block's start
-    total:  (B, s, s) product of S over each block
+    made:   what was built from it, once
     """
 
     layout: Layout
     matrix: Array
-    reach: Array
-    total: Array
-    _steps: dict[tuple[bool, bool], Array] = field(default_factory=dict)
+    made: dict[str, Array] = field(default_factory=dict)
 
     @property
     def states(self) -> int:
         """s."""
-        return int(self.total.shape[-1])
+        return int(self.matrix.shape[-1]) - 6
 
     def run(self, gyro: Array | None, mag: Array | None) -> Array:
         """Outputs (N, 3, p) of the inputs z = [gyro; mag], each (N, 3, p) or None for zero."""
         given = gyro if gyro is not None else mag
         if given is None:
             raise ValueError("a recursion needs an input")
-        count, _, p = given.shape
-        s, rows = self.states, self.layout.rows
+        if given.shape[2] <= NARROW:
+            return self._banded(gyro, mag)
+        return self._stepped(gyro, mag, given.shape[2])
+
+    def _banded(self, gyro: Array | None, mag: Array | None) -> Array:
+        """Few columns: the states of all rows solve a triangular system with a band."""
+        s = self.states
+        first, last = s + 3 * (gyro is None), s + 6 - 3 * (mag is None)
+        inputs = np.concatenate([part for part in (gyro, mag) if part is not None], axis=1)
+        driven = self.matrix[:, :, first:last] @ inputs
+        states, _ = dtbtrs(self._band(), driven[:, 3:].reshape(-1, driven.shape[2]), "L", "N", "U")
+        before = states.reshape(-1, s, driven.shape[2])[:-1]
+        out: Array = driven[:, :3].copy()
+        out[1:] += self.matrix[1:, :3, :s] @ before
+        return out
+
+    def _band(self) -> Array:
+        """(2 s, N s) subdiagonals of what maps the states to what drives them, I - S one down."""
+        if "band" not in self.made:
+            s, count = self.states, len(self.matrix)
+            band = np.zeros((2 * s, count, s))
+            for i, j in np.ndindex(s, s):
+                band[s + i - j, :-1, j] = -self.matrix[1:, 3 + i, j]
+            self.made["band"] = band.reshape(2 * s, -1)
+        return self.made["band"]
+
+    def _stepped(self, gyro: Array | None, mag: Array | None, p: int) -> Array:
+        """Many columns, p: all blocks from zero, and then what their true starts add."""
+        count, s, rows = len(self.matrix), self.states, self.layout.rows
         steps = self._padded(gyro is not None, mag is not None)
         width = steps.shape[-1]
         out = np.empty((count + 1, 3, p))
@@ -123,20 +151,26 @@ class Recursion:
 
     def _padded(self, gyro: bool, mag: bool) -> Array:
         """(n, B, 3 + s, s + 3 or 6) the matrix step by step, its columns of the inputs given."""
-        if (gyro, mag) not in self._steps:
+        key = f"steps{' gyro' * gyro}{' mag' * mag}"
+        if key not in self.made:
             s = self.states
             columns = [*range(s), *[*range(s, s + 3)] * gyro, *[*range(s + 3, s + 6)] * mag]
             rest = np.zeros(self.matrix.shape[1:])
             rest[3:, :s] = np.eye(s)
             kept = self.layout.padded(self.matrix, rest)[:, :, :, columns]
-            self._steps[gyro, mag] = np.ascontiguousarray(kept)
-        return self._steps[gyro, mag]
+            self.made[key] = np.ascontiguousarray(kept)
+        return self.made[key]
 
     def _chain(self, out: Array, ends: Array) -> None:
         """Add what each block's true starting state contributes, in place."""
+        if "reach" not in self.made:
+            s = self.states
+            before, self.made["total"] = products_before(self.layout, self.matrix[:, 3:, :s])
+            self.made["reach"] = self.matrix[:, :3, :s] @ before
+        reach, total = self.made["reach"], self.made["total"]
         start = np.zeros_like(ends[0])
         for b, (first, last) in enumerate(zip(self.layout.starts, self.layout.ends, strict=True)):
             if np.any(start):
-                flat = self.reach[first:last].reshape(-1, self.states) @ start
+                flat = reach[first:last].reshape(-1, self.states) @ start
                 out[first:last] += flat.reshape(last - first, 3, -1)
-            start = self.total[b] @ start + ends[b]
+            start = total[b] @ start + ends[b]

@@ -15,12 +15,13 @@ to where its motion sinks into SINK times the gyro's noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.mismatch.innovation import Filtered
+from ahrsd.mismatch.innovation import Bearings, Filtered
 from ahrsd.mismatch.recursive import both_ways, gaussian
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context
@@ -36,12 +37,20 @@ class Fit(Protocol):
     """What a context is made of."""
 
     @property
-    def filtered(self) -> Filtered:
-        """The filter's last pass."""
+    def filtered(self) -> Filtered | Bearings:
+        """The filter's last pass, or what it would say of the motion."""
 
     @property
     def terms_gyro(self) -> Array | None:
         """(N, 3) contributions of the named terms to the gyro, or None."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """What a context is made of where nothing was fitted."""
+
+    filtered: Bearings
+    terms_gyro: Array | None = None
 
 
 def build_context(track: Track, fit: Fit) -> Context:
@@ -115,7 +124,7 @@ def _density(values: Array, segment: int) -> Array:
     return np.asarray(power / np.sum(window**2))
 
 
-def attitude(track: Track, done: Filtered) -> tuple[Array, bool]:
+def attitude(track: Track, done: Filtered | Bearings) -> tuple[Array, bool]:
     """R_nb (N, 3, 3) and whether its z axis is down."""
     accel = track.accel_b_m_s2
     if accel is not None and not np.isfinite(accel).all():

@@ -11,16 +11,16 @@ rate says.  What the gyro's noise did to that attitude counts as motion: a body 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.mismatch.context import build_context
+from ahrsd.mismatch.context import Given, build_context
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.base import Effect, Readings, contribution, readings_of
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.innovation import Filtered, run_filter
+from ahrsd.mismatch.innovation import Filtered, bearings
 from ahrsd.mismatch.noise import colour_of
 from ahrsd.mismatch.recursive import autoregression, both_ways
 from ahrsd.mismatch.track import Track
@@ -43,14 +43,6 @@ def noise_of(model: NullModel, filtered: Filtered | None = None) -> Noise:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Given:
-    """A fit that was made earlier, as `build_context` wants it."""
-
-    filtered: Filtered
-    terms_gyro: Array | None
-
-
 def context_along(
     track: Track,
     model: NullModel,
@@ -66,13 +58,13 @@ def context_along(
         missing = term.setting.get("covariate")
         if missing not in (None, "accel", *track.covariates):
             raise ValueError(f"{term.identifier} needs the column {missing}")
-    context = build_context(track, Given(run_filter(track, model, sensitive=False), None))
+    context = build_context(track, Given(bearings(track, model)))
     added = [term for term in terms if library[term.identifier].kind == "mean"]
     if not added:
         return context
     parts = [contribution(library[t.identifier], context, t.value, t.setting) for t in added]
     mag, gyro = (np.sum([part[side] for part in parts], axis=0) for side in (0, 1))
-    return build_context(track, Given(run_filter(track, model, mag, gyro, sensitive=False), gyro))
+    return build_context(track, Given(bearings(track, model, mag, gyro), gyro))
 
 
 def truth_along(context: Context) -> Readings:

@@ -24,10 +24,11 @@ from ahrsd.estimator import chain
 from ahrsd.estimator.start import linear_start
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.coarse import group_size, thinned
-from ahrsd.mismatch.context import build_context
+from ahrsd.mismatch.context import Given, build_context
 from ahrsd.mismatch.innovation import (
     TRACELESS,
     Filtered,
+    bearings,
     nuisance_columns,
     run_filter,
     sensitivities,
@@ -323,7 +324,7 @@ def _at(
     gyro: Array | None = None
     columns: tuple[Columns, ...] = ()
     if problem.terms:
-        basis = last or _Point(model, values, run_filter(problem.track, model), None, None, ())
+        basis = last or Given(bearings(problem.track, model))
         context = build_context(problem.track, basis)
         columns = tuple(term.columns(context) for term in problem.terms)
         mag, gyro = _contributions(problem, columns, values)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -103,13 +104,18 @@ def role_of(name: str, values: Array) -> str | None:
     lower = name.lower()
     if _ATTITUDE.match(lower):
         return None
-    named = next((role for role, row in ROLES.items() if re.search(row.pattern, lower)), None)
+    named = _role_by_name(lower)
     if named is not None:
         return named
     known = values[np.isfinite(values)]
     if len(known) and np.isin(known, (0.0, 1.0)).all() and known.any():
         return "switch" if _longest_on(known) > _LONG_ON_ROWS else "ping"
     return None
+
+
+@lru_cache
+def _role_by_name(lower: str) -> str | None:
+    return next((role for role, row in ROLES.items() if re.search(row.pattern, lower)), None)
 
 
 def named(covariates: Mapping[str, Array], role: str) -> tuple[str, ...]:

@@ -10,10 +10,11 @@ from scipy import stats
 from tracks import experiment, moved_model, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.mismatch.blocks import layout_of
+from ahrsd.mismatch.blocks import NARROW, layout_of
 from ahrsd.mismatch.innovation import (
     TRACELESS,
     Filtered,
+    bearings,
     nuisance_columns,
     run_filter,
     sensitivities,
@@ -143,6 +144,31 @@ def test_sensitivities_of_terms_on_both_sides() -> None:
     )
     numeric = -(up.whitened - down.whitened) / 2e-6
     assert np.abs(both[:, :, 0] - numeric).max() < 1e-6 * np.abs(numeric).max()
+
+
+@pytest.mark.parametrize("walk", [0.0, 1e-4])
+def test_few_columns_and_many_are_seen_alike(walk: float) -> None:
+    """The band and the blocks are the same recursion, across a gap too."""
+    made = experiment(samples=500)
+    track = _with_gap(track_of(made), 240, 15)
+    done = run_filter(track, replace(true_model(made), gyro_walk_rad_s_sqrt_s=walk))
+    rng = np.random.default_rng(5)
+    mag, gyro = rng.standard_normal((2, len(track), 3, NARROW + 1))
+    for mine in (Columns(mag), Columns(None, gyro), Columns(mag, gyro)):
+        many = sensitivities(done, mine)
+        few = Columns(
+            *(None if part is None else part[:, :, :NARROW] for part in (mine.mag, mine.gyro))
+        )
+        assert np.abs(sensitivities(done, few) - many[:, :, :-1]).max() < 1e-9 * np.abs(many).max()
+
+
+def test_bearings_are_those_of_the_run() -> None:
+    made = experiment(samples=500)
+    track, model = _with_gap(track_of(made), 240, 15), true_model(made)
+    mag, gyro = np.random.default_rng(6).standard_normal((2, len(track), 3)) * 1e-3
+    done, quick = run_filter(track, model, mag, gyro), bearings(track, model, mag, gyro)
+    assert np.array_equal(quick.nominal_b, done.nominal_b)
+    assert np.array_equal(quick.orientation, done.orientation)
 
 
 def test_columns_without_anything_are_refused() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -204,6 +205,7 @@ def lacking(effect: Effect) -> str:
     return " and ".join(needs) if needs else "a longer recording"
 
 
+@lru_cache(maxsize=2)  # every effect asks in every setting
 def readings_of(context: Context) -> Readings:
     """What the sensors of a context would read without noise, and the truth behind it."""
     track, model = context.track, context.model

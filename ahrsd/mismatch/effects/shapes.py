@@ -6,6 +6,8 @@ by course.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from ahrsd.mismatch import roles
@@ -45,10 +47,15 @@ def on_axes(course: Array) -> Array:
     return np.asarray(np.einsum("nk,ij->nikj", course, np.eye(3)).reshape(len(course), 3, -1))
 
 
+@lru_cache(maxsize=2)
+def world_axes(readings: Readings) -> Array:
+    """(N, 3, 3) a field along each axis of the world as the magnetometer reads it."""
+    return np.asarray(readings.soft_iron @ np.swapaxes(readings.R_nb, 1, 2))
+
+
 def in_world(readings: Readings, course: Array) -> Array:
     """Columns (N, 3, 3k) on the magnetometer: each course on each axis of the world."""
-    seen = readings.soft_iron @ np.swapaxes(readings.R_nb, 1, 2)
-    columns = np.einsum("nij,nk->nikj", seen, course)
+    columns = np.einsum("nij,nk->nikj", world_axes(readings), course)
     return np.asarray(columns.reshape(len(course), 3, -1))
 
 

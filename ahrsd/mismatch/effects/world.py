@@ -5,6 +5,7 @@ All of them are fields n in the world, seen in the sensor frame: D = A R^T f.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -246,6 +247,7 @@ class FieldStep(Linear):
         return Columns(mag=shapes.in_world(readings, shapes.since(readings, setting)))
 
 
+@lru_cache(maxsize=2)
 def position_m(readings: Readings) -> Array | None:
     """North, east, down (N, 3) in metres, down 0 where it was not logged.
 
@@ -327,7 +329,7 @@ def moved_object(context: Context, setting: Setting, place_and_turn: Array) -> S
 
 def _seen(readings: Readings, field_n: Array) -> Array:
     """Fields of the world (N, 3, p) as the magnetometer reads them."""
-    return np.asarray(readings.soft_iron @ np.swapaxes(readings.R_nb, 1, 2) @ field_n)
+    return np.asarray(shapes.world_axes(readings) @ field_n)
 
 
 def _object(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
