@@ -62,6 +62,7 @@ from ahrsd.mismatch.search import (
     formed_basis_of,
     settled,
 )
+from ahrsd.mismatch.slow_noise import in_its_noise
 from ahrsd.mismatch.sought import sought
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.track import Spec, Track
@@ -158,7 +159,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
         left = with_one_source(left)
     if unknown.detected(left, problem.limits):
         left = of_the_rate(left)
-    left = with_spells(left)
+    left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
     if short is not None and short.evidence_nats > left.strongest.evidence:
         return _Searched(start, settled(state), surveys, first, last, left, short)
     if unknown.detected(left, problem.limits):

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.mismatch.coloured import Coloured
 from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.effects.world import moved_object
 from ahrsd.mismatch.evidence import colour, log_bayes
@@ -86,7 +87,7 @@ class Base:
     kept: NDArray[np.intp]
     back: Array
     weight: Array | None = None
-    rest: Rest | None = None
+    rest: Rest | Coloured | None = None
 
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
         """The columns (N, 3, p) as the innovation sees them, several at a time."""

@@ -18,7 +18,7 @@ from ahrsd.mismatch.directions import by_direction
 from ahrsd.mismatch.evidence import log_bayes
 from ahrsd.mismatch.gram import Gram, gram
 from ahrsd.mismatch.limits import Limits
-from ahrsd.mismatch.locate import FRAMES, Frame, Located
+from ahrsd.mismatch.locate import FRAMES, Frame, Located, Segments
 from ahrsd.mismatch.regime import Regime
 from ahrsd.mismatch.regression import Base, group_gram, quieter
 from ahrsd.mismatch.score import chi2_p, score
@@ -76,27 +76,36 @@ def remainder(basis: Base, with_bins: bool = True) -> Remainder:
     count as noise.
     """
     cut = locate.coarse_cut(basis.context.track)
-    groups: dict[str, Columns] = {
-        locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
-        for frame in FRAMES
-    }
+    groups = _frames(basis, cut)
     loud = group_gram(basis, groups)
     first = max(
         (locate.locate(loud, frame, cut, basis.colour) for frame in FRAMES),
         key=lambda one: one.statistic,
     )
     strongest = basis.whitened([groups[locate.group_name(first.frame)]])[0]
-    quiet = by_direction(quieter(basis, strongest), strongest)
+    return tested(by_direction(quieter(basis, strongest), strongest), with_bins=with_bins)
+
+
+def tested(basis: Base, *, with_bins: bool) -> Remainder:
+    """The same in noise of the basis's own colour."""
+    cut = locate.coarse_cut(basis.context.track)
     found = regime.regimes(basis.context) if with_bins else ()
-    groups |= {one.group: regime.regime_columns(one) for one in found}
-    whole = group_gram(quiet, groups)
-    located = {frame: locate.locate(whole, frame, cut, quiet.colour) for frame in FRAMES}
+    groups = _frames(basis, cut) | {one.group: regime.regime_columns(one) for one in found}
+    whole = group_gram(basis, groups)
+    located = {frame: locate.locate(whole, frame, cut, basis.colour) for frame in FRAMES}
     bins = []
     for one in found:
         width = whole.groups[one.group].stop - whole.groups[one.group].start
         what = score(whole, one.group, np.full(width, locate.UNITS["sensor"]), 1e-3)
-        bins.append((one, log_bayes(what, quiet.colour, locate.SPAN), chi2_p(what, quiet.colour)))
-    return Remainder(quiet, located, tuple(sorted(bins, key=lambda item: -item[1])))
+        bins.append((one, log_bayes(what, basis.colour, locate.SPAN), chi2_p(what, basis.colour)))
+    return Remainder(basis, located, tuple(sorted(bins, key=lambda item: -item[1])))
+
+
+def _frames(basis: Base, cut: Segments) -> dict[str, Columns]:
+    return {
+        locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
+        for frame in FRAMES
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
