@@ -254,17 +254,21 @@ def fitted(
     """
     count = len(start)
 
+    G, s = G / noise, s / noise
+
     def loss(sizes: Array) -> tuple[float, Array]:
         deviation = np.exp(sizes)[group]
-        A = G * deviation[:, None] * deviation / noise
+        A = G * deviation
+        A *= deviation[:, None]
         A[np.diag_indices_from(A)] += 1.0
-        L = linalg.cholesky(A, lower=True, check_finite=False)
-        mean = linalg.cho_solve((L, True), deviation * s / noise, check_finite=False)
-        inverse, _ = linalg.lapack.dpotri(L, lower=1)
-        nats = 0.5 * float(mean @ (deviation * s)) / noise - float(np.sum(np.log(np.diag(L))))
-        pull = mean**2 + np.diag(inverse) - 1.0
-        slope = [float(pull[group == k].sum()) for k in range(count)]
-        return -nats, -np.asarray(slope)
+        # of the inverse only the diagonal is asked for: sums of squares down the columns of L^-1
+        L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
+        root, _ = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)
+        seen = root @ (deviation * s)
+        mean = seen @ root
+        nats = 0.5 * float(seen @ seen) + float(np.sum(np.log(np.diag(root))))
+        pull = mean**2 + np.einsum("ij,ij->j", root, root) - 1.0
+        return -nats, -np.bincount(group, weights=pull, minlength=count)
 
     bounds = [(SMALLEST, LARGEST_PLACE if k in (PLACES, WAYS) else LARGEST) for k in range(count)]
     if named is not None:
