@@ -52,6 +52,7 @@ class Discrepancy:
     """Random effects beside a model's own columns.
 
     basis:   the model with all its names;  columns: (N, 3, q) whitened, in units
+    products: (q, q) of the columns with one another
     group:   (q,) number of the variance that a column has
     noise:   power of what is left beside everything, at least 1
     sizes:   (groups,) logarithms of the deviations of the whole model
@@ -61,6 +62,7 @@ class Discrepancy:
 
     basis: Base
     columns: Array
+    products: Array
     group: NDArray[np.intp]
     noise: float
     sizes: Array
@@ -101,7 +103,9 @@ def discrepancy(basis: Base) -> Discrepancy:
     scaled = [part * unit for part, unit in zip(columns, units, strict=True)]
     group = np.repeat(np.arange(len(parts)), [part.shape[2] for part in scaled])
     together = np.concatenate(scaled, axis=2)
-    G, s = projected(basis, together)
+    flat = together.reshape(-1, len(group))
+    products = flat.T @ flat
+    G, s = projected(basis, together, products)
     left = _left(basis, together, G, s)
     noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
     nats, sizes = fitted(G, s, group, noise, np.zeros(len(parts)))
@@ -110,23 +114,31 @@ def discrepancy(basis: Base) -> Discrepancy:
     if known.any():
         at = G[np.ix_(known, known)], s[known], group[known] - PLACES
         by_place, _ = fitted(*at, noise, np.zeros(2))
-    return Discrepancy(basis, together, group, noise, sizes, nats, nats - by_place)
+    return Discrepancy(basis, together, products, group, noise, sizes, nats, nats - by_place)
 
 
-def beyond(found: Discrepancy, without: Base, columns: Array, scale: Array) -> float:
-    """Nats by which a name is more than the random effects can be.
+def beyond(
+    found: Discrepancy, without: Base, columns: Array, scale: Array, enough: float = np.inf
+) -> float:
+    """Nats by which a name is more than the random effects can be; at least `enough`, if so.
 
     without: the basis without it;  columns (N, 3, p) whitened;  scale (p,): prior deviations
     """
     count = len(found.sizes)
-    G, s = projected(without, np.concatenate([found.columns, columns * scale], axis=2))
+    together = np.concatenate([found.columns, columns * scale], axis=2)
+    G, s = projected(without, together, found.products)
     plain = slice(0, len(found.group))
     start = np.maximum(found.sizes, 0.0)  # from a variance of zero no slope leads away
     less, sizes = fitted(G[plain, plain], s[plain], found.group, found.noise, start)
     group = np.concatenate([found.group, np.full(len(scale), count)])
-    starts = [np.append(found.sizes, 0.0), np.append(sizes, 0.0)]
-    more = max(fitted(G, s, group, found.noise, at, count)[0] for at in starts)
-    return more - less - float(np.log(len(SIZES)))
+    less += float(np.log(len(SIZES)))
+    worth = -np.inf
+    for begin in (found.sizes, sizes):
+        more, _ = fitted(G, s, group, found.noise, np.append(begin, 0.0), count)
+        worth = max(worth, more - less)
+        if worth > enough:
+            break
+    return worth
 
 
 def _random_effects(context: Context) -> list[tuple[Callable[[Context], Columns], float]]:
@@ -214,9 +226,10 @@ def places(context: Context) -> locate.Segments:
     return locate.Segments(np.arange(count + 1.0), index)
 
 
-def projected(basis: Base, columns: Array) -> tuple[Array, Array]:
+def projected(basis: Base, columns: Array, products: Array | None = None) -> tuple[Array, Array]:
     """Information (q, q) and score (q,) of the columns with the known ones regressed out.
 
+    products: of the first columns with one another, where they are known already
     Combinations with less information than RANK_SHARE of what the columns had are left out: they
     are made of the noise of the field that the columns were built from.
     """
@@ -225,13 +238,20 @@ def projected(basis: Base, columns: Array) -> tuple[Array, Array]:
     e = basis.innovation.ravel()
     cross = Z.T @ X
     M = solve(Z.T @ Z, cross)
-    whole = X.T @ X
+    whole = X.T @ X if products is None else _more_products(products, X)
     root = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh((whole - cross.T @ M) / np.outer(root, root))
     kept = values > RANK_SHARE * len(root)
     directions = root[:, None] * vectors[:, kept]
     s = vectors[:, kept].T @ ((X.T @ e - M.T @ (Z.T @ e)) / root)
     return (directions * values[kept]) @ directions.T, directions @ s
+
+
+def _more_products(known: Array, X: Array) -> Array:
+    """(q, q) X^T X of (N, q), of which the first rows and columns are known."""
+    count = len(known)
+    new = X.T @ X[:, count:]
+    return np.block([[known, new[:count]], [new[:count].T, new[count:]]])
 
 
 def _left(basis: Base, columns: Array, G: Array, s: Array) -> Array:
@@ -268,7 +288,7 @@ def fitted(
         mean = seen @ root
         nats = 0.5 * float(seen @ seen) + float(np.sum(np.log(np.diag(root))))
         pull = mean**2 + np.einsum("ij,ij->j", root, root) - 1.0
-        return -nats, -np.bincount(group, weights=pull, minlength=count)
+        return -nats, np.asarray(-np.bincount(group, pull, count), float)
 
     bounds = [(SMALLEST, LARGEST_PLACE if k in (PLACES, WAYS) else LARGEST) for k in range(count)]
     if named is not None:

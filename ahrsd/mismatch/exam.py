@@ -64,8 +64,9 @@ def examined(state: State) -> tuple[State, bool]:
         found = rest_of(state, basis)
         if found is None:
             return state, False
-        worth = [_worth(state, basis, found, k) for k in range(len(state.named))]
         bar = max(limits.beyond_nats, limits.beyond_share * found.unknown)
+        enough = max(bar, found.unknown)  # no question is how much more than that
+        worth = [_worth(state, basis, found, k, enough) for k in range(len(state.named))]
         poor = [k for k in range(len(worth)) if worth[k] <= bar]
         poor = [k for k in poor if state.names[k] in OF_A_ROOM] or poor
         poor = poor or [k for k in range(len(worth)) if _imitates(state.names[k], worth[k], found)]
@@ -86,11 +87,17 @@ def rest_of(state: State, basis: Base) -> Discrepancy | None:
     """What the model leaves, None where that is no more than noise."""
     if not state.named:
         return None
+    found = random_effects(state, basis)
+    return found if found.nats > state.problem.limits.unknown_nats else None
+
+
+def random_effects(state: State, basis: Base) -> Discrepancy:
+    """Those that the state needs, with its formed basis."""
     made = state.fit.made
     if "rest" not in made:
         made["rest"] = discrepancy(basis)
     found: Discrepancy = made["rest"]
-    return found if found.nats > state.problem.limits.unknown_nats else None
+    return found
 
 
 def paired(state: State) -> State:
@@ -113,8 +120,11 @@ def paired(state: State) -> State:
     return state
 
 
-def _worth(state: State, basis: Base, found: Discrepancy, number: int) -> float:
-    """Nats by which a name, with its counterpart if it has one, is more than what is left."""
+def _worth(state: State, basis: Base, found: Discrepancy, number: int, enough: float) -> float:
+    """Nats by which a name, with its counterpart if it has one, is more than what is left.
+
+    At least `enough`, where it is more.
+    """
     judged = state.named[number]
     bounds = np.array([parameter.bound for parameter in judged.candidate.effect.parameters])
     if np.any(np.abs(state.fit.terms[number].value) > bounds):
@@ -127,7 +137,7 @@ def _worth(state: State, basis: Base, found: Discrepancy, number: int) -> float:
         left = left.without(term_group(other), state.fit.terms[other].value)
         columns = np.concatenate([columns, _columns(basis, other)], axis=2)
         scale = np.concatenate([scale, scale])
-    return beyond(found, left, columns, scale)
+    return beyond(found, left, columns, scale, enough)
 
 
 def _columns(basis: Base, number: int) -> Array:
