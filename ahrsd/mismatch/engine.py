@@ -38,6 +38,7 @@ from ahrsd.mismatch.findings import (
     rounding,
     whole_term,
 )
+from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
@@ -160,6 +161,9 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     if unknown.detected(left, problem.limits):
         left = of_the_rate(left)
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
+    if short is None and not at_rest(start):
+        known = max((judged.evidence for judged in state.named), default=0.0)
+        left = with_forms(left, known, problem.limits)
     if short is not None and short.evidence_nats > left.strongest.evidence:
         return _Searched(start, settled(state), surveys, first, last, left, short)
     if unknown.detected(left, problem.limits):

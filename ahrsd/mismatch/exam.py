@@ -8,7 +8,7 @@ import numpy as np
 
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
 from ahrsd.mismatch.name import judge
-from ahrsd.mismatch.nested import without_wider
+from ahrsd.mismatch.nested import contained, without_wider
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
@@ -39,6 +39,9 @@ def pruned(state: State) -> State:
         basis = formed_basis_of(state)
         evidence = []
         for k, judged in enumerate(state.named):
+            if contained(state, k):
+                evidence.append(-np.inf)
+                continue
             left = without_wider(state, k, without_term(state, k, basis))
             columns = columns_of(left, [judged.candidate])
             gram = candidate_gram(left, columns, state.problem.block_s)

@@ -255,9 +255,10 @@ def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candi
         G = XX - cross.T @ M
         s = Xe + whole.T @ basis.back - M.T @ known_e
         what = total_score(G, s, np.diag(XX), scale, effect.least_information)
-        cost = np.log(len(options)) + np.log(float(option.get("searched", 1)))
-        evidence = log_bayes(what, basis.colour) - cost if _possible(effect, what) else -np.inf
-        out.append(Candidate(effect, option, len(options), evidence))
+        tried = len(options) * int(option.get("searched", 1))
+        paid = log_bayes(what, basis.colour) - float(np.log(tried))
+        evidence = paid if _possible(effect, what) else -np.inf
+        out.append(Candidate(effect, option, tried, evidence))
     return out
 
 

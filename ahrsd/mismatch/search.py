@@ -19,7 +19,7 @@ from ahrsd.mismatch.effects.base import Setting
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
-from ahrsd.mismatch.name import Judged, judge
+from ahrsd.mismatch.name import Judged, judge, ranked
 from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.regression import (
@@ -150,31 +150,12 @@ def survey(state: State, basis: Base | None = None) -> Survey:
     if not candidates or candidates[0].evidence <= problem.limits.evidence_nats:
         return Survey(basis, candidates, ())
     quiet = quieter(basis, columns_of(basis, candidates[:1])[candidates[0].name])
-    candidates = _by_evidence(basis, quiet, candidates)
+    candidates = ranked(basis, quiet, candidates)
     near = [c for c in candidates if c.evidence > problem.limits.evidence_nats][:LOOKED_AT]
     columns = columns_of(basis, near)
     gram = candidate_gram(basis, columns, problem.block_s)
     judged = [judge(c, gram, columns[c.name], quiet, len(candidates), problem.limits) for c in near]
     return Survey(basis, candidates, tuple(judged))
-
-
-def _by_evidence(
-    basis: Base, quiet: Base, candidates: tuple[Candidate, ...]
-) -> tuple[Candidate, ...]:
-    """The candidates in the noise that the strongest of them leaves, strongest first.
-
-    What an effect does is no noise: told as if it were, a name of three coefficients may lead one
-    of nine that explains more by thirty nats.
-    """
-    if quiet.colour >= basis.colour:
-        return candidates
-    louder = [
-        replace(c, evidence=c.evidence + evidence_of(quiet, c) - evidence_of(basis, c))
-        if np.isfinite(c.evidence)
-        else c
-        for c in candidates
-    ]
-    return tuple(sorted(louder, key=lambda c: -c.evidence))
 
 
 def at_rest(fit: NullFit) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ahrsd.mismatch.exam import examined, paired, pruned
+from ahrsd.mismatch.nested import eddies_alone
 from ahrsd.mismatch.search import State, Survey, survey, swapped
 from ahrsd.mismatch.selection import forward
 from ahrsd.mismatch.stand_ins import without_stand_ins, without_unlikely
@@ -34,6 +35,7 @@ def sought(state: State) -> Sought:
     """Every name that the state's fit allows beside what it has."""
     more, first, last = forward(state)
     slim, beside = examined(paired(pruned(more)))
+    slim = eddies_alone(slim)
     last = last if slim.names == more.names else survey(slim)
     named, surveys, last = without_unlikely(*swapped(slim, last))
     named, surveys, left = without_stand_ins(named, surveys, beside)

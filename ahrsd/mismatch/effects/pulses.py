@@ -32,13 +32,13 @@ def trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]
     quick = _quick(residual, round(0.5 / step_s))
     periods, tried = _periods(quick, step_s, span_s, longest_s)
     best = max(
-        (_folded(quick, time_s, period_s, step_s / _BINS) for period_s in periods),
+        (_folded(quick, time_s, period_s, step_s, _BINS) for period_s in periods),
         key=lambda found: found[0],
     )
     for reach in (1.0, 1.0 / _CLOSER):
         shift = reach * best[1] ** 2 / (_PADDING * span_s * _HIGHEST_HZ) / _CLOSER
         near = best[1] + shift * np.arange(-_CLOSER, _CLOSER + 1)
-        folded = (_folded(quick, time_s, float(p), step_s / _FINE_BINS) for p in near)
+        folded = (_folded(quick, time_s, float(p), step_s, _FINE_BINS) for p in near)
         best = max(folded, key=lambda found: found[0])
     _, period_s, phase_s, width_s = best
     return (
@@ -47,7 +47,7 @@ def trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]
             "period_s": round(period_s, 7),
             "phase_s": round(phase_s, 5),
             "width_s": round(width_s, 5),
-            "searched": tried * round(period_s / step_s),
+            "searched": tried * round(_FINE_BINS * period_s / step_s),
         },
     )
 
@@ -93,10 +93,13 @@ def _periods(quick: Array, step_s: float, span_s: float, longest_s: float) -> tu
 
 
 def _folded(
-    quick: Array, time_s: Array, period_s: float, bin_s: float
+    quick: Array, time_s: Array, period_s: float, step_s: float, fine: int
 ) -> tuple[float, float, float, float]:
-    """Power of the best window of the folded residual: (power, period, its phase, its width)."""
-    bins = max(8, round(period_s / bin_s))
+    """Power of the best window of the folded residual: (power, period, its phase, its width).
+
+    fine: bins to a sample; a pulse is a sample at least, or it would hit a few outliers only
+    """
+    bins = max(8, round(fine * period_s / step_s))
     at = np.minimum((time_s % period_s / period_s * bins).astype(np.intp), bins - 1)
     count = np.bincount(at, minlength=bins).astype(float)
     sums = np.stack([np.bincount(at, weights=axis, minlength=bins) for axis in quick.T])
@@ -105,7 +108,7 @@ def _folded(
     much = np.concatenate([np.zeros((3, 1)), np.cumsum(np.tile(sums, 2), axis=1)], axis=1)
     first = np.arange(bins)
     best = (-1.0, period_s, 0.0, 0.0)
-    for width in range(2, max(3, round(_LONGEST_S * bins / period_s)) + 1):
+    for width in range(fine, max(fine + 1, round(_LONGEST_S * bins / period_s)) + 1):
         hit = many[first + width] - many[first]
         power = np.sum((much[:, first + width] - much[:, first]) ** 2, axis=0) / np.maximum(hit, 1)
         k = int(np.argmax(power))

@@ -1,0 +1,49 @@
+"""The unknown that has no course: an error of the gyro by its rates, a matrix that changes slowly.
+
+A gyro whose scale is another to the left than to the right, or a mount that bends with the day, has
+no place in time and hardly one in a regime: over a twentieth of the recording it averages out, and
+what it does counts as noise.  Free forms of such errors see it (`rivals`).  They are asked where
+nothing else is left, each as a random effect that pays for its coefficients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate, fitted, projected
+from ahrsd.mismatch.limits import Limits
+from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.rivals import MORE_SHARE, by_matrix
+from ahrsd.mismatch.unknown import Remainder, detected
+from ahrsd.samples import Array
+
+
+def with_forms(left: Remainder, named_nats: float, limits: Limits) -> Remainder:
+    """The remainder, told of a form's frame where nothing else is left and a form explains it.
+
+    named_nats: evidence of the strongest name; of its own form a hundredth may be left
+    """
+    if detected(left, limits):
+        return left
+    basis = left.basis
+    rate, matrix = basis.whitened([by_rate(basis.context), by_matrix(basis.context)])
+    found: dict[Frame, float] = {
+        "gyro": _evidence(basis, rate * UNIT_RAD_S),
+        "sensor": _evidence(basis, matrix * UNIT_GAUSS),
+    }
+    frame = max(found, key=lambda one: found[one])
+    evidence = found[frame] - float(np.log(len(found)))
+    if evidence <= limits.unknown_nats + MORE_SHARE * named_nats:
+        return left
+    located = {**left.located, frame: replace(left.located[frame], evidence=evidence)}
+    return replace(left, located=located, stood_in=frame)
+
+
+def _evidence(basis: Base, columns: Array) -> float:
+    """Nats of the columns (N, 3, p) as one random effect."""
+    G, s = projected(basis, columns)
+    group = np.zeros(len(s), dtype=np.intp)
+    return fitted(G, s, group, max(1.0, basis.colour), np.zeros(1))[0]
