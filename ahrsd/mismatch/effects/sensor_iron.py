@@ -9,6 +9,8 @@ from ahrsd.mismatch.effects.base import Linear, Readings, Setting
 from ahrsd.mismatch.values import Columns
 
 _MG = 1e-3
+#: time constants of a drift that settles, as a vehicle that warms up does
+SETTLING_S = (30.0, 60.0, 120.0, 240.0)
 
 
 class HardIronStep(Linear):
@@ -42,13 +44,16 @@ class HardIronStep(Linear):
 
 
 class HardIronDrift(Linear):
-    """M2: straight in time, or relaxing like viscous iron; the parameter is the whole change."""
+    """M2: straight, relaxing like viscous iron, or settling; the parameter is the whole change."""
 
     identifier = "hard_iron_drift"
     code = "M2"
     family = "sensor"
     words = "the hard iron drifts slowly"
-    equation = "m += k s, s = t / T, or ln(1 + t/t1) / ln(1 + T/t1); T: length of the recording"
+    equation = (
+        "m += k s, s = t / T, or ln(1 + t/t1) / ln(1 + T/t1), or "
+        "(1 - exp(-t/t1)) / (1 - exp(-T/t1)); T: length of the recording"
+    )
     parameters = shapes.vector("change", "gauss", 1.0 * _MG, 50.0 * _MG)
     typical = shapes.along(2.0 * _MG)
     signature = "a steady course in the sensor frame"
@@ -62,9 +67,13 @@ class HardIronDrift(Linear):
     source = "retentive error of ship's compasses (dossier M2)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Straight; fast, then slow."""
+        """Straight; fast, then slow; settling, with time constants a factor of two apart."""
         over = shapes.span(readings)
-        return ({**over, "shape": "line"}, {**over, "shape": "log", "relaxation_s": 10.0})
+        return (
+            {**over, "shape": "line"},
+            {**over, "shape": "log", "relaxation_s": 10.0},
+            *({**over, "shape": "settling", "time_constant_s": tau} for tau in SETTLING_S),
+        )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The course from 0 to 1 on each axis."""
@@ -72,6 +81,9 @@ class HardIronDrift(Linear):
         if setting["shape"] == "log":
             ratio = setting["span_s"] / setting["relaxation_s"]
             part = np.log1p(np.maximum(part, 0.0) * ratio) / np.log1p(ratio)
+        elif setting["shape"] == "settling":
+            ratio = setting["span_s"] / setting["time_constant_s"]
+            part = np.expm1(-np.maximum(part, 0.0) * ratio) / np.expm1(-ratio)
         return Columns(mag=shapes.on_axes(part))
 
 
@@ -125,8 +137,8 @@ class Hysteresis(Linear):
     source = "play operator (Preisach); Bowditch on retentive error (dossier M16)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Radii from the noise of a few readings to more than half of the field's usual swing."""
-        return tuple({"radius_gauss": radius} for radius in (0.0015, 0.006, 0.02, 0.06, 0.15))
+        """Radii from a tenth of the field's usual swing to more than half of it."""
+        return tuple({"radius_gauss": radius} for radius in (0.02, 0.06, 0.15))
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
