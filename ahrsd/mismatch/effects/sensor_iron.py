@@ -137,8 +137,8 @@ class Hysteresis(Linear):
     source = "play operator (Preisach); Bowditch on retentive error (dossier M16)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Radii from a tenth of the field's usual swing to more than half of it."""
-        return tuple({"radius_gauss": radius} for radius in (0.02, 0.06, 0.15))
+        """Radii from the noise of a few readings to more than half of the field's usual swing."""
+        return tuple({"radius_gauss": radius} for radius in (0.0015, 0.006, 0.02, 0.06, 0.15))
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
