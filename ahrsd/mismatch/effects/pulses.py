@@ -106,11 +106,11 @@ def _folded(
     # twice around, so that a window may reach over the period's end
     many = np.concatenate([[0.0], np.cumsum(np.tile(count, 2))])
     much = np.concatenate([np.zeros((3, 1)), np.cumsum(np.tile(sums, 2), axis=1)], axis=1)
-    first = np.arange(bins)
     best = (-1.0, period_s, 0.0, 0.0)
     for width in range(fine, max(fine + 1, round(_LONGEST_S * bins / period_s)) + 1):
-        hit = many[first + width] - many[first]
-        power = np.sum((much[:, first + width] - much[:, first]) ** 2, axis=0) / np.maximum(hit, 1)
+        ends = slice(width, width + bins)
+        hit = many[ends] - many[:bins]
+        power = np.sum((much[:, ends] - much[:, :bins]) ** 2, axis=0) / np.maximum(hit, 1)
         k = int(np.argmax(power))
         if power[k] > best[0]:
             wide = period_s / bins
