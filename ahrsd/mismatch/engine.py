@@ -161,8 +161,9 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     if unknown.detected(left, problem.limits):
         left = of_the_rate(left)
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
+    known = max((judged.evidence for judged in state.named), default=0.0)
+    left = unknown.beside_names(left, known)
     if short is None and not at_rest(start):
-        known = max((judged.evidence for judged in state.named), default=0.0)
         left = with_forms(left, known, problem.limits)
     if short is not None and short.evidence_nats > left.strongest.evidence:
         return _Searched(start, settled(state), surveys, first, last, left, short)

@@ -16,7 +16,14 @@ from ahrsd.mismatch.evidence import log_bayes, posterior
 from ahrsd.mismatch.gram import Gram
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.regression import Base, Candidate, evidence_of, without_known
-from ahrsd.mismatch.score import Score, chi2_p, robust_p, score, shift_statistics
+from ahrsd.mismatch.score import (
+    Score,
+    chi2_p,
+    robust_p,
+    score,
+    shift_statistics,
+    total_score,
+)
 from ahrsd.mismatch.validate import Gain, heldout
 from ahrsd.samples import Array
 
@@ -25,6 +32,8 @@ MINIMUM_SHIFT_SHARE = 0.05
 #: what fewer blocks than this show cannot be known from the others: a jump of the outside field,
 #: which the filter follows within seconds; nats beyond all doubt then stand for the held-out gain
 LONELY_BLOCKS, LONELY_NATS = 5.0, 20.0
+#: deviations beyond which a reading says no more: three axes of it are 13 nats, a place costs them
+OUTLIER = 3.0
 #: what is shorter turns too little to tell a field outside from one on the vehicle
 LONELY_S = 8.0
 
@@ -90,9 +99,8 @@ def judge(
     family = min(1.0, tests * chi2_p(what, basis.colour))
     robust = min(1.0, tests * robust_p(what, basis.colour))
     gain = heldout(gram, known, candidate.name, candidate.scale)
-    found, shifted = shift_statistics(
-        *without_known(basis, columns), round(MINIMUM_SHIFT_SHARE * len(columns))
-    )
+    own, left = without_known(basis, columns)
+    found, shifted = shift_statistics(own, left, round(MINIMUM_SHIFT_SHARE * len(columns)))
     beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
     lonely = _lonely(candidate, what, evidence)
     bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
@@ -101,6 +109,7 @@ def judge(
         ("block-robust probability", robust < limits.robust_family_p),
         ("evidence", evidence > limits.evidence_nats),
         ("held-out gain", gain.nats_per_sample > limits.cv_gain or lonely),
+        ("without outliers", _without_outliers(candidate, own, left, basis) > limits.evidence_nats),
         ("time-shifted copies", beaten >= limits.placebo_beaten),
         ("physical bounds", bool(np.all(np.abs(what.value) <= bounds))),
     )
@@ -116,6 +125,20 @@ def judge(
         max(0.0, (usual - what.rank) / (2.0 * len(columns))),
         tuple(name for name, passed in checks if not passed),
     )
+
+
+def _without_outliers(candidate: Candidate, columns: Array, left: Array, basis: Base) -> float:
+    """Evidence where no reading says more than one of OUTLIER deviations.
+
+    A handful of wild readings at the turn of a recording is an object passed by, or a jump, to
+    whatever has a column that is large just there.
+    """
+    most = OUTLIER * 1.4826 * max(float(np.median(np.abs(left))), 1e-300)
+    flat, readings = columns.reshape(-1, columns.shape[2]), np.clip(left, -most, most).ravel()
+    G = flat.T @ flat
+    least = candidate.effect.least_information
+    what = total_score(G, flat.T @ readings, np.diag(G), candidate.scale, least)
+    return log_bayes(what, basis.colour) - float(np.log(candidate.tried))
 
 
 def _lonely(candidate: Candidate, what: Score, evidence: float) -> bool:
