@@ -1,63 +1,212 @@
 """Names that stand out beside what no name explains.
 
 A real recording always leaves something: against white noise it hides what is weaker, and spoils
-the first names that are tried.  Here the random effects of `discrepancy` are whitened out of the
-innovations and of every column, and the library is held against what is then left.  What a name
-says must be more than other sizes of the random effects would say.
+the first names that are tried.  Here what is left is noise with a spectrum in the world
+(`spectrum`), and the library is held against that.  A candidate's spectrum is measured beside it,
+so that its evidence is how much less is left with it, whatever is left.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-from ahrsd.mismatch import unknown
-from ahrsd.mismatch.discrepancy import beyond, discrepancy
-from ahrsd.mismatch.exam import IMITATORS
-from ahrsd.mismatch.name import Judged
-from ahrsd.mismatch.search import State, Survey, added, formed_basis_of, survey
-from ahrsd.mismatch.stand_ins import TIME_SHAPED, wrong_in_form
+import numpy as np
 
+from ahrsd.mismatch import unknown
+from ahrsd.mismatch.delays import DELAYS
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate
+from ahrsd.mismatch.exam import IMITATORS
+from ahrsd.mismatch.name import Judged, judge
+from ahrsd.mismatch.nested import simplest
+from ahrsd.mismatch.regression import (
+    Base,
+    Candidate,
+    best_settings,
+    candidate_gram,
+    closest_onset,
+    columns_of,
+    evidence_of,
+    quieter,
+)
+from ahrsd.mismatch.reweighted import reweighted
+from ahrsd.mismatch.rivals import OWN_SHARE, by_matrix, by_memory, compared, more
+from ahrsd.mismatch.score import Score
+from ahrsd.mismatch.search import (
+    ONSET_SHARE,
+    STEPS,
+    State,
+    Survey,
+    added,
+    at_rest,
+    formed_basis_of,
+    term_group,
+    without_term,
+)
+from ahrsd.mismatch.spectrum import Spectrum, against, spectrum_of
+from ahrsd.mismatch.stand_ins import TIME_SHAPED
+from ahrsd.samples import Array
+
+#: of what has the shape of time: what is logged, and steps that are sharp
+SAID = ("switched_device", "hard_iron_step", "gyro_bias_step")
+#: evidence of a step over that of the next one, in all frames, that the rest has: a room walked
+#: through has many, and of jumps with heavy tails the largest is seldom so far ahead
+SHARPER_THAN = 5.0
+#: nats that a step must be worth: the largest change of any course is one, to some extent
+STEP_NATS = 100.0
 #: what a room or an unlogged source does from place to place and from minute to minute, and what a
 #: sensor does that is not quite linear: beside a rest such names say no more than the rest does
 OF_THE_REST = (
     *IMITATORS,
-    *(name for names in TIME_SHAPED.values() for name in names if name != "switched_device"),
+    *(name for names in TIME_SHAPED.values() for name in names if name not in SAID),
     "field_gradient",
     "onboard_calibration_active",
     "flexible_mount",
     "mag_cross_axis",
     "mag_nonlinearity",
+    "gyro_nonlinearity",
 )
+#: what differs between recordings of one sensor by this much, or is laid to it, says nothing of it
+OF_ITSELF = {
+    "mag_gyro_misalignment": 0.03,
+    "gyro_scale": 0.04,
+    "clock_rate": 0.03,
+    "gyro_nonorthogonality": 0.03,
+}
+#: names that follow a logged cause
+CAUSED = (
+    "motor_current_field",
+    "current_derivative_field",
+    "speed_field",
+    "altitude_field",
+    "moving_iron",
+    "rotor_field",
+    "switched_device",
+    "mag_bias_temperature",
+    "mag_scale_temperature",
+    "gyro_bias_temperature",
+)
+#: candidates whose spectra are measured
+LOOKED_AT = 8
 
 
 def named_beside(
-    state: State, surveys: list[Survey], left: unknown.Remainder
+    state: State,
+    surveys: list[Survey],
+    left: unknown.Remainder,
+    stood_in: frozenset[str] = frozenset(),
 ) -> tuple[State, list[Survey], unknown.Remainder]:
-    """The state with the names that stand out beside the rest, where there is one."""
+    """The state with the names that stand out beside the rest, where there is one.
+
+    stood_in: names that only stood in for another form.  Where a cause was logged that does not
+              change: what bends with the temperature has no offset by it
+    """
     limits = state.problem.limits
+    if not unknown.detected(left, limits):
+        return state, surveys, left
+    given = state, surveys, left
+    state = reweighted(state)
+    refused = {name for name in stood_in if name in CAUSED}
     while len(state.named) < limits.most_terms and unknown.detected(left, limits):
-        found = _standing_out(state)
-        if found is None:
+        seen = look(state, refused)
+        standing = [one for one in seen.judged if one.accepted]
+        if not standing:
             break
-        more = added(state, found[0])
-        if len(state.named) in wrong_in_form(more, beside=True):
-            break  # a mount that bends is no misalignment, not even a part of one
-        state = more
-        surveys = [*surveys, found[1]]
+        best = simplest(standing)
+        tried = reweighted(added(state, best))
+        if not _holds(tried):
+            refused.add(best.candidate.name)
+            continue
+        state, surveys = tried, [*surveys, seen]
         left = unknown.remainder(formed_basis_of(state))
-    return state, surveys, left
+    return given if len(state.named) == len(given[0].named) else (state, surveys, left)
 
 
-def _standing_out(state: State) -> tuple[Judged, Survey] | None:
-    """The strongest name beside the rest, and the survey in which it was found."""
+def _holds(state: State) -> bool:
+    """Whether the newest term is of no other form, and a step is sharper than what is left."""
+    last = len(state.named) - 1
+    basis = formed_basis_of(state)
+    quiet = against(basis, spectrum_of(basis))
+    if state.names[last] not in STEPS.values():
+        return not _of_another_form(state, last, quiet)
+    mine = evidence_of(without_term(state, last, quiet), state.named[last].candidate)
+    steps = {name: state.problem.library[name] for name in STEPS.values()}
+    usual = best_settings(quiet, steps, [])[0].evidence
+    return mine > SHARPER_THAN * usual
+
+
+def look(state: State, refused: Sequence[str] | set[str] = ()) -> Survey:
+    """The library held against the spectrum of what is left."""
     problem, basis = state.problem, formed_basis_of(state)
-    found = discrepancy(basis)
-    library = {name: e for name, e in problem.library.items() if name not in OF_THE_REST}
-    asked = replace(state, problem=replace(problem, library=library))
-    seen = survey(asked, found.softened())
-    for judged in (one for one in seen.judged if one.accepted):
-        columns = judged.candidate.effect.columns(basis.context, judged.candidate.setting)
-        alone = basis.whitened([columns])[0]
-        if beyond(found, basis, alone, judged.candidate.scale) > problem.limits.beside_nats:
-            return judged, seen
-    return None
+    plain = spectrum_of(basis)
+    quiet = against(basis, plain)
+    silent = {*OF_THE_REST, *refused}
+    if any(name in DELAYS for name in state.names):
+        silent |= set(DELAYS)
+    library = {name: e for name, e in problem.library.items() if name not in silent}
+    if at_rest(state.fit):
+        library = {name: effect for name, effect in library.items() if effect.family == "gyro"}
+    taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
+    candidates = best_settings(quiet, library, taken)
+    judged = [_judged(state, basis, plain, one, len(candidates)) for one in candidates[:LOOKED_AT]]
+    judged.sort(key=lambda one: -one.evidence)
+    evidence = {one.candidate.name: one.evidence for one in judged}
+    told = [replace(c, evidence=evidence.get(c.name, c.evidence)) for c in candidates]
+    return Survey(quiet, tuple(sorted(told, key=lambda c: -c.evidence)), tuple(judged))
+
+
+def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: int) -> Judged:
+    """A candidate held against the spectrum that is left beside it."""
+    limits = state.problem.limits
+    columns = columns_of(basis, [one])[one.name]
+    noise = spectrum_of(basis, columns)
+    quiet = against(basis, noise)
+    if one.name in STEPS.values():
+        one = closest_onset(quiet, one, ONSET_SHARE * state.problem.track.duration_s)
+        columns = columns_of(basis, [one])[one.name]
+        noise = spectrum_of(basis, columns)
+        quiet = against(basis, noise)
+    seen = noise.whitened(columns)
+    quiet = quieter(quiet, seen)
+    gram = candidate_gram(quiet, {one.name: seen}, state.problem.block_s)
+    held = judge(one, gram, seen, quiet, tried, limits)
+    gain = (noise.nats - plain.nats) / quiet.colour
+    evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
+    checks = {
+        "evidence": evidence > (STEP_NATS if one.name in STEPS.values() else limits.beside_nats),
+        "size": _material(one, held.what),
+    }
+    others = (why for why in held.refused if why not in checks)
+    refused = (*others, *(why for why, passed in checks.items() if not passed))
+    return replace(held, evidence=evidence, refused=refused)
+
+
+def _paid(what: Score, scale: Array) -> float:
+    """Nats that coefficients cost: of one prior deviation, or as much as they are."""
+    if what.rank == 0:
+        return 0.0
+    size2 = float(np.mean((what.value / scale) ** 2))
+    return 0.5 * float(np.sum(np.log1p(max(size2, 1e-4) * what.information)))
+
+
+def _material(one: Candidate, what: Score) -> bool:
+    """Whether it is larger than what sensors have by themselves that look like it."""
+    return float(np.linalg.norm(what.value)) > OF_ITSELF.get(one.name, 0.0)
+
+
+def _of_another_form(state: State, number: int, quiet: Base) -> bool:
+    """Whether a free form is more than a term, which beside it keeps less than half of its own."""
+    context = quiet.context
+    left = without_term(state, number, quiet)
+    scale = state.named[number].candidate.scale
+    mine = quiet.known[:, :, quiet.groups[term_group(number)]] * scale
+    columns = quiet.whitened([by_rate(context), by_memory(context), by_matrix(context)])
+    units = (UNIT_RAD_S, UNIT_GAUSS, UNIT_GAUSS)
+    free = [part * unit for part, unit in zip(columns, units, strict=True)]
+    slow = np.cos(np.linspace(0.0, np.pi, len(mine)))[:, None, None]
+    noise = max(1.0, quiet.colour)
+    for part in (slow * mine, *free):
+        name, form, both = compared(left, mine, part, noise)
+        if form > name + more(name) and both - form < OWN_SHARE * name:
+            return True
+    return False

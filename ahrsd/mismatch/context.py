@@ -137,7 +137,7 @@ def attitude(track: Track, done: Filtered | Bearings) -> tuple[Array, bool]:
     width = DRIFT_S / track.step_s
     field = _carried(U, done.nominal_b, runs, width)
     if accel is None:
-        return np.asarray(_held_by_field(field, runs) @ U), False
+        return np.asarray(held_by_field(field, runs) @ U), False
     down = _unit(_carried(U, -accel, runs, width))
     east = _unit(np.cross(down, field))
     return np.stack([np.cross(east, down), east, down], axis=1) @ U, True
@@ -175,7 +175,7 @@ def _carried(U: Array, vectors: Array, runs: Sequence[slice], width: float) -> A
     return np.asarray(out)
 
 
-def _held_by_field(field: Array, runs: Sequence[slice]) -> Array:
+def held_by_field(field: Array, runs: Sequence[slice]) -> Array:
     """Smallest rotations (N, 3, 3) that bring the carried field to where it was at first."""
     unit = _unit(field)
     out = np.empty((len(field), 3, 3))

@@ -19,7 +19,7 @@ the one without it.  Where nothing is left the variances are zero and nothing ch
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ from scipy import linalg
 from ahrsd.mismatch import locate
 from ahrsd.mismatch.evidence import SIZES, colour
 from ahrsd.mismatch.gram import RANK_SHARE, solve
-from ahrsd.mismatch.regression import Base, based, residual
-from ahrsd.mismatch.rest import Rest
+from ahrsd.mismatch.regression import Base, residual
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -68,31 +67,6 @@ class Discrepancy:
     sizes: Array
     nats: float
     unknown: float
-
-    def softened(self) -> Base:
-        """The basis with the random effects of these sizes whitened out of it."""
-        size = np.exp(self.sizes)[self.group]
-        kept = size > 2 * np.exp(SMALLEST)
-        scaled = self.columns.reshape(-1, len(self.group))[:, kept] * size[kept]
-        U, d, _ = np.linalg.svd(scaled, full_matrices=False)
-        rest = Rest(U, np.sqrt(self.noise / (self.noise + d**2)), self.noise)
-        known, innovation = (rest.whitened(v) for v in (self.basis.known, self.basis.innovation))
-        return replace(
-            based(self.basis, self.basis.groups, known, innovation),
-            rest=rest,
-            colour=colour(innovation, self.basis.rate_hz),
-        )
-
-    def refined(self, name: str) -> tuple[Array, Array]:
-        """What is left to change in a known group's value (p,) beside them, and its deviation."""
-        X = np.concatenate([self.basis.known, self.columns], axis=2)
-        X = X.reshape(-1, X.shape[2]) / np.sqrt(self.noise)
-        e = self.basis.innovation.ravel() / np.sqrt(self.noise)
-        prior = np.zeros(X.shape[1])
-        prior[-len(self.group) :] = np.exp(-2.0 * self.sizes)[self.group]
-        inverse = solve(X.T @ X + np.diag(prior), np.column_stack([X.T @ e, np.eye(X.shape[1])]))
-        at = self.basis.groups[name]
-        return inverse[at, 0], np.sqrt(np.maximum(np.diag(inverse[:, 1:])[at], 0.0))
 
 
 def discrepancy(basis: Base) -> Discrepancy:

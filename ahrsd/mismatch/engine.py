@@ -65,6 +65,7 @@ from ahrsd.mismatch.search import (
 )
 from ahrsd.mismatch.slow_noise import in_its_noise
 from ahrsd.mismatch.sought import sought
+from ahrsd.mismatch.spectrum import against, spectrum_of
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
@@ -154,7 +155,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     done = wandering(sought(State(problem, start)))
     first, last = done.first, done.last
-    state, surveys, left = named_beside(done.state, done.surveys, done.left)
+    state, surveys, left = named_beside(done.state, done.surveys, done.left, done.stood_in)
     short = bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)
@@ -220,7 +221,7 @@ def _told(
 def _names(done: _Searched, fast: Quick) -> tuple[list[Finding], tuple[Term, ...]]:
     """Findings and whole terms of the search's names, then of what only the recorded rate shows."""
     state, basis, last = done.state, basis_of(done.state), fast.last.basis
-    beside = rest_of(state, basis)
+    beside = None if rest_of(state, basis) is None else against(basis, spectrum_of(basis))
     slow = [
         finding(state, basis, k, seen, done.last, beside) for k, seen in enumerate(done.surveys)
     ]

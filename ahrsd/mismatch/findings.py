@@ -9,7 +9,6 @@ import numpy as np
 from ahrsd.mismatch.confound import separating_manoeuvre
 from ahrsd.mismatch.delays import DELAYS, time_constant_less_lag, usual_step, weighed
 from ahrsd.mismatch.diagnosis import Cost, Finding, Heldout, Share, Value, Where
-from ahrsd.mismatch.discrepancy import Discrepancy
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.evidence import SHARPER, posterior
 from ahrsd.mismatch.facts import Fact
@@ -20,6 +19,7 @@ from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of, scaled
+from ahrsd.mismatch.reweighted import stepped
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
     WANDERING,
@@ -45,12 +45,12 @@ def finding(
     number: int,
     seen: Survey,
     last: Survey,
-    beside: Discrepancy | None = None,
+    beside: Base | None = None,
 ) -> Finding:
     """The finding of term `number`.
 
     basis: of the whole model;  seen: the survey without the term;  last: with all terms
-    beside: what the whole model leaves, if it is more than noise
+    beside: the basis against the spectrum of what is left, if that is more than noise
     """
     judged, library = state.named[number], state.problem.library
     shares = _delay_shares(state, basis, number, beside) or shares_of(state, number, seen, last)
@@ -122,15 +122,15 @@ def whole_term(
     basis: Base,
     number: int,
     name: str | None = None,
-    beside: Discrepancy | None = None,
+    beside: Base | None = None,
 ) -> Term:
     """A fitted term as it is told: whole value, deviations for the noise as coloured as it is.
 
     name: what a delay is called in the end
     """
     term = state.fit.terms[number]
-    scale = _by_scale(state, basis, number)
-    change, deviation = refined(basis, number, term.identifier, beside, scale)
+    told = _told_in(state, basis, number, beside)
+    change, deviation = refined(told, number, _by_scale(state, told, number))
     value = added_value(state, number) + change
     setting = {k: v for k, v in term.setting.items() if k != "searched"}
     if not _is_delay(state, number):
@@ -160,22 +160,19 @@ def _by_scale(state: State, basis: Base, number: int) -> Array | None:
     return np.asarray((high - low) / (2 * _SCALE_STEP))
 
 
-def refined(
-    basis: Base,
-    number: int,
-    name: str,
-    beside: Discrepancy | None,
-    scale: Array | None = None,
-) -> tuple[Array, Array]:
+def _told_in(state: State, basis: Base, number: int, beside: Base | None) -> Base:
+    """The basis in which a term was fitted, and is told."""
+    if beside is None or (stepped(state) and not _is_delay(state, number)):
+        return basis
+    return beside
+
+
+def refined(basis: Base, number: int, scale: Array | None = None) -> tuple[Array, Array]:
     """What is left to change in a term's value (p,), and its deviation (p,) in coloured noise.
 
     scale (N, 3): how the whitened readings move with the term's time constant or radius, which was
     fitted too.
-    A delay shows in the turns, whatever else is the matter: it is taken beside what is left.  What
-    shows in the level of the field would give half of itself away to it.
     """
-    if beside is not None and name in DELAYS:
-        return beside.refined(term_group(number))
     Z = basis.known.reshape(-1, basis.known.shape[2])
     if scale is not None:
         Z = np.column_stack([Z, scale.ravel()])
@@ -190,12 +187,13 @@ def _is_delay(state: State, number: int) -> bool:
 
 
 def _delay_shares(
-    state: State, basis: Base, number: int, beside: Discrepancy | None
+    state: State, basis: Base, number: int, beside: Base | None
 ) -> dict[str, float] | None:
     if not _is_delay(state, number):
         return None
     term = state.fit.terms[number]
-    change, deviation = (float(part[0]) for part in refined(basis, number, term.identifier, beside))
+    told = _told_in(state, basis, number, beside)
+    change, deviation = (float(part[0]) for part in refined(told, number))
     recorded = usual_step(state.problem.recorded.dt_s)
     lag_s = DELAYS[term.identifier] * (state.lag_s(number) + change)
     return weighed(basis, state.problem.library, lag_s, deviation, recorded)

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.mismatch.coloured import Coloured
 from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.effects.world import moved_object
 from ahrsd.mismatch.evidence import colour, log_bayes
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.objects import closest_object
-from ahrsd.mismatch.rest import Rest
+from ahrsd.mismatch.rest import Whitening
 from ahrsd.mismatch.score import Score, total_score
 from ahrsd.mismatch.sums import Sums
 from ahrsd.mismatch.values import Columns, Context
@@ -87,7 +86,7 @@ class Base:
     kept: NDArray[np.intp]
     back: Array
     weight: Array | None = None
-    rest: Rest | Coloured | None = None
+    rest: Whitening | None = None
 
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
         """The columns (N, 3, p) as the innovation sees them, several at a time."""

@@ -97,7 +97,7 @@ def of_the_rate(left: Remainder) -> Remainder:
     noise = max(1.0, basis.colour)
     name, form, both = compared(basis, mine * UNIT_GAUSS, rate * UNIT_RAD_S, noise)
     name = max(name, best.evidence)
-    if form > name + _more(name) and both - form < OWN_SHARE * name:
+    if form > name + more(name) and both - form < OWN_SHARE * name:
         gyro = replace(left.located["gyro"], evidence=form)
         located = {**left.located, "gyro": gyro}
         return replace(left, located=located, stood_in="gyro", spells_s=())
@@ -125,10 +125,10 @@ def _rivals(
     """
     name, form, both = compared(left, mine, other, noise)
     most = form if alone else max(form, both)
-    return most > name + _more(name) and both - form < share * name
+    return most > name + more(name) and both - form < share * name
 
 
-def _more(name: float) -> float:
+def more(name: float) -> float:
     """Nats by which a form must be more than a name of so many."""
     return MORE_NATS + MORE_SHARE * max(name, 0.0)
 

@@ -21,6 +21,7 @@ class Sought:
 
     first, last: the surveys before and after the names
     before: the state before any name was taken out again
+    stood_in: names that were taken out since they only stood in for something of another form
     """
 
     state: State
@@ -29,6 +30,7 @@ class Sought:
     last: Survey
     left: Remainder
     before: State
+    stood_in: frozenset[str] = frozenset()
 
 
 def sought(state: State) -> Sought:
@@ -38,5 +40,6 @@ def sought(state: State) -> Sought:
     slim = eddies_alone(slim)
     last = last if slim.names == more.names else survey(slim)
     named, surveys, last = without_unlikely(*swapped(slim, last))
-    named, surveys, left = without_stand_ins(named, surveys, beside)
-    return Sought(named, surveys, first, last, left, more)
+    true, surveys, left = without_stand_ins(named, surveys, beside)
+    stood_in = frozenset(named.names) - frozenset(true.names)
+    return Sought(true, surveys, first, last, left, more, stood_in)

@@ -1,4 +1,4 @@
-"""Names held against what is left when the remainder is whitened out; delays beside wider names."""
+"""Names held against the spectrum of what is left; delays beside wider names."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import pytest
 from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
-from ahrsd.mismatch.discrepancy import discrepancy
+from ahrsd import so3
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.exam import pruned
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import base
 from ahrsd.mismatch.score import total_score
 from ahrsd.mismatch.search import State, added, survey
 from ahrsd.mismatch.track import Spec, Track
@@ -36,27 +35,6 @@ def switched(track: Track) -> np.ndarray:
     return np.random.default_rng(9).integers(0, 2, seconds.max() + 1)[seconds].astype(float)
 
 
-def test_the_remainder_is_whitened_out_of_innovation_and_columns():
-    track = room()
-    fit = fit_null(track, walk=False)
-    basis = base(fit.context(), fit.filtered, [], 25.0)
-    soft = discrepancy(basis).softened()
-    assert basis.colour > 3.0
-    assert soft.colour < 0.5 * basis.colour
-    effect = EFFECTS["hard_iron_step"]
-    columns = effect.columns(basis.context, {"onset_s": 80.0})
-    seen = soft.whitened([columns])[0]
-    # V^-1/2 applied twice is V^-1: the products with the innovation are those of one application
-    rest = soft.rest
-    assert rest is not None
-    np.testing.assert_allclose(seen, rest.whitened(basis.whitened([columns])[0]), atol=1e-12)
-    U, d2 = rest.directions, rest.noise * (rest.kept**-2.0 - 1.0)
-    values = basis.innovation.ravel()
-    inverse = values / rest.noise - U @ ((d2 / (d2 + rest.noise)) * (U.T @ values)) / rest.noise
-    twice = rest.whitened(rest.whitened(basis.innovation))
-    np.testing.assert_allclose(twice.ravel(), inverse, atol=1e-9)
-
-
 def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
     track = room()
     value = np.array([5e-3, -3e-3, 4e-3])
@@ -68,6 +46,32 @@ def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
         assert abs(parameter.value - true) < 4 * parameter.std < 6e-3
     assert [one.effect for one in found.findings] == ["switched_device"]
     assert found.unexplained.detected
+
+
+def test_a_misalignment_is_named_beside_a_room_with_its_value():
+    track = room()
+    angle = np.array([0.05, -0.03, 0.04])
+    reading = track.mag_b_gauss @ so3.exp(angle[None])[0].T
+    found = diagnose(replace(track, mag_b_gauss=reading))
+    (mount,) = found.findings
+    assert mount.effect == "mag_gyro_misalignment"
+    values = np.array([parameter.value for parameter in mount.parameters])
+    np.testing.assert_allclose(np.linalg.norm(values), np.linalg.norm(angle), rtol=0.15)
+    assert abs(values @ angle) > 0.97 * np.linalg.norm(values) * np.linalg.norm(angle)
+    assert found.unexplained.detected
+
+
+def test_a_sharp_step_is_named_beside_a_room_and_a_change_like_the_others_is_not():
+    track = room()
+    later = (track.time_s >= 83.0)[:, None]
+    for size, named in ((0.12, ["hard_iron_step"]), (0.006, [])):
+        step = size * np.array([0.6, -0.64, 0.48])
+        found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + later * step))
+        assert [one.effect for one in found.findings] == named
+        for one in found.findings:
+            values = [parameter.value for parameter in one.parameters]
+            np.testing.assert_allclose(values, step, atol=0.15 * size)
+            assert one.setting["onset_s"] == pytest.approx(83.0, abs=0.5)
 
 
 def test_a_room_alone_gets_no_name():
