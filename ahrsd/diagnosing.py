@@ -26,22 +26,29 @@ from ahrsd.samples import Array, SampleBlock
 
 SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
 FEWEST_ROWS = 100
+RATE_AGREES = 0.05  # of a spec and the stamps' median step: clocks are closer, units are not
 _SPEC_KEYS = ("sigma_mag_gauss", "sigma_gyro_rad_s", "rate_hz", "field_gauss")
 
 
 def load_track(
-    path: Path, rate_hz: float | None = None, progress: Callable[[int], None] | None = None
+    path: Path,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+    *,
+    spec: Spec | None = None,
 ) -> tuple[Track, list[str]]:
     """The recording as one track, and what a person should know of how it was read.
 
+    rate_hz: for a byte stream without a time of its own, before that of the spec
     Raises RecordingError where there is nothing to diagnose.
     """
     recording = open_recording(path, rate_hz, check_units=False)
+    said_hz = None if spec is None else spec.rate_hz
     if recording.kind is Kind.TABLE:
         table = recording.table or read_table(path, check_units=False)
         blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
     else:
-        blocks, notes = _streamed(path, rate_hz, progress)
+        blocks, notes = _streamed(path, rate_hz or said_hz, progress)
     track = track_of(blocks)
     if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
         raise RecordingError(
@@ -49,7 +56,18 @@ def load_track(
             f"is too short to diagnose: {len(track)} samples in {track.duration_s:.1f} s",
             f"record at least {SHORTEST_S:.0f} s and {FEWEST_ROWS} samples, better some minutes",
         )
-    return track, notes
+    return track, [*notes, *_of_its_rate(track, said_hz)]
+
+
+def _of_its_rate(track: Track, said_hz: float | None) -> list[str]:
+    """One line where the time stamps and the spec's rate say different things."""
+    rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
+    if said_hz is None or abs(rate_hz / said_hz - 1.0) < RATE_AGREES:
+        return []
+    return [
+        f"the spec says {said_hz:g} Hz, the time stamps {rate_hz:.4g} Hz: the stamps are used; "
+        "check that they are in seconds"
+    ]
 
 
 def _streamed(
@@ -136,11 +154,11 @@ def diagnose_recording(
 ) -> Diagnosis:
     """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError."""
     known = Spec() if spec is None else load_spec(spec)
-    track, notes = load_track(real, rate_hz or known.rate_hz, progress)
+    track, notes = load_track(real, rate_hz, progress, spec=known)
     if simulation is None:
         found = _answered(real, track, known)
         return replace(found, notes=(*notes, *found.notes))
-    simulated, _ = load_track(simulation, rate_hz or known.rate_hz)
+    simulated, _ = load_track(simulation, rate_hz, spec=known)
     try:
         overlap = align(track, simulated)
     except ValueError as error:

@@ -10,6 +10,7 @@ import pytest
 from ahrsd.diagnosing import load_spec, load_track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.mismatch.aligned import align
+from ahrsd.mismatch.track import Spec
 from ahrsd.recording.table_writer import write_table
 from ahrsd.simulation import Settings, simulate
 
@@ -195,6 +196,14 @@ def test_a_spec_that_is_wrong_is_one_line(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(AhrsdError, match=words):
         load_spec(path)
+
+
+@pytest.mark.parametrize(("ratio", "lines"), [(1.03, 0), (0.98, 0), (1.2, 1), (0.04, 1)])
+def test_a_spec_of_another_rate_than_the_time_stamps_is_said(saved, clean, ratio, lines):
+    rate_hz = 1.0 / float(np.median(np.diff(clean["time_s"])))
+    _, notes = load_track(saved(clean), spec=Spec(rate_hz=ratio * rate_hz))
+    assert len([note for note in notes if "the stamps are used" in note]) == lines
+    assert not any("--rate" in note for note in notes)
 
 
 def test_a_recording_that_is_missing(tmp_path):
