@@ -67,7 +67,8 @@ def examined(state: State) -> tuple[State, bool]:
         found = rest_of(state, basis)
         if found is None:
             return state, False
-        bar = max(limits.beyond_nats, limits.beyond_share * found.unknown)
+        small = limits.unknown_nats + found.unknown  # of a small rest even the form is not much
+        bar = max(min(limits.beyond_nats, small), limits.beyond_share * found.unknown)
         enough = max(bar, found.unknown)  # no question is how much more than that
         worth = [_worth(state, basis, found, k, enough) for k in range(len(state.named))]
         poor = [k for k in range(len(worth)) if worth[k] <= bar]
