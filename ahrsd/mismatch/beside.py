@@ -100,6 +100,9 @@ def named_beside(
 
     stood_in: names that only stood in for another form.  Where a cause was logged that does not
               change: what bends with the temperature has no offset by it
+
+    What is laid to the sensor itself and not said, a mount of half a degree that gives, looks in
+    part like other names: they must be more than half of it.
     """
     limits = state.problem.limits
     if not unknown.detected(left, limits):
@@ -109,7 +112,8 @@ def named_beside(
     refused = {name for name in stood_in if name in CAUSED}
     while len(state.named) < limits.most_terms and unknown.detected(left, limits):
         seen = look(state, refused)
-        standing = [one for one in seen.judged if one.accepted]
+        bar = OWN_SHARE * max((j.evidence for j in seen.judged if "size" in j.refused), default=0.0)
+        standing = [one for one in seen.judged if one.accepted and one.evidence > bar]
         if not standing:
             break
         best = simplest(standing)
