@@ -139,7 +139,7 @@ def _lost_beside(whole: Problem, fast: Quick) -> list[Fact]:
 class _Searched:
     """The null fit, the state with all names, the surveys without each of them, what is left.
 
-    short: bursts, where they are what is left
+    short: bursts, where they are what is left;  beside: whether all was fitted anew against a rest
     """
 
     start: NullFit
@@ -149,13 +149,14 @@ class _Searched:
     last: Survey
     left: unknown.Remainder
     short: Unexplained | None = None
+    beside: bool = False
 
 
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     done = wandering(sought(State(problem, start)))
-    first, last = done.first, done.last
     state, surveys, left = named_beside(done.state, done.surveys, done.left, done.stood_in)
+    beside = len(state.named) > len(done.state.named)
     short = bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)
@@ -166,11 +167,11 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     left = unknown.beside_names(left, known)
     if short is None and not at_rest(start):
         left = with_forms(left, known, problem.limits)
-    if short is not None and short.evidence_nats > left.strongest.evidence:
-        return _Searched(start, settled(state), surveys, first, last, left, short)
-    if unknown.detected(left, problem.limits):
+    if short is not None and short.evidence_nats <= left.strongest.evidence:
+        short = None
+    if short is None and unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
-    return _Searched(start, settled(state), surveys, first, last, left)
+    return _Searched(start, settled(state), surveys, done.first, done.last, left, short, beside)
 
 
 def _told(
@@ -185,7 +186,7 @@ def _told(
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
     named, terms = _names(done, fast)
-    noise = _noise_facts(problem, fast, facts, unknown.detected(done.left, limits))
+    noise = _noise_facts(problem, fast, facts, done)
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
         *sorted(named, key=_least_gain),
@@ -238,14 +239,16 @@ def _names(done: _Searched, fast: Quick) -> tuple[list[Finding], tuple[Term, ...
 
 
 def _noise_facts(
-    problem: Problem, fast: Quick, facts: Sequence[Fact], beside_unknown: bool
+    problem: Problem, fast: Quick, facts: Sequence[Fact], done: _Searched
 ) -> list[Fact]:
     """What is to be said of the noise's level; coarse numbers scatter by themselves.
 
-    beside_unknown: to the fit, what no name explains is noise, so that its level says nothing
+    What no name explains is noise to the fit: beside it the level says nothing, and where all was
+    fitted anew against it, nor does its coming and going.
     """
-    if any(fact.effect == "mag_quantisation" for fact in facts):
+    if done.beside or any(fact.effect == "mag_quantisation" for fact in facts):
         return []
+    beside_unknown = unknown.detected(done.left, problem.limits)
     given = problem.spec.sigma_mag_gauss is not None
     found = level_facts(fast.state.fit.filtered, spec_given=given)
     return [
