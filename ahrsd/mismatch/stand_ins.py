@@ -3,8 +3,10 @@ unlogged source, any name for what has another form (`rivals`)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.bursts import bursts
@@ -14,6 +16,7 @@ from ahrsd.mismatch.locate import FRAMES, Frame
 from ahrsd.mismatch.regression import Base, evidence_of
 from ahrsd.mismatch.rivals import of_another_form
 from ahrsd.mismatch.search import (
+    CANCELS,
     ORDINARY_WALK_RAD_S_SQRT_S,
     STEPS,
     State,
@@ -24,6 +27,7 @@ from ahrsd.mismatch.search import (
     survey,
     term_group,
 )
+from ahrsd.samples import Array
 
 #: names that are a course in time and nothing else, by the frame that they act in
 TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
@@ -94,10 +98,18 @@ def wrong_in_form(state: State, beside: bool) -> list[int]:
     """Terms that come and go as nothing in the library does, or are of another form."""
     basis = formed_basis_of(state)
     # a magnet is put on and taken off again; a gyro's bias does not come back
-    back = [k for k, name in enumerate(state.names) if name == STEPS["gyro"]]
-    back = [k for k in back if counterpart(state, k) is not None]
+    steps = [k for k, name in enumerate(state.names) if name == STEPS["gyro"]]
+    back = [k for k in steps if counterpart(state, k) is not None]
+    if len(steps) > 1 and _returns([state.fit.terms[k].value for k in steps]):
+        back = steps
     courses = [name for names in TIME_SHAPED.values() for name in names]
     return sorted({*back, *of_another_form(state, basis, courses, beside=beside)})
+
+
+def _returns(steps: Sequence[Array]) -> bool:
+    """Whether steps (3,) end where they began: what swells and fades, in a few levels."""
+    whole = sum(float(np.linalg.norm(one)) for one in steps)
+    return 2 * float(np.linalg.norm(np.sum(steps, axis=0))) < CANCELS * whole
 
 
 def _bumps(state: State, left: unknown.Remainder) -> tuple[list[int], bool]:
