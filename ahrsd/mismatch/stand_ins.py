@@ -100,13 +100,13 @@ def wrong_in_form(state: State, beside: bool) -> list[int]:
     # a magnet is put on and taken off again; a gyro's bias does not come back
     steps = [k for k, name in enumerate(state.names) if name == STEPS["gyro"]]
     back = [k for k in steps if counterpart(state, k) is not None]
-    if len(steps) > 1 and _returns([state.fit.terms[k].value for k in steps]):
+    if len(steps) > 1 and end_where_they_began([state.fit.terms[k].value for k in steps]):
         back = steps
     courses = [name for names in TIME_SHAPED.values() for name in names]
     return sorted({*back, *of_another_form(state, basis, courses, beside=beside)})
 
 
-def _returns(steps: Sequence[Array]) -> bool:
+def end_where_they_began(steps: Sequence[Array]) -> bool:
     """Whether steps (3,) end where they began: what swells and fades, in a few levels."""
     whole = sum(float(np.linalg.norm(one)) for one in steps)
     return 2 * float(np.linalg.norm(np.sum(steps, axis=0))) < CANCELS * whole
