@@ -86,6 +86,8 @@ CAUSED = (
     "mag_scale_temperature",
     "gyro_bias_temperature",
 )
+#: why a name is not said that is laid to the sensor itself
+SIZE = "size"
 #: candidates whose spectra are measured
 LOOKED_AT = 8
 
@@ -100,9 +102,6 @@ def named_beside(
 
     stood_in: names that only stood in for another form.  Where a cause was logged that does not
               change: what bends with the temperature has no offset by it
-
-    What is laid to the sensor itself and not said, a mount of half a degree that gives, looks in
-    part like other names: they must be more than half of it.
     """
     limits = state.problem.limits
     if not unknown.detected(left, limits):
@@ -112,8 +111,7 @@ def named_beside(
     refused = {name for name in stood_in if name in CAUSED}
     while len(state.named) < limits.most_terms and unknown.detected(left, limits):
         seen = look(state, refused)
-        bar = OWN_SHARE * max((j.evidence for j in seen.judged if "size" in j.refused), default=0.0)
-        standing = [one for one in seen.judged if one.accepted and one.evidence > bar]
+        standing = sayable(seen.judged)
         if not standing:
             break
         best = simplest(standing)
@@ -124,6 +122,19 @@ def named_beside(
         state, surveys = tried, [*surveys, seen]
         left = unknown.remainder(formed_basis_of(state))
     return given if len(state.named) == len(given[0].named) else (state, surveys, left)
+
+
+def sayable(judged: Sequence[Judged]) -> list[Judged]:
+    """The names that may be said, the likeliest first; none where one that may not is likelier.
+
+    What is laid to the sensor itself and not said, a mount of half a degree that gives, looks in
+    part like other names: they must be more than half of it.
+    """
+    own = max((one.evidence for one in judged if SIZE in one.refused), default=0.0)
+    others = [one for one in judged if SIZE not in one.refused]
+    if not others or not others[0].accepted:
+        return []
+    return [one for one in others if one.accepted and one.evidence > OWN_SHARE * own]
 
 
 def _holds(state: State) -> bool:
@@ -155,7 +166,12 @@ def look(state: State, refused: Sequence[str] | set[str] = ()) -> Survey:
     judged = [_judged(state, basis, plain, one, len(candidates)) for one in candidates[:LOOKED_AT]]
     judged.sort(key=lambda one: -one.evidence)
     evidence = {one.candidate.name: one.evidence for one in judged}
-    told = [replace(c, evidence=evidence.get(c.name, c.evidence)) for c in candidates]
+    own = {one.candidate.name for one in judged if SIZE in one.refused}
+    told = [
+        replace(c, evidence=evidence.get(c.name, c.evidence))
+        for c in candidates
+        if c.name not in own
+    ]
     return Survey(quiet, tuple(sorted(told, key=lambda c: -c.evidence)), tuple(judged))
 
 
@@ -178,7 +194,7 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
     checks = {
         "evidence": evidence > (STEP_NATS if one.name in STEPS.values() else limits.beside_nats),
-        "size": _material(one, held.what),
+        SIZE: _material(one, held.what),
     }
     others = (why for why in held.refused if why not in checks)
     refused = (*others, *(why for why, passed in checks.items() if not passed))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
 from ahrsd import so3
+from ahrsd.mismatch.beside import sayable
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.exam import pruned
@@ -107,3 +109,20 @@ def test_a_direction_counts_where_a_coefficient_at_its_bound_would_show():
     what = total_score(G, s, np.diag(G), scale, effect.least_information)
     assert what.rank == 2
     np.testing.assert_allclose(what.value, [30 * scale[0], 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("judged", "said"),
+    [
+        ([(90.0, ()), (40.0, ())], [90.0, 40.0]),
+        ([(90.0, ("held-out gain",)), (80.0, ())], []),  # the likelier one may not be said
+        ([(90.0, ("size",)), (80.0, ()), (40.0, ())], [80.0]),  # more than half of a crooked mount
+        ([], []),
+    ],
+)
+def test_what_is_less_likely_than_what_may_not_be_said_is_not_said(judged, said):
+    seen = [
+        SimpleNamespace(evidence=nats, refused=why, accepted=not why, candidate=None)
+        for nats, why in judged
+    ]
+    assert [one.evidence for one in sayable(seen)] == said
