@@ -51,6 +51,16 @@ def test_strong_pulses_leave_no_edge_of_theirs_behind() -> None:
     assert np.count_nonzero(train(time_s, found) != train(time_s, truth)) <= 2
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_pulse_lasts_a_sample_at_least_and_its_search_is_paid(seed: int) -> None:
+    """Narrower ones would hit nothing but the outliers of a heavy tail."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(8000) / RATE_HZ
+    (found,) = trains(1e-3 * rng.standard_t(3, (8000, 3)), time_s, 1 / RATE_HZ)
+    assert found["width_s"] >= 0.99 / RATE_HZ
+    assert found["searched"] > 1000 * found["period_s"] * RATE_HZ * 16
+
+
 def test_a_short_recording_holds_no_train() -> None:
     assert trains(np.zeros((200, 3)), np.arange(200) / RATE_HZ, 1 / RATE_HZ) == ()
 

@@ -1,5 +1,8 @@
 """The library held against one state: in whose noise the candidates are ranked."""
 
+from dataclasses import replace
+
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.mismatch.effects.library import EFFECTS
@@ -7,8 +10,9 @@ from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.regression import evidence_of
-from ahrsd.mismatch.search import State, survey
+from ahrsd.mismatch.search import State, formed_basis_of, survey
 from ahrsd.mismatch.track import Spec
+from ahrsd.mismatch.unknown import beside_names, detected, remainder
 
 
 def surveyed(**trial):
@@ -33,3 +37,17 @@ def test_red_noise_stays_noise_to_whatever_is_strongest_in_it():
     assert seen.basis.colour > 1.1
     assert not any(one.accepted for one in seen.judged)
     assert seen.candidates[0].evidence < LIMITS.evidence_nats
+
+
+def test_what_large_names_leave_of_their_own_form_is_no_unknown():
+    """A thousandth of a name's evidence comes off the remainder's, of every frame and regime."""
+    track = made(Trial(4, samples=5_000)).track
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    left = remainder(formed_basis_of(state))
+    gyro = replace(left.located["gyro"], evidence=24.2, p_value=1e-12)
+    found = replace(left, located={**left.located, "gyro": gyro})
+    assert detected(found, LIMITS)
+    assert not detected(beside_names(found, 41_931.0), LIMITS)
+    assert detected(beside_names(found, 6_000.0), LIMITS)
+    assert beside_names(found, 6_000.0).strongest.evidence == pytest.approx(18.2)
