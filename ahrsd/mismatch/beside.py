@@ -73,19 +73,6 @@ OF_ITSELF = {
     "clock_rate": 0.03,
     "gyro_nonorthogonality": 0.03,
 }
-#: names that follow a logged cause
-CAUSED = (
-    "motor_current_field",
-    "current_derivative_field",
-    "speed_field",
-    "altitude_field",
-    "moving_iron",
-    "rotor_field",
-    "switched_device",
-    "mag_bias_temperature",
-    "mag_scale_temperature",
-    "gyro_bias_temperature",
-)
 #: why a name is not said that is laid to the sensor itself
 SIZE = "size"
 #: candidates whose spectra are measured
@@ -100,15 +87,15 @@ def named_beside(
 ) -> tuple[State, list[Survey], unknown.Remainder]:
     """The state with the names that stand out beside the rest, where there is one.
 
-    stood_in: names that only stood in for another form.  Where a cause was logged that does not
-              change: what bends with the temperature has no offset by it
+    stood_in: names by a logged cause that only stood in for another form, which stays so: what
+              bends with the temperature has no offset by it
     """
     limits = state.problem.limits
     if not unknown.detected(left, limits):
         return state, surveys, left
     given = state, surveys, left
     state = reweighted(state)
-    refused = {name for name in stood_in if name in CAUSED}
+    refused = set(stood_in)
     while len(state.named) < limits.most_terms and unknown.detected(left, limits):
         seen = look(state, refused)
         standing = sayable(seen.judged)

@@ -91,8 +91,8 @@ def bearings(
 ) -> Bearings:
     """The same as `run_filter` has with these arguments, for a tenth of the time."""
     motion = _motion(track, model, terms_gyro)
-    layout = layout_of(track.runs or (slice(0, len(track)),))
-    orientation = _orientation(layout, motion, _opening(layout, len(track)))
+    layout, opens = _laid_out(track)
+    orientation = _orientation(layout, motion, opens)
     field = _readings(track, model, terms_mag)
     return Bearings(model, _nominal(field, orientation, layout, model, motion.dt_s), orientation)
 
@@ -109,17 +109,14 @@ def run_filter(
 ) -> Filtered:
     """Filter a track.  terms_*: (N, 3) contributions of the named terms, subtracted first.
 
-    held:      take gains and nominal field of this earlier run (same track), not the model's own
+    held: take gains and nominal field of this earlier run (same track), not the model's own
     sensitive: false where only innovations are wanted, not what `sensitivities` needs
-    strength_known: the field is as strong as the nominal one; else every run finds its strength as
-               it goes (not with `held`)
+    strength_known: the field is as strong as the nominal one, else a run finds it (not with `held`)
     Rows whose reading is not finite are passed over.  ValueError where a run has no rows.
     """
-    field = _readings(track, model, terms_mag)
-    motion = _motion(track, model, terms_gyro)
-    layout = layout_of(track.runs or (slice(0, len(track)),))
-    opens, blind = _opening(layout, len(track)), ~_complete(field)
-    orientation = _orientation(layout, motion, opens)
+    field, motion = _readings(track, model, terms_mag), _motion(track, model, terms_gyro)
+    layout, opens = _laid_out(track)
+    blind, orientation = ~_complete(field), _orientation(layout, motion, opens)
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
         linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
@@ -129,12 +126,13 @@ def run_filter(
     if strength_known:
         found.gain[opens] = 0.0
         field = np.where(opens[:, None], nominal, field)
-    state = _transition(motion, nominal, opens, model)
-    readings, used = np.where(blind[:, None], 0, field), ~(opens | blind)
+    state, used = _transition(motion, nominal, opens, model), ~(opens | blind)
+    readings = np.where(blind[:, None], 0, field)
     predicted = _predicted(layout, state, found, model.soft_iron, readings)
     innovation = np.where(used[:, None], (field - predicted) @ model.soft_iron, 0.0)
     root = _inverse_root(found.innovation_covariance) * used[:, None, None]
     whitened = np.einsum("nij,nj->ni", root, innovation)
+    needed = (layout, state, found, model.soft_iron, root, motion, predicted)
     return Filtered(
         track=track,
         model=model,
@@ -147,17 +145,16 @@ def run_filter(
         used=used,
         log_likelihood=np.where(used, _log_likelihood(whitened, root), 0.0),
         gains=found,
-        recursion=_sensitivity(layout, state, found, model.soft_iron, root, motion, predicted)
-        if sensitive
-        else None,
+        recursion=_sensitivity(*needed) if sensitive else None,
     )
 
 
-def _opening(layout: Layout, count: int) -> NDArray[np.bool]:
-    """(count,) the rows with which a run opens."""
-    opens = np.zeros(count, dtype=bool)
+def _laid_out(track: Track) -> tuple[Layout, NDArray[np.bool]]:
+    """The track's runs as the filter passes them, and (N,) the rows with which a run opens."""
+    layout = layout_of(track.runs or (slice(0, len(track)),))
+    opens = np.zeros(len(track), dtype=bool)
     opens[layout.starts[layout.opens]] = True
-    return opens
+    return layout, opens
 
 
 def _log_likelihood(whitened: Array, root: Array) -> Array:

@@ -378,7 +378,7 @@ def _taken(problem: _Problem, point: _Point, step: Array, cost: float, near: boo
     """
     for halving in range(_HALVINGS):
         part = step / 4**halving
-        model = _moved(point.model, part)
+        model = moved(point.model, part)
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
             continue
         held = point.filtered if near else None
@@ -388,7 +388,8 @@ def _taken(problem: _Problem, point: _Point, step: Array, cost: float, near: boo
     return None
 
 
-def _moved(model: NullModel, step: Array) -> NullModel:
+def moved(model: NullModel, step: Array) -> NullModel:
+    """A model with its 11 numbers of the calibration changed by step (11,) or more."""
     return replace(
         model,
         soft_iron=model.soft_iron + np.einsum("a,aij->ij", step[:5], TRACELESS),

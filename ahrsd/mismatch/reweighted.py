@@ -11,14 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch.delays import DELAYS
-from ahrsd.mismatch.innovation import TRACELESS
-from ahrsd.mismatch.null import FittedTerm, at_model
+from ahrsd.mismatch.null import FittedTerm, at_model, moved
 from ahrsd.mismatch.prior import PRIOR
 from ahrsd.mismatch.regression import CALIBRATION
 from ahrsd.mismatch.search import STEPS, State, formed_basis_of, term_group
 from ahrsd.mismatch.spectrum import against, spectrum_of
 from ahrsd.mismatch.values import NullModel
-from ahrsd.samples import Array
 
 ROUNDS = 3
 
@@ -57,16 +55,6 @@ def stepped(state: State) -> bool:
     and after.
     """
     return any(name in STEPS.values() for name in state.names)
-
-
-def moved(model: NullModel, change: Array) -> NullModel:
-    """A model with its 11 numbers of the calibration changed."""
-    return replace(
-        model,
-        soft_iron=model.soft_iron + np.einsum("a,aij->ij", change[:5], TRACELESS),
-        hard_iron_gauss=model.hard_iron_gauss + change[5:8],
-        gyro_bias_rad_s=model.gyro_bias_rad_s + change[8:11],
-    )
 
 
 def _at(state: State, model: NullModel, terms: tuple[FittedTerm, ...]) -> State:

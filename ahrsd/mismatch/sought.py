@@ -21,7 +21,7 @@ class Sought:
 
     first, last: the surveys before and after the names
     before: the state before any name was taken out again
-    stood_in: names that were taken out since they only stood in for something of another form
+    stood_in: names by a logged cause that were taken out since they only stood in for another form
     """
 
     state: State
@@ -41,5 +41,6 @@ def sought(state: State) -> Sought:
     last = last if slim.names == more.names else survey(slim)
     named, surveys, last = without_unlikely(*swapped(slim, last))
     true, surveys, left = without_stand_ins(named, surveys, beside)
-    stood_in = frozenset(named.names) - frozenset(true.names)
+    logged = (j.candidate.name for j in named.named if "covariate" in j.candidate.setting)
+    stood_in = frozenset(logged) - frozenset(true.names)
     return Sought(true, surveys, first, last, left, more, stood_in)
