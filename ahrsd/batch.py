@@ -17,7 +17,7 @@ from ahrsd.calibration import Estimate
 from ahrsd.calibrator import Calibrator
 from ahrsd.config import Config
 from ahrsd.core import Core
-from ahrsd.diagnosing import track_of
+from ahrsd.diagnosing import checked, track_of
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.misalignment import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
@@ -146,7 +146,7 @@ def _without_terms(
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     if not blocks:
         return seen, ()
-    track, refused = prepared(track_of(blocks))
+    track, refused = prepared(checked(track_of(blocks))[0])
     try:
         track, left = without(track, model.calibration, model.terms)
     except ValueError as error:

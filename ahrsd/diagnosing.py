@@ -5,7 +5,9 @@ A table may have any units or axes here: that they are wrong is one of the possi
 
 from __future__ import annotations
 
+import difflib
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -16,7 +18,9 @@ import numpy as np
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.mismatch.aligned import align, differing
+from ahrsd.mismatch.dead import dead_axes, possible
 from ahrsd.mismatch.diagnosis import Diagnosis
+from ahrsd.mismatch.effects.shapes import GRAVITY_M_S2
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.model_file import RepairedModel, from_text
 from ahrsd.mismatch.track import Spec, Track
@@ -27,7 +31,15 @@ from ahrsd.samples import Array, SampleBlock
 SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
 FEWEST_ROWS = 100
 RATE_AGREES = 0.05  # of a spec and the stamps' median step: clocks are closer, units are not
-_SPEC_KEYS = ("sigma_mag_gauss", "sigma_gyro_rad_s", "rate_hz", "field_gauss")
+_FEW_MISSING = 0.02  # of the rows, whose acceleration is filled from their neighbours
+_ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
+#: what a spec may say, the least and the most that is believable, and its unit
+_SPEC_KEYS = {
+    "sigma_mag_gauss": (1e-7, 0.3, "gauss per sample"),
+    "sigma_gyro_rad_s": (1e-7, 1.0, "rad/s per sample"),
+    "rate_hz": (0.1, 1e4, "Hz"),
+    "field_gauss": (0.01, 10.0, "gauss"),
+}
 
 
 def load_track(
@@ -49,14 +61,45 @@ def load_track(
         blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
     else:
         blocks, notes = _streamed(path, rate_hz or said_hz, progress)
-    track = track_of(blocks)
+    track, said = checked(track_of(blocks))
     if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
         raise RecordingError(
             path,
             f"is too short to diagnose: {len(track)} samples in {track.duration_s:.1f} s",
             f"record at least {SHORTEST_S:.0f} s and {FEWEST_ROWS} samples, better some minutes",
         )
-    return track, [*notes, *_of_its_rate(track, said_hz)]
+    return track, [*notes, *said, *_of_its_rate(track, said_hz)]
+
+
+def checked(track: Track) -> tuple[Track, list[str]]:
+    """The track without what no sensor gives, and one line for each such thing."""
+    track, notes = possible(track)
+    accel, said = _acceleration(track)
+    return replace(track, accel_b_m_s2=accel), [*notes, *dead_axes(track), *said]
+
+
+def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
+    """(N, 3) m/s^2, short holes filled; None where it cannot be used; one line on what was done."""
+    accel = track.accel_b_m_s2
+    if accel is None:
+        return None, []
+    known = np.isfinite(accel).all(axis=1)
+    missing = int(np.count_nonzero(~known))
+    if missing == len(track):
+        return None, []
+    if missing > _FEW_MISSING * len(track):
+        return None, [f"the acceleration was left out: {missing} of {len(track)} rows have none"]
+    notes = [f"{missing} rows without acceleration were filled"] if missing else []
+    if missing:
+        time_s = track.time_s
+        accel = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    if size == 0.0:
+        return None, ["the acceleration was left out: it is 0 throughout, not even gravity"]
+    for unit, factor in _ACCEL_UNITS:
+        if 0.7 * GRAVITY_M_S2 < size * factor < 1.4 * GRAVITY_M_S2:
+            return accel * factor, [*notes, f"the acceleration was in {unit}: taken as m/s^2"]
+    return accel, notes
 
 
 def _of_its_rate(track: Track, said_hz: float | None) -> list[str]:
@@ -99,12 +142,13 @@ def track_of(blocks: list[SampleBlock]) -> Track:
     dt_s[:1] = np.nan
     starts = [*np.flatnonzero(np.isnan(dt_s)).tolist(), len(dt_s)]
     accel = join(lambda b: b.accel_b_m_s2)
+    with_accel = bool(np.isfinite(accel).any())
     return Track(
         time_s=join(lambda b: b.time_s),
         dt_s=dt_s,
         mag_b_gauss=join(lambda b: b.raw_b_gauss),
         gyro_b_rad_s=join(lambda b: b.gyro_b_rad_s),
-        accel_b_m_s2=accel if np.isfinite(accel).all() else None,
+        accel_b_m_s2=accel if with_accel else None,
         covariates={
             name: np.concatenate([block.covariates[name] for block in blocks])
             for name in sorted(names)
@@ -113,25 +157,40 @@ def track_of(blocks: list[SampleBlock]) -> Track:
     )
 
 
-def load_spec(path: Path) -> Spec:
-    """What the user knows of the sensor (JSON).  Raises AhrsdError, one line."""
+def load_spec(path: Path) -> tuple[Spec, list[str]]:
+    """What the user knows of the sensor (JSON), and one line on each entry that was not used.
+
+    Raises AhrsdError, one line, where it cannot be read.
+    """
     try:
-        body = json.loads(path.read_text(encoding="utf-8"))
+        body = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise AhrsdError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise AhrsdError(f"{path}: is not JSON: {error}") from None
     if not isinstance(body, dict):
         raise AhrsdError(f"{path}: must be an object with some of {', '.join(_SPEC_KEYS)}")
+    notes = [_unknown_key(path, key) for key in body if key not in _SPEC_KEYS]
     values: dict[str, float] = {}
-    for key in _SPEC_KEYS:
+    for key, (least, most, unit) in _SPEC_KEYS.items():
         value = body.get(key)
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0.0:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0.0 < value < math.inf:
             raise AhrsdError(f"{path}: {key} = {value!r}: must be a positive number")
-        values[key] = float(value)
-    return Spec(**values)
+        if least <= value <= most:
+            values[key] = float(value)
+        else:
+            words = f"{path.name}: {key} = {value:g} was left out"
+            notes.append(f"{words}: a sensor has {least:g} to {most:g} {unit}")
+    return Spec(**values), notes
+
+
+def _unknown_key(path: Path, key: str) -> str:
+    near = difflib.get_close_matches(key, _SPEC_KEYS, n=1, cutoff=0.3)
+    hint = f"is {near[0]} meant?" if near else f"it may have {', '.join(_SPEC_KEYS)}"
+    return f"{path.name}: {key} is no entry of a spec and was left out; {hint}"
 
 
 def load_model(path: Path) -> RepairedModel:
@@ -153,8 +212,9 @@ def diagnose_recording(
     progress: Callable[[int], None] | None = None,
 ) -> Diagnosis:
     """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError."""
-    known = Spec() if spec is None else load_spec(spec)
+    known, unused = (Spec(), []) if spec is None else load_spec(spec)
     track, notes = load_track(real, rate_hz, progress, spec=known)
+    notes = [*unused, *notes]
     if simulation is None:
         found = _answered(real, track, known)
         return replace(found, notes=(*notes, *found.notes))

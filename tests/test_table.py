@@ -234,8 +234,22 @@ def test_what_is_no_table_is_refused_in_one_line(tmp_path, name, content, words)
 
 
 def test_semicolons_are_named(tmp_path):
-    with pytest.raises(RecordingError, match="separated by commas"):
+    with pytest.raises(RecordingError, match="separated by semicolons; write it with commas"):
         read_table(save(tmp_path / "t.csv", columns(), ";"))
+
+
+def test_text_in_another_encoding_is_named(tmp_path):
+    path = save(tmp_path / "t.csv", columns())
+    path.write_bytes(path.read_text().encode("utf-16"))
+    with pytest.raises(RecordingError, match="is UTF-16 text; save it as UTF-8"):
+        read_table(path)
+
+
+def test_blanks_around_names_are_none_of_them(tmp_path):
+    path = save(tmp_path / "t.csv", columns())
+    head, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([head.replace(",", ", "), *rest]) + "\n")
+    assert len(read_table(path).rows) > 0
 
 
 def test_every_real_table_loads(recordings):

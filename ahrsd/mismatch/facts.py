@@ -48,6 +48,8 @@ def matters(fact: Fact) -> bool:
     """Whether the fact is a finding; else it is worth a note."""
     if fact.effect == "dropped_samples" and not fact.setting:
         return fact.parameters[0].value > MISSING_SHARE
+    if fact.effect == "stuck_gyro":  # no name of the library
+        return False
     if fact.effect == "timestamp_jitter" and not fact.stops:
         return fact.parameters[0].value > JITTER_SHARE * float(fact.setting["step_s"])
     return True

@@ -14,6 +14,7 @@ import numpy as np
 
 from ahrsd.mismatch.clipping import clipping, quantisation
 from ahrsd.mismatch.coarse import noise_of
+from ahrsd.mismatch.dead import stuck_axes, stuck_gyro
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.facts import Fact
@@ -41,7 +42,10 @@ def hygiene(track: Track) -> tuple[Fact, ...]:
     wrong = as_recorded(track)
     limits = clipping(track)
     clipped = next((fact.bad for fact in limits if fact.bad is not None), None)
-    rest = repeats(track, clipped) + limits + quantisation(track) + stamps(track)
+    again = repeats(track, clipped) + stuck_gyro(track)
+    known = [fact.bad for fact in again + limits if fact.bad is not None]
+    again += stuck_axes(track, np.any([np.zeros(len(track), bool), *known], axis=0))
+    rest = again + limits + quantisation(track) + stamps(track)
     return tuple(sorted(wrong + rest, key=lambda fact: not fact.stops))
 
 

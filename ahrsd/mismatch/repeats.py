@@ -59,7 +59,10 @@ def _turned(track: Track, first: int, last: int) -> float:
     """Gauss by which the whole turn over these rows moves the reading that they repeat."""
     rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
     turn = rate[first:last].T @ np.nan_to_num(track.dt_s[first:last], nan=0.0)
-    return float(np.linalg.norm(np.cross(turn, track.mag_b_gauss[first])))
+    said = track.mag_b_gauss[first]
+    if not said.any():  # 0 0 0 is no field that could have been turned
+        return float(np.linalg.norm(turn)) * track.usual_gauss
+    return float(np.linalg.norm(np.cross(turn, said)))
 
 
 def _resolution(track: Track) -> float:
@@ -84,7 +87,7 @@ def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[n
     fine = any(turned) and _step(track) == 0.0
     for (first, last), moved in zip(long, turned, strict=True):
         if moved or fine:
-            bad[first:last] = True
+            bad[first - (not track.mag_b_gauss[first].any()) : last] = True
             intervals.append((float(track.time_s[first - 1]), float(track.time_s[last - 1])))
     if not intervals:
         return [], bad

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,10 @@ class Track:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    def with_columns(self, covariates: dict[str, Array]) -> Track:
+        """The same with other covariates."""
+        return replace(self, covariates=covariates)
+
     @property
     def duration_s(self) -> float:
         """From the first sample to the last, seconds."""
@@ -46,9 +50,9 @@ class Track:
 
     @property
     def usual_gauss(self) -> float:
-        """The usual size of the magnetometer's reading, 0 where there is none."""
+        """The usual size of a reading of the magnetometer that is not 0 0 0; 0 where none is."""
         size = np.linalg.norm(self.mag_b_gauss, axis=1)
-        size = size[np.isfinite(size)]
+        size = size[np.isfinite(size) & (size > 0.0)]
         return float(np.median(size)) if len(size) else 0.0
 
 

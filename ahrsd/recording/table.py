@@ -131,14 +131,31 @@ def read_table(path: Path, *, check_units: bool = True) -> Table:
 
 
 def _read_csv(path: Path) -> pyarrow.Table:
-    content = pyarrow.BufferReader(b"".join(read_chunks(path, 1 << 20)))
+    data = b"".join(read_chunks(path, 1 << 20))
+    _check_text(path, data)
     try:
+        content = pyarrow.BufferReader(data)
         table = pyarrow.csv.read_csv(content, pyarrow.csv.ReadOptions(use_threads=False))
+        table = table.rename_columns([name.strip() for name in table.column_names])
         _check_names(path, table.column_names)
     except (pyarrow.ArrowInvalid, pyarrow.ArrowKeyError, UnicodeDecodeError) as error:
         words = str(error).splitlines()[0]
         raise RecordingError(path, f"is no CSV table: {words}", "repair that row") from error
     return table
+
+
+def _check_text(path: Path, data: bytes) -> None:
+    """Refuse what no reader of comma-separated UTF-8 can read, by what it is."""
+    if "time_s" in data[:2000].decode("utf-16", "ignore"):
+        raise RecordingError(path, "is UTF-16 text", "save it as UTF-8")
+    head = data[: data.find(b"\n") + 1] or data
+    if b"," not in head and (b";" in head or b"\t" in head):
+        word = "semicolons" if b";" in head else "tabs"
+        raise RecordingError(
+            path,
+            f"has its columns separated by {word}",
+            "write it with commas between the columns and points in the numbers",
+        )
 
 
 def _read_parquet(path: Path) -> pyarrow.Table:
@@ -163,8 +180,6 @@ def _check_names(path: Path, names: list[str]) -> None:
     others = [name for name in names if name not in _REQUIRED]
     alike = difflib.get_close_matches(missing[0], others, n=1, cutoff=0.5)
     hint = f" (is {alike[0]} meant? convert and rename it)" if alike else ""
-    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-        hint = " (columns must be separated by commas)"
     raise RecordingError(
         path,
         f"has no column {', '.join(missing)}",

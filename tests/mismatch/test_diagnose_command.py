@@ -209,3 +209,49 @@ def test_a_spec_of_another_rate_than_the_time_stamps_is_said(saved, clean, ratio
 def test_a_recording_that_is_missing(tmp_path):
     with pytest.raises(RecordingError, match="does not exist"):
         load_track(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            '{"rate": 40}',
+            "spec.json: rate is no entry of a spec and was left out; is rate_hz meant",
+        ),
+        ('{"sigma_mag_gaus": 0.01}', "is sigma_mag_gauss meant?"),
+        ('{"zzz": 1}', "it may have sigma_mag_gauss, sigma_gyro_rad_s, rate_hz, field_gauss"),
+        ('{"sigma_mag_gauss": 10}', "sigma_mag_gauss = 10 was left out: a sensor has 1e-07 to 0.3"),
+        ('{"field_gauss": 48000}', "field_gauss = 48000 was left out"),
+    ],
+)
+def test_an_entry_of_a_spec_that_is_not_used_is_said(tmp_path, text, words):
+    path = tmp_path / "spec.json"
+    path.write_text(text)
+    spec, (note,) = load_spec(path)
+    assert spec == Spec()
+    assert words in note
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(0.0, "it is 0 throughout, not even gravity"), (1 / 9.80665, "the acceleration was in g")],
+)
+def test_an_acceleration_that_is_none_or_in_g_is_said(saved, clean, factor, words):
+    made = simulate(_settings("wam", 5)).samples
+    more = {f"accel_{a}_m_s2": factor * v for a, v in zip("xyz", made.accel_b_m_s2.T, strict=True)}
+    track, notes = load_track(saved({**clean, **more}))
+    assert any(words in note for note in notes)
+    if factor:
+        assert track.accel_b_m_s2 == pytest.approx(made.accel_b_m_s2)
+    else:
+        assert track.accel_b_m_s2 is None
+
+
+def test_a_row_without_acceleration_is_filled(saved, clean):
+    made = simulate(_settings("wam", 5)).samples
+    accel = made.accel_b_m_s2.copy()
+    accel[100] = math.nan
+    more = {f"accel_{a}_m_s2": v for a, v in zip("xyz", accel.T, strict=True)}
+    track, notes = load_track(saved({**clean, **more}))
+    assert "1 rows without acceleration were filled" in notes
+    assert track.accel_b_m_s2 is not None
