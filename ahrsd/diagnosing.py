@@ -21,7 +21,7 @@ from ahrsd.mismatch.aligned import align, differing
 from ahrsd.mismatch.dead import dead_axes, possible
 from ahrsd.mismatch.diagnosis import Diagnosis
 from ahrsd.mismatch.effects.shapes import GRAVITY_M_S2
-from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.logged import diagnose_logged
 from ahrsd.mismatch.model_file import RepairedModel, from_text
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.recording.opening import Kind, open_recording
@@ -231,6 +231,6 @@ def diagnose_recording(
 
 def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
     try:
-        return diagnose(track, spec, recording=path.name)
+        return diagnose_logged(track, spec, recording=path.name)
     except ValueError as error:
         raise RecordingError(path, str(error), "record again, with the vehicle turning") from None

@@ -52,7 +52,7 @@ def align(real: Track, simulated: Track) -> Overlap:
     if abs(shift_s) > 0.5 * _step_s(real):
         notes.append(f"the simulation was moved by {shift_s:+.3f} s to match the recording's rates")
     moved = replace(simulated, time_s=simulated.time_s - shift_s)
-    return Overlap(_cut(real, begin, end), _cut(moved, begin, end), tuple(notes))
+    return Overlap(cut(real, begin, end), cut(moved, begin, end), tuple(notes))
 
 
 def _step_s(track: Track) -> float:
@@ -99,7 +99,8 @@ def _size(rates: Array) -> Array:
     return np.asarray(np.linalg.norm(rates - np.median(rates, axis=0), axis=1))[:, None]
 
 
-def _cut(track: Track, begin_s: float, end_s: float) -> Track:
+def cut(track: Track, begin_s: float, end_s: float) -> Track:
+    """The rows between two times."""
     rows = slice(
         int(np.searchsorted(track.time_s, begin_s, "left")),
         int(np.searchsorted(track.time_s, end_s, "right")),

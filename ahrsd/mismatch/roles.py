@@ -12,12 +12,14 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
 _SHORT_GAP_S = 2.0  # a column of 1 Hz beside samples of 25 Hz is filled, a failed logger is not
 _MOST_MISSING = 0.98
+_MOST_HOLES = 0.5  # of the rows: with more holes than values a column says too little
 _LONG_ON_ROWS = 4  # a 0/1 column that stays on longer is a switch, else a train of pulses
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
 # what the sensor itself makes of the same readings: it moves with every error and causes none
@@ -174,6 +176,40 @@ def prepared(track: Track) -> tuple[Track, tuple[str, ...]]:
         else:
             notes.append(f"column {name} was left out: its values are no numbers to compute with")
     return replace(track, covariates=kept), tuple(notes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Holed:
+    """A column with long holes: values (N,) drawn across them;  missing (N,) rows inside them."""
+
+    values: Array
+    missing: NDArray[np.bool]
+    words: str
+
+
+def holed(track: Track) -> dict[str, Holed]:
+    """Columns that could be a cause but for holes that are too long to guess what is in them."""
+    out = {}
+    for name, values in track.covariates.items():
+        good, time_s = np.isfinite(values), track.time_s
+        share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
+        if not _filled(name, values, time_s)[1] or share > _MOST_HOLES:
+            continue
+        filled = np.interp(time_s, time_s[good], values[good])
+        if role_of(name, filled) is None or fault(name, filled):
+            continue
+        before = np.maximum.accumulate(np.where(good, time_s, -np.inf))
+        after = np.minimum.accumulate(np.where(good, time_s, np.inf)[::-1])[::-1]
+        missing = ~good & (after - before > _SHORT_GAP_S)
+        if np.count_nonzero(missing) > _MOST_HOLES * len(values):
+            continue
+        first = int(np.argmax(missing))
+        words = (
+            f"column {name} has no values in {np.count_nonzero(missing) * track.step_s:.1f} s, "
+            f"first at {time_s[first]:.1f} s: readings without it were not used"
+        )
+        out[name] = Holed(filled, missing, words)
+    return out
 
 
 def _filled(name: str, values: Array, time_s: Array) -> tuple[Array, str]:

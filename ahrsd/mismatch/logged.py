@@ -1,0 +1,99 @@
+"""A diagnosis with columns that were logged badly: with holes, or by a clock of their own.
+
+What a column can still say is asked first; it counts only if an effect is named by it.  Else the
+answer is the one that the recording gives without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.mismatch import roles
+from ahrsd.mismatch.clocks import Late, clock_of, suspects
+from ahrsd.mismatch.diagnosis import Diagnosis
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.hygiene import hygiene, put_right
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.search import State, formed_basis_of
+from ahrsd.mismatch.track import Spec, Track
+
+#: of the unknown that may be left when a column is at its true time
+LEFT = 0.5
+#: columns whose clock is sought, the likeliest first
+MOST_ASKED = 2
+
+
+def diagnose_logged(track: Track, spec: Spec | None = None, *, recording: str = "") -> Diagnosis:
+    """`diagnose`, with what columns with holes and wrong clocks can still say.
+
+    ValueError, one line, where nothing can be fitted.
+    """
+    holed = roles.holed(track)
+    if holed:
+        filled = track.with_columns(
+            {**track.covariates, **{k: one.values for k, one in holed.items()}}
+        )
+        missing = np.zeros(len(track), dtype=bool)
+        for one in holed.values():
+            missing |= one.missing
+        found = _on_time(_blind(filled, missing), spec, recording)
+        used = [name for name in holed if name in causes(found)]
+        if used:
+            notes = tuple(holed[name].words for name in used)
+            return replace(found, notes=(*notes, *found.notes))
+    return _on_time(track, spec, recording)
+
+
+def _on_time(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+    """The diagnosis, with a column whose clock is wrong at its true time where that names it."""
+    found = diagnose(track, spec, recording=recording)
+    usable = roles.prepared(track)[0]
+    clock = _clock(found, usable, spec or Spec())
+    if clock is None:
+        return found
+    again = diagnose(clock.moved(usable), spec, recording=recording)
+    before, after = found.unexplained, again.unexplained
+    less = not after.detected or after.evidence_nats < LEFT * before.evidence_nats
+    by_it = [one for one in again.findings if one.setting.get("covariate") == clock.column]
+    worth = max((one.evidence_nats for one in by_it), default=0.0)
+    if not by_it or not (less or worth > before.evidence_nats):
+        return found
+    said = f"{clock.words}: its cause is judged at the sensor's time"
+    return replace(again, notes=(said, *again.notes))
+
+
+def _clock(found: Diagnosis, track: Track, spec: Spec) -> Late | None:
+    """The clock of a column that explains what is left better at another time."""
+    left = found.unexplained
+    if not left.detected or left.where is None or found.drawn is None:
+        return None
+    if left.where.frame != "sensor":
+        return None
+    course = next(one for one in found.drawn.courses if one.frame == "sensor")
+    named = {one.channel for one in left.follows} & set(causes(found))
+    asked = [(0.0, name) for name in sorted(named)] or suspects(course, track)
+    if not asked:
+        return None
+    problem, cold = problem_of(put_right(track, hygiene(track)), spec, EFFECTS, LIMITS)
+    basis = formed_basis_of(State(problem, fit_null(problem.track, problem.spec, cold)))
+    clocks = (clock_of(basis, name, lag_s) for lag_s, name in asked[:MOST_ASKED])
+    return next((clock for clock in clocks if clock is not None), None)
+
+
+def causes(found: Diagnosis) -> tuple[str, ...]:
+    """Columns by which effects are named."""
+    names = (one.setting.get("covariate") for one in found.findings)
+    by_place = any(one.effect in ("field_gradient", "field_anomaly") for one in found.findings)
+    position = ("position_north_m", "position_east_m", "position_down_m") if by_place else ()
+    return (*(name for name in names if isinstance(name, str)), *position)
+
+
+def _blind(track: Track, rows: NDArray[np.bool]) -> Track:
+    """The track without the magnetometer's readings of these rows."""
+    return replace(track, mag_b_gauss=np.where(rows[:, None], np.nan, track.mag_b_gauss))
