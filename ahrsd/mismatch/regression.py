@@ -224,9 +224,13 @@ def columns_of(basis: Base, candidates: Sequence[Candidate]) -> dict[str, Array]
 def group_gram(basis: Base, groups: Mapping[str, Columns], block_s: float | None = None) -> Gram:
     """Gram of the given groups, calibration and terms projected out; one block by default."""
     whitened = basis.whitened(list(groups.values()))
+    return known_out(basis, dict(zip(groups, whitened, strict=True)), block_s)
+
+
+def known_out(basis: Base, columns: Mapping[str, Array], block_s: float | None = None) -> Gram:
+    """Gram of whitened columns (N, 3, p), calibration and terms projected out; one block."""
     length_s = basis.context.track.duration_s if block_s is None else block_s
-    whole = candidate_gram(basis, dict(zip(groups, whitened, strict=True)), length_s)
-    return whole.project(list(basis.groups))
+    return candidate_gram(basis, columns, length_s).project(list(basis.groups))
 
 
 def without_known(basis: Base, columns: Array) -> tuple[Array, Array]:

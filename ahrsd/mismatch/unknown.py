@@ -8,6 +8,7 @@ nonparametric repair.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from ahrsd.mismatch.gram import Gram, gram
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import FRAMES, Frame, Located, Segments
 from ahrsd.mismatch.regime import Regime
-from ahrsd.mismatch.regression import Base, group_gram, quieter
+from ahrsd.mismatch.regression import Base, group_gram, known_out, quieter
 from ahrsd.mismatch.score import chi2_p, score
 from ahrsd.mismatch.validate import Gain, alternating, heldout
 from ahrsd.mismatch.values import Columns
@@ -78,29 +79,51 @@ def remainder(basis: Base, with_bins: bool = True) -> Remainder:
     count as noise.
     """
     cut = locate.coarse_cut(basis.context.track)
-    groups = _frames(basis, cut)
-    loud = group_gram(basis, groups)
+    seen = _whitened(basis, _frames(basis, cut))
     first = max(
-        (locate.locate(loud, frame, cut, basis.colour) for frame in FRAMES),
+        (locate.locate(_alone(basis, seen, frame), frame, cut, basis.colour) for frame in FRAMES),
         key=lambda one: one.statistic,
     )
-    strongest = basis.whitened([groups[locate.group_name(first.frame)]])[0]
-    return tested(by_direction(quieter(basis, strongest), strongest), with_bins=with_bins)
+    strongest = seen[locate.group_name(first.frame)]
+    weighed = by_direction(quieter(basis, strongest), strongest)
+    weight = weighed.weight
+    if weight is not None and weight is not basis.weight:
+        if basis.weight is not None or basis.rest is not None:
+            return tested(weighed, with_bins=with_bins)
+        seen = {name: weight @ columns for name, columns in seen.items()}
+    return tested(weighed, with_bins=with_bins, seen=seen)
 
 
-def tested(basis: Base, *, with_bins: bool) -> Remainder:
-    """The same in noise of the basis's own colour."""
+def tested(basis: Base, *, with_bins: bool, seen: Mapping[str, Array] | None = None) -> Remainder:
+    """The same in noise of the basis's own colour.
+
+    seen: the frames' columns (N, 3, p) by group as the basis whitens them, where they are known
+    """
     cut = locate.coarse_cut(basis.context.track)
     found = regime.regimes(basis.context) if with_bins else ()
-    groups = _frames(basis, cut) | {one.group: regime.regime_columns(one) for one in found}
-    whole = group_gram(basis, groups)
-    located = {frame: locate.locate(whole, frame, cut, basis.colour) for frame in FRAMES}
+    seen = _whitened(basis, _frames(basis, cut)) if seen is None else seen
+    located = {
+        frame: locate.locate(_alone(basis, seen, frame), frame, cut, basis.colour)
+        for frame in FRAMES
+    }
+    binned = _whitened(basis, {one.group: regime.regime_columns(one) for one in found})
     bins = []
     for one in found:
-        width = whole.groups[one.group].stop - whole.groups[one.group].start
-        what = score(whole, one.group, np.full(width, locate.UNITS["sensor"]), 1e-3)
+        own = known_out(basis, {one.group: binned[one.group]})
+        width = binned[one.group].shape[2]
+        what = score(own, one.group, np.full(width, locate.UNITS["sensor"]), 1e-3)
         bins.append((one, log_bayes(what, basis.colour, locate.SPAN), chi2_p(what, basis.colour)))
     return Remainder(basis, located, tuple(sorted(bins, key=lambda item: -item[1])))
+
+
+def _whitened(basis: Base, groups: Mapping[str, Columns]) -> dict[str, Array]:
+    return dict(zip(groups, basis.whitened(list(groups.values())), strict=True))
+
+
+def _alone(basis: Base, seen: Mapping[str, Array], frame: Frame) -> Gram:
+    """The Gram of one frame: none of the others is asked beside it."""
+    name = locate.group_name(frame)
+    return known_out(basis, {name: seen[name]})
 
 
 def _frames(basis: Base, cut: Segments) -> dict[str, Columns]:
