@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.mismatch.effects import series
+from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.gram import Gram, block_edges, gram
 from ahrsd.mismatch.innovation import nuisance_columns, run_filter, sensitivities
 from ahrsd.mismatch.null import NullFit
@@ -55,8 +56,10 @@ def gain_of(
     after = _seen(fit, fit.model.gyro_walk_rad_s_sqrt_s)
     blocks = _put_back(after.fifths, name, value)
     known = [group for group in blocks.groups if group != name]
-    if not wanders and _alone(blocks, known, name, value, scale):
-        return None
+    if not wanders:
+        lost, won = _exchanged(blocks, known, name, value, scale)
+        if _alone(lost, won, len(scale), _scatter(fit)):
+            return None
     level = fit.filtered.normalised_innovation
     gain = heldout(blocks, known, name, scale, one_by_one)
     before, scatter = gain.before, 0.0
@@ -106,15 +109,42 @@ def _put_back(blocks: Gram, name: str, value: Array) -> Gram:
     return replace(blocks, blocks=turn.T @ blocks.blocks @ turn)
 
 
-def _alone(blocks: Gram, known: list[str], name: str, value: Array, scale: Array) -> bool:
-    """Whether a fifth says much more of a group than the others know, too little for a gain."""
-    lost = won = 0.0
+def _alone(lost: Array, won: Array, count: int, scatter: float) -> bool:
+    """Whether fifths say much more of a group than the others know, too little for a gain.
+
+    lost, won (FOLDS,): `_exchanged`, of `count` coefficients
+    scatter: times which is lost in noise as it is
+    """
+    if lost.sum() <= _LOST * count:
+        return False
+    there = scatter * lost > np.maximum(won / 2, won.sum() / 10)
+    return bool(scatter * lost.sum() > won.sum() / 2 or there.any())
+
+
+def _exchanged(
+    blocks: Gram, known: list[str], name: str, value: Array, scale: Array
+) -> tuple[Array, Array]:
+    """What each fifth loses because the others do not know it exactly, and wins.
+
+    (FOLDS,) each, twice in nats, of white noise.
+    """
+    lost, won = [], []
     for training, test in one_by_one(len(blocks)):
         others = blocks.rows(training)
         seen = others.project(known)
         where = seen.groups[name]
         information = seen.total[where, where] + np.diag(1.0 / (PRIOR * scale) ** 2)
         there = blocks.rows(test).project(known, others.total).total[where, where]
-        lost += float(np.trace(np.linalg.solve(information, there)))
-        won += float(value @ there @ value)
-    return lost > _LOST * len(scale) and lost > won / 2
+        lost.append(float(np.trace(np.linalg.solve(information, there))))
+        won.append(float(value @ there @ value))
+    return np.array(lost), np.array(won)
+
+
+def _scatter(fit: NullFit) -> float:
+    """By how much more than in white noise what is known of one part is off in another.
+
+    A room's field is another one where the vehicle was put down: a step that came just before is
+    known from there far less well than white noise would have it.
+    """
+    rate_hz = 1.0 / float(np.nanmedian(fit.filtered.track.dt_s))
+    return max(1.0, colour(fit.filtered.whitened, rate_hz))

@@ -10,7 +10,7 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.heldout import gain_of
+from ahrsd.mismatch.heldout import _alone, gain_of
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.null import FittedTerm, fit_null
 
@@ -91,7 +91,7 @@ def test_a_bias_that_wanders_is_held_against_one_that_stays(track):
     steps = rng.normal(size=(SAMPLES, 3)) * np.sqrt(float(np.nanmedian(track.dt_s)))
     walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 4e-5 * np.cumsum(steps, axis=0))
     setting = {"start_s": float(track.time_s[0]), "span_s": track.duration_s}
-    stays = gained(walked, "gyro_bias_drift", setting)
+    stays = gained(walked, "gyro_bias_drift", setting) or 0.0  # its ends no others know
     follows = gained(walked, "gyro_bias_drift", setting, walk=4e-5)
     assert follows > 5 * max(stays, 20.0)
 
@@ -113,3 +113,12 @@ def test_a_filter_that_knows_the_strength_of_the_field_does_not_follow_it(made, 
 
     assert off(strength_known=True) == pytest.approx(1.0, abs=0.1)
     assert off() < 0.9
+
+
+def test_what_a_room_hides_of_a_step_is_not_known_from_the_rest_after_it() -> None:
+    """A fifth loses as much more as the noise scatters, and then others do not know it."""
+    lost, won = np.array([0.0, 4.0, 3.0, 1900.0, 1.0]), np.array([0.0, 1.1e4, 1.4e4, 1.9e4, 1.1e4])
+    assert not _alone(lost, won, 3, 1.0)
+    assert _alone(lost, won, 3, 13.0)
+    harmless = np.array([0.0, 4.0, 3.0, 60.0, 1.0])
+    assert not _alone(harmless, np.array([0.0, 1.1e4, 1.4e4, 20.0, 1.1e4]), 3, 13.0)
