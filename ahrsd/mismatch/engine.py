@@ -31,16 +31,11 @@ from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import rest_of
 from ahrsd.mismatch.facts import Fact, around_lost_turns, matters
-from ahrsd.mismatch.findings import (
-    contribution,
-    finding,
-    of_fact,
-    rounding,
-    whole_term,
-)
+from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, whole_term
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
+from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.missing import lost_turns, missing_turns
 from ahrsd.mismatch.name import Judged
@@ -65,7 +60,6 @@ from ahrsd.mismatch.search import (
 )
 from ahrsd.mismatch.slow_noise import in_its_noise
 from ahrsd.mismatch.sought import sought
-from ahrsd.mismatch.spectrum import against, spectrum_of
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
@@ -222,7 +216,7 @@ def _told(
 def _names(done: _Searched, fast: Quick) -> tuple[list[Finding], tuple[Term, ...]]:
     """Findings and whole terms of the search's names, then of what only the recorded rate shows."""
     state, basis, last = done.state, basis_of(done.state), fast.last.basis
-    beside = None if rest_of(state, basis) is None else against(basis, spectrum_of(basis))
+    beside = None if rest_of(state, basis) is None else beside_itself(basis, state.names)
     slow = [
         finding(state, basis, k, seen, done.last, beside) for k, seen in enumerate(done.surveys)
     ]
