@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ahrsd.mismatch import roles, unknown
 from ahrsd.mismatch.beside import named_beside
 from ahrsd.mismatch.bursts import bursts
+from ahrsd.mismatch.cut_out import beside_brief
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
@@ -102,7 +103,7 @@ def diagnose(
     facts = (*facts, *lost)
     if at_rest(done.start):
         notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
-    return _told(recording, problem, done, fast, facts, (*notes, *problem.notes))
+    return _told(recording, problem, done, fast, facts, (*notes, *done.state.problem.notes))
 
 
 def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:
@@ -148,10 +149,10 @@ class _Searched:
 
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
-    done = wandering(sought(State(problem, start)))
+    done, brief = beside_brief(wandering(sought(State(problem, start))))
     state, surveys, left = named_beside(done.state, done.surveys, done.left, done.stood_in)
     beside = len(state.named) > len(done.state.named)
-    short = bursts(formed_basis_of(state))
+    short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = with_one_source(left)
     if unknown.detected(left, problem.limits):

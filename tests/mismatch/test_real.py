@@ -96,8 +96,19 @@ def test_a_magnet_is_put_on_and_taken_off() -> None:
     for step in (on, off):
         assert np.linalg.norm(values(step)) == pytest.approx(0.06, rel=0.1)
         assert step.where.frame == "sensor"
+        assert step.heldout.nll_gain_per_sample > step.heldout.placebo_gain
     (lag,) = named(found, "mag_time_lag")
     assert values(lag)[0] == pytest.approx(0.0115, abs=2e-3)
+
+
+def test_the_lag_is_named_beside_a_strong_magnet_that_a_hand_puts_on() -> None:
+    """The way of the hand is louder than the lag; a mount of a degree looks like some of it."""
+    found = diagnosed("broad/32_disturbed_attached_magnet_1cm.csv.gz")
+    assert len(named(found, "hard_iron_step")) == 2
+    (lag,) = named(found, "mag_time_lag")
+    assert values(lag)[0] == pytest.approx(0.0115, abs=2.5e-3)
+    assert len(found.findings) == 3
+    assert any("left out" in note for note in found.notes)
 
 
 def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
