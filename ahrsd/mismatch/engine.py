@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch import roles, unknown
+from ahrsd.mismatch.along_field import framed
 from ahrsd.mismatch.beside import named_beside
 from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.cut_out import beside_brief
@@ -43,13 +44,11 @@ from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, at_model, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
-from ahrsd.mismatch.one_source import with_one_source
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
-from ahrsd.mismatch.rivals import of_the_rate
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     State,
@@ -154,9 +153,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     beside = len(state.named) > len(done.state.named)
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
-        left = with_one_source(left)
-    if unknown.detected(left, problem.limits):
-        left = of_the_rate(left)
+        left = framed(formed_basis_of(state), left, problem.limits)
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
     known = max((judged.evidence for judged in state.named), default=0.0)
     left = unknown.beside_names(left, known)

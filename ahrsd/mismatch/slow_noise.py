@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import locate, unknown
+from ahrsd.mismatch.along_field import in_a_field
 from ahrsd.mismatch.coloured import coloured
 from ahrsd.mismatch.evidence import CLEAR_PEAK
 from ahrsd.mismatch.limits import Limits
@@ -32,7 +33,8 @@ def in_its_noise(basis: Base, left: Remainder, limits: Limits) -> Remainder:
     white = left.basis.colour <= CLEAR_PEAK
     if white or left.one_source or left.stood_in is not None:
         return left
-    again = with_spells(unknown.tested(lawful(basis, left), with_bins=bool(left.bins)))
+    again = unknown.tested(lawful(basis, left), with_bins=bool(left.bins))
+    again = with_spells(in_a_field(basis, again) if unknown.detected(again, limits) else again)
     agreed = unknown.detected(left, limits) and unknown.detected(again, limits)
     return left if agreed else again
 
