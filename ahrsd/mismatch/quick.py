@@ -14,11 +14,11 @@ from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.problem import Problem, model_at_rate, noise_of_thinned
-from ahrsd.mismatch.search import State, Survey, refitted, survey
+from ahrsd.mismatch.search import ALTERNATING, State, Survey, refitted, survey
 from ahrsd.mismatch.thin import thinned
 
 #: sought at the recorded rate only
-QUICK = ("ac_interference", "rotor_field", "sync_pulses")
+QUICK = ALTERNATING
 #: sought at both: half of it is lost at the working rate
 BOTH = ("current_derivative_field",)
 

@@ -67,6 +67,8 @@ SMALL_LAG_S = 2e-3
 LAG_STEPS = 3
 #: a gyro bias that wanders by 20 deg/h in 400 s is noise of an ordinary gyro and gets no name
 ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
+#: what a vehicle that hardly turns can tell of the field: what no turn and no drift does
+ALTERNATING = ("ac_interference", "rotor_field", "sync_pulses")
 #: names of a gyro bias that changes with time alone
 WANDERING = ("gyro_bias_drift", "gyro_bias_step", "gyro_startup", "gyro_bias_temperature")
 
@@ -143,7 +145,7 @@ def survey(state: State, basis: Base | None = None) -> Survey:
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
     library = problem.library
     if at_rest(state.fit):
-        library = {name: effect for name, effect in library.items() if effect.family == "gyro"}
+        library = {k: e for k, e in library.items() if e.family == "gyro" or k in ALTERNATING}
     if any(name in DELAYS for name in state.names):
         library = {name: effect for name, effect in library.items() if name not in DELAYS}
     candidates = tuple(in_time(basis, c) for c in best_settings(basis, library, taken))
@@ -273,8 +275,7 @@ def refitted(state: State, named: tuple[Judged, ...]) -> State:
     if problem.lag_s != 0.0 and not any(one.candidate.name in DELAYS for one in named):
         problem = problem.lagging(0.0)  # what nobody names is not taken out of the track
     walks = state.walk > 0.0
-    if walks:
-        start = replace(start, gyro_walk_rad_s_sqrt_s=state.walk)
+    start = replace(start, gyro_walk_rad_s_sqrt_s=state.walk)
     fit = fit_null(problem.track, problem.spec, start, tuple(fitted), noise=not walks, walk=walks)
     return replace(state, problem=problem, fit=fit, named=named)
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd import so3
 from ahrsd.mismatch.effects.base import readings_of
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.effects.pulses import train, trains
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.search import at_rest
 from ahrsd.mismatch.thin import working_factor
 from ahrsd.mismatch.track import Track
 
@@ -113,3 +115,26 @@ def test_a_rotor_is_found_though_its_tachometer_is_rounded(quiet: Track) -> None
     left = turning.mag_b_gauss - readings_of(context).mag_b_gauss
     value = np.linalg.lstsq(columns.reshape(-1, 6), left.ravel(), rcond=None)[0]
     assert abs(np.linalg.norm(value) / (1e-3 * np.sqrt(2)) - 1) < 0.1
+
+
+def test_an_alternating_field_needs_no_turns() -> None:
+    """A vehicle that hardly turns says little of a field, but a line is none of a gyro's doing."""
+    still = _rocking(np.random.default_rng(5))
+    assert at_rest(fit_null(still))
+    wave = np.cos(2 * np.pi * 18.46 * still.time_s)[:, None] * np.array([3e-4, -4e-4, 0.0])
+    found = diagnose(replace(still, mag_b_gauss=still.mag_b_gauss + wave))
+    assert [one.effect for one in found.findings] == ["ac_interference"]
+    assert abs(found.findings[0].setting["frequency_hz"] - 18.46) < 1e-3
+    assert diagnose(still).findings == ()
+
+
+def _rocking(rng: np.random.Generator) -> Track:
+    """Three minutes of a vehicle that rocks by a degree or so and hardly turns."""
+    time_s = np.arange(7200) / RATE_HZ
+    angles = 0.02 * np.sin(time_s[:, None] * np.array([0.11, 0.17, 0.23]) + [0.0, 1.0, 2.0])
+    R_nb = so3.exp(angles)
+    turned = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:]) * RATE_HZ
+    gyro = np.vstack([turned[:1], turned]) + 4e-4 * rng.standard_normal((7200, 3))
+    mag = np.einsum("nji,j->ni", R_nb, [0.2, 0.05, 0.45]) + 1e-3 * rng.standard_normal((7200, 3))
+    dt_s = np.diff(time_s, prepend=np.nan)
+    return Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, 7200),))
