@@ -17,7 +17,6 @@ from ahrsd.mismatch.along_field import framed
 from ahrsd.mismatch.beside import named_beside
 from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.cut_out import beside_brief
-from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
     Baseline,
@@ -39,10 +38,11 @@ from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.limits import LIMITS, Limits
-from ahrsd.mismatch.missing import lost_turns, missing_turns
+from ahrsd.mismatch.lost import believed, beyond_lost, lost_beside
+from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
-from ahrsd.mismatch.null import NullFit, at_model, fit_null, unusable
+from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
@@ -94,14 +94,18 @@ def diagnose(
     if lost:
         problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
     done, fast = _named(problem, cold)
-    beside = _lost_beside(whole, fast)
+    beside = lost_beside(whole, fast.state)
     if bool(beside) != bool(lost):
-        lost = beside
-        problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
-        done, fast = _named(problem, cold)
+        other, cold = problem_of(put_right(track, (*facts, *beside)), spec, library, limits)
+        again = _named(other, cold)
+        if not believed(lost, done.state, again[0].state):
+            lost, problem, (done, fast) = beside, other, again
     facts = (*facts, *lost)
     if at_rest(done.start):
-        notes = (*notes, "the sensor hardly turned: only effects on the gyro can be told")
+        notes = (
+            *notes,
+            "the sensor hardly turned: only effects on the gyro and alternating fields can be told",
+        )
     return _told(recording, problem, done, fast, facts, (*notes, *done.state.problem.notes))
 
 
@@ -113,20 +117,6 @@ def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:
         done = _searched(cleaned(fast, problem), done.start.model)
         fast = quick(done.state, problem)
     return done, fast
-
-
-def _lost_beside(whole: Problem, fast: Quick) -> list[Fact]:
-    """Lost turns of the recording as it came, beside everything that was named.
-
-    A field that jumps looks like lost turns now and then, and hides those that are.
-    """
-    state = fast.state
-    fit = state.fit
-    if state.problem.recorded is not whole.recorded:
-        track = delayed_gyro(whole.recorded, state.problem.lag_s)
-        fit = at_model(track, fit.model, fit.terms)
-    rate = fit.filtered.track.gyro_b_rad_s - fit.model.gyro_bias_rad_s
-    return missing_turns(fit.filtered, rate)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,7 +175,7 @@ def _told(
         *(of_fact(fact, library) for fact in noise),
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
-    left = _left(done, problem)
+    left = _left(done, problem, facts)
     seen = (*state.named, *fast.state.named[fast.known :])
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
     something = bool(found) or left.detected
@@ -257,11 +247,11 @@ def _doubted(one: Finding, sure: float) -> Finding:
     return replace(one, confidence=one.confidence * sure, alternatives=others)
 
 
-def _left(done: _Searched, problem: Problem) -> Unexplained:
+def _left(done: _Searched, problem: Problem, facts: Sequence[Fact]) -> Unexplained:
     """What no name explains."""
     if done.short is not None:
         return done.short
-    if unknown.detected(done.left, problem.limits):
+    if beyond_lost(done.left, facts, problem):
         return unknown.described(done.left, problem.block_s, problem.limits)
     return Unexplained(False)
 

@@ -1,0 +1,45 @@
+"""Lost turns beside everything that was named, and which of two searches is believed.
+
+A field that jumps looks like lost turns now and then, and hides those that are.  So they are looked
+for once more in the recording as it came, beside the names; and where the two answers differ, the
+likelier of the two models is it: turns that were taken for a jump leave the jump's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ahrsd.mismatch.delay import delayed_gyro
+from ahrsd.mismatch.facts import Fact
+from ahrsd.mismatch.missing import missing_turns
+from ahrsd.mismatch.null import at_model
+from ahrsd.mismatch.problem import Problem
+from ahrsd.mismatch.search import State
+from ahrsd.mismatch.unknown import Remainder, detected
+
+
+def lost_beside(whole: Problem, state: State) -> list[Fact]:
+    """Lost turns of the recording as it came, `whole`, beside the terms of a state."""
+    fit = state.fit
+    if state.problem.recorded is not whole.recorded:
+        track = delayed_gyro(whole.recorded, state.problem.lag_s)
+        fit = at_model(track, fit.model, fit.terms)
+    rate = fit.filtered.track.gyro_b_rad_s - fit.model.gyro_bias_rad_s
+    return missing_turns(fit.filtered, rate)
+
+
+def believed(lost: Sequence[Fact], put_right: State, as_it_came: State) -> bool:
+    """Whether lost turns that were seen at first stay, though they are not seen beside the names.
+
+    put_right: the model of the recording with them put right;  as_it_came: without
+    """
+    return bool(lost) and put_right.fit.log_likelihood > as_it_came.fit.log_likelihood
+
+
+def beyond_lost(left: Remainder, facts: Sequence[Fact], problem: Problem) -> bool:
+    """Whether something is left that is more than the turns lost where no jump shows them.
+
+    Those are an error of the gyro: of slow turns only their number is known, and not when.
+    """
+    unseen = any(fact.turned is not None for fact in facts) and left.strongest.frame == "gyro"
+    return detected(left, problem.limits) and not unseen
