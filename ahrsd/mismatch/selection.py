@@ -47,7 +47,8 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
     while len(state.named) < state.problem.limits.most_terms:
         accepted = [judged for judged in last.judged if judged.accepted]
         if not accepted:
-            more = stepped(state)
+            more = _cause_after_all(state, last)
+            more = stepped(state) if more is state else more
             if more is state:
                 break
             state, last = more, survey(more)
@@ -80,6 +81,25 @@ def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
     wider = replace(noisy, fit=at_model(state.problem.track, largest, noisy.fit.terms))
     best = max(_likelihood(noisy), _likelihood(wider))
     return named if _likelihood(named) > best + limits.unknown_nats else noisy
+
+
+def _cause_after_all(state: State, seen: Survey) -> State:
+    """The state with a cause in place of the bias that wanders, where that is likelier by now.
+
+    Asked while another name was still missing, a walk had the rest of that to follow, too.
+    """
+    likeliest = seen.candidates[:1]
+    if not state.walk or not likeliest or likeliest[0].name not in CAUSED:
+        return state
+    if likeliest[0].evidence < state.problem.limits.unknown_nats:
+        return state
+    still = refitted(replace(state, walk=0.0), state.named)
+    again = survey(still)
+    accepted = [judged for judged in again.judged if judged.accepted]
+    if not accepted or accepted[0].candidate.name != likeliest[0].name:
+        return state
+    tried = _noise_or_cause(still, accepted[0], again)
+    return state if tried.walk else shaped_again(tried, newest=True)
 
 
 def _likelihood(state: State) -> float:

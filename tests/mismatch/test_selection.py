@@ -1,0 +1,53 @@
+"""Which name comes next, and when a bias that changes is noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S, State, refitted, survey
+from ahrsd.mismatch.selection import _cause_after_all
+from ahrsd.mismatch.track import Spec, Track
+
+SCALE = 1 + np.array([-1.2e-3, 2.3e-3, -1.6e-3])
+
+
+def _beside_a_walk(track: Track) -> State:
+    """The state with the gyro's scale named, and a bias that may wander."""
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    start = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    scale = next(j for j in survey(start).judged if j.candidate.name == "gyro_scale")
+    return refitted(replace(start, walk=ORDINARY_WALK_RAD_S_SQRT_S), (scale,))
+
+
+@pytest.fixture(scope="module")
+def track() -> Track:
+    plain = made(Trial(3, scenario="wam", samples=6000)).track
+    return replace(plain, gyro_b_rad_s=plain.gyro_b_rad_s * SCALE)
+
+
+def test_a_cause_is_asked_for_again_when_another_name_is_in(track: Track) -> None:
+    """A walk had the scale's error to follow as well, and took the step with it."""
+    later = (track.time_s - track.time_s[0] > 140.0)[:, None]
+    stepped = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + later * [2.1e-4, 5.4e-4, 1.4e-4])
+    state = _beside_a_walk(stepped)
+    more = _cause_after_all(state, survey(state))
+    assert more.names == ("gyro_scale", "gyro_bias_step")
+    assert more.walk == 0.0
+    assert more.fit.model.gyro_walk_rad_s_sqrt_s == 0.0
+    assert abs(float(more.named[1].candidate.setting["onset_s"]) - track.time_s[0] - 140.0) < 3.0
+
+
+def test_a_bias_that_wanders_stays_noise(track: Track) -> None:
+    rng = np.random.default_rng(4)
+    steps = ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(0.04) * rng.standard_normal((len(track), 3))
+    wandered = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + np.cumsum(steps, axis=0))
+    state = _beside_a_walk(wandered)
+    assert _cause_after_all(state, survey(state)) is state
