@@ -13,6 +13,7 @@ from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.findings import added_value, shares_of, where
 from ahrsd.mismatch.locate import FRAMES, Frame
+from ahrsd.mismatch.one_course import of_one_course
 from ahrsd.mismatch.regression import Base, evidence_of
 from ahrsd.mismatch.rivals import of_another_form
 from ahrsd.mismatch.search import (
@@ -84,6 +85,10 @@ def without_stand_ins(
     state, surveys, left = _dropped(state, surveys, bumps, left)
     if one_course:
         left = replace(left, stood_in="world")
+    parts, whose = of_one_course(state, formed_basis_of(state))
+    state, surveys, left = _dropped(state, surveys, parts, left)
+    if parts and not unknown.detected(left, limits):
+        left = replace(left, stood_in=whose)
     if state.named:
         wrong = wrong_in_form(state, beside)
         if wrong:

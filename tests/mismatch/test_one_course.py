@@ -1,0 +1,49 @@
+"""Several names that share one smooth course, and those that only look as if they did."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.one_course import price
+from ahrsd.mismatch.regression import Candidate
+from ahrsd.simulation import simulate
+
+PLACES = ("position_north_m", "position_east_m", "position_down_m")
+
+
+def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
+    """Three gains of an on-board calibration followed it to a quarter of a hundredth."""
+    trial = made(Trial(2, (), PLACES, scenario="lam", samples=6000))
+    R_nb = simulate(trial.settings).R_nb
+    rng, track = np.random.default_rng(2), trial.track
+    phase = np.pi * (track.time_s - track.time_s[0]) / track.duration_s
+    field_n = 1.5e-3 * sum(
+        np.cos(j * phase + rng.uniform(0, 6.28))[:, None] * rng.standard_normal(3) * j**-1.5
+        for j in range(2, 9)
+    )
+    mag = track.mag_b_gauss + np.einsum("nji,nj->ni", R_nb, field_n)
+    found = diagnose(replace(track, mag_b_gauss=mag))
+    assert found.findings == ()
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "world"
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_two_smooth_effects_are_still_two(seed):
+    effects = (("hard_iron_drift", 3.0), ("mag_scale_temperature", 1.0))
+    found = diagnose(made(Trial(seed, effects, samples=6000)).track)
+    assert {one.effect for one in found.findings} == {name for name, _ in effects}
+
+
+def test_what_was_sought_is_paid():
+    onset_and_scale = {"onset_s": 80.0, "time_constant_s": 20.0}
+    active = Candidate(EFFECTS["onboard_calibration_active"], onset_and_scale, 1, 0.0)
+    assert price(active, 0.0) == 0.0
+    assert abs(price(active, 1000.0) - np.log(2001.0)) < 1e-9
+    assert price(replace(active, tried=100), 0.0) == np.log(100)
+    step = Candidate(EFFECTS["field_step"], {"onset_s": 80.0}, 1, 0.0)
+    assert abs(price(step, 1000.0) - np.log(2001.0) / 2) < 1e-9
