@@ -19,6 +19,7 @@ from ahrsd.mismatch.effects.base import Setting
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.memory import with_memory
 from ahrsd.mismatch.name import Judged, judge, ranked
 from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
 from ahrsd.mismatch.problem import Problem
@@ -254,7 +255,7 @@ def _scaled_again(state: State) -> State:
     if "onset_s" in judged.candidate.setting:
         return shaped_again(state, newest=True)
     left = formed_basis_of(state).without(term_group(last), state.fit.terms[last].value)
-    closer = closest_scale(left, judged.candidate, SCALE_AGAIN)
+    closer = with_memory(left, closest_scale(left, judged.candidate, SCALE_AGAIN))
     if closer.setting == judged.candidate.setting:
         return state
     candidate = replace(judged.candidate, setting=closer.setting)

@@ -143,7 +143,7 @@ class Hysteresis(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
         induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
-        gap = (series.play(induced, radius) - induced) / radius
+        gap = (series.play(induced, radius, setting.get("memory")) - induced) / radius
         return Columns(mag=np.asarray(gap[:, :, None] * np.eye(3)))
 
 

@@ -5,6 +5,7 @@ A run begins where `dt_s` is nan.  Nothing here reaches over a gap.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -135,11 +136,14 @@ def _low_pass_of_curves(x: Array, slope: Array, step_s: Array, time_constant_s: 
     return first_order(np.vstack([first, new]), keep)
 
 
-def play(values: Array, radius: float) -> Array:
-    """The play operator (N, k): the middle of a slot of half-width `radius` that `values` drags."""
+def play(values: Array, radius: float, memory: Sequence[float] | None = None) -> Array:
+    """The play operator (N, k): the middle of a slot of half-width `radius` that `values` drags.
+
+    memory (k,): where in the slot the first of the values lies, -1 to 1; its middle if None
+    """
     out = np.empty_like(values)
     low, high = values - radius, values + radius
-    last = values[0].copy()
+    last = values[0] + radius * np.asarray(memory or (0.0,) * values.shape[1])
     for k in range(len(values)):
         last = np.minimum(np.maximum(last, low[k]), high[k])
         out[k] = last

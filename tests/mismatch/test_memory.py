@@ -1,0 +1,33 @@
+"""What iron remembers from before the recording is its own, and no jump in the first seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from mismatch_trials import Trial, made
+
+from ahrsd.mismatch.effects import series
+from ahrsd.mismatch.effects.base import contribution
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.null import fit_null
+
+
+def test_play_begins_where_it_was_left() -> None:
+    values = np.array([[0.0], [0.2], [-0.3], [-0.8], [1.0], [0.9]])
+    middle = series.play(values, 0.5, (1.0,))[:, 0]
+    np.testing.assert_allclose(middle, [0.5, 0.5, 0.2, -0.3, 0.5, 0.5], atol=1e-12)
+    assert series.play(values, 0.5, (0.0,)).tolist() == series.play(values, 0.5).tolist()
+
+
+def test_the_memory_is_found_and_nothing_else_is_named() -> None:
+    track = made(Trial(5, scenario="wam", samples=6000)).track
+    setting = {"radius_gauss": 0.03, "memory": (1.0, -1.0, 1.0)}
+    value = np.array([2e-3, 2.5e-3, 3e-3])
+    added, _ = contribution(EFFECTS["hysteresis"], fit_null(track).context(), value, setting)
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert [one.effect for one in found.findings] == ["hysteresis"]
+    assert not found.unexplained.detected
+    assert found.findings[0].setting["memory"] == (1.0, -1.0, 1.0)
+    assert abs(found.findings[0].setting["radius_gauss"] - 0.03) < 1e-3
