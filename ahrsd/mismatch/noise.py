@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
 from ahrsd.mismatch.diagnosis import Value, Where
@@ -25,12 +26,12 @@ _FREQUENCIES = 4096  # of a spectrum
 _FLOOR = 1e-6  # white part of a colour, at least
 _BLOCK_S = 2.0
 _FINE_S, _PASSES = 1.0, 4  # in which bursts are told apart
-_SURE_NATS = 3.0  # by which a burst is one
 _FILLED = 0.7  # of a stretch that is loud throughout
 #: nats by which a change of level must be likelier than none: with the 20,000 stretches that 400 s
 #: have, one recording of one level in ten thousand has such a one
 _NATS = 17.0
 _RATIO = 1.3  # of the levels, at least
+_OUTLIER = 3.0  # deviations from which a reading is no more a sign of a louder noise
 _BURST_SHARE = 0.4  # of the recording that a burst may last
 _OPPOSED = -0.3  # correlation of successive differences, at most
 _LEVEL = 1.15  # times the spec's noise
@@ -116,11 +117,17 @@ def _freedom(z: Array) -> float:
     return float(tried[int(np.argmax(nats))])
 
 
-def levels(done: Filtered, block_s: float = _BLOCK_S) -> tuple[Array, Array, Array]:
-    """Middle (B,), white variance of the whitened innovations (B,), and their number (B,)."""
+def levels(
+    done: Filtered, block_s: float = _BLOCK_S, most: float = np.inf
+) -> tuple[Array, Array, Array]:
+    """Middle (B,), white variance of the whitened innovations (B,), and their number (B,).
+
+    most: square of a difference beyond which it counts as that much
+    """
     track = done.track
     pairs = done.used[1:] & done.used[:-1]
-    half = np.where(pairs, np.sum(np.diff(done.whitened, axis=0) ** 2, axis=1) / 2, 0.0)
+    squares = np.minimum(np.diff(done.whitened, axis=0) ** 2, most)
+    half = np.where(pairs, np.sum(squares, axis=1) / 2, 0.0)
     block = ((track.time_s[1:] - track.time_s[0]) / block_s).astype(int)
     size = np.asarray(np.bincount(block, weights=3.0 * pairs), dtype=np.float64)
     total = np.bincount(block, weights=half, minlength=len(size))
@@ -134,18 +141,18 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
     middle, variance, size = levels(done)
     if len(middle) < 10 or not np.any(variance > 1e-18):
         return []
-    # neighbouring differences share a sample, and heavy tails scatter more than Gaussian ones
-    weight = size / 1.5 / (1.0 + max(tails_of(done).excess_kurtosis, 0.0) / 2.0)
-    first, last, gain = _loudest(variance, weight)
+    # one reading far out is no louder noise
+    most = _OUTLIER**2 * 2.0 * _middle_variance(done) or np.inf
+    clipped = levels(done, most=most)[1]
+    first, last, gain = _loudest(clipped, size / _worth(done, most))
     inside = np.zeros(len(middle), dtype=bool)
     inside[first:last] = True
-    loud = float(np.average(variance[inside], weights=weight[inside])) if inside.any() else 1.0
-    quiet = float(np.average(variance[~inside], weights=weight[~inside])) if not inside.all() else 1
+    loud, quiet = _sides(variance, size, inside)
     changed = gain > _NATS and loud > _RATIO * quiet and _is_noise(done, middle[inside])
     if changed:
         stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
         sides = loud, quiet
-        spans, loud, quiet = _loud_spans(done, loud, quiet)
+        spans, loud, quiet = _loud_spans(done, *_sides(clipped, size, inside), most)
         filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
         # what lasts from the beginning or to the end changed once
         amid = first > 0 and last < len(middle)
@@ -156,12 +163,24 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
             return [_burst(done, spans or [stretch], loud, quiet)]
         return [_level(done, stretch, loud, quiet)]
     # a few outliers are the power of a louder noise, but the level of most readings is the spec's
-    overall = min(float(np.average(variance, weights=weight)), _middle_variance(done))
+    overall = min(float(np.average(variance, weights=size)), _middle_variance(done))
     spec_given = spec_given and _is_noise(done, middle)
-    if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 / weight.sum()):
+    if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 * _worth(done) / size.sum()):
         whole = (float(middle[0] - _BLOCK_S / 2), float(middle[-1] + _BLOCK_S / 2))
         return [_level(done, whole, overall, 1.0)]
     return []
+
+
+def _worth(done: Filtered, most: float = np.inf) -> float:
+    """How many squared differences, each at most `most`, tell as much as one Gaussian reading.
+
+    Neighbouring differences share a sample; heavy tails scatter more than Gaussian ones; what is
+    far out on one axis may be on all.
+    """
+    pairs = done.used[1:] & done.used[:-1]
+    rows = np.sum(np.minimum(np.diff(done.whitened, axis=0)[pairs] ** 2, most), axis=1)
+    scatter = float(np.var(rows) / np.mean(rows) ** 2)
+    return 1.5 * max(scatter / (2.0 / 3.0), 1.0)
 
 
 def _middle_variance(done: Filtered) -> float:
@@ -200,26 +219,39 @@ def _loudest(variance: Array, weight: Array) -> tuple[int, int, float]:
     return int(a[best]), int(b[best]), float(gain[best])
 
 
+def _sides(variance: Array, size: Array, inside: NDArray[np.bool]) -> tuple[float, float]:
+    """Mean of (B,) variances inside and outside; 1 of none."""
+    loud, quiet = (
+        float(np.average(variance[part], weights=size[part])) if part.any() else 1.0
+        for part in (inside, ~inside)
+    )
+    return loud, quiet
+
+
 def _loud_spans(
-    done: Filtered, loud: float, quiet: float
+    done: Filtered, loud: float, quiet: float, most: float
 ) -> tuple[list[tuple[float, float]], float, float]:
-    """Where the noise is at the louder of two levels rather than the other; the levels."""
-    middle, variance, size = levels(done, _FINE_S)
-    weight = size / 1.5
+    """Where the noise is at the louder of two levels rather than the other; the levels.
+
+    loud, quiet, most: of squares that count as `most` at most
+    """
+    middle, clipped, size = levels(done, _FINE_S, most)
+    weight = size / _worth(done, most)
     on = np.zeros(len(middle), dtype=bool)
     for _ in range(_PASSES):
-        nats = 0.5 * weight * (np.log(quiet / loud) + variance * (1 / quiet - 1 / loud))
+        nats = 0.5 * weight * (np.log(quiet / loud) + clipped * (1 / quiet - 1 / loud))
         on = nats > 0
         if on.all() or not on.any():
             break
-        loud = float(np.average(variance[on], weights=weight[on]))
-        quiet = float(np.average(variance[~on], weights=weight[~on]))
-    found = [
-        (float(middle[a] - _FINE_S / 2), float(middle[b - 1] + _FINE_S / 2))
-        for a, b in spans_of(on, 1)
-        if float(np.sum(nats[a:b])) > _SURE_NATS
-    ]
-    return found, loud, quiet
+        loud, quiet = _sides(clipped, size, on)
+    # a spell may begin in any of the blocks
+    price = float(np.log(max(len(middle), 1)))
+    kept = [(a, b) for a, b in spans_of(on, 1) if float(np.sum(nats[a:b])) > price]
+    on = np.zeros(len(middle), dtype=bool)
+    for a, b in kept:
+        on[a:b] = True
+    found = [(float(middle[a] - _FINE_S / 2), float(middle[b - 1] + _FINE_S / 2)) for a, b in kept]
+    return found, *_sides(levels(done, _FINE_S)[1], size, on)
 
 
 def _burst(done: Filtered, spans: list[tuple[float, float]], loud: float, quiet: float) -> Fact:

@@ -92,6 +92,35 @@ def test_several_bursts_are_told_apart() -> None:
         assert abs(end - 0.04 * b) < 1.5
 
 
+def _heavy(seed: int, samples: int) -> Filtered:
+    """White innovations of Student's t with 3.5 degrees of freedom and variance 1."""
+    done = _filtered(0)
+    drawn = np.random.default_rng([seed, 35]).standard_t(3.5, (samples, 3)) / np.sqrt(3.5 / 1.5)
+    track = replace(
+        done.track,
+        time_s=np.arange(samples) * 0.02,
+        mag_b_gauss=np.zeros((samples, 3)),
+        gyro_b_rad_s=np.zeros((samples, 3)),
+    )
+    return replace(done, track=track, whitened=drawn, used=np.ones(samples, dtype=bool))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_heavy_tails_are_no_bursts_and_hide_none(seed: int) -> None:
+    done = _heavy(seed, 10000)
+    assert level_facts(done) == []
+    louder = done.whitened.copy()
+    louder[5000:5500] *= 1.8
+    (fact,) = level_facts(replace(done, whitened=louder))
+    assert fact.effect == "noise_burst"
+    assert len(fact.where.intervals_s) <= 6
+    inside = sum(
+        min(b, 111.0) - max(a, 99.0) for a, b in fact.where.intervals_s if a < 111 and b > 99
+    )
+    assert inside > 8.0
+    assert sum(b - a for a, b in fact.where.intervals_s) - inside < 8.0
+
+
 @pytest.mark.parametrize("onset", [0, 1800])
 def test_a_higher_level(onset: int) -> None:
     rng = np.random.default_rng(7)
