@@ -43,10 +43,11 @@ def by_direction(basis: Base, columns: Array) -> Base:
 
 
 def weighed(basis: Base, weight: Array) -> Base:
-    """The basis with its rows weighed by (N, 3, 3)."""
+    """The basis with its rows weighed by (N, 3, 3), beside what they were weighed by already."""
     known = weight @ basis.known
     innovation = np.einsum("nij,nj->ni", weight, basis.innovation)
-    return replace(based(basis, basis.groups, known, innovation), weight=weight)
+    both = weight if basis.weight is None else weight @ basis.weight
+    return replace(based(basis, basis.groups, known, innovation), weight=both)
 
 
 def mean_colour(innovation: Array, rate_hz: float) -> float:

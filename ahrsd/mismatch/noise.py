@@ -136,38 +136,58 @@ def levels(
     return middle[kept], total[kept] / size[kept], size[kept]
 
 
-def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
-    """A burst, or a level that changed or is above the spec's."""
+@dataclass(frozen=True, slots=True)
+class Louder:
+    """Noise at two levels: seconds at the louder one, white variances of the whitened innovations.
+
+    burst: it comes and goes; else it changed once
+    """
+
+    spans_s: tuple[tuple[float, float], ...]
+    loud: float
+    quiet: float
+    burst: bool
+
+
+def louder(done: Filtered) -> Louder | None:
+    """Where the noise is at a louder level than elsewhere; None where it has one level."""
     middle, variance, size = levels(done)
     if len(middle) < 10 or not np.any(variance > 1e-18):
-        return []
+        return None
     # one reading far out is no louder noise
     most = _OUTLIER**2 * 2.0 * _middle_variance(done) or np.inf
     clipped = levels(done, most=most)[1]
     first, last, gain = _loudest(clipped, size / _worth(done, most))
     inside = np.zeros(len(middle), dtype=bool)
     inside[first:last] = True
-    loud, quiet = _sides(variance, size, inside)
-    changed = gain > _NATS and loud > _RATIO * quiet and _is_noise(done, middle[inside])
-    if changed:
-        stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
-        sides = loud, quiet
-        spans, loud, quiet = _loud_spans(done, *_sides(clipped, size, inside), most)
-        filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
-        # what lasts from the beginning or to the end changed once
-        amid = first > 0 and last < len(middle)
-        short = amid and last - first <= _BURST_SHARE * len(middle)
-        if loud < _RATIO * quiet:  # not two levels that come and go: the one stretch alone
-            spans, loud, quiet = [], *sides
-        if short or (len(spans) > 1 and filled < _FILLED):
-            return [_burst(done, spans or [stretch], loud, quiet)]
-        return [_level(done, stretch, loud, quiet)]
+    sides = loud, quiet = _sides(variance, size, inside)
+    if gain <= _NATS or loud <= _RATIO * quiet or not _is_noise(done, middle[inside]):
+        return None
+    stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
+    spans, loud, quiet = _loud_spans(done, *_sides(clipped, size, inside), most)
+    filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
+    # what lasts from the beginning or to the end changed once
+    amid = first > 0 and last < len(middle)
+    short = amid and last - first <= _BURST_SHARE * len(middle)
+    if loud < _RATIO * quiet:  # not two levels that come and go: the one stretch alone
+        spans, loud, quiet = [], *sides
+    if short or (len(spans) > 1 and filled < _FILLED):
+        return Louder(tuple(spans or [stretch]), loud, quiet, burst=True)
+    return Louder((stretch,), loud, quiet, burst=False)
+
+
+def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
+    """A burst, or a level that changed or is above the spec's."""
+    if found := louder(done):
+        return [(_burst if found.burst else _level)(done, found)]
+    middle, variance, size = levels(done)
+    if not spec_given or len(middle) < 10 or not _is_noise(done, middle):
+        return []
     # a few outliers are the power of a louder noise, but the level of most readings is the spec's
     overall = min(float(np.average(variance, weights=size)), _middle_variance(done))
-    spec_given = spec_given and _is_noise(done, middle)
-    if spec_given and overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 * _worth(done) / size.sum()):
+    if overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 * _worth(done) / size.sum()):
         whole = (float(middle[0] - _BLOCK_S / 2), float(middle[-1] + _BLOCK_S / 2))
-        return [_level(done, whole, overall, 1.0)]
+        return [_level(done, Louder((whole,), overall, 1.0, burst=False))]
     return []
 
 
@@ -254,22 +274,24 @@ def _loud_spans(
     return found, *_sides(levels(done, _FINE_S)[1], size, on)
 
 
-def _burst(done: Filtered, spans: list[tuple[float, float]], loud: float, quiet: float) -> Fact:
+def _burst(done: Filtered, found: Louder) -> Fact:
+    loud, quiet = found.loud, found.quiet
     sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
-    times = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in spans)
+    times = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in found.spans_s)
     words = f"from {times} s the noise is {np.sqrt(loud / quiet):.2g} times its usual level"
-    begin, end = spans[0]
+    begin, end = found.spans_s[0]
     return Fact(
         "noise_burst",
         words,
-        Where(tuple(spans), ("x", "y", "z"), "noise"),
+        Where(found.spans_s, ("x", "y", "z"), "noise"),
         0.98,
         (Value("burst", sigma, sigma * 0.1, "gauss"),),
         {"onset_s": begin, "length_s": end - begin},
     )
 
 
-def _level(done: Filtered, stretch: tuple[float, float], loud: float, quiet: float) -> Fact:
+def _level(done: Filtered, found: Louder) -> Fact:
+    (stretch,), loud, quiet = found.spans_s, found.loud, found.quiet
     begin, end = stretch[0], min(stretch[1], float(done.track.time_s[-1]))
     sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
     ratio = float(np.sqrt(loud / quiet))

@@ -1,0 +1,51 @@
+"""Whether an unknown is no more than noise that is louder for a while.
+
+Readings of a louder time are held against the noise of all: what they have of structure by chance
+looks like a source that comes and goes.  So what is to be told is looked for once more where each
+reading counts by the noise of its time.  Not sooner: the filter weighs all readings alike, and what
+a louder time leaves in its state is slow where the readings are quiet again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.mismatch import unknown
+from ahrsd.mismatch.directions import weighed
+from ahrsd.mismatch.evidence import colour
+from ahrsd.mismatch.limits import Limits
+from ahrsd.mismatch.noise import louder
+from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.spells import with_spells
+from ahrsd.mismatch.unknown import Remainder
+
+
+def in_even_noise(basis: Base, left: Remainder, limits: Limits) -> Remainder:
+    """The remainder, or, where noise of two levels is all that is seen, that of even rows.
+
+    basis: the model's, from which the remainder was taken.  A name that was taken out again for its
+    form, and a source of one direction, are there.
+    """
+    if left.stood_in is not None or left.one_source or not unknown.detected(left, limits):
+        return left
+    level = even(basis)
+    if level is basis:
+        return left
+    again = with_spells(unknown.remainder(level, with_bins=bool(left.bins)))
+    return left if unknown.detected(again, limits) else again
+
+
+def even(basis: Base) -> Base:
+    """The basis with its rows weighed by the noise of their time, where it has two levels."""
+    found = louder(basis.filtered)
+    if found is None:
+        return basis
+    time_s = basis.context.track.time_s
+    loud = np.zeros(len(time_s), dtype=bool)
+    for begin, end in found.spans_s:
+        loud |= (time_s >= begin) & (time_s <= end)
+    weight = 1.0 / np.sqrt(np.where(loud, found.loud, found.quiet))
+    done = weighed(basis, weight[:, None, None] * np.eye(3))
+    return replace(done, colour=colour(done.innovation, done.rate_hz))
