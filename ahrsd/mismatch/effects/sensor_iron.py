@@ -173,5 +173,6 @@ class ViscousMagnetisation(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on what trails."""
-        slow = series.low_pass(readings.field_b, readings.dt_s, setting["time_constant_s"])
+        tau, memory = setting["time_constant_s"], setting.get("memory")
+        slow = series.low_pass(readings.field_b, readings.dt_s, tau, memory)
         return Columns(mag=shapes.times_symmetric(slow - readings.field_b))

@@ -80,14 +80,26 @@ def delayed_rate(readings: Readings, delay_s: float) -> Array:
     return out
 
 
-def low_pass(values: Array, dt_s: Array, time_constant_s: float) -> Array:
+def low_pass(
+    values: Array, dt_s: Array, time_constant_s: float, memory: Sequence[float] | None = None
+) -> Array:
     """First-order low-pass of (N, k), exact for values that are straight between samples.
 
-    Each run begins settled.
+    Each run begins settled; the first one, where given, by `memory` (k,) beside the first value.
     """
     out = np.empty_like(values)
     for run in runs(dt_s):
         out[run] = _low_pass(values[run], dt_s[run][1:], time_constant_s)
+    if memory is not None:
+        out += np.asarray(memory) * forgotten(dt_s, time_constant_s)[:, None]
+    return out
+
+
+def forgotten(dt_s: Array, time_constant_s: float) -> Array:
+    """(N,) what is left in the first run of 1 at its first sample, 0 in the others."""
+    out = np.zeros(len(dt_s))
+    first = next(iter(runs(dt_s)))
+    out[first] = np.exp(-np.concatenate([[0.0], np.cumsum(dt_s[first][1:])]) / time_constant_s)
     return out
 
 
