@@ -33,6 +33,7 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import rest_of
 from ahrsd.mismatch.facts import Fact, around_lost_turns, matters
 from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, whole_term
+from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
@@ -142,6 +143,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     done, brief = beside_brief(wandering(sought(State(problem, start))))
     state, surveys, left = named_beside(done.state, done.surveys, done.left, done.stood_in)
     beside = len(state.named) > len(done.state.named)
+    state, surveys, left = without_unforetold(state, surveys, left, beside=beside)
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)

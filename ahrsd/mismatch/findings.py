@@ -70,7 +70,7 @@ def finding(
         alternatives=tuple(a for a in alternatives if a.confidence > SMALLEST_SHARE),
         where=where(judged, added_value(state, number), basis),
         parameters=parameters,
-        heldout=_heldout(state, basis, number, _with_all_else(judged, seen)),
+        heldout=_heldout(state, basis, number, with_all_else(judged, seen)),
         cost_if_left_out=cost(basis, number, added_value(state, number)),
         separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
@@ -270,7 +270,7 @@ def shares_of(state: State, number: int, seen: Survey, last: Survey) -> dict[str
     return {mine: found[mine], **rest}
 
 
-def _with_all_else(judged: Judged, seen: Survey) -> Judged:
+def with_all_else(judged: Judged, seen: Survey) -> Judged:
     """The name judged beside all the others with the noise that they leave, where it was."""
     mine = (j for j in seen.judged if j.candidate.name == judged.candidate.name)
     return next(mine, judged)

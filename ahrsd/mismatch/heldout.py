@@ -44,12 +44,19 @@ class _Seen:
 
 
 def gain_of(
-    fit: NullFit, number: int, value: Array, scale: Array, *, wanders: bool = False
+    fit: NullFit,
+    number: int,
+    value: Array,
+    scale: Array,
+    *,
+    wanders: bool = False,
+    white: bool = False,
 ) -> Gain | None:
     """The held-out gain of a term of a fit.
 
     value (p,): the whole of it;  scale (p,): its prior deviations
     wanders: it is a bias that may walk in the fit, and would not without it
+    white: what fifths do not know of each other is reckoned in white noise
     None where a fifth says what the others do not know.  The noise is as loud as the fit leaves it.
     """
     name = _name(number)
@@ -58,7 +65,7 @@ def gain_of(
     known = [group for group in blocks.groups if group != name]
     if not wanders:
         lost, won = _exchanged(blocks, known, name, value, scale)
-        if _alone(lost, won, len(scale), _scatter(fit)):
+        if _alone(lost, won, len(scale), 1.0 if white else _scatter(fit)):
             return None
     level = fit.filtered.normalised_innovation
     gain = heldout(blocks, known, name, scale, one_by_one)

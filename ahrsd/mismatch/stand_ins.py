@@ -80,20 +80,20 @@ def without_stand_ins(
         doubtful = shaped if len(shaped) > limits.most_shaped else []
         if shaped and not doubtful:
             doubtful = shaped if _stand_in(state, frame, shaped, left) else []
-        state, surveys, left = _dropped(state, surveys, doubtful, left)
+        state, surveys, left = dropped(state, surveys, doubtful, left)
     bumps, one_course = _bumps(state, left)
-    state, surveys, left = _dropped(state, surveys, bumps, left)
+    state, surveys, left = dropped(state, surveys, bumps, left)
     if one_course:
         left = replace(left, stood_in="world")
     parts, whose = of_one_course(state, formed_basis_of(state))
-    state, surveys, left = _dropped(state, surveys, parts, left)
+    state, surveys, left = dropped(state, surveys, parts, left)
     if parts and not unknown.detected(left, limits):
         left = replace(left, stood_in=whose)
     if state.named:
         wrong = wrong_in_form(state, beside)
         if wrong:
-            frame = _frame_of(state, wrong[0])
-            state, surveys, left = _dropped(state, surveys, wrong, left)
+            frame = frame_of(state, wrong[0])
+            state, surveys, left = dropped(state, surveys, wrong, left)
             if not unknown.detected(left, limits):
                 left = replace(left, stood_in=frame)
     return state, surveys, left
@@ -136,7 +136,8 @@ def _bumps(state: State, left: unknown.Remainder) -> tuple[list[int], bool]:
     return (loose, True) if len(loose) > 1 else ([], False)
 
 
-def _frame_of(state: State, number: int) -> Frame:
+def frame_of(state: State, number: int) -> Frame:
+    """The frame in which a term acts."""
     effect = state.named[number].candidate.effect
     frame = effect.frame or effect.family
     return next((known for known in FRAMES if known == frame), "sensor")
@@ -170,9 +171,10 @@ def _bare(state: State, terms: list[int]) -> Base:
     return bare
 
 
-def _dropped(
+def dropped(
     state: State, surveys: list[Survey], terms: list[int], left: unknown.Remainder
 ) -> tuple[State, list[Survey], unknown.Remainder]:
+    """The state and surveys without these terms, and what is then left."""
     if not terms:
         return state, surveys, left
     kept = [k for k in range(len(state.named)) if k not in terms]
