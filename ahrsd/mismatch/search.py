@@ -20,6 +20,7 @@ from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.memory import with_memory
+from ahrsd.mismatch.moments import as_found, at_one_moment
 from ahrsd.mismatch.name import Judged, judge, ranked
 from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
 from ahrsd.mismatch.problem import Problem
@@ -139,8 +140,11 @@ def formed_basis_of(state: State) -> Base:
     return formed
 
 
-def survey(state: State, basis: Base | None = None) -> Survey:
-    """Every effect in its best setting, and the strongest of them held against the gate."""
+def survey(state: State, basis: Base | None = None, own: Candidate | None = None) -> Survey:
+    """Every effect in its best setting, and the strongest of them held against the gate.
+
+    own: a name whose setting is known, which no search for it may miss
+    """
     problem = state.problem
     basis = basis or formed_basis_of(state)
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
@@ -149,7 +153,8 @@ def survey(state: State, basis: Base | None = None) -> Survey:
         library = {k: e for k, e in library.items() if e.family == "gyro" or k in ALTERNATING}
     if any(name in DELAYS for name in state.names):
         library = {name: effect for name, effect in library.items() if name not in DELAYS}
-    candidates = tuple(in_time(basis, c) for c in best_settings(basis, library, taken))
+    seen = as_found(basis, best_settings(basis, library, taken), own)
+    candidates = at_one_moment(basis, [in_time(basis, c) for c in seen])
     if not candidates or candidates[0].evidence <= problem.limits.evidence_nats:
         return Survey(basis, candidates, ())
     quiet = quieter(basis, columns_of(basis, candidates[:1])[candidates[0].name])
@@ -382,6 +387,6 @@ def _without(state: State, number: int, basis: Base) -> tuple[Survey, float]:
     """The survey without one term of the state's basis, and the term's own evidence in it."""
     left = without_term(state, number, basis)
     others = tuple(j for i, j in enumerate(state.named) if i != number)
-    seen = survey(replace(state, named=others), left)
-    name = state.named[number].candidate.name
+    own = state.named[number].candidate
+    seen, name = survey(replace(state, named=others), left, own), own.name
     return seen, max((c.evidence for c in seen.candidates if c.name == name), default=0.0)
