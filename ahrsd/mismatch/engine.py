@@ -53,6 +53,7 @@ from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
+    HARDLY_TURNED,
     State,
     Survey,
     at_rest,
@@ -102,13 +103,9 @@ def diagnose(
         again = _named(other, cold)
         if not believed(lost, done.state, again[0].state):
             lost, problem, (done, fast) = beside, other, again
-    facts = (*facts, *lost)
-    if at_rest(done.start):
-        notes = (
-            *notes,
-            "the sensor hardly turned: only effects on the gyro and alternating fields can be told",
-        )
-    return _told(recording, problem, done, fast, facts, (*notes, *done.state.problem.notes))
+    still = (HARDLY_TURNED,) if at_rest(done.start) else ()
+    notes = (*notes, *still, *done.state.problem.notes)
+    return _told(recording, problem, done, fast, (*facts, *lost), notes)
 
 
 def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:

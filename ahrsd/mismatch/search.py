@@ -45,6 +45,10 @@ LOOKED_AT = 8
 LOOSE = 30.0
 #: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
 REST_SPREAD = 4e-3
+HARDLY_TURNED = (
+    "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
+    "can be told"
+)
 #: nats by which a frame must lead before steps in it are believed
 FRAME_LEAD = 10.0
 #: a jump in each frame
@@ -71,6 +75,8 @@ LAG_STEPS = 3
 ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
 #: what a vehicle that hardly turns can tell of the field: what no turn and no drift does
 ALTERNATING = ("ac_interference", "rotor_field", "sync_pulses")
+#: fields of the sensor that need no turning: those, and the logged causes whose manoeuvre is a rest
+AT_REST = (*ALTERNATING, "motor_current_field", "switched_device")
 #: names of a gyro bias that changes with time alone
 WANDERING = ("gyro_bias_drift", "gyro_bias_step", "gyro_startup", "gyro_bias_temperature")
 
@@ -150,7 +156,7 @@ def survey(state: State, basis: Base | None = None, own: Candidate | None = None
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
     library = problem.library
     if at_rest(state.fit):
-        library = {k: e for k, e in library.items() if e.family == "gyro" or k in ALTERNATING}
+        library = {k: e for k, e in library.items() if e.family == "gyro" or k in AT_REST}
     if any(name in DELAYS for name in state.names):
         library = {name: effect for name, effect in library.items() if name not in DELAYS}
     seen = as_found(basis, best_settings(basis, library, taken), own)

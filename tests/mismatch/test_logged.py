@@ -94,3 +94,22 @@ def test_columns_with_holes(driven) -> None:
     found = roles.holed(track.with_columns(columns))
     assert list(found) == ["c_a"]
     assert np.array_equal(np.flatnonzero(found["c_a"].missing), np.arange(500, 1000))
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_current_is_named_at_rest_if_the_field_follows_it(own: bool) -> None:
+    """The manoeuvre that tells a current from what the turning does: pulses at rest."""
+    rng = np.random.default_rng(5)
+    time_s = np.arange(3000) / 10.0
+    current, other = levels(time_s, 3), levels(time_s, 9)
+    mag = np.array([0.2, -0.1, 0.4]) + 1e-3 * rng.standard_normal((3000, 3))
+    mag += 1e-3 * current[:, None] * np.array([1.0, -0.5, 0.8])
+    gyro = 1e-3 * rng.standard_normal((3000, 3))
+    dt_s = np.full(3000, 0.1)
+    dt_s[0] = np.nan
+    columns = {"motor_current_a": current if own else other}
+    still = Track(time_s, dt_s, mag, gyro, None, columns, (slice(0, 3000),))
+    found = diagnose_logged(still)
+    names = [one.effect for one in found.findings]
+    assert names == (["motor_current_field"] if own else [])
+    assert any("hardly turned" in note for note in found.notes)
