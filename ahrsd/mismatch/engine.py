@@ -37,7 +37,6 @@ from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
-from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, lost_beside
 from ahrsd.mismatch.loudness import in_even_noise
@@ -63,6 +62,7 @@ from ahrsd.mismatch.search import (
 )
 from ahrsd.mismatch.slow_noise import in_its_noise
 from ahrsd.mismatch.sought import sought
+from ahrsd.mismatch.spectrum import against, spectrum_of
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel, Term
@@ -205,7 +205,7 @@ def _told(
 def _names(done: _Searched, fast: Quick) -> tuple[list[Finding], tuple[Term, ...]]:
     """Findings and whole terms of the search's names, then of what only the recorded rate shows."""
     state, basis, last = done.state, basis_of(done.state), fast.last.basis
-    beside = None if rest_of(state, basis) is None else beside_itself(basis, state.names)
+    beside = None if rest_of(state, basis) is None else against(basis, spectrum_of(basis))
     slow = [
         finding(state, basis, k, seen, done.last, beside) for k, seen in enumerate(done.surveys)
     ]

@@ -16,6 +16,7 @@ from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.heldout import gain_of
 from ahrsd.mismatch.innovation import TRACELESS
 from ahrsd.mismatch.intervals import spans
+from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of, scaled
@@ -162,9 +163,11 @@ def _by_scale(state: State, basis: Base, number: int) -> Array | None:
 
 def _told_in(state: State, basis: Base, number: int, beside: Base | None) -> Base:
     """The basis in which a term was fitted, and is told."""
-    if beside is None or (stepped(state) and not _is_delay(state, number)):
+    if beside is None:
         return basis
-    return beside
+    if _is_delay(state, number):
+        return beside_itself(beside, state.names)
+    return basis if stepped(state) else beside
 
 
 def refined(basis: Base, number: int, scale: Array | None = None) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from ahrsd import so3
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.findings import refined
-from ahrsd.mismatch.itself import ITSELF, beside_itself, gyro_matrix
+from ahrsd.mismatch.itself import ITSELF, USUAL, beside_itself, gyro_matrix
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.regression import Base, base
 from ahrsd.mismatch.spectrum import against, spectrum_of
@@ -45,10 +45,20 @@ def test_the_matrix_is_what_a_mount_and_a_scale_do() -> None:
 
 def test_a_mount_of_a_degree_does_not_move_a_lag() -> None:
     basis = basis_of(late(0.025))
-    plain, _ = refined(against(basis, spectrum_of(basis)), 0)
-    value, deviation = refined(beside_itself(basis, ["mag_time_lag"]), 0)
-    assert abs(value[0] - LAG_S) < 3 * deviation[0]
-    assert abs(value[0] - LAG_S) < abs(plain[0] - LAG_S)
+    plain = against(basis, spectrum_of(basis))
+    off = abs(refined(plain, 0)[0][0] - LAG_S)
+    value, deviation = refined(beside_itself(plain, ["mag_time_lag"]), 0)
+    assert abs(value[0] - LAG_S) < min(3 * deviation[0], off)
+
+
+def test_of_the_matrix_no_more_is_believed_than_sensors_have() -> None:
+    """Without motion nothing is known of it but that."""
+    basis = basis_of(late(0.0))
+    still = replace(basis, context=replace(basis.context, rate_b_rad_s=np.zeros((4000, 3))))
+    told = beside_itself(still, [])
+    flat = told.known.reshape(-1, told.known.shape[2])[:, told.groups[ITSELF]]
+    deviation = np.sqrt(told.colour / np.diag(flat.T @ flat))
+    np.testing.assert_allclose(deviation, USUAL)
 
 
 @pytest.mark.parametrize("name", ["mag_gyro_misalignment", "gyro_scale"])
