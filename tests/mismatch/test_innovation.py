@@ -78,7 +78,9 @@ def test_blocks_equal_the_plain_loop_across_a_gap() -> None:
     assert np.abs(done.predicted_b - predicted).max() < 1e-12
     assert not done.used[[0, 310]].any()
     assert done.used.sum() == len(track) - 2
-    assert np.array_equal(done.predicted_b[310], _first_field(track, model, 310))
+    # a product of one row and of many differ in the last bit on some processors
+    first = _first_field(track, model, 310)
+    np.testing.assert_allclose(done.predicted_b[310], first, rtol=1e-14)
 
 
 def _first_field(track: Track, model: NullModel, row: int) -> Array:
