@@ -17,6 +17,7 @@ from ahrsd.mismatch.along_field import framed
 from ahrsd.mismatch.beside import named_beside
 from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.cut_out import beside_brief
+from ahrsd.mismatch.dead import dead
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import (
     Baseline,
@@ -87,7 +88,7 @@ def diagnose(
     """
     spec = spec or Spec()
     track, notes = roles.prepared(track)
-    if why := unusable(track):
+    if why := unusable(track) or dead(track):
         raise ValueError(why)
     facts = hygiene(track)
     if any(fact.stops for fact in facts):

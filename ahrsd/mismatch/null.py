@@ -25,7 +25,6 @@ from ahrsd.estimator.start import linear_start
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.coarse import group_size, thinned
 from ahrsd.mismatch.context import Given, build_context
-from ahrsd.mismatch.dead import dead
 from ahrsd.mismatch.innovation import (
     TRACELESS,
     Filtered,
@@ -167,7 +166,7 @@ def unusable(track: Track) -> str | None:
     steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
     if np.count_nonzero(steps) < _FEWEST:
         return f"{np.count_nonzero(steps)} samples follow another one, {_FEWEST} are needed"
-    return dead(track)
+    return None
 
 
 def cold_start(track: Track, spec: Spec) -> NullModel:
