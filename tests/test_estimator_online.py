@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import chi2
 
 from ahrsd.calibration import Affine
+from ahrsd.estimator import summary
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.recording.table import read_table
@@ -137,7 +138,7 @@ def _worst_heading_sigma(run, estimate):
 
 def _tilted_over_level(run, estimate):
     """The estimator's own figure at the driven tilts over that at level, same covariance."""
-    from ahrsd.estimator import chain, summary
+    from ahrsd.estimator import chain
 
     size = np.linalg.norm(bench.FIELD_N_GAUSS)
     c = np.r_[chain.upper_triangle(estimate.soft_iron * size), estimate.hard_iron_gauss]
@@ -454,3 +455,18 @@ def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():
     assert 1.15 < estimate.misfit < 1.4
     of_bound = np.sqrt(np.diag(estimate.covariance) / np.diag(bench.bound(run)))
     assert np.all(of_bound[6:] < 1.06)
+
+
+def test_names_of_what_is_not_seen_do_not_hang_on_the_basis():
+    """Equal eigenvalues leave the basis open: another processor has another one."""
+    rng = np.random.default_rng(5)
+    V = np.linalg.qr(rng.normal(size=(12, 9)))[0]
+    names = summary._blind_names(V)
+    assert len(names) == len(set(names)) == 9
+    for _ in range(20):
+        R = np.linalg.qr(rng.normal(size=(9, 9)))[0]
+        assert summary._blind_names(V @ R) == names
+    axes = np.eye(12)[:, [5, 8, 11]]
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    assert summary._blind_names(axes @ R) == ("soft iron zz", "hard iron z", "gyro bias z")
+    assert summary._blind_names(axes[:, :0]) == ()

@@ -88,12 +88,26 @@ def observability(covariance: Array, W: Array) -> Observability:
     scaled = W @ covariance @ W.T
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     ratio = np.sqrt(np.clip(values, 0.0, None))
-    blind = []
-    for k in np.flatnonzero(ratio > BLIND):
-        v = np.abs(vectors[:, k])
-        blind.append(" + ".join(_NAMES[i] for i in np.argsort(v)[::-1][:3] if v[i] > 0.4))
     return Observability(
         prior_ratio=ratio,
-        unobservable=tuple(dict.fromkeys(name for name in blind if name)),
+        unobservable=_blind_names(vectors[:, ratio > BLIND]),
         score=float(_FLOOR / max(float(ratio[-1]), 1e-9)),
     )
+
+
+def _blind_names(vectors: Array) -> tuple[str, ...]:
+    """One name for each dimension of the subspace that the orthonormal vectors (12, K) span.
+
+    Eigenvectors of equal eigenvalues are any basis, another on each processor. So the parameter
+    that lies nearest to the subspace is taken, then the nearest to what is left of it: with
+    |P_ij| <= sqrt(P_ii P_jj) it leads its own projection, and no two names begin alike.
+    """
+    P = vectors @ vectors.T
+    names = []
+    for _ in range(vectors.shape[1]):
+        lead = int(np.argmax(np.round(np.diag(P), 6)))
+        v = P[:, lead] / np.sqrt(P[lead, lead])
+        others = [i for i in np.argsort(-np.abs(v), kind="stable") if i != lead and abs(v[i]) > 0.4]
+        names.append(" + ".join(_NAMES[i] for i in [lead, *others[:2]]))
+        P = P - np.outer(v, v)
+    return tuple(names)
