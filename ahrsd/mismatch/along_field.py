@@ -14,7 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import locate, unknown
+from ahrsd.mismatch.course_gram import course_gram, course_response
 from ahrsd.mismatch.discrepancy import by_rate
+from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.one_source import with_one_source
 from ahrsd.mismatch.regression import Base, residual
@@ -64,11 +66,13 @@ def slowness(basis: Base) -> float:
     Beside a free course of the gyro's error and one by its rates.
     """
     cut = locate.segments(basis.context.track.time_s, FINE)
-    course = locate.frame_columns(basis.context, "gyro", cut)
-    gyro = basis.whitened([course, by_rate(basis.context)])
+    beside = basis.beside("rates", basis.whitened([by_rate(basis.context)])[0])
+    total = course_gram(beside, "gyro", cut).total
+    course = solve(total[:-1, :-1], total[:-1, -1:])[:, 0].reshape(-1, 3)
+    left = basis.innovation - course_response(basis, "gyro", cut, course)
     field = basis.context.field_b @ basis.context.model.soft_iron
     unit = field / np.linalg.norm(field, axis=1, keepdims=True)
-    gone = residual(np.concatenate([basis.known, *gyro], axis=2), basis.innovation)
+    gone = residual(beside.known, left)
     along = np.sum(gone * unit, axis=1)
     along = along - along.mean()
     apart = max(1, round(APART_S * basis.rate_hz))

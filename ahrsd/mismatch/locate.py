@@ -85,15 +85,19 @@ def group_name(frame: Frame) -> str:
 
 def frame_columns(context: Context, frame: Frame, cut: Segments) -> Columns:
     """3 columns per segment, segment-major."""
-    if frame == "world":
-        basis = context.model.soft_iron @ np.swapaxes(context.R_nb, 1, 2)
-    else:
-        basis = np.broadcast_to(np.eye(3), (len(cut.index), 3, 3))
+    basis = unit_columns(context, frame)
     out = np.zeros((len(cut.index), 3, len(cut), 3))
     inside = np.flatnonzero(cut.index >= 0)
     out[inside, :, cut.index[inside], :] = basis[inside]
     flat = out.reshape(len(cut.index), 3, -1)
     return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+
+
+def unit_columns(context: Context, frame: Frame) -> Array:
+    """(N, 3, 3) what a source of one unit along each axis of the frame adds, gauss or rad/s."""
+    if frame == "world":
+        return np.asarray(context.model.soft_iron @ np.swapaxes(context.R_nb, 1, 2))
+    return np.broadcast_to(np.eye(3), (len(context.track), 3, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,16 +18,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.mismatch.course_gram import course_gram
 from ahrsd.mismatch.locate import (
     FRAMES,
     UNITS,
     Frame,
-    frame_columns,
     group_name,
     locate,
     segments,
 )
-from ahrsd.mismatch.regression import Base, group_gram
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.unknown import FINE, Remainder
 from ahrsd.samples import Array
 
@@ -58,10 +58,9 @@ def with_one_source(left: Remainder) -> Remainder:
     if count < FEWEST:
         return left
     cut = segments(basis.context.track.time_s, count)
-    columns = {group_name(frame): frame_columns(basis.context, frame, cut) for frame in FRAMES[:2]}
-    gram = group_gram(basis, columns)
+    grams = {frame: course_gram(basis, frame, cut) for frame in FRAMES[:2]}
     found: dict[Frame, float] = {}
-    for frame in FRAMES[:2]:
+    for frame, gram in grams.items():
         where = gram.groups[group_name(frame)]
         information, score = gram.total[where, where], gram.total[where, -1]
         unit = UNITS[frame]
@@ -74,7 +73,7 @@ def with_one_source(left: Remainder) -> Remainder:
         return left
     one = left.located[frame]
     if one.evidence < nats:
-        seen = locate(gram, frame, cut, basis.colour)
+        seen = locate(grams[frame], frame, cut, basis.colour)
         one = replace(seen, evidence=nats, p_value=float(np.exp(-nats)))
     return replace(left, located={**left.located, frame: one}, one_source=True)
 

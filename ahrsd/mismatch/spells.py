@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.mismatch.course_gram import course_gram
 from ahrsd.mismatch.evidence import log_bayes
 from ahrsd.mismatch.gram import RANK_SHARE, Gram
 from ahrsd.mismatch.intervals import spans
@@ -37,7 +38,7 @@ from ahrsd.mismatch.locate import (
     segments,
     segments_between,
 )
-from ahrsd.mismatch.regression import Base, group_gram
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.score import total_score
 from ahrsd.mismatch.unknown import Remainder
 from ahrsd.samples import Array
@@ -85,12 +86,11 @@ def with_spells(left: Remainder) -> Remainder:
 
 def _course(basis: Base, frame: Frame, cut: Segments, known_s: Sequence[Span] = ()) -> _Course:
     """A frame's course on a grid beside boxes over the given stretches."""
-    columns = {group_name(frame): frame_columns(basis.context, frame, cut)}
     if known_s:
         boxes = _stretches(basis.context.track.time_s, known_s)
-        columns["boxes"] = frame_columns(basis.context, frame, boxes)
-    gram = group_gram(basis, columns)
-    return _Course(gram.project(["boxes"]) if known_s else gram, frame, basis.colour)
+        columns = basis.whitened([frame_columns(basis.context, frame, boxes)])[0]
+        basis = basis.beside("boxes", columns)
+    return _Course(course_gram(basis, frame, cut), frame, basis.colour)
 
 
 class _Course:

@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.mismatch import intervals, locate, regime
+from ahrsd.mismatch.course_gram import course_gram
 from ahrsd.mismatch.diagnosis import Heldout, Suspect, Unexplained, Where
 from ahrsd.mismatch.directions import by_direction
 from ahrsd.mismatch.evidence import log_bayes
 from ahrsd.mismatch.gram import Gram, gram
 from ahrsd.mismatch.limits import Limits
-from ahrsd.mismatch.locate import FRAMES, Frame, Located, Segments
+from ahrsd.mismatch.locate import FRAMES, Frame, Located
 from ahrsd.mismatch.regime import Regime
-from ahrsd.mismatch.regression import Base, group_gram, known_out, quieter
+from ahrsd.mismatch.regression import Base, known_out, quieter
 from ahrsd.mismatch.score import chi2_p, score
 from ahrsd.mismatch.validate import Gain, alternating, heldout
 from ahrsd.mismatch.values import Columns
@@ -79,33 +80,26 @@ def remainder(basis: Base, with_bins: bool = True) -> Remainder:
     count as noise.
     """
     cut = locate.coarse_cut(basis.context.track)
-    seen = _whitened(basis, _frames(basis, cut))
+    grams = {frame: course_gram(basis, frame, cut) for frame in FRAMES}
     first = max(
-        (locate.locate(_alone(basis, seen, frame), frame, cut, basis.colour) for frame in FRAMES),
+        (locate.locate(grams[frame], frame, cut, basis.colour) for frame in FRAMES),
         key=lambda one: one.statistic,
     )
-    strongest = seen[locate.group_name(first.frame)]
+    strongest = basis.whitened([locate.frame_columns(basis.context, first.frame, cut)])[0]
     weighed = by_direction(quieter(basis, strongest), strongest)
-    weight = weighed.weight
-    if weight is not None and weight is not basis.weight:
-        if basis.weight is not None or basis.rest is not None:
-            return tested(weighed, with_bins=with_bins)
-        seen = {name: weight @ columns for name, columns in seen.items()}
-    return tested(weighed, with_bins=with_bins, seen=seen)
+    same = weighed.weight is basis.weight
+    return tested(weighed, with_bins=with_bins, grams=grams if same else None)
 
 
-def tested(basis: Base, *, with_bins: bool, seen: Mapping[str, Array] | None = None) -> Remainder:
+def tested(basis: Base, *, with_bins: bool, grams: Mapping[Frame, Gram] | None = None) -> Remainder:
     """The same in noise of the basis's own colour.
 
-    seen: the frames' columns (N, 3, p) by group as the basis whitens them, where they are known
+    grams: of each frame alone, none of the others is asked beside it; where they are known
     """
     cut = locate.coarse_cut(basis.context.track)
     found = regime.regimes(basis.context) if with_bins else ()
-    seen = _whitened(basis, _frames(basis, cut)) if seen is None else seen
-    located = {
-        frame: locate.locate(_alone(basis, seen, frame), frame, cut, basis.colour)
-        for frame in FRAMES
-    }
+    grams = grams or {frame: course_gram(basis, frame, cut) for frame in FRAMES}
+    located = {frame: locate.locate(grams[frame], frame, cut, basis.colour) for frame in FRAMES}
     binned = _whitened(basis, {one.group: regime.regime_columns(one) for one in found})
     bins = []
     for one in found:
@@ -118,19 +112,6 @@ def tested(basis: Base, *, with_bins: bool, seen: Mapping[str, Array] | None = N
 
 def _whitened(basis: Base, groups: Mapping[str, Columns]) -> dict[str, Array]:
     return dict(zip(groups, basis.whitened(list(groups.values())), strict=True))
-
-
-def _alone(basis: Base, seen: Mapping[str, Array], frame: Frame) -> Gram:
-    """The Gram of one frame: none of the others is asked beside it."""
-    name = locate.group_name(frame)
-    return known_out(basis, {name: seen[name]})
-
-
-def _frames(basis: Base, cut: Segments) -> dict[str, Columns]:
-    return {
-        locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
-        for frame in FRAMES
-    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +134,7 @@ def course(left: Remainder) -> Course:
     basis, frame = left.basis, left.strongest.frame
     name = locate.group_name(frame)
     cut = locate.segments(basis.context.track.time_s, FINE)
-    whole = group_gram(basis, {name: locate.frame_columns(basis.context, frame, cut)})
+    whole = course_gram(basis, frame, cut)
     where = whole.groups[name]
     total = whole.total / basis.colour
     G, s = total[where, where], total[where, -1]

@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import locate, unknown
+from ahrsd.mismatch.course_gram import course_gram
 from ahrsd.mismatch.evidence import log_bayes, log_bayes_walk
 from ahrsd.mismatch.findings import shares_of
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.name import judge
-from ahrsd.mismatch.regression import candidate_gram, columns_of, group_gram
+from ahrsd.mismatch.regression import candidate_gram, columns_of
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     FRAME_LEAD,
@@ -110,7 +111,7 @@ def _walks(left: unknown.Remainder) -> tuple[float, float]:
     """
     gyro, basis = left.located["gyro"], left.basis
     name, unit = locate.group_name("gyro"), locate.UNITS["gyro"]
-    gram = group_gram(basis, {name: locate.frame_columns(basis.context, "gyro", gyro.cut)})
+    gram = course_gram(basis, "gyro", gyro.cut)
     columns = gram.groups[name]
     G, s = gram.total[columns, columns], gram.total[columns, -1]
     what = score(gram, name, np.full(len(s), unit), 1e-3)
