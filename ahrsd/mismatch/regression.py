@@ -22,6 +22,7 @@ from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.objects import closest_object
 from ahrsd.mismatch.rest import Whitening
 from ahrsd.mismatch.score import Score, total_score
+from ahrsd.mismatch.side_by_side import batches, joined
 from ahrsd.mismatch.sums import Sums
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
@@ -89,22 +90,19 @@ class Base:
     rest: Whitening | None = None
 
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
-        """The columns (N, 3, p) as the innovation sees them, several at a time."""
-        out: list[Array] = []
-        at = 0
-        while at < len(columns):
-            end, width = at, 0
-            while end < len(columns) and (end == at or width + columns[end].width <= BATCH_COLUMNS):
-                width += columns[end].width
-                end += 1
-            joined = _joined(columns[at:end], len(self.innovation))
-            seen = sensitivities(self.filtered, joined)
-            seen = seen if self.weight is None else self.weight @ seen
-            seen = seen if self.rest is None else self.rest.whitened(seen)
-            edges = np.cumsum([0, *(part.width for part in columns[at:end])])
-            out += [seen[:, :, a:b] for a, b in itertools.pairwise(edges)]
-            at = end
-        return out
+        """The columns (N, 3, p) as the innovation sees them, several of one side at a time."""
+        out: dict[int, Array] = {}
+        for batch in batches(columns, BATCH_COLUMNS):
+            seen = self._seen(joined([columns[k] for k in batch]))
+            edges = np.cumsum([0, *(columns[k].width for k in batch)])
+            parts = (seen[:, :, a:b] for a, b in itertools.pairwise(edges))
+            out.update(zip(batch, parts, strict=True))
+        return [out[k] for k in range(len(columns))]
+
+    def _seen(self, columns: Columns) -> Array:
+        seen = sensitivities(self.filtered, columns)
+        seen = seen if self.weight is None else self.weight @ seen
+        return seen if self.rest is None else self.rest.whitened(seen)
 
     def beside(self, name: str, columns: Array) -> Base:
         """The same with a further group of whitened columns (N, 3, p) known."""
@@ -379,18 +377,3 @@ def _possible(effect: Effect, what: Score) -> bool:
     if effect.identifier not in ONE_SIDED or what.rank == 0:
         return True
     return bool(np.all(what.value > -2.0 * np.sqrt(np.diag(what.covariance))))
-
-
-def _joined(parts: Sequence[Columns], count: int) -> Columns:
-    """Columns side by side; zeros on a side that only some of them have."""
-
-    def side(values: list[Array | None]) -> Array | None:
-        if all(value is None for value in values):
-            return None
-        filled = [
-            np.zeros((count, 3, part.width)) if value is None else value
-            for part, value in zip(parts, values, strict=True)
-        ]
-        return np.concatenate(filled, axis=2)
-
-    return Columns(side([part.mag for part in parts]), side([part.gyro for part in parts]))
