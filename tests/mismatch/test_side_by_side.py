@@ -11,10 +11,8 @@ from ahrsd.mismatch.values import Columns
 
 def of(mag: int = 0, gyro: int = 0) -> Columns:
     rng = np.random.default_rng(mag + 10 * gyro)
-    return Columns(
-        rng.normal(size=(5, 3, mag)) if mag else None,
-        rng.normal(size=(5, 3, gyro)) if gyro else None,
-    )
+    sides = [rng.normal(size=(5, 3, width)) if width else None for width in (mag, gyro)]
+    return Columns(*sides)
 
 
 def test_batches_are_of_one_side_and_no_wider_than_wanted() -> None:
