@@ -14,13 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import locate, unknown
-from ahrsd.mismatch.course_gram import course_gram, course_response
-from ahrsd.mismatch.discrepancy import by_rate
-from ahrsd.mismatch.gram import solve
+from ahrsd.mismatch.discrepancy import UNIT_RAD_S, by_rate
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.one_source import with_one_source
-from ahrsd.mismatch.regression import Base, residual
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import of_the_rate
+from ahrsd.mismatch.together import left_beside, projected_with, together
 from ahrsd.mismatch.unknown import FINE, Remainder
 
 APART_S = 1.0
@@ -66,13 +65,11 @@ def slowness(basis: Base) -> float:
     Beside a free course of the gyro's error and one by its rates.
     """
     cut = locate.segments(basis.context.track.time_s, FINE)
-    beside = basis.beside("rates", basis.whitened([by_rate(basis.context)])[0])
-    total = course_gram(beside, "gyro", cut).total
-    course = solve(total[:-1, :-1], total[:-1, -1:])[:, 0].reshape(-1, 3)
-    left = basis.innovation - course_response(basis, "gyro", cut, course)
+    free = together(basis, [("gyro", UNIT_RAD_S)], cut, [(by_rate(basis.context), UNIT_RAD_S)])
+    G, s = projected_with(basis, free, free.products())
     field = basis.context.field_b @ basis.context.model.soft_iron
     unit = field / np.linalg.norm(field, axis=1, keepdims=True)
-    gone = residual(beside.known, left)
+    gone = left_beside(basis, free, G, s)
     along = np.sum(gone * unit, axis=1)
     along = along - along.mean()
     apart = max(1, round(APART_S * basis.rate_hz))

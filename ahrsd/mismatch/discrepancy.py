@@ -18,7 +18,6 @@ the one without it.  Where nothing is left the variances are zero and nothing ch
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,14 +26,24 @@ from scipy import linalg
 
 from ahrsd.mismatch import locate
 from ahrsd.mismatch.evidence import SIZES, colour
-from ahrsd.mismatch.gram import RANK_SHARE, solve
-from ahrsd.mismatch.regression import Base, residual
+from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.together import (
+    Together,
+    left_beside,
+    projected_with,
+    together,
+)
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
 PIECES = 24
 #: unit of the random effects, gauss and rad/s; sizes are sought from e^-6 to e^8 of it
 UNIT_GAUSS, UNIT_RAD_S = 1e-3, 1e-4
+COURSES: tuple[tuple[locate.Frame, float], ...] = (
+    ("sensor", UNIT_GAUSS),
+    ("world", UNIT_GAUSS),
+    ("gyro", UNIT_RAD_S),
+)
 SMALLEST, LARGEST = -6.0, 8.0
 #: standing: slower than this for longer than that; it takes a moment to get away from a place
 STILL_RAD_S, STILL_S = 0.05, 2.0
@@ -50,7 +59,7 @@ ITERATIONS = 40
 class Discrepancy:
     """Random effects beside a model's own columns.
 
-    basis:   the model with all its names;  columns: (N, 3, q) whitened, in units
+    basis:   the model with all its names;  columns: whitened, (q) in units
     products: (q, q) of the columns with one another
     group:   (q,) number of the variance that a column has
     noise:   power of what is left beside everything, at least 1
@@ -60,7 +69,7 @@ class Discrepancy:
     """
 
     basis: Base
-    columns: Array
+    columns: Together
     products: Array
     group: NDArray[np.intp]
     noise: float
@@ -71,24 +80,22 @@ class Discrepancy:
 
 def discrepancy(basis: Base) -> Discrepancy:
     """The random effects that a model needs."""
-    parts = _random_effects(basis.context)
-    columns = basis.whitened([make(basis.context) for make, _ in parts])
-    units = [unit for _, unit in parts]
-    scaled = [part * unit for part, unit in zip(columns, units, strict=True)]
-    group = np.repeat(np.arange(len(parts)), [part.shape[2] for part in scaled])
-    together = np.concatenate(scaled, axis=2)
-    flat = together.reshape(-1, len(group))
-    products = flat.T @ flat
-    G, s = projected(basis, together, products)
-    left = _left(basis, together, G, s)
+    cut = locate.segments(basis.context.track.time_s, PIECES)
+    shapes = _shapes(basis.context)
+    columns = together(basis, COURSES, cut, shapes)
+    widths = [3 * PIECES] * len(COURSES) + [part.width for part, _ in shapes]
+    group = np.repeat(np.arange(len(widths)), widths)
+    products = columns.products()
+    G, s = projected_with(basis, columns, products)
+    left = left_beside(basis, columns, G, s)
     noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
-    nats, sizes = fitted(G, s, group, noise, np.zeros(len(parts)))
+    nats, sizes = fitted(G, s, group, noise, np.zeros(len(widths)))
     known = group >= PLACES
     by_place = 0.0
     if known.any():
         at = G[np.ix_(known, known)], s[known], group[known] - PLACES
         by_place, _ = fitted(*at, noise, np.zeros(2))
-    return Discrepancy(basis, together, products, group, noise, sizes, nats, nats - by_place)
+    return Discrepancy(basis, columns, products, group, noise, sizes, nats, nats - by_place)
 
 
 def beyond(
@@ -99,8 +106,7 @@ def beyond(
     without: the basis without it;  columns (N, 3, p) whitened;  scale (p,): prior deviations
     """
     count = len(found.sizes)
-    together = np.concatenate([found.columns, columns * scale], axis=2)
-    G, s = projected(without, together, found.products)
+    G, s = projected_with(without, found.columns, found.products, columns * scale)
     plain = slice(0, len(found.group))
     start = np.maximum(found.sizes, 0.0)  # from a variance of zero no slope leads away
     less, sizes = fitted(G[plain, plain], s[plain], found.group, found.noise, start)
@@ -115,27 +121,14 @@ def beyond(
     return worth
 
 
-def _random_effects(context: Context) -> list[tuple[Callable[[Context], Columns], float]]:
-    """What makes the columns of each group, and their unit."""
-    cut = locate.segments(context.track.time_s, PIECES)
-
-    def course(frame: locate.Frame) -> Callable[[Context], Columns]:
-        return lambda here: locate.frame_columns(here, frame, cut)
-
-    out: list[tuple[Callable[[Context], Columns], float]] = [
-        (course("sensor"), UNIT_GAUSS),
-        (course("world"), UNIT_GAUSS),
-        (course("gyro"), UNIT_RAD_S),
-        (by_attitude, UNIT_GAUSS),
-        (by_rate, UNIT_RAD_S),
-    ]
+def _shapes(context: Context) -> list[tuple[Columns, float]]:
+    """The random effects that are no courses, and their unit."""
+    out = [(by_attitude(context), UNIT_GAUSS), (by_rate(context), UNIT_RAD_S)]
     rests = places(context)
-    if len(rests):
+    mag = locate.frame_columns(context, "sensor", rests).mag if len(rests) else None
+    if mag is not None:
         itself = np.repeat(np.arange(len(rests)) % PARTS == PARTS - 1, 3)
-        mag = locate.frame_columns(context, "sensor", rests).mag
-        if mag is not None:
-            standing, leaving = Columns(mag=mag[:, :, itself]), Columns(mag=mag[:, :, ~itself])
-            out += [(lambda _: standing, UNIT_GAUSS), (lambda _: leaving, UNIT_GAUSS)]
+        out += [(Columns(mag=mag[:, :, part]), UNIT_GAUSS) for part in (itself, ~itself)]
     return out
 
 
@@ -198,40 +191,6 @@ def places(context: Context) -> locate.Segments:
         index[(track.time_s >= begins_s[k]) & (track.time_s <= ends_s[k])] = count
         count += 1
     return locate.Segments(np.arange(count + 1.0), index)
-
-
-def projected(basis: Base, columns: Array, products: Array | None = None) -> tuple[Array, Array]:
-    """Information (q, q) and score (q,) of the columns with the known ones regressed out.
-
-    products: of the first columns with one another, where they are known already
-    Combinations with less information than RANK_SHARE of what the columns had are left out: they
-    are made of the noise of the field that the columns were built from.
-    """
-    Z = basis.known.reshape(-1, basis.known.shape[2])
-    X = columns.reshape(len(Z), -1)
-    e = basis.innovation.ravel()
-    cross = Z.T @ X
-    M = solve(Z.T @ Z, cross)
-    whole = X.T @ X if products is None else _more_products(products, X)
-    root = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh((whole - cross.T @ M) / np.outer(root, root))
-    kept = values > RANK_SHARE * len(root)
-    directions = root[:, None] * vectors[:, kept]
-    s = vectors[:, kept].T @ ((X.T @ e - M.T @ (Z.T @ e)) / root)
-    return (directions * values[kept]) @ directions.T, directions @ s
-
-
-def _more_products(known: Array, X: Array) -> Array:
-    """(q, q) X^T X of (N, q), of which the first rows and columns are known."""
-    count = len(known)
-    new = X.T @ X[:, count:]
-    return np.block([[known, new[:count]], [new[:count].T, new[count:]]])
-
-
-def _left(basis: Base, columns: Array, G: Array, s: Array) -> Array:
-    """(N, 3) innovation with the known columns and these, projected G and s, regressed out."""
-    theta = solve(G, s[:, None])[:, 0]
-    return residual(basis.known, basis.innovation - columns @ theta)
 
 
 def fitted(

@@ -12,11 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate, fitted, projected
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate, fitted
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import MORE_SHARE, by_matrix
+from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.unknown import Remainder, detected
 from ahrsd.samples import Array
 

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.mismatch.discrepancy import UNIT_GAUSS, fitted, projected
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS, fitted
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.regression import Base, Candidate, scale_of
 from ahrsd.mismatch.rivals import compared
 from ahrsd.mismatch.search import State, term_group, without_term
+from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 

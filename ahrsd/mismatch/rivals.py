@@ -32,12 +32,12 @@ from ahrsd.mismatch.discrepancy import (
     by_rate,
     every_direction,
     fitted,
-    projected,
 )
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.locate import frame_columns
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.search import State, term_group, without_term
+from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.unknown import Remainder
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array

@@ -10,11 +10,11 @@ from mismatch_trials import Trial, made
 from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of
 
-from ahrsd.mismatch.discrepancy import projected
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.regression import base
 from ahrsd.mismatch.rivals import by_memory, compared
+from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.track import Track
 
 
