@@ -20,12 +20,28 @@ EVIDENCE_BYTES = 20 << 20  # an hour of segments, their tracks, small temporarie
 STEP_BYTES = 512  # one step of the estimator's window: data, directions, response
 _PIECE_BYTES = 64 << 10
 _MAPPED_BYTES = 256 << 10  # from this size on a block is mapped by itself
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # <malloc.h>
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -3, -4, -8
+_PAD_BYTES = 64 << 20  # by which a heap grows at once that is never given back
 
 
 def needed_bytes(estimator: EstimatorParameters) -> int:
     """What a run's histories take when they are full."""
     return EVIDENCE_BYTES + STEP_BYTES * estimator.window_steps
+
+
+def keep_heap() -> bool:
+    """Give nothing back, and map nothing by itself: for a command that is soon over.
+
+    Arrays of tens of megabytes come and go by the hundred; mapped anew, each is zeroed by the
+    kernel page by page. False, and nothing is done, where the C library is not glibc.
+    """
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "mallopt"):
+        return False
+    libc.mallopt(_M_MMAP_MAX, 0)
+    libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+    libc.mallopt(_M_TOP_PAD, _PAD_BYTES)
+    return True
 
 
 def take_heap(size_bytes: int) -> bool:

@@ -81,3 +81,24 @@ def test_a_larger_window_needs_more():
     twice = EstimatorParameters(window_steps=2 * usual.window_steps)
     assert 20 * MB < needed_bytes(usual) < 32 * MB
     assert needed_bytes(twice) - needed_bytes(usual) == 512 * usual.window_steps
+
+
+@GLIBC
+def test_a_short_commands_arrays_take_the_pages_of_those_before():
+    """Page faults of a hundred arrays of 16 MB, after the first of them: none."""
+    faults, kept = run(
+        "from ahrsd.heap import keep_heap\n"
+        "def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "def hundred():\n"
+        "    before = faults()\n"
+        "    for _ in range(100): np.full(1 << 21, 1.0)\n"
+        "    return faults() - before\n"
+        "import ctypes\n"
+        "ctypes.CDLL(None).mallopt(-3, 1 << 20)\n"
+        "mapped = hundred()\n"
+        "assert keep_heap()\n"
+        "hundred()\n"
+        "print(json.dumps([mapped, hundred()]))\n"
+    )
+    assert faults >= 100  # huge pages or not
+    assert kept <= 10

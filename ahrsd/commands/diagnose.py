@@ -10,6 +10,7 @@ import click
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.errors import AhrsdError
+from ahrsd.heap import keep_heap
 
 if TYPE_CHECKING:
     from ahrsd.mismatch.diagnosis import Diagnosis
@@ -47,6 +48,7 @@ def command(
     from ahrsd.mismatch.spoken import lines
 
     refuse_unwritable(json_path)
+    keep_heap()
     with byte_progress(real) as progress:
         found = diagnose_recording(
             real, simulation=simulation, spec=spec, rate_hz=rate_hz, progress=progress
