@@ -17,6 +17,7 @@ from ahrsd.mismatch import unknown
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate
 from ahrsd.mismatch.exam import IMITATORS
+from ahrsd.mismatch.moved import ONSET_SHARE
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.nested import simplest
 from ahrsd.mismatch.regression import (
@@ -33,7 +34,6 @@ from ahrsd.mismatch.reweighted import reweighted
 from ahrsd.mismatch.rivals import OWN_SHARE, by_matrix, by_memory, compared, more
 from ahrsd.mismatch.score import Score
 from ahrsd.mismatch.search import (
-    ONSET_SHARE,
     STEPS,
     State,
     Survey,

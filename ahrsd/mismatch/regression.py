@@ -34,7 +34,7 @@ BATCH_COLUMNS = 96
 ONE_SIDED = ("mag_time_lag", "gyro_time_lag", "mag_low_pass", "mag_sample_hold")
 ONSET_STEPS, ONSET_PASSES = 12, 2
 #: settings that are a size, sought between the values of their grid, and what that choice costs
-SCALES = ("time_constant_s", "radius_gauss", "length_s")
+SCALES = ("time_constant_s", "radius_gauss", "length_s", "length_m")
 ANGLES = ("turn_deg",)
 SCALE_CHOICES = 3
 WORTH_NATS = 4.0
@@ -337,7 +337,8 @@ def closest_scale(basis: Base, start: Candidate, reach: float) -> Candidate:
         return start
     if "place_m" in start.setting:
         return _closest_place(basis, [start])
-    for share in (1.0, 1 / 3, 1 / 9):
+    keys = dict.fromkeys([key, *(angle for angle in ANGLES if angle in start.setting)])
+    for share, key in itertools.product((1.0, 1 / 3, 1 / 9), keys):
         steps = [scaled(best.setting, key, k * share * reach) for k in (-1, 0, 1)]
         found = max(_scan(basis, best.effect, steps), key=lambda candidate: candidate.evidence)
         best = replace(found, tried=start.tried, evidence=found.evidence + np.log(len(steps)))

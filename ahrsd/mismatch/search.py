@@ -15,12 +15,11 @@ import numpy as np
 
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.delays import DELAYS, beyond_the_lag, plain
-from ahrsd.mismatch.effects.base import Setting
-from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.memory import with_memory
 from ahrsd.mismatch.moments import as_found, at_one_moment
+from ahrsd.mismatch.moved import SCALE_AGAIN, both, moved_together
 from ahrsd.mismatch.name import Judged, judge, ranked
 from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
 from ahrsd.mismatch.problem import Problem
@@ -35,7 +34,6 @@ from ahrsd.mismatch.regression import (
     evidence_of,
     quieter,
     scale_of,
-    scaled,
 )
 from ahrsd.samples import Array
 
@@ -59,12 +57,8 @@ STEPS: Mapping[Frame, str] = {
 }
 #: nats by which another onset or scale must be better to be taken
 SHAPED_NATS, SHAPED_PASSES = 1.0, 5
-#: steps for the derivatives by both, and how far an onset may move at once, of the recording
-ONSET_STEP_S, SCALE_STEP, ONSET_SHARE = 0.5, 0.05, 0.05
 #: group of what a low-pass does beyond a delay
 FORM = "form of the delay"
-#: by how much a time constant's logarithm may still change in the joint fit
-SCALE_AGAIN = 0.3
 #: steps that cancel to this share are one thing that was put on and taken off again
 CANCELS = 0.25
 #: nats that such a coincidence of three coefficients is worth
@@ -224,33 +218,12 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
         return None
     if "place_m" in at.setting:
         return replace(closest_scale(left, at, SCALE_AGAIN), tried=1)
-    if key is not None and "onset_s" in at.setting:
-        setting = _moved_together(basis, at, key, state.fit.terms[number].value)
+    if keys := both(at):
+        setting = moved_together(basis, at, keys, state.fit.terms[number].value)
         found = replace(at, setting=setting)
         return replace(found, tried=1, evidence=evidence_of(left, found))
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named if j.candidate is not at]
     return next(iter(best_settings(left, {at.name: at.effect}, taken)), None)
-
-
-def _moved_together(basis: Base, at: Candidate, key: str, value: Array) -> Setting:
-    """The setting with onset and scale where the whole fit's linear model has them."""
-    time_s, step_s = basis.context.track.time_s, ONSET_STEP_S
-    onset_s = float(at.setting["onset_s"])
-    moved = [
-        {**at.setting, "onset_s": onset_s + step_s},
-        {**at.setting, "onset_s": onset_s - step_s},
-        scaled(at.setting, key, SCALE_STEP),
-        scaled(at.setting, key, -SCALE_STEP),
-    ]
-    columns = [at.effect.columns(basis.context, setting) for setting in moved]
-    later, earlier, longer, shorter = (part @ value for part in basis.whitened(columns))
-    D = np.stack([(later - earlier) / (2 * step_s), (longer - shorter) / (2 * SCALE_STEP)], axis=2)
-    Z = np.concatenate([basis.known, D], axis=2).reshape(-1, basis.known.shape[2] + 2)
-    change = solve(Z.T @ Z, (Z.T @ basis.innovation.ravel())[:, None])[-2:, 0]
-    reach_s = ONSET_SHARE * basis.context.track.duration_s
-    onset_s += float(np.clip(change[0], -reach_s, reach_s))
-    setting = scaled(at.setting, key, float(np.clip(change[1], -SCALE_AGAIN, SCALE_AGAIN)))
-    return {**setting, "onset_s": round(float(np.clip(onset_s, time_s[0], time_s[-1])), 4)}
 
 
 def _unpaid(candidate: Candidate) -> float:
@@ -263,7 +236,7 @@ def _scaled_again(state: State) -> State:
     judged = state.named[last]
     if scale_of(judged.candidate) is None:
         return state
-    if "onset_s" in judged.candidate.setting:
+    if both(judged.candidate):
         return shaped_again(state, newest=True)
     left = formed_basis_of(state).without(term_group(last), state.fit.terms[last].value)
     closer = with_memory(left, closest_scale(left, judged.candidate, SCALE_AGAIN))

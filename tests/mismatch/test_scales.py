@@ -49,3 +49,32 @@ def test_a_start_up_between_the_grids_time_constants() -> None:
     assert abs(found.setting["time_constant_s"] / 35.0 - 1) < 0.15
     got = np.array([one.value for one in found.parameters])
     assert np.abs(got - value).max() < 1e-4
+
+
+def test_a_slow_pulsation_of_the_outside_field_of_any_phase_is_one_name() -> None:
+    track, readings = _quiet(5)
+    effect = EFFECTS["geomagnetic_drift"]
+    span_s = float(np.ptp(track.time_s))
+    wave = {"start_s": float(track.time_s[0]), "span_s": span_s, "shape": "wave"}
+    setting = {**wave, "length_s": 0.55 * span_s, "turn_deg": 67.0}
+    changed = effect.simulate(readings, np.array([2.5e-3, -1e-3, 2e-3]), setting).mag_b_gauss
+    answer = diagnose(
+        replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
+    )
+    assert [one.effect for one in answer.findings] == ["geomagnetic_drift"]
+    assert not answer.unexplained.detected
+    assert abs(answer.findings[0].setting["length_s"] / setting["length_s"] - 1) < 0.1
+
+
+def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
+    track, readings = _quiet(6)
+    passed = (track.time_s - track.time_s[0]) / np.ptp(track.time_s)
+    height = 7.0 + 5.0 * np.sin(2 * np.pi * 2.3 * passed + 1.0) * np.cos(2 * np.pi * 0.7 * passed)
+    course = np.exp(-height / 3.0)[:, None] * np.array([0.012, -0.01, 0.015])
+    changed = np.einsum("nji,nj->ni", readings.R_nb, course) @ readings.soft_iron.T
+    answer = diagnose(
+        replace(track, mag_b_gauss=track.mag_b_gauss + changed, covariates={"altitude_m": height})
+    )
+    assert [one.effect for one in answer.findings] == ["altitude_field"]
+    assert not answer.unexplained.detected
+    assert abs(answer.findings[0].setting["length_m"] / 3.0 - 1) < 0.2

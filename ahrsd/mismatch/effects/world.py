@@ -29,6 +29,10 @@ _SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 _NEAREST_M = 0.2
 _WAY = 5  # places along the way around which it is sought, too
 _CLEAR = 4.0  # usual departures of the size from which an object is sought
+#: half waves of a slow pulsation, in lengths of the recording, and their phases, coarsely
+_HALF_WAVES, _PHASES_DEG = (0.45, 0.7, 1.05), (0.0, 45.0, 90.0, 135.0)
+#: metres in which a field from below falls by e, in ranges of the height, coarsely
+_DECAYS = (0.15, 0.4, 1.0)
 #: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
 _GRADIENT = ("nn", "ee", "ne", "nd", "ed")
 
@@ -154,7 +158,10 @@ class GeomagneticDrift(Linear):
     code = "W3"
     family = "world"
     words = "the earth's field changes with time: daily variation, magnetic storm"
-    equation = "m += A R^T k s(t), s = t/T, or sin(pi t/T); T: length of the recording"
+    equation = (
+        "m += A R^T k s(t), s = t/T, sin(pi t/T), or sin(pi (t - T/2)/L + phase); "
+        "T: length of the recording"
+    )
     parameters = shapes.vector("change", "gauss", 1.0 * _MG, 50 * _MG)
     typical = shapes.along(2.0 * _MG)
     signature = "a trend fixed in the world, the same for all vehicles there"
@@ -168,25 +175,45 @@ class GeomagneticDrift(Linear):
     source = "dossier W3"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """There, or there and back."""
+        """There, or there and back, or half a wave or more of any phase: a slow pulsation."""
         over = shapes.span(readings)
-        return ({**over, "shape": "line"}, {**over, "shape": "hump"})
+        waves = tuple(
+            {
+                **over,
+                "shape": "wave",
+                "length_s": round(part * over["span_s"], 3),
+                "turn_deg": phase,
+            }
+            for part, phase in product(_HALF_WAVES, _PHASES_DEG)
+        )
+        return ({**over, "shape": "line"}, {**over, "shape": "hump"}, *waves)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The course on each axis of the world."""
         part = shapes.elapsed(readings, setting)
-        course = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
+        if setting["shape"] == "wave":
+            # its phase is that of the middle: there it and the length are known apart
+            turns = (part - 0.5) * setting["span_s"] / setting["length_s"]
+            course = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
+        else:
+            course = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
         return Columns(mag=shapes.in_world(readings, course))
 
 
 class AltitudeField(Linear):
-    """W4; `near` falls off like a dipole layer's field and has slope 1 at the lowest point."""
+    """W4; `near` falls off like a dipole layer's field, `decay` like that of stripes in the ground.
+
+    Both have slope 1 at the lowest point.
+    """
 
     identifier = "altitude_field"
     code = "W4"
     family = "world"
     words = "the field changes with height above basalt, a wreck or reinforced concrete"
-    equation = "m += A R^T k f(a), f = a - a0, or (1 - (a0/a)^3) a0/3 with the lowest height a0"
+    equation = (
+        "m += A R^T k f(a), f = a - a0, or with the lowest height a0 (1 - (a0/a)^3) a0/3, "
+        "or (1 - exp(-(a - a0)/L)) L"
+    )
     parameters = shapes.vector("per_metre", "gauss/m", 0.5 * _MG, 100 * _MG)
     typical = shapes.along(0.5 * _MG)
     needs = ("altitude|position",)
@@ -207,6 +234,10 @@ class AltitudeField(Linear):
             lowest = float(np.min(readings.covariates[name]))
             if lowest > 0.1:
                 found.append({"covariate": name, "reference": lowest, "shape": "near"})
+            reach = float(np.ptp(readings.covariates[name]))
+            if reach > 0:
+                at = {"covariate": name, "reference": lowest, "shape": "decay"}
+                found += [{**at, "length_m": round(part * reach, 3)} for part in _DECAYS]
         return tuple(found)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -215,6 +246,8 @@ class AltitudeField(Linear):
         if setting["shape"] == "near":
             lowest = setting["reference"]
             course = (1 - (lowest / np.maximum(course + lowest, 0.5 * lowest)) ** 3) * lowest / 3
+        if setting["shape"] == "decay":
+            course = -np.expm1(-course / setting["length_m"]) * setting["length_m"]
         return Columns(mag=shapes.in_world(readings, course))
 
 
