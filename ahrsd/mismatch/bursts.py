@@ -8,6 +8,8 @@ is one.  Their frame is the one in which a constant per burst explains most.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from ahrsd.mismatch import locate
 from ahrsd.mismatch.diagnosis import Unexplained, Where
 from ahrsd.mismatch.facts import spans_of
-from ahrsd.mismatch.locate import FRAMES, Located, Segments
+from ahrsd.mismatch.locate import FRAMES, Frame, Located, Segments
 from ahrsd.mismatch.regression import Base, group_gram, residual
 from ahrsd.samples import Array
 
@@ -23,9 +25,9 @@ _WINDOW_S = 1.0
 _WIDTHS_S = (0.5, 1.0, 2.0)  # in which further ones are sought
 _LOUD = 44.0  # chi-squared of three: 1 in 1e9 windows by chance
 _BESIDE = 25.0  # of further ones beside these: 1 in 60000 windows by chance, of any width
-_FEWEST = 2
+FEWEST = 2
 _TIE_NATS = 3.0  # frames that no turn tells apart: most of what comes and goes is on the vehicle
-_MOST_SHARE = 0.3  # of the recording; beyond, it is no burst
+MOST_SHARE = 0.3  # of the recording; beyond, it is no burst
 _LEAST_ROWS = 3
 _LONG = 10  # windows; what lasts longer has no shape of its own
 _AXES = ("x", "y", "z")
@@ -33,24 +35,34 @@ _AXES = ("x", "y", "z")
 
 def bursts(basis: Base) -> Unexplained | None:
     """What the names leave, if it is bursts; None where there are fewer than two."""
-    time_s = basis.context.track.time_s
     left = residual(basis.known, basis.innovation)
     rows = loud_rows(left, basis.rate_hz, basis.colour)
     gap = round(_WINDOW_S * basis.rate_hz)
     spans = spans_of(rows, gap)
-    if len(spans) < _FEWEST or np.mean(rows) > _MOST_SHARE:
+    if len(spans) < FEWEST or np.mean(rows) > MOST_SHARE:
         return None
     near = [loud_rows(left, basis.rate_hz, basis.colour, _BESIDE, width) for width in _WIDTHS_S]
     spans = spans_of(np.any(near, axis=0), gap)
     spans = [closest(left, a, b) if b - a < _LONG * gap else (a, b) for a, b in spans]
-    cut = _cut(time_s, spans)
+    return told(basis, spans, spans)
+
+
+def told(
+    basis: Base,
+    spans: list[tuple[int, int]],
+    pieces: list[tuple[int, int]],
+    frames: Sequence[Frame] = FRAMES,
+) -> Unexplained:
+    """Bursts over these rows in the frame in which a constant per piece explains most."""
+    time_s = basis.context.track.time_s
+    cut = _cut(time_s, pieces)
     columns = {
         locate.group_name(frame): locate.frame_columns(basis.context, frame, cut)
-        for frame in FRAMES
+        for frame in frames
     }
     gram = group_gram(basis, columns)
     best = max(
-        (locate.locate(gram, frame, cut, basis.colour) for frame in FRAMES),
+        (locate.locate(gram, frame, cut, basis.colour) for frame in frames),
         key=lambda one: one.evidence + (_TIE_NATS if one.frame == "sensor" else 0.0),
     )
     return _described(best, [(float(time_s[a]), float(time_s[b - 1])) for a, b in spans])
@@ -66,8 +78,8 @@ def loud_rows(
     width = max(4, round(window_s * rate_hz))
     if len(left) < 4 * width:
         return np.zeros(len(left), dtype=bool)
-    sums = _moving_sum(left, width)
-    scatter = np.sum(_moving_sum(left**2, width) - sums**2 / width, axis=1) / (3 * (width - 1))
+    sums = moving_sum(left, width)
+    scatter = np.sum(moving_sum(left**2, width) - sums**2 / width, axis=1) / (3 * (width - 1))
     statistic = np.sum(sums**2, axis=1) / width / np.maximum(scatter, colour)
     rows = np.zeros(len(left), dtype=bool)
     for first in np.flatnonzero(statistic > least):
@@ -92,7 +104,7 @@ def closest(left: Array, start: int, end: int) -> tuple[int, int]:
     return found
 
 
-def _moving_sum(values: Array, width: int) -> Array:
+def moving_sum(values: Array, width: int) -> Array:
     """(N - width + 1, k) of (N, k)."""
     total = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
     return np.asarray(total[width:] - total[:-width])

@@ -51,6 +51,7 @@ from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
+from ahrsd.mismatch.ringing import ringing
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     HARDLY_TURNED,
@@ -255,7 +256,8 @@ def _left(done: _Searched, problem: Problem, facts: Sequence[Fact]) -> Unexplain
         return done.short
     if beyond_lost(done.left, facts, problem):
         return unknown.described(done.left, problem.block_s, problem.limits)
-    return Unexplained(False)
+    lost = any(fact.turned is not None for fact in facts)
+    return (None if lost else ringing(formed_basis_of(done.state))) or Unexplained(False)
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:
