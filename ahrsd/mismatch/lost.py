@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.facts import Fact
-from ahrsd.mismatch.missing import missing_turns
+from ahrsd.mismatch.missing import LONG, missing_turns
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.search import State
@@ -39,7 +39,11 @@ def believed(lost: Sequence[Fact], put_right: State, as_it_came: State) -> bool:
 def beyond_lost(left: Remainder, facts: Sequence[Fact], problem: Problem) -> bool:
     """Whether something is left that is more than the turns lost where no jump shows them.
 
-    Those are an error of the gyro: of slow turns only their number is known, and not when.
+    Those are an error of the gyro: of slow turns only their number is known, and not when.  Where
+    a second was lost, how far the sensor turned meanwhile is not known either: the field jumps, and
+    what the filter makes of that on its way back is in every frame.
     """
-    unseen = any(fact.turned is not None for fact in facts) and left.strongest.frame == "gyro"
+    lost = [fact for fact in facts if fact.turned is not None]
+    unseen = bool(lost) and left.strongest.frame == "gyro"
+    unseen |= any(LONG in fact.setting for fact in lost)
     return detected(left, problem.limits) and not unseen

@@ -29,6 +29,10 @@ _SURE_NATS = 12.0  # by which they must be whole steps rather than noise: others
 #: deviations of a mean that no noise jumps by, and the part of such a jump that is across the turn,
 #: more than a lost one has
 _CLEAR, _ACROSS = 8.0, 0.5
+#: and those of a jump that many turns in a row were lost at, which nobody can count
+_LONG = 30.0
+#: entry of the setting: how many of these there are
+LONG = "long"
 
 
 def lost_turns(track: Track, model: NullModel) -> list[Fact]:
@@ -60,6 +64,7 @@ class _Jumps:
 
     scatter (N,): deviation of `steps` that noise makes
     others: how many jumps there are that no lost turn makes
+    long: how many are far beyond noise and ahead: beside lost turns, where a second or so was lost
     """
 
     steps: Array
@@ -68,6 +73,7 @@ class _Jumps:
     forward: NDArray[np.intp]
     backward: NDArray[np.intp]
     others: int
+    long: int
 
 
 def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _Jumps:
@@ -90,12 +96,15 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
     fresh = np.sum(behind * v, axis=1) < 0.5 * size**2
     tell = (size > least * sigma) & (rest < 5 * sigma) & complete & fresh
     whole = np.abs(steps - np.round(steps)) < _NEAR
-    far = np.linalg.norm(jump, axis=1)
     forward = _peaks(tell & whole & (steps > 1 - _NEAR), steps, samples)
     far = np.linalg.norm(jump, axis=1)
-    across = complete & (far > _CLEAR * sigma) & ((rest > _ACROSS * far) | (steps < 0))
+    clear = complete & (far > _CLEAR * sigma)
     for k in forward.tolist():  # before and behind a jump its mean is not along the turn
-        across[max(0, k - 2 * samples) : k + 2 * samples] = False
+        clear[max(0, k - 2 * samples) : k + 2 * samples] = False
+    sudden = clear & (np.linalg.norm(behind, axis=1) < 0.5 * far)
+    long = _peaks(sudden & (far > _LONG * sigma) & (steps > 1.0 + 2 * _NEAR), far, samples)
+    # on its way back from a long one the filter makes many that no lost turn makes
+    across = (sudden if len(long) else clear) & ((rest > _ACROSS * far) | (steps < 0))
     return _Jumps(
         steps,
         sigma / np.maximum(size, 1e-300),
@@ -103,6 +112,7 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
         forward,
         _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
         len(_peaks(across, far, samples)),
+        len(long),
     )
 
 
@@ -142,7 +152,7 @@ def _fact(track: Track, found: _Jumps) -> Fact:
     )
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
-    setting = {"hidden": True}
+    setting = {"hidden": True} | ({LONG: found.long} if found.long else {})
     return Fact("dropped_samples", words, where, 0.98, parameters, setting, turned=turned)
 
 

@@ -279,6 +279,24 @@ def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
     assert abs(_value(_only(tuple(facts))) - 0.015) < 0.008
 
 
+def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
+    """On its way back from a large jump the filter makes many that no lost turn makes."""
+    made = experiment("mam", samples=6000, seed=3, sigma_mag=3e-4)
+    track = track_of(made)
+    model = replace(true_model(made), sigma_mag_gauss=3e-4)
+    rng = np.random.default_rng(5)
+    kept = rng.random(len(track)) > 0.008
+    for first in rng.integers(300, 5600, 8):
+        kept[first : first + 40] = False
+    cut = _without(track, np.flatnonzero(kept), restamp=True)
+    # as slow as a filter is that believes its gyro
+    slow = replace(model, sigma_gyro_rad_s=1e-4)
+    facts = missing_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    fact = _only(tuple(facts))
+    assert fact.effect == "dropped_samples"
+    assert 4 <= fact.setting["long"] <= 10
+
+
 def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
     rng = np.random.default_rng(2)
     stamped = track.time_s + 3e-3 * rng.standard_normal(len(track))

@@ -1,5 +1,6 @@
 """Lost turns beside the names: which search is believed, and what slow turns leave."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.lost import believed, beyond_lost
 
 LOST = Fact("dropped_samples", "", Where((), (), "link"), 0.98, turned=np.ones(3))
+LONG = replace(LOST, setting={"hidden": True, "long": 2})
 STAMPED = Fact("dropped_samples", "", Where((), (), "link"), 0.98)
 
 
@@ -30,7 +32,13 @@ def test_lost_turns_stay_where_the_recording_is_likelier_with_them(
 
 @pytest.mark.parametrize(
     ("facts", "frame", "told"),
-    [([LOST], "gyro", False), ([LOST], "sensor", True), ([STAMPED], "gyro", True), ([], "gyro", 1)],
+    [
+        ([LOST], "gyro", False),
+        ([LOST], "sensor", True),
+        ([LONG], "sensor", False),
+        ([STAMPED], "gyro", True),
+        ([], "gyro", True),
+    ],
 )
 def test_what_lost_turns_leave_is_an_error_of_the_gyro(facts, frame, told):
     left = SimpleNamespace(
@@ -39,4 +47,4 @@ def test_what_lost_turns_leave_is_an_error_of_the_gyro(facts, frame, told):
         stood_in=None,
         one_source=False,
     )
-    assert beyond_lost(left, facts, SimpleNamespace(limits=LIMITS)) is bool(told)
+    assert beyond_lost(left, facts, SimpleNamespace(limits=LIMITS)) is told
