@@ -37,6 +37,7 @@ from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, wh
 from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
+from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, lost_beside
@@ -171,14 +172,15 @@ def _told(
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
     named, terms = _names(done, fast)
-    noise = _noise_facts(problem, fast, facts, done)
+    noise, left = _noise_facts(problem, fast, facts, done), _left(done, problem, facts)
+    if burst := loud_gyro(left, problem.recorded):
+        noise, left = [*noise, burst], Unexplained(False)
     found = (
         *(of_fact(fact, library) for fact in facts if matters(fact)),
         *sorted(named, key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
     )
-    left = _left(done, problem, facts)
     seen = (*state.named, *fast.state.named[fast.known :])
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
     something = bool(found) or left.detected
