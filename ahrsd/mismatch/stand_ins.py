@@ -157,6 +157,10 @@ def _stand_in(state: State, frame: Frame, terms: list[int], left: unknown.Remain
     fires = unknown.detected(left, limits)
     if fires and left.located[frame].statistic > (1 - limits.coverage) * free.statistic:
         return True
+    # a wave of any length and phase is most of any slow course: what it leaves there is the rest
+    waves = any(state.named[k].candidate.setting.get("shape") == "wave" for k in terms)
+    if fires and waves and left.strongest.frame == frame:
+        return True
     if len(terms) > 1:  # on and off again: neither proves much without the other
         return False
     evidence = evidence_of(before.basis, state.named[terms[0]].candidate)
