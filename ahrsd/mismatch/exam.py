@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
-from ahrsd.mismatch.name import judge
+from ahrsd.mismatch.name import believable, judge
 from ahrsd.mismatch.nested import contained, without_wider
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
 from ahrsd.mismatch.search import (
@@ -130,8 +130,8 @@ def _worth(state: State, basis: Base, found: Discrepancy, number: int, enough: f
     At least `enough`, where it is more.
     """
     judged = state.named[number]
-    bounds = np.array([parameter.bound for parameter in judged.candidate.effect.parameters])
-    if np.any(np.abs(state.fit.terms[number].value) > bounds):
+    value = state.fit.terms[number].value
+    if not believable(judged.candidate, judged.what, value, basis.colour):
         return -np.inf
     left = without_wider(state, number, without_term(state, number, basis))
     columns = _columns(basis, number)

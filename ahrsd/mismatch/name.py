@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.mismatch.effects.base import BOUND_DEVIATIONS
 from ahrsd.mismatch.evidence import log_bayes, posterior
 from ahrsd.mismatch.gram import Gram
 from ahrsd.mismatch.limits import Limits
@@ -103,7 +104,6 @@ def judge(
     found, shifted = shift_statistics(own, left, round(MINIMUM_SHIFT_SHARE * len(columns)))
     beaten = float(np.mean(shifted < found)) if len(shifted) else 1.0
     lonely = _lonely(candidate, what, evidence)
-    bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
     checks = (
         ("family-wise probability", family < limits.family_p),
         ("block-robust probability", robust < limits.robust_family_p),
@@ -111,7 +111,7 @@ def judge(
         ("held-out gain", gain.nats_per_sample > limits.cv_gain or lonely),
         ("without outliers", _without_outliers(candidate, own, left, basis) > limits.evidence_nats),
         ("time-shifted copies", beaten >= limits.placebo_beaten),
-        ("physical bounds", bool(np.all(np.abs(what.value) <= bounds))),
+        ("physical bounds", believable(candidate, what, what.value, basis.colour)),
     )
     usual = float(np.quantile(shifted, 0.99)) if len(shifted) else 0.0
     return Judged(
@@ -125,6 +125,17 @@ def judge(
         max(0.0, (usual - what.rank) / (2.0 * len(columns))),
         tuple(name for name, passed in checks if not passed),
     )
+
+
+def believable(candidate: Candidate, what: Score, value: Array, colour: float) -> bool:
+    """Whether no coefficient (p,) is beyond its physical bound by more than noise brings it there.
+
+    Where the calibration takes nearly all of an effect, the little that is left knows a coefficient
+    at its bound to a tenth or worse.
+    """
+    bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
+    sigma = np.sqrt(np.diag(what.covariance) * colour) if what.rank else 0.0
+    return bool(np.all(np.abs(value) <= bounds + BOUND_DEVIATIONS * sigma))
 
 
 def _without_outliers(candidate: Candidate, columns: Array, left: Array, basis: Base) -> float:

@@ -1,0 +1,67 @@
+"""A coefficient at its physical bound, which is known only so well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.mismatch.effects.base import BOUND_DEVIATIONS
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.exam import examined
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.name import Judged, believable
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.regression import Candidate
+from ahrsd.mismatch.score import total_score
+from ahrsd.mismatch.search import State, added, survey
+from ahrsd.mismatch.track import Spec, Track
+
+NAME = "mag_cross_axis"
+
+
+@pytest.mark.parametrize(
+    ("beyond", "colour", "believed"),
+    [(-1.0, 1.0, True), (1.9, 1.0, True), (3.1, 1.0, False), (5.9, 4.0, True), (6.1, 4.0, False)],
+)
+def test_what_is_beyond_its_bound_by_noise_alone_is_believed(beyond, colour, believed):
+    candidate = Candidate(EFFECTS[NAME], {"products": "own"}, 1, 0.0)
+    sigma = np.linspace(0.5e-3, 1.6e-3, 6)
+    G = np.diag(sigma**-2)
+    value = np.zeros(6)
+    value[3] = -(20e-3 + beyond * sigma[3])
+    what = total_score(G, G @ value, np.diag(G), candidate.scale, 0.01)
+    np.testing.assert_allclose(what.value, value, atol=1e-9)
+    assert believable(candidate, what, value, colour) == believed
+
+
+@pytest.fixture(scope="module")
+def track() -> Track:
+    return made(Trial(3, ((NAME, 2.0),), samples=6000)).track
+
+
+def _bounded(track: Track, bound_gauss: float) -> tuple[State, Judged]:
+    """The state without names, and the effect judged in it with that bound."""
+
+    class Bounded(type(EFFECTS[NAME])):  # type: ignore[misc]
+        parameters = tuple(replace(p, bound=bound_gauss) for p in EFFECTS[NAME].parameters)
+
+    problem, cold = problem_of(track, Spec(), {**EFFECTS, NAME: Bounded()}, LIMITS)
+    state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    return state, next(one for one in survey(state).judged if one.candidate.name == NAME)
+
+
+def test_a_name_goes_only_where_its_coefficients_are_beyond_doubt(track):
+    _, free = _bounded(track, 20e-3)
+    size = np.abs(free.what.value)
+    largest = int(np.argmax(size))
+    sigma = np.sqrt(free.what.covariance[largest, largest])
+    assert size[largest] > 10 * sigma
+    state, near = _bounded(track, float(size[largest] - 1.5 * sigma))
+    assert near.refused == ()
+    assert examined(added(state, near))[0].names == (NAME,)
+    _, far = _bounded(track, float(size[largest] - 2 * BOUND_DEVIATIONS * sigma))
+    assert far.refused == ("physical bounds",)
