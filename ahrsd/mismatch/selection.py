@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import noise_fit
+from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.nested import simplest
 from ahrsd.mismatch.null import at_model
-from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, columns_of
+from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, columns_of, quieter
 from ahrsd.mismatch.score import Score
 from ahrsd.mismatch.search import (
     FRAME_LEAD,
@@ -44,8 +45,9 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
     """
     first = last = survey(state)
     closer = 0  # names for which the shapes have been sought again before one came twice
+    broken: set[str] = set()  # names that the joint fit does not bear out beside those given
     while len(state.named) < state.problem.limits.most_terms:
-        accepted = [judged for judged in last.judged if judged.accepted]
+        accepted = [j for j in last.judged if j.accepted and j.candidate.name not in broken]
         if not accepted:
             more = _cause_after_all(state, last)
             more = stepped(state) if more is state else more
@@ -59,9 +61,32 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
         elif best.candidate.name in WANDERING and not state.walk:
             state = _noise_or_cause(state, best, last)
         else:
-            state = added(state, best)
-        last = survey(state)
+            tried = added(state, best)
+            if not borne_out(state, tried, best, last):
+                broken.add(best.candidate.name)
+                continue
+            state = tried
+        broken, last = set(), survey(state)
     return state, first, last
+
+
+def borne_out(state: State, tried: State, judged: Judged, seen: Survey) -> bool:
+    """Whether a name still has its evidence after the joint fit with it (`tried`).
+
+    seen: the survey of the state, whose evidence is in the noise that its strongest leaves.
+
+    Evidence is of a linear model.  Where the calibration takes nearly all of an effect, the little
+    that is left wants coefficients that are far from linear: its statistic promises what no fit
+    gains, and what the fit then leaves would be given names of its own.
+    """
+    if judged.candidate.name in DELAYS:
+        return True  # another track
+    gained = _likelihood(tried) - _likelihood(state)
+    gained = max(gained, tried.fit.log_likelihood - state.fit.log_likelihood)
+    strongest = seen.candidates[0]
+    noise = quieter(seen.basis, columns_of(seen.basis, [strongest])[strongest.name]).colour
+    short = max(0.0, judged.what.statistic / 2 - gained) / noise
+    return judged.evidence - short > state.problem.limits.evidence_nats
 
 
 def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:

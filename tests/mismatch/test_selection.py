@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.mismatch import selection
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S, State, refitted, survey
-from ahrsd.mismatch.selection import _cause_after_all
+from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S, State, added, refitted, survey
+from ahrsd.mismatch.selection import _cause_after_all, borne_out, forward
 from ahrsd.mismatch.track import Spec, Track
 
 SCALE = 1 + np.array([-1.2e-3, 2.3e-3, -1.6e-3])
@@ -51,3 +52,33 @@ def test_a_bias_that_wanders_stays_noise(track: Track) -> None:
     wandered = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + np.cumsum(steps, axis=0))
     state = _beside_a_walk(wandered)
     assert _cause_after_all(state, survey(state)) is state
+
+
+@pytest.fixture(scope="module")
+def crossed() -> State:
+    """A magnetometer with a cross axis, before anything is named."""
+    track = made(Trial(3, (("mag_cross_axis", 2.0),), samples=6000)).track
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    return State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+
+
+def test_a_name_that_the_joint_fit_does_not_bear_out_is_not_given(crossed, monkeypatch):
+    """Of what the calibration takes nearly all, the fit gained little and left more than before."""
+    assert forward(crossed)[0].names == ("mag_cross_axis",)
+
+    def in_vain(state: State, judged) -> State:
+        return replace(state, named=(*state.named, judged))
+
+    monkeypatch.setattr(selection, "added", in_vain)
+    assert forward(crossed)[0].names == ()
+
+
+def test_a_name_is_borne_out_by_what_is_gained_beyond_its_price(crossed):
+    seen = survey(crossed)
+    best = seen.judged[0]
+    tried = added(crossed, best)
+    assert borne_out(crossed, tried, best, seen)
+    assert 2 * (tried.fit.log_likelihood - crossed.fit.log_likelihood) > best.what.statistic
+    assert not borne_out(crossed, crossed, best, seen)
+    more = replace(best, evidence=best.what.statistic / 2 + 5.0)
+    assert borne_out(crossed, crossed, more, seen)
