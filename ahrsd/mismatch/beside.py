@@ -75,6 +75,12 @@ OF_ITSELF = {
 }
 #: why a name is not said that is laid to the sensor itself
 SIZE = "size"
+#: courses in time alone, by the family of an effect whose logged cause may be as smooth as they
+DRIFTS = {
+    "sensor": ("hard_iron_drift", "onboard_calibration_active"),
+    "world": ("geomagnetic_drift",),
+    "gyro": ("gyro_startup", "gyro_bias_drift"),
+}
 #: candidates whose spectra are measured
 LOOKED_AT = 8
 
@@ -102,6 +108,9 @@ def named_beside(
         if not standing:
             break
         best = simplest(standing)
+        if _no_more_than_a_drift(state, best):
+            refused.add(best.candidate.name)
+            continue
         tried = reweighted(added(state, best))
         if not _holds(tried):
             refused.add(best.candidate.name)
@@ -122,6 +131,27 @@ def sayable(judged: Sequence[Judged]) -> list[Judged]:
     if not others or not others[0].accepted:
         return []
     return [one for one in others if one.accepted and one.evidence > OWN_SHARE * own]
+
+
+def _no_more_than_a_drift(state: State, judged: Judged) -> bool:
+    """Whether a course in time alone is as likely as a name by what was logged.
+
+    What was logged may be as smooth as a drift is: then it explains what drifts.  Its own effect
+    follows it more closely than a line or what settles.
+    """
+    if "covariate" not in judged.candidate.setting:
+        return False
+    wanted = DRIFTS.get(judged.candidate.effect.family, ())
+    courses = {name: one for name, one in state.problem.library.items() if name in wanted}
+    basis = formed_basis_of(state)
+    plain = spectrum_of(basis)
+    taken = [(j.candidate.name, j.candidate.setting) for j in state.named]
+    near = best_settings(against(basis, plain), courses, taken)
+    return any(
+        _judged(state, basis, plain, one, len(near)).evidence
+        > judged.evidence - state.problem.limits.lead_nats
+        for one in near
+    )
 
 
 def _holds(state: State) -> bool:

@@ -11,7 +11,8 @@ from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
 from ahrsd import so3
-from ahrsd.mismatch.beside import sayable
+from ahrsd.mismatch import beside, unknown
+from ahrsd.mismatch.beside import named_beside, sayable
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.exam import pruned
@@ -19,7 +20,7 @@ from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.score import total_score
-from ahrsd.mismatch.search import State, added, survey
+from ahrsd.mismatch.search import State, added, formed_basis_of, survey
 from ahrsd.mismatch.track import Spec, Track
 
 
@@ -81,6 +82,37 @@ def test_a_room_alone_gets_no_name():
     found = diagnose(replace(track, covariates={"lamp_on": switched(track)}))
     assert found.findings == ()
     assert found.unexplained.detected
+
+
+def warmed(track: Track) -> np.ndarray:
+    """(N,) degrees: a box that warms up."""
+    return 20.0 + 25.0 * (1 - np.exp(-(track.time_s - track.time_s[0]) / 60.0))
+
+
+def beside_a_room(mag_b_gauss: np.ndarray, degrees: np.ndarray) -> tuple[str, ...]:
+    """Names that stand out beside the room's remainder."""
+    track = replace(room(), mag_b_gauss=mag_b_gauss, covariates={"temperature_c": degrees})
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    left = unknown.remainder(formed_basis_of(state), with_bins=False)
+    assert unknown.detected(left, LIMITS)
+    return named_beside(state, [], left)[0].names
+
+
+def test_a_drift_beside_a_room_is_not_laid_to_the_temperature_that_settles_like_it(monkeypatch):
+    track = room()
+    course = np.exp(-(track.time_s - track.time_s[0]) / 35.0)[:, None]
+    drifting = track.mag_b_gauss + course * [0.036, -0.03, 0.036]
+    assert beside_a_room(drifting, warmed(track)) == ()
+    monkeypatch.setattr(beside, "_no_more_than_a_drift", lambda *_: False)
+    assert beside_a_room(drifting, warmed(track)) == ("mag_bias_temperature",)
+
+
+def test_a_temperature_that_has_a_course_of_its_own_is_named_beside_a_room():
+    track = room()
+    degrees = warmed(track) + 2.0 * np.sin(track.time_s / 9.0)
+    bent = track.mag_b_gauss + (degrees - 20.0)[:, None] * [2.4e-3, -2e-3, 2.4e-3]
+    assert beside_a_room(bent, degrees) == ("mag_bias_temperature",)
 
 
 @pytest.mark.parametrize(
