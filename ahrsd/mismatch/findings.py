@@ -19,7 +19,7 @@ from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import Judged
-from ahrsd.mismatch.regression import CALIBRATION, Base, scale_of, scaled
+from ahrsd.mismatch.regression import CALIBRATION, Base, candidate_gram, scale_of, scaled
 from ahrsd.mismatch.reweighted import stepped
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
@@ -31,13 +31,15 @@ from ahrsd.mismatch.search import (
     term_group,
 )
 from ahrsd.mismatch.unknown import AXES, innovation_rms
-from ahrsd.mismatch.validate import heading_error_deg
+from ahrsd.mismatch.validate import Gain, alternating, heading_error_deg, heldout
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.samples import Array
 
 #: shares below this are not worth a line
 SMALLEST_SHARE = 0.005
 _SCALE_STEP = 0.05
+#: seconds that are dealt in turn where an effect shows no longer than some of them
+SECOND_S = 1.0
 
 
 def finding(
@@ -286,11 +288,28 @@ def _heldout(state: State, basis: Base, number: int, judged: Judged) -> Heldout:
     """
     wanders = state.walk > 0.0 and judged.candidate.name in WANDERING
     value, scale = added_value(state, number), judged.candidate.scale
-    gain = gain_of(state.fit, number, value, scale, wanders=wanders) or judged.gain
+    gain = gain_of(state.fit, number, value, scale, wanders=wanders)
+    if gain is None:
+        gain = judged.gain
+        if gain.nats_per_sample <= 0.0:
+            gain = _within_seconds(basis, number, value, scale)
     rms, thin = innovation_rms(basis), state.problem.thin
     ratio = gain.before / max(gain.after, 1e-12)
     before = rms * float(np.sqrt(max(ratio, 0.0)))
     return Heldout(before, rms, gain.nats_per_sample / thin, judged.placebo_gain / thin)
+
+
+def _within_seconds(basis: Base, number: int, value: Array, scale: Array) -> Gain:
+    """The gain on every second second of a name that shows for a few seconds alone.
+
+    What the outside field does at once the filter has followed before a stretch is over; then no
+    stretch knows of it what another needs, and what is told of the gain is chance.
+    """
+    name = term_group(number)
+    columns = {name: basis.known[:, :, basis.groups[name]]}
+    gram = candidate_gram(basis.without(name, value), columns, SECOND_S)
+    known = [group for group in basis.groups if group != name]
+    return heldout(gram, known, name, scale, alternating)
 
 
 def _regime(judged: Judged, basis: Base, added: Array) -> str | None:
