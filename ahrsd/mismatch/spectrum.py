@@ -8,6 +8,13 @@ divided by it:
 
 * Innovations, whitened, are brought back to gauss and turned into the frame that the gyro carries
   along, held by the field: two axes across it, one along it.
+* What the filter followed them by, e_j by K_j e_j, is put back: with h+ = h- + K e the reading less
+  the field that the gyro alone would have carried there is
+      u_k = C e_k + sum_(j<k) K_j e_j      (all turned into the world),
+  linear in the innovations and lossless, whatever the gains.  In the innovations themselves what is
+  slow is small, as small as what the ends of the recording make of a quick remainder, and a gyro's
+  error that adds up was lost beside it.  Where the field was in the beginning nobody knows: the
+  mean of u is dropped.
 * The cosine transform (DCT-II) makes walks, levels and differences of them independent.  The power
   is a walk's, a level's and a difference's, as much of each as is likeliest, times the mean of what
   is left in bands; for both axes across alike.
@@ -38,20 +45,31 @@ AXES = (slice(0, 2), slice(2, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spectrum:
-    """Noise of its own power at every frequency.
+class World:
+    """From whitened innovations to gauss in the world: two axes across the field, one along it.
 
-    turn: (N, 3, 3) of whitened innovations to gauss in the world;  power: (N, 3) of coefficients
-    nats: log likelihood of what was left, but for a constant
+    turn: (N, 3, 3) the innovation itself;  followed: (N, 3, 3) what the filter followed it by
     """
 
     turn: Array
+    followed: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spectrum:
+    """Noise of its own power at every frequency.
+
+    seen: how innovations are seen from the world;  power: (N, 3) of coefficients
+    nats: log likelihood of what was left, but for a constant
+    """
+
+    seen: World
     power: Array
     nats: float
 
     def whitened(self, values: Array) -> Array:
         """Values (N, 3) or (N, 3, p), again in time."""
-        seen = transformed(self.turn, values.reshape(*self.power.shape, -1))
+        seen = transformed(self.seen, values.reshape(*self.power.shape, -1))
         seen /= np.sqrt(self.power)[:, :, None]
         return np.asarray(fft.idct(seen, type=2, axis=0, norm="ortho").reshape(values.shape))
 
@@ -65,25 +83,26 @@ def against(basis: Base, noise: Spectrum) -> Base:
 
 def spectrum_of(basis: Base, columns: Array | None = None) -> Spectrum:
     """The spectrum of what known columns, and these beside them (N, 3, p), leave of a basis."""
-    turn = in_world(basis)
+    world = in_world(basis)
     beside = () if columns is None else (columns,)
     stacked = np.concatenate([basis.known, *beside, basis.innovation[:, :, None]], axis=2)
-    seen = transformed(turn, stacked)
+    seen = transformed(world, stacked)
     Z, e = seen[:, :, :-1], seen[:, :, -1]
-    power = smooth_power(e, np.ones_like(e))
+    power = smooth_power(e, _freedom(len(e)))
     for _ in range(ROUNDS):
         weight = 1.0 / np.sqrt(power)
         F = (Z * weight[:, :, None]).reshape(-1, Z.shape[2])
         inverse = solve(F.T @ F, np.eye(Z.shape[2]))
         left = e - Z @ (inverse @ (F.T @ (e * weight).ravel()))
         free = 1.0 - np.einsum("ij,jk,ik->i", F, inverse, F).reshape(e.shape)
+        free *= _freedom(len(e))
         power = smooth_power(left, free)
     nats = -0.5 * float(np.sum(np.log(power) + left**2 / power))
-    return Spectrum(turn, power, nats)
+    return Spectrum(world, power, nats)
 
 
-def in_world(basis: Base) -> Array:
-    """(N, 3, 3) of whitened innovations to gauss, two axes across the field and one along it."""
+def in_world(basis: Base) -> World:
+    """How the innovations of a basis are seen from the world."""
     done = basis.filtered
     root = np.zeros_like(done.gains.innovation_covariance)
     root[done.used] = np.linalg.cholesky(done.gains.innovation_covariance[done.used])
@@ -95,12 +114,28 @@ def in_world(basis: Base) -> Array:
         across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
         across /= np.linalg.norm(across)
         turn[run] = np.stack([across, np.cross(along, across), along]) @ turn[run]
-    return np.asarray(turn @ np.linalg.inv(done.model.soft_iron) @ root)
+    gain = np.where(done.used[:, None, None], done.gains.gain[:, :3], 0.0)
+    return World(turn @ np.linalg.inv(done.model.soft_iron) @ root, turn @ gain @ root)
 
 
-def transformed(turn: Array, values: Array) -> Array:
-    """Cosine coefficients (N, 3, p) in the world of whitened values (N, 3, p)."""
-    return np.asarray(fft.dct(turn @ values, type=2, axis=0, norm="ortho"))
+def transformed(world: World, values: Array) -> Array:
+    """Cosine coefficients (N, 3, p) in the world of whitened values (N, 3, p).
+
+    The first, where the field was in the beginning, is known to nobody: zero.
+    """
+    followed = np.cumsum(world.followed @ values, axis=0)
+    left = world.turn @ values
+    left[1:] += followed[:-1]
+    out = fft.dct(left, type=2, axis=0, norm="ortho")
+    out[0] = 0.0
+    return np.asarray(out)
+
+
+def _freedom(count: int) -> Array:
+    """(N, 3) of the coefficients where nothing was fitted."""
+    out = np.ones((count, 3))
+    out[0] = 0.0
+    return out
 
 
 def smooth_power(coefficients: Array, free: Array) -> Array:
@@ -109,7 +144,7 @@ def smooth_power(coefficients: Array, free: Array) -> Array:
     free: (N, 3) what a regression left of each coefficient's freedom, 1 where nothing was fitted
     """
     count = len(coefficients)
-    walk = 4.0 * np.sin(np.pi * (np.arange(count) + 0.5) / (2 * count)) ** 2
+    walk = 4.0 * np.sin(np.pi * np.maximum(np.arange(count), 0.5) / (2 * count)) ** 2
     shapes = np.stack([1.0 / walk, np.ones(count), walk])
     edges = _bands(count)
     out = np.empty_like(coefficients)

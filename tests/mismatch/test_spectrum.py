@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import fft
 from tracks import experiment, track_of
 
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import at_model, fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import Base, base
+from ahrsd.mismatch.regression import Base, base, without_known
 from ahrsd.mismatch.reweighted import moved, reweighted
 from ahrsd.mismatch.search import State, formed_basis_of
-from ahrsd.mismatch.spectrum import against, smooth_power, spectrum_of
+from ahrsd.mismatch.spectrum import against, in_world, smooth_power, spectrum_of, transformed
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import Columns
 
@@ -46,7 +47,7 @@ def basis_of(track: Track) -> Base:
 
 def test_the_power_of_a_walk_and_a_level_is_found_at_every_frequency():
     count = 4000
-    walk = 4.0 * np.sin(np.pi * (np.arange(count) + 0.5) / (2 * count)) ** 2
+    walk = 4.0 * np.sin(np.pi * np.maximum(np.arange(count), 0.5) / (2 * count)) ** 2
     true = np.stack([2e-4 / walk + 0.3, 2e-4 / walk + 0.3, 4.0 * walk + 0.1], axis=1)
     power = []
     for seed in range(20):
@@ -55,6 +56,32 @@ def test_the_power_of_a_walk_and_a_level_is_found_at_every_frequency():
     ratio = np.mean(power, axis=0) / true
     np.testing.assert_allclose(ratio[30:], 1.0, atol=0.2)
     np.testing.assert_allclose(ratio[:30], 1.0, atol=0.6)
+
+
+def test_what_the_filter_followed_is_put_back():
+    """The world sees the calibrated readings, turned by the gyro alone, but for their mean."""
+    basis = basis_of(made())
+    seen = transformed(in_world(basis), basis.innovation[:, :, None])[:, :, 0]
+    left = fft.idct(seen, type=2, axis=0, norm="ortho")
+    done = basis.filtered
+    field = (done.track.mag_b_gauss - done.model.hard_iron_gauss) @ np.linalg.inv(
+        done.model.soft_iron
+    )
+    carried = np.einsum("nij,nj->ni", done.orientation, field)
+    carried -= carried.mean(axis=0)
+    turn, _ = np.linalg.qr(np.linalg.lstsq(carried, left, rcond=None)[0])
+    turn *= np.sign(np.sum((carried @ turn) * left, axis=0))
+    np.testing.assert_allclose(left, carried @ turn, atol=1e-4)
+    assert np.std(left) > 5e-3
+
+
+def test_a_gyro_error_that_adds_up_is_seen_beside_a_quick_remainder():
+    basis = basis_of(made())
+    late = np.where(basis.context.track.time_s > 60.0, 1e-3, 0.0)
+    columns = basis.whitened([Columns(gyro=np.eye(3) * late[:, None, None])])[0]
+    quiet = against(basis, spectrum_of(basis))
+    own, _ = without_known(quiet, quiet.rest.whitened(columns))
+    assert np.min(np.linalg.norm(own, axis=(0, 1))) > 20.0
 
 
 def test_what_is_left_of_a_band_in_the_world_is_white_afterwards():
