@@ -90,19 +90,23 @@ def named_beside(
     surveys: list[Survey],
     left: unknown.Remainder,
     stood_in: frozenset[str] = frozenset(),
+    *,
+    hidden: bool = False,
 ) -> tuple[State, list[Survey], unknown.Remainder]:
     """The state with the names that stand out beside the rest, where there is one.
 
     stood_in: names by a logged cause that only stood in for another form, which stays so: what
               bends with the temperature has no offset by it
+    hidden: whether names were taken out again that were worth no more than what they left.  Then
+            there is a rest, too, also where no course in time shows it
     """
     limits = state.problem.limits
-    if not unknown.detected(left, limits):
+    if not (hidden or unknown.detected(left, limits)):
         return state, surveys, left
     given = state, surveys, left
     state = reweighted(state)
     refused = set(stood_in)
-    while len(state.named) < limits.most_terms and unknown.detected(left, limits):
+    while len(state.named) < limits.most_terms:
         seen = look(state, refused)
         standing = sayable(seen.judged)
         if not standing:
@@ -207,6 +211,8 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     quiet = quieter(quiet, seen)
     gram = candidate_gram(quiet, {one.name: seen}, state.problem.block_s)
     held = judge(one, gram, seen, quiet, tried, limits)
+    if held.what.rank < len(one.scale):  # directions that are not paid for explain nothing
+        noise = spectrum_of(basis, columns @ held.what.basis)
     gain = (noise.nats - plain.nats) / quiet.colour
     evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
     checks = {

@@ -141,7 +141,9 @@ class _Searched:
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     done, brief = beside_brief(wandering(sought(State(problem, start))))
-    state, surveys, left = named_beside(done.state, done.surveys, done.left, done.stood_in)
+    state, surveys, left = named_beside(
+        done.state, done.surveys, done.left, done.stood_in, hidden=done.hidden
+    )
     beside = len(state.named) > len(done.state.named)
     state, surveys, left = without_unforetold(state, surveys, left, beside=beside)
     short = brief or bursts(formed_basis_of(state))

@@ -11,7 +11,7 @@ from ahrsd.mismatch.exam import examined, paired, pruned
 from ahrsd.mismatch.nested import eddies_alone
 from ahrsd.mismatch.search import State, Survey, survey, swapped
 from ahrsd.mismatch.selection import forward
-from ahrsd.mismatch.stand_ins import without_stand_ins, without_unlikely
+from ahrsd.mismatch.stand_ins import TIME_SHAPED, without_stand_ins, without_unlikely
 from ahrsd.mismatch.unknown import Remainder
 
 
@@ -22,6 +22,7 @@ class Sought:
     first, last: the surveys before and after the names
     before: the state before any name was taken out again
     stood_in: names by a logged cause that were taken out since they only stood in for another form
+    hidden: whether names were taken out that were worth no more than what they leave
     """
 
     state: State
@@ -31,16 +32,21 @@ class Sought:
     left: Remainder
     before: State
     stood_in: frozenset[str] = frozenset()
+    hidden: bool = False
 
 
 def sought(state: State) -> Sought:
     """Every name that the state's fit allows beside what it has."""
     more, first, last = forward(state)
-    slim, beside = examined(paired(pruned(more)))
+    given = paired(pruned(more))
+    slim, beside = examined(given)
+    hidden = len(slim.named) < len(given.named)
     slim = eddies_alone(slim)
     last = last if slim.names == more.names else survey(slim)
     named, surveys, last = without_unlikely(*swapped(slim, last))
     true, surveys, left = without_stand_ins(named, surveys, beside)
     logged = (j.candidate.name for j in named.named if "covariate" in j.candidate.setting)
-    stood_in = frozenset(logged) - frozenset(true.names)
-    return Sought(true, surveys, first, last, left, more, stood_in)
+    # a course in time is held against a free one, which explains what is left with it
+    courses = {name for names in TIME_SHAPED.values() for name in names}
+    stood_in = frozenset(logged) - courses - frozenset(true.names)
+    return Sought(true, surveys, first, last, left, more, stood_in, hidden)

@@ -11,16 +11,18 @@ from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
 from ahrsd import so3
-from ahrsd.mismatch import beside, unknown
-from ahrsd.mismatch.beside import named_beside, sayable
+from ahrsd.mismatch import beside, sought, unknown
+from ahrsd.mismatch.beside import _judged, named_beside, sayable
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.exam import pruned
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.score import total_score
 from ahrsd.mismatch.search import State, added, formed_basis_of, survey
+from ahrsd.mismatch.spectrum import spectrum_of
 from ahrsd.mismatch.track import Spec, Track
 
 
@@ -158,3 +160,68 @@ def test_what_is_less_likely_than_what_may_not_be_said_is_not_said(judged, said)
         for nats, why in judged
     ]
     assert [one.evidence for one in sayable(seen)] == said
+
+
+def state_of(track: Track) -> State:
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    return State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+
+
+def crooked(track: Track, angle: np.ndarray) -> Track:
+    """The track of a magnetometer that is mounted at an angle."""
+    return replace(track, mag_b_gauss=track.mag_b_gauss @ so3.exp(angle[None])[0].T)
+
+
+def test_names_lost_to_a_rest_are_sought_beside_it_though_no_course_shows_it(monkeypatch):
+    """And the second, when nothing is left that a course would show."""
+    track = crooked(room(), np.array([0.06, -0.05, 0.04]))
+    lit = switched(track)
+    reading = track.mag_b_gauss + lit[:, None] * np.array([5e-3, -3e-3, 4e-3])
+    state = state_of(replace(track, mag_b_gauss=reading, covariates={"lamp_on": lit}))
+    left = unknown.remainder(formed_basis_of(state))
+    monkeypatch.setattr(unknown, "detected", lambda *_: False)
+    assert named_beside(state, [], left)[0].names == ()
+    found = named_beside(state, [], left, hidden=True)[0].names
+    assert set(found) == {"mag_gyro_misalignment", "switched_device"}
+
+
+class Deaf(type(EFFECTS["mag_gyro_misalignment"])):
+    """A mount of which no direction can be told."""
+
+    least_information = 1e12
+
+
+def test_directions_that_are_not_paid_for_explain_nothing():
+    state = state_of(crooked(room(), np.array([0.06, -0.05, 0.04])))
+    basis = formed_basis_of(state)
+    plain = spectrum_of(basis)
+    heard, deaf = (
+        _judged(state, basis, plain, Candidate(effect, {}, 1, 0.0), 1)
+        for effect in (EFFECTS["mag_gyro_misalignment"], Deaf())
+    )
+    assert heard.evidence > 60.0
+    assert deaf.what.rank == 0
+    assert deaf.evidence == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_lamp_that_a_free_course_explains_as_well_is_asked_for_beside_the_rest(monkeypatch):
+    """Any course in time is explained by a free one, and the rest with it; other forms are not."""
+
+    def named(*names: str) -> SimpleNamespace:
+        setting = {"covariate": "logged"}
+        candidates = [SimpleNamespace(name=name, setting=setting) for name in names]
+        judged = tuple(SimpleNamespace(candidate=one) for one in candidates)
+        return SimpleNamespace(named=judged, names=names)
+
+    found = named("switched_device", "mag_bias_temperature")
+    steps = {
+        "forward": lambda _: (found, None, None),
+        "examined": lambda state: (state, True),
+        "swapped": lambda state, last: (state, [], last),
+        "without_unlikely": lambda *all_of: all_of,
+        "without_stand_ins": lambda *_: (named(), [], None),
+        **{name: lambda state: state for name in ("pruned", "paired", "eddies_alone")},
+    }
+    for name, step in steps.items():
+        monkeypatch.setattr(sought, name, step)
+    assert sought.sought(found).stood_in == {"mag_bias_temperature"}
