@@ -114,7 +114,7 @@ class GyroGSensitivity(Linear):
     family = "gyro"
     words = "the gyro feels acceleration and tilt"
     equation = "w += G a, a: specific force in g"
-    parameters = shapes.matrix("per_g", "rad/s/g", 5e-4, 0.02)
+    parameters = shapes.matrix("per_g", "rad/s/g", 5e-4, 0.05)
     typical = (6e-4, 2e-4, 0.0, -3e-4, 4e-4, 1e-4, 0.0, 2e-4, -5e-4)
     needs = ("accel",)
     signature = "a gyro bias that follows the tilt"
