@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tracks import experiment, recorded, track_of
 
 from ahrsd.mismatch.along_field import MOSTLY_SLOW, framed, in_a_field, slowness
@@ -71,6 +72,7 @@ def test_an_error_of_the_gyro_stays_one() -> None:
     assert framed(basis, left, LIMITS).strongest.frame == "gyro"
 
 
+@pytest.mark.slow
 def test_a_magnet_that_stands_in_the_room_is_an_unknown_of_the_world() -> None:
     found = diagnose(recorded("broad/28_disturbed_stationary_magnet_A"))
     assert [one.effect for one in found.findings] == ["mag_time_lag"]

@@ -40,6 +40,7 @@ def switched(track: Track) -> np.ndarray:
     return np.random.default_rng(9).integers(0, 2, seconds.max() + 1)[seconds].astype(float)
 
 
+@pytest.mark.slow
 def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
     track = room()
     value = np.array([5e-3, -3e-3, 4e-3])
@@ -110,6 +111,7 @@ def test_a_drift_beside_a_room_is_not_laid_to_the_temperature_that_settles_like_
     assert beside_a_room(drifting, warmed(track)) == ("mag_bias_temperature",)
 
 
+@pytest.mark.slow
 def test_a_temperature_that_has_a_course_of_its_own_is_named_beside_a_room():
     track = room()
     degrees = warmed(track) + 2.0 * np.sin(track.time_s / 9.0)

@@ -32,7 +32,7 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("seed", [6, 11])
+@pytest.mark.parametrize("seed", [6, pytest.param(11, marks=pytest.mark.slow)])
 def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=2500))
     found = diagnose(_disturbed(track, SHAPES[shape](track.time_s), logged=True))
@@ -54,7 +54,7 @@ def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
     assert np.abs(np.array(where.direction) @ K) / np.linalg.norm(K) > 0.9
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow)])
 def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=3000))
     found = diagnose(_disturbed(track, SHAPES["square"](track.time_s), logged=False))
@@ -62,7 +62,7 @@ def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None
     assert found.unexplained.detected
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 6])
 def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=3000))
     track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)

@@ -37,6 +37,7 @@ def test_a_lag_is_named_with_its_size_and_told_apart_from_a_low_pass():
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_slow_low_pass_is_one_name_and_leaves_nothing_for_others():
     found, _ = answer(("mag_low_pass", 3.0))
     assert [one.effect for one in found.findings] == ["mag_low_pass"]

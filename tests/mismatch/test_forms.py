@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.mismatch.engine import diagnose
 
 
+@pytest.mark.slow
 def test_a_gyro_that_turns_more_to_one_side_is_an_unknown_of_the_gyro():
     track = made(Trial(8, samples=8_000, rate_hz=25.0)).track
     rate = track.gyro_b_rad_s

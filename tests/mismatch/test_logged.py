@@ -40,8 +40,12 @@ def logged(track: Track, name: str, values: Array) -> Track:
     ("clock", "words"),
     [
         (lambda t: t - 3.0, "runs 3 s late against the sensor:"),
-        (lambda t: t + 20.0, "runs 20 s early against the sensor:"),
-        (lambda t: 0.98 * t, "and its clock drifts by 2"),
+        pytest.param(
+            lambda t: t + 20.0,
+            "runs 20 s early against the sensor:",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(lambda t: 0.98 * t, "and its clock drifts by 2", marks=pytest.mark.slow),
     ],
     ids=["late", "early", "drift"],
 )
@@ -56,7 +60,9 @@ def test_a_clock_that_is_wrong_is_said_and_the_cause_named(driven, clock, words)
         assert value.value == pytest.approx(truth, abs=max(5 * value.std, 1e-4))
 
 
-@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize(
+    "seed", [11, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (12, 13))]
+)
 def test_another_column_is_no_cause_at_any_time(driven, seed: int) -> None:
     track, _ = driven
     other = levels(track.time_s - track.time_s[0], seed)
@@ -75,6 +81,7 @@ def test_the_rest_of_a_column_with_a_hole_names_its_cause(driven) -> None:
     assert "column motor_current_a has no values in 39.9 s, first at 100." in found.notes[0]
 
 
+@pytest.mark.slow
 def test_a_column_with_a_hole_that_is_no_cause_is_left_out(driven) -> None:
     track, current = driven
     holed = np.where((track.time_s > 100.0) & (track.time_s < 140.0), np.nan, 0.3 * current)

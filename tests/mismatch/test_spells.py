@@ -67,6 +67,7 @@ def quiet() -> Track:
     return replace(made(Trial(seed=8, samples=6000)).track, covariates={})
 
 
+@pytest.mark.slow
 def test_what_comes_and_goes_is_told_from_beginning_to_end(quiet: Track) -> None:
     spans_s = [(40.0, 71.0), (95.0, 128.0), (171.0, 190.0)]
     on = np.any([(quiet.time_s >= a) & (quiet.time_s < b) for a, b in spans_s], axis=0)

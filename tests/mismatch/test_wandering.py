@@ -24,6 +24,7 @@ def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_bias_that_swings_is_no_walk(track):
     swing = 6e-4 * np.sin(2 * np.pi * track.time_s / 37.0)[:, None] * np.array([1.0, -0.5, 0.7])
     found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + swing))
@@ -50,6 +51,7 @@ def test_an_ordinary_walk_has_no_cause(track):
     assert {one.effect for one in diagnose(walked).findings} <= {"gyro_bias_drift"}
 
 
+@pytest.mark.slow
 def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
     steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
     scaled = track.gyro_b_rad_s * np.array([1.004, 0.997, 1.005])
