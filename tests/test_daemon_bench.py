@@ -24,7 +24,7 @@ def benchmark(name):
 
 
 @pytest.mark.benchmark
-@pytest.mark.parametrize("rate_hz", [200, 800])
+@pytest.mark.parametrize("rate_hz", [pytest.param(200, marks=pytest.mark.slow), 800])
 def test_no_sample_is_lost_and_the_processor_is_hardly_used(rate_hz, tmp_path):
     figures = benchmark("bench_run").measure(rate_hz, 15.0, tmp_path)
     print(figures)

@@ -45,7 +45,7 @@ def test_a_magnet_put_on_early(bench, kind, seed):
     assert np.linalg.norm(error) < 0.01
 
 
-@pytest.mark.parametrize("kind", ["wam", "mam", "lam"])
+@pytest.mark.parametrize("kind", ["wam", "mam", pytest.param("lam", marks=pytest.mark.slow)])
 def test_iron_that_stays_is_not_divided(bench, kind):
     for seed in range(3):
         run = bench.simulate(kind, "slow", seed, samples=4000)

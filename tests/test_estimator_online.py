@@ -57,8 +57,17 @@ def same(a, b):
 # -- accuracy and honesty ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["wam", "mam", "lam"])
-@pytest.mark.parametrize("motion", ["slow", "rov"])
+@pytest.mark.parametrize(
+    ("kind", "motion"),
+    [
+        ("lam", "slow"),
+        ("mam", "rov"),
+        pytest.param("lam", "rov", marks=pytest.mark.slow),
+        pytest.param("mam", "slow", marks=pytest.mark.slow),
+        pytest.param("wam", "rov", marks=pytest.mark.slow),
+        pytest.param("wam", "slow", marks=pytest.mark.slow),
+    ],
+)
 def test_errors_are_of_the_size_of_the_bound_and_of_the_covariance(kind, motion):
     """The short form; `tests/benchmarks/bench_estimator.py --runs 100` is the full one."""
     scores, excess = [], []
@@ -361,7 +370,7 @@ def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
 # -- cost ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["wam", "planar"])
+@pytest.mark.parametrize("kind", ["wam", pytest.param("planar", marks=pytest.mark.slow)])
 def test_cost_and_memory_do_not_grow_with_the_run(kind):
     """Per sample: the last 9,000 samples of 21,000 cost what the 9,000 before do."""
     parameters = EstimatorParameters(epoch_steps=128, window_steps=1024)

@@ -42,6 +42,7 @@ def test_a_misaligned_device_reads_the_turned_field():
     assert np.array_equal(gyro, gyro_before)
 
 
+@pytest.mark.slow
 def test_the_gyro_follows_the_device_s_own_temperature():
     wanted = ["gyro_bias_temperature=bias_per_degree_y=0.001"]
     device = build(SETUP, EmulatedEffects(SETUP, wanted))

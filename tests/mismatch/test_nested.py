@@ -1,11 +1,13 @@
 """A delay and the eddy currents that contain it."""
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.mismatch.engine import diagnose
 
 
+@pytest.mark.slow
 def test_a_delay_beside_eddy_currents_that_are_more_is_not_said():
     """Eddies of 5 ms, as different from axis to axis as they can be, and a step of the iron."""
     one = made(

@@ -77,6 +77,7 @@ def test_unlogged_pulses_are_named(quiet: Track) -> None:
     assert abs(found[0].parameters[0].value - 2e-3) < 5e-4
 
 
+@pytest.mark.slow
 def test_what_the_form_of_pulses_leaves_is_no_line(quiet: Track) -> None:
     """Pulses that swell and fade, held for a box, leave multiples of their rate."""
     part = np.minimum(((quiet.time_s - 0.4) % 1.0661) / 0.12, 1.0)

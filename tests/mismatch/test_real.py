@@ -101,6 +101,7 @@ def test_a_magnet_is_put_on_and_taken_off() -> None:
     assert values(lag)[0] == pytest.approx(0.0115, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_lag_is_named_beside_a_strong_magnet_that_a_hand_puts_on() -> None:
     """The way of the hand is louder than the lag; a mount of a degree looks like some of it."""
     found = diagnosed("broad/32_disturbed_attached_magnet_1cm.csv.gz")
@@ -111,6 +112,7 @@ def test_the_lag_is_named_beside_a_strong_magnet_that_a_hand_puts_on() -> None:
     assert any("left out" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
     found = diagnosed("broad/21_undisturbed_fast_combined.csv.gz")
     (lag,) = found.findings
@@ -119,7 +121,11 @@ def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["repoimu/TStick_Test11_Trial1.csv.gz", "vn100_distorters/clearIMU.csv.gz"]
+    "name",
+    [
+        "repoimu/TStick_Test11_Trial1.csv.gz",
+        pytest.param("vn100_distorters/clearIMU.csv.gz", marks=pytest.mark.slow),
+    ],
 )
 def test_ordinary_recordings_get_no_name_of_physics(name: str) -> None:
     assert {one.effect for one in diagnosed(name).findings} <= {"noise_burst", "noise_level"}

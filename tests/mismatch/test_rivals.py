@@ -34,6 +34,7 @@ def test_a_mount_that_stays_crooked_has_a_name(track: Track) -> None:
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_mount_that_bends_more_and_more_has_none(track: Track) -> None:
     share = np.linspace(0.0, 1.0, len(track))[:, None]
     found = diagnose(turned(track, share * np.array([6e-3, -4e-3, 5e-3])))
@@ -42,6 +43,7 @@ def test_a_mount_that_bends_more_and_more_has_none(track: Track) -> None:
     assert found.unexplained.where.frame in ("sensor", "gyro")
 
 
+@pytest.mark.slow
 def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Track) -> None:
     warmth = 1.0 - np.exp(-3.0 * np.linspace(0.0, 1.0, len(track)))[:, None]
     found = diagnose(turned(track, warmth * np.array([12e-3, -8e-3, 10e-3])))

@@ -80,6 +80,7 @@ def test_what_comes_and_goes_is_told_from_beginning_to_end(quiet: Track) -> None
     assert np.abs(np.array(where.intervals_s) - spans_s).max() < 2.0
 
 
+@pytest.mark.slow
 def test_a_bump_of_the_gyro_is_told_where_it_is(quiet: Track) -> None:
     part = np.clip((quiet.time_s - 100.0) / 40.0, 0.0, 1.0)
     bump = np.sin(np.pi * part)[:, None] ** 2 * np.array([1e-3, -2e-3, 2e-3])

@@ -33,6 +33,7 @@ def test_a_bias_that_swings_is_no_walk(track):
     assert found.unexplained.where.frame == "gyro"
 
 
+@pytest.mark.slow
 def test_a_step_and_a_start_up_are_no_walk(track):
     """Both explain in three numbers what a walk needs all its freedom for."""
     onset_s = 0.4 * (track.time_s[0] + track.time_s[-1])
