@@ -44,9 +44,9 @@ KINDS = {
 }
 #: functions of the engine that are timed, in the order in which they run
 PHASES = (
-    "problem_of", "fit_null", "sought", "wandering", "named_beside", "bursts", "with_one_source",
-    "with_spells", "in_its_noise", "with_forms", "with_free_course", "quick", "checks",
-    "usual_noise", "omnibus",
+    "problem_of", "fit_null", "sought", "wandering", "named_beside", "bursts", "framed",
+    "with_spells", "in_its_noise", "in_even_noise", "with_forms", "with_free_course", "quick",
+    "checks", "usual_noise", "omnibus",
 )  # fmt: skip
 
 
