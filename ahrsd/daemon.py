@@ -144,7 +144,7 @@ class Daemon:
             self._finish()
         except PortError:
             raise
-        except Exception:
+        except Exception:  # the one supervisor: whatever it was, the device is put back; it goes on
             self._make_amends()
             raise
         finally:
