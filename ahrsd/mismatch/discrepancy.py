@@ -22,9 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
-from ahrsd.mismatch import locate
+from ahrsd.mismatch import locate, variances
 from ahrsd.mismatch.evidence import SIZES, colour
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.together import (
@@ -52,7 +51,6 @@ MOST_RESTS = 6
 PARTS = 2 * len(LEAVING_S) + 1  # of a place, itself the last
 PLACES, WAYS = 5, 6  # numbers of their groups
 LARGEST_PLACE = 4.0  # logarithm: fields of two places in a room differ by 50 mG; a magnet's by more
-ITERATIONS = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,30 +203,8 @@ def fitted(
 
     named: the group that is a name: its deviation stays near its prior
     """
-    count = len(start)
-
-    G, s = G / noise, s / noise
-
-    def loss(sizes: Array) -> tuple[float, Array]:
-        deviation = np.exp(sizes)[group]
-        A = G * deviation
-        A *= deviation[:, None]
-        A[np.diag_indices_from(A)] += 1.0
-        # of the inverse only the diagonal is asked for: sums of squares down the columns of L^-1
-        L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
-        root, _ = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)
-        seen = root @ (deviation * s)
-        mean = seen @ root
-        nats = 0.5 * float(seen @ seen) + float(np.sum(np.log(np.diag(root))))
-        pull = mean**2 + np.einsum("ij,ij->j", root, root) - 1.0
-        return -nats, np.asarray(-np.bincount(group, pull, count), float)
-
-    bounds = [(SMALLEST, LARGEST_PLACE if k in (PLACES, WAYS) else LARGEST) for k in range(count)]
+    low = np.full(len(start), SMALLEST)
+    high = np.array([LARGEST_PLACE if k in (PLACES, WAYS) else LARGEST for k in range(len(start))])
     if named is not None:
-        bounds[named] = (float(np.log(SIZES[0])), float(np.log(SIZES[-1])))
-    from scipy.optimize import minimize  # dear to import, and needed beside a name only
-
-    result = minimize(
-        loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS}
-    )
-    return float(-result.fun), np.asarray(result.x, float)
+        low[named], high[named] = np.log(SIZES[0]), np.log(SIZES[-1])
+    return variances.fitted(G / noise, s / noise, group, np.asarray(start, float), low, high)
