@@ -102,8 +102,9 @@ def _at(G: Array, s: Array, group: NDArray[np.intp], sizes: Array) -> _At:
     seen = root @ (deviation * s)
     mean = seen @ root
     nats = 0.5 * float(seen @ seen) + float(np.sum(np.log(np.diag(root))))
-    explained = np.bincount(group, mean**2, count)
-    taken = np.bincount(group, 1.0 - np.einsum("ij,ij->j", root, root), count)
+    explained = np.asarray(np.bincount(group, mean**2, count), np.float64)
+    unsure = np.einsum("ij,ij->j", root, root)
+    taken = np.asarray(np.bincount(group, 1.0 - unsure, count), np.float64)
     ratio = np.maximum(explained, _TINY) / np.maximum(taken, _TINY)
     each = np.zeros((len(s), count))
     each[np.arange(len(s)), group] = mean / np.sqrt(ratio)[group]
