@@ -18,7 +18,7 @@ from ahrsd.mismatch.innovation import TRACELESS
 from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.locate import segments
-from ahrsd.mismatch.name import Judged
+from ahrsd.mismatch.name import LONELY_BLOCKS, Judged
 from ahrsd.mismatch.regression import CALIBRATION, Base, candidate_gram, scale_of, scaled
 from ahrsd.mismatch.reweighted import stepped
 from ahrsd.mismatch.search import (
@@ -284,15 +284,15 @@ def with_all_else(judged: Judged, seen: Survey) -> Judged:
 def _heldout(state: State, basis: Base, number: int, judged: Judged) -> Heldout:
     """Gains per recorded sample, of which `thin` are one of the search's.
 
-    Of fifths of the recording; where those know too little of each other the gate's own gain.
+    Of fifths of the recording; where those know too little of each other the gate's own gain, and
+    of what so few of the gate's blocks show that they do not know each other either, by the second.
     """
     wanders = state.walk > 0.0 and judged.candidate.name in WANDERING
     value, scale = added_value(state, number), judged.candidate.scale
     gain = gain_of(state.fit, number, value, scale, wanders=wanders)
     if gain is None:
-        gain = judged.gain
-        if gain.nats_per_sample <= 0.0:
-            gain = _within_seconds(basis, number, value, scale)
+        brief = judged.what.effective_blocks < LONELY_BLOCKS
+        gain = _within_seconds(basis, number, value, scale) if brief else judged.gain
     rms, thin = innovation_rms(basis), state.problem.thin
     ratio = gain.before / max(gain.after, 1e-12)
     before = rms * float(np.sqrt(max(ratio, 0.0)))
