@@ -33,6 +33,9 @@ BATCH_COLUMNS = 96
 #: effects whose parameters cannot be negative
 ONE_SIDED = ("mag_time_lag", "gyro_time_lag", "mag_low_pass", "mag_sample_hold")
 ONSET_STEPS, ONSET_PASSES = 12, 2
+#: rows that an onset leaves on either side: a run's first row opens the filter, and what begins
+#: with it has no before.  A field of a quarter of a gauss then takes up how the gyro drifts
+ROWS_BESIDE = 3
 #: settings that are a size, sought between the values of their grid, and what that choice costs
 SCALES = ("time_constant_s", "radius_gauss", "length_s", "length_m")
 ANGLES = ("turn_deg",)
@@ -362,10 +365,11 @@ def _closest_place(basis: Base, starts: Sequence[Candidate]) -> Candidate:
 def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:
     """The best onset within `reach_s`, to a small part of it; the choice is not paid for."""
     time_s = basis.context.track.time_s
+    first_s, last_s = time_s[ROWS_BESIDE], time_s[-ROWS_BESIDE]
     best = start
     for _ in range(ONSET_PASSES):
         grid = best.setting["onset_s"] + reach_s * np.linspace(-1, 1, ONSET_STEPS + 1)
-        inside = np.unique(np.clip(grid, time_s[0], time_s[-1]))
+        inside = np.unique(np.clip(grid, first_s, last_s))
         closer = [{**best.setting, "onset_s": round(float(t), 4)} for t in inside]
         best = max(_scan(basis, best.effect, closer), key=lambda candidate: candidate.evidence)
         best = replace(best, tried=start.tried, evidence=best.evidence + np.log(len(closer)))

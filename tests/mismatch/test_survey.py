@@ -9,7 +9,7 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import evidence_of
+from ahrsd.mismatch.regression import Candidate, base, closest_onset, evidence_of
 from ahrsd.mismatch.search import State, formed_basis_of, survey
 from ahrsd.mismatch.track import Spec
 from ahrsd.mismatch.unknown import beside_names, detected, remainder
@@ -51,3 +51,14 @@ def test_what_large_names_leave_of_their_own_form_is_no_unknown():
     assert not detected(beside_names(found, 41_931.0), LIMITS)
     assert detected(beside_names(found, 6_000.0), LIMITS)
     assert beside_names(found, 6_000.0).strongest.evidence == pytest.approx(18.2)
+
+
+def test_what_begins_has_a_before_and_an_after():
+    """A field all through the recording, which takes up how the gyro drifts, is no step."""
+    track = made(Trial(seed=1, samples=8000, effects=(("field_gradient", 4.0),))).track
+    fit = fit_null(track, walk=False)
+    basis = base(fit.context(), fit.filtered, [], 25.0)
+    for row, reach_s in ((50, 10.0), (-50, 10.0)):
+        near = Candidate(EFFECTS["field_step"], {"onset_s": float(track.time_s[row])}, 1, 0.0)
+        onset_s = closest_onset(basis, near, reach_s).setting["onset_s"]
+        assert track.time_s[3] <= onset_s <= track.time_s[-3]
