@@ -47,6 +47,7 @@ from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
+from ahrsd.mismatch.passing import without_passing
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
@@ -149,6 +150,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)
+    state, surveys, left = without_passing(state, surveys, left)
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
     left = in_even_noise(formed_basis_of(state), left, problem.limits)
     known = max((judged.evidence for judged in state.named), default=0.0)
