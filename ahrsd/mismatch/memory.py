@@ -3,7 +3,7 @@
 The middle of the play operator lies anywhere within its radius of the field when the recording
 begins, and most often at one end: the vehicle had turned.  Until the field has been as far away on
 either side nothing else is seen of it; taken for the middle, it looks like a small jump in the
-first seconds.  So each axis is held against both ends.
+first seconds.  So each axis is held against both ends, and then against what is between.
 
 Iron that takes its time to follow a turn has not settled when the recording begins either:
 
@@ -26,6 +26,8 @@ from ahrsd.mismatch.values import Columns
 
 #: nats that the choice of an axis costs
 CHOICE_NATS = float(np.log(3.0))
+#: parts of the radius by which a memory is moved, once or twice
+PLAYED_STEPS = (1.0, 0.25)
 #: nats that three more numbers cost, each known to a seventh of what it may be
 UNSETTLED_NATS = 6.0
 #: logarithm of the factor within which the time constant is sought beside the memory
@@ -78,16 +80,23 @@ def _behind(left: Base, candidate: Candidate) -> Candidate:
 
 
 def _played(left: Base, candidate: Candidate) -> Candidate:
-    """Iron with hysteresis with the memory that explains most."""
+    """Iron with hysteresis with the memory that explains most.
+
+    Axis by axis, twice: what one axis remembers is another matter once the others' is right.
+    """
     best, nats = candidate, evidence_of(left, candidate)
-    for axis in range(3):
-        at = list(best.setting.get("memory", (0.0, 0.0, 0.0)))
-        tried = [
-            replace(best, setting={**best.setting, "memory": (*at[:axis], end, *at[axis + 1 :])})
-            for end in {-1.0, 0.0, 1.0} - {at[axis]}
-        ]
-        found = [evidence_of(left, one) for one in tried]
-        k = int(np.argmax(found))
-        if found[k] > nats + CHOICE_NATS:
-            best, nats = tried[k], found[k]
+    for step in PLAYED_STEPS:
+        for axis in [*range(3), *range(3)]:
+            at = list(best.setting.get("memory", (0.0, 0.0, 0.0)))
+            ends = {float(np.clip(at[axis] + k * step, -1.0, 1.0)) for k in (-2, -1, 1, 2)}
+            tried = [
+                replace(
+                    best, setting={**best.setting, "memory": (*at[:axis], end, *at[axis + 1 :])}
+                )
+                for end in sorted(ends - {at[axis]})
+            ]
+            found = [evidence_of(left, one) for one in tried]
+            k = int(np.argmax(found))
+            if found[k] > nats + CHOICE_NATS:
+                best, nats = tried[k], found[k]
     return best
