@@ -33,6 +33,15 @@ from ahrsd.samples import Array
 
 #: names of a changing gyro bias that have a cause or a moment, which a random walk has not
 CAUSED = ("gyro_startup", "gyro_bias_temperature", "gyro_bias_step")
+#: effects of one thing of which several logged columns may be measures: vibration, a temperature
+ONE_CAUSE = (
+    "vibration_rectification",
+    "gyro_bias_temperature",
+    "mag_bias_temperature",
+    "mag_scale_temperature",
+)
+#: part of the first one's evidence from which a second column is a second cause
+SECOND_MEASURE = 0.05
 #: how often the times of steps are sought again in the joint fit
 STEP_PASSES = 2
 
@@ -48,6 +57,7 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
     broken: set[str] = set()  # names that the joint fit does not bear out beside those given
     while len(state.named) < state.problem.limits.most_terms:
         accepted = [j for j in last.judged if j.accepted and j.candidate.name not in broken]
+        accepted = [j for j in accepted if not _measured_again(state, j)]
         if not accepted:
             more = _cause_after_all(state, last)
             more = stepped(state) if more is state else more
@@ -68,6 +78,18 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
             state = tried
         broken, last = set(), survey(state)
     return state, first, last
+
+
+def _measured_again(state: State, judged: Judged) -> bool:
+    """Whether a name is there already by another measure of the same cause, and small beside it.
+
+    How it shakes is told by the shaft's speed and by the current, neither exactly: the second says
+    what the first is off by, and then neither has a size of its own.
+    """
+    if judged.candidate.name not in ONE_CAUSE:
+        return False
+    there = [one.evidence for one in state.named if one.candidate.name == judged.candidate.name]
+    return bool(there) and judged.evidence < SECOND_MEASURE * max(there)
 
 
 def borne_out(state: State, tried: State, judged: Judged, seen: Survey) -> bool:

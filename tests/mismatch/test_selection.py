@@ -82,3 +82,20 @@ def test_a_name_is_borne_out_by_what_is_gained_beyond_its_price(crossed):
     assert not borne_out(crossed, crossed, best, seen)
     more = replace(best, evidence=best.what.statistic / 2 + 5.0)
     assert borne_out(crossed, crossed, more, seen)
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.03, 1), (0.5, 2)])
+def test_vibration_by_two_columns_is_named_once_unless_both_say_much(share, named) -> None:
+    """How it shakes is told by the shaft and by the current, neither exactly."""
+    track = made(Trial(7, scenario="wam", samples=8000)).track
+    time_s = track.time_s
+    shaft = 90.0 + 30.0 * np.sign(np.sin(time_s / 9.0))
+    current = 4.0 + 2.0 * np.sign(np.sin(time_s / 23.0))
+    parts = [part**2 / np.mean(part**2) for part in (shaft, current)]
+    shaking = (1 - share) * parts[0] + share * parts[1]
+    gyro = track.gyro_b_rad_s + 2e-3 * shaking[:, None] * [0.5, -0.7, 0.5]
+    columns = {"motor_rpm": shaft, "motor_current_a": current}
+    track = replace(track, gyro_b_rad_s=gyro, covariates=columns)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    state, _, _ = forward(State(problem, fit_null(problem.track, problem.spec, cold, walk=False)))
+    assert state.names == ("vibration_rectification",) * named
