@@ -262,8 +262,9 @@ def _left(done: _Searched, problem: Problem, facts: Sequence[Fact]) -> Unexplain
         return done.short
     if beyond_lost(done.left, facts, problem):
         return unknown.described(done.left, problem.block_s, problem.limits)
-    lost = any(fact.turned is not None for fact in facts)
-    return (None if lost else ringing(formed_basis_of(done.state))) or Unexplained(False)
+    # a turn put together from what is left, and the error of coarse steps, ring by themselves
+    itself = any(fact.turned is not None or fact.effect == "mag_quantisation" for fact in facts)
+    return (None if itself else ringing(formed_basis_of(done.state))) or Unexplained(False)
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

@@ -12,7 +12,10 @@ from blindworld.rings import orders
 from ahrsd.diagnosing import diagnose_recording
 
 #: ring -> cases, seed
-RINGS = {"ring120b": (120, 3171823325885559521)}
+RINGS = {
+    "ring120b": (120, 3171823325885559521),
+    "ring300b": (300, 7839750651448068454),
+}
 
 
 def answered(ring, case, folder):
@@ -38,3 +41,12 @@ def test_what_nobody_logged_is_an_unknown_without_a_name(case, frame, tmp_path):
     assert found.findings == ()
     assert found.unexplained.detected
     assert found.unexplained.where.frame == frame
+
+
+def test_coarse_steps_are_named_and_nothing_rings_beside_them(tmp_path):
+    found, truth = answered("ring300b", "196ca98c", tmp_path)
+    (named,) = found.findings
+    assert [named.effect] == truth["effects"][0]["right"]
+    step = truth["effects"][0]["parameters"][0]["value"]
+    assert named.parameters[0].value == pytest.approx(step, rel=1e-3)
+    assert not found.unexplained.detected
