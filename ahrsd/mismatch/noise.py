@@ -215,7 +215,9 @@ def _is_noise(done: Filtered, blocks: Array) -> bool:
     Successive differences of white noise are correlated by -1/2.
     """
     time_s = done.track.time_s
-    near = np.min(np.abs(time_s[:, None] - blocks), axis=1) <= _BLOCK_S / 2
+    later = np.searchsorted(blocks, time_s).clip(1, len(blocks) - 1)
+    away_s = np.minimum(np.abs(time_s - blocks[later - 1]), np.abs(time_s - blocks[later]))
+    near = away_s <= _BLOCK_S / 2
     d = np.diff(done.whitened, axis=0)
     kept = (done.used & near)[2:] & done.used[1:-1] & done.used[:-2]
     square = float(np.sum(d[1:][kept] ** 2))

@@ -8,20 +8,20 @@ An onset is then sought more closely, to a fraction of a second.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.mismatch.choices import choices
 from ahrsd.mismatch.effects.base import Effect, Setting
 from ahrsd.mismatch.effects.world import moved_object
-from ahrsd.mismatch.evidence import colour, log_bayes
+from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.gram import Gram, block_edges, gram, slices, solve
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.mismatch.objects import closest_object
 from ahrsd.mismatch.rest import Whitening
-from ahrsd.mismatch.score import Score, total_score
 from ahrsd.mismatch.side_by_side import batches, joined
 from ahrsd.mismatch.sums import Sums
 from ahrsd.mismatch.values import Columns, Context
@@ -95,12 +95,16 @@ class Base:
     def whitened(self, columns: Sequence[Columns]) -> list[Array]:
         """The columns (N, 3, p) as the innovation sees them, several of one side at a time."""
         out: dict[int, Array] = {}
-        for batch in batches(columns, BATCH_COLUMNS):
-            seen = self._seen(joined([columns[k] for k in batch]))
+        for batch, seen in self.passed(columns):
             edges = np.cumsum([0, *(columns[k].width for k in batch)])
             parts = (seen[:, :, a:b] for a, b in itertools.pairwise(edges))
             out.update(zip(batch, parts, strict=True))
         return [out[k] for k in range(len(columns))]
+
+    def passed(self, columns: Sequence[Columns]) -> Iterator[tuple[list[int], Array]]:
+        """Numbers of some of the columns, and these whitened next to each other (N, 3, ...)."""
+        for batch in batches(columns, BATCH_COLUMNS):
+            yield batch, self._seen(joined([columns[k] for k in batch]))
 
     def _seen(self, columns: Columns) -> Array:
         seen = sensitivities(self.filtered, columns)
@@ -251,34 +255,36 @@ def _scan(basis: Base, effect: Effect, options: Sequence[Setting]) -> list[Candi
     inverse = solve(sums.inner[np.ix_(kept, kept)], np.eye(len(kept)))
     known_e = (sums.seen + sums.inner @ basis.back)[kept]
     scale = np.array([parameter.scale for parameter in effect.parameters])
-    out = []
-    for option, key in zip(options, keys, strict=True):
-        XX, whole, Xe = sums.found[key]
-        cross = whole[kept]
-        M = inverse @ cross
-        G = XX - cross.T @ M
-        s = Xe + whole.T @ basis.back - M.T @ known_e
-        what = total_score(G, s, np.diag(XX), scale, effect.least_information)
-        tried = len(options) * int(option.get("searched", 1))
-        paid = log_bayes(what, basis.colour) - float(np.log(tried))
-        evidence = paid if _possible(effect, what) else -np.inf
-        out.append(Candidate(effect, option, tried, evidence))
-    return out
+    XX, whole, Xe = map(np.stack, zip(*(sums.found[key] for key in keys), strict=True))
+    cross = whole[:, kept]
+    M = inverse @ cross
+    G = XX - np.swapaxes(cross, 1, 2) @ M
+    s = Xe + basis.back @ whole - known_e @ M
+    power = np.diagonal(XX, axis1=1, axis2=2)
+    what = choices(G, s, power, scale, effect.least_information)
+    tried = [len(options) * int(option.get("searched", 1)) for option in options]
+    evidence = what.log_bayes(basis.colour) - np.log(tried)
+    if effect.identifier in ONE_SIDED:  # a delay or a time constant, negative beyond doubt
+        evidence[what.below_zero(2.0)] = -np.inf
+    found = zip(options, tried, evidence.tolist(), strict=True)
+    return [Candidate(effect, option, count, paid) for option, count, paid in found]
 
 
 def _summed(basis: Base, wanted: Sequence[tuple[Effect, Setting]]) -> list[tuple[str, str]]:
     """Keys of effects in their settings among the basis's sums, which then has all of them."""
     keys = [(effect.identifier, repr(option)) for effect, option in wanted]
-    batch: list[tuple[tuple[str, str], Columns]] = []
+    batch: dict[tuple[str, str], Columns] = {}
+    width = 0
     for number, (key, (effect, option)) in enumerate(zip(keys, wanted, strict=True), start=1):
-        if key not in basis.sums.found:
-            batch.append((key, effect.columns(basis.context, option)))
-        width = sum(columns.width for _, columns in batch)
+        if key not in basis.sums.found and key not in batch:
+            batch[key] = effect.columns(basis.context, option)
+            width += batch[key].width
         if batch and (width >= BATCH_COLUMNS or number == len(keys)):
-            parts = basis.whitened([columns for _, columns in batch])
-            for (new, _), part in zip(batch, parts, strict=True):
-                basis.sums.add(new, part)
-            batch = []
+            new, columns = list(batch), list(batch.values())
+            for numbers, seen in basis.passed(columns):
+                parts = [(new[k], columns[k].width) for k in numbers]
+                basis.sums.add(parts, seen)
+            batch, width = {}, 0
     return keys
 
 
@@ -375,10 +381,3 @@ def closest_onset(basis: Base, start: Candidate, reach_s: float) -> Candidate:
         best = replace(best, tried=start.tried, evidence=best.evidence + np.log(len(closer)))
         reach_s *= 2.0 / ONSET_STEPS
     return best
-
-
-def _possible(effect: Effect, what: Score) -> bool:
-    """False for a delay or a time constant that is negative beyond doubt."""
-    if effect.identifier not in ONE_SIDED or what.rank == 0:
-        return True
-    return bool(np.all(what.value > -2.0 * np.sqrt(np.diag(what.covariance))))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 from ahrsd.samples import Array
 
@@ -27,7 +29,11 @@ class Sums:
         Z, e = known.reshape(-1, known.shape[2]), innovation.ravel()
         return Sums(Z, e, Z.T @ Z, Z.T @ e)
 
-    def add(self, key: tuple[str, str], columns: Array) -> None:
-        """Whitened columns (N, 3, p)."""
+    def add(self, parts: Sequence[tuple[tuple[str, str], int]], columns: Array) -> None:
+        """Whitened columns (N, 3, p) of the parts (key, width) next to each other."""
         X = columns.reshape(-1, columns.shape[2])
-        self.found[key] = X.T @ X, self.known.T @ X, X.T @ self.innovation
+        squares, cross, seen = X.T @ X, self.known.T @ X, self.innovation @ X
+        ends = accumulate(width for _, width in parts)
+        for (key, width), end in zip(parts, ends, strict=True):
+            own = slice(end - width, end)
+            self.found[key] = squares[own, own], cross[:, own], seen[own]

@@ -29,9 +29,12 @@ def unit_fields(away_m: Array, distance_m: float) -> Array:
 
     A moment is given as the field that it makes beside itself at `distance_m`.
     """
-    distance = np.maximum(np.linalg.norm(away_m, axis=1), _NEAREST_M / 4)[:, None, None]
-    r = away_m[:, :, None] / distance
-    return np.asarray((3 * r @ np.swapaxes(r, 1, 2) - np.eye(3)) * (distance_m / distance) ** 3)
+    distance = np.maximum(np.linalg.norm(away_m, axis=1), _NEAREST_M / 4)
+    r = away_m / distance[:, None]
+    strength = (distance_m / distance) ** 3
+    fields = (3 * strength[:, None] * r)[:, :, None] * r[:, None, :]
+    fields[:, [0, 1, 2], [0, 1, 2]] -= strength[:, None]
+    return np.asarray(fields)
 
 
 def found_place(

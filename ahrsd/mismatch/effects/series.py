@@ -153,13 +153,17 @@ def play(values: Array, radius: float, memory: Sequence[float] | None = None) ->
 
     memory (k,): where in the slot the first of the values lies, -1 to 1; its middle if None
     """
-    out = np.empty_like(values)
     low, high = values - radius, values + radius
-    last = values[0] + radius * np.asarray(memory or (0.0,) * values.shape[1])
-    for k in range(len(values)):
-        last = np.minimum(np.maximum(last, low[k]), high[k])
-        out[k] = last
-    return out
+    start = values[0] + radius * np.asarray(memory or (0.0,) * values.shape[1])
+    # a clamp after a clamp is a clamp: pairs of rows first, then pairs of those
+    reach = 1
+    while reach < len(values):
+        before, after = (slice(None, -reach), slice(reach, None))
+        low[after], high[after] = (
+            np.minimum(np.maximum(end[before], low[after]), high[after]) for end in (low, high)
+        )
+        reach *= 2
+    return np.asarray(np.minimum(np.maximum(start, low), high))
 
 
 def moving_mean(values: Array, dt_s: Array, rows: int) -> Array:
