@@ -358,12 +358,14 @@ def _closest_place(basis: Base, starts: Sequence[Candidate]) -> Candidate:
     """An object's place and the turn of the positions' frame sought together; unpaid for."""
     effect, context, setting = starts[0].effect, basis.context, starts[0].setting
 
-    def seen(places: Sequence[Array]) -> list[Array]:
-        moved = [moved_object(context, setting, place) for place in places]
-        return basis.whitened([effect.columns(context, one) for one in moved])
+    def fields(place: Array) -> Array:
+        return np.asarray(effect.columns(context, moved_object(context, setting, place)).mag)
+
+    def whitened(parts: Sequence[Array]) -> list[Array]:
+        return basis.whitened([Columns(mag=part) for part in parts])
 
     at = [np.append(one.setting["place_m"], one.setting["turn_deg"]) for one in starts]
-    found = closest_object(seen, basis.known, basis.innovation, at)
+    found = closest_object(fields, whitened, basis.known, basis.innovation, at)
     best = replace(starts[0], setting=moved_object(context, setting, found))
     return replace(best, evidence=evidence_of(basis, best))
 
