@@ -13,9 +13,7 @@ from pathlib import Path
 
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples, Stop
-from ahrsd.recording import blocks
 from ahrsd.recording.bytestream import read_chunks, read_received
-from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.recording.table import Table, read_table
 
 _END = "end of recording"
@@ -66,6 +64,8 @@ class Recording:
         return _byte_inputs(self.path)
 
     def _capture_inputs(self) -> Iterator[Input]:
+        from ahrsd.recording.capture import CaptureReader, Sent
+
         reader = CaptureReader(self.path)
         last: Input | None = None
         received = 0
@@ -118,6 +118,8 @@ def open_recording(
         return Recording(path, kind, rate_hz)
     unused = [] if rate_hz is None else [f"--rate is not used: a {kind.value} has its own time"]
     if kind is Kind.CAPTURE:
+        from ahrsd.recording.capture import CaptureReader  # a table needs no reader of captures
+
         header = CaptureReader(path).header
         return Recording(path, kind, header=header, notes=unused)
     table = read_table(path, check_units=check_units)
@@ -126,6 +128,8 @@ def open_recording(
 
 def _by_content(path: Path) -> Kind:
     start = next(read_chunks(path))
+    from ahrsd.recording import blocks
+
     if blocks.is_mcap(start):
         return Kind.CAPTURE
     if b"time_s" in start.split(b"\n", 1)[0]:

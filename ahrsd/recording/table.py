@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow
 import pyarrow.csv
-import pyarrow.parquet
 from numpy.typing import NDArray
 
 from ahrsd.errors import RecordingError
@@ -159,8 +158,10 @@ def _check_text(path: Path, data: bytes) -> None:
 
 
 def _read_parquet(path: Path) -> pyarrow.Table:
+    from pyarrow import parquet  # most tables are text, and every import is paid at every start
+
     try:
-        table = pyarrow.parquet.read_table(path)
+        table = parquet.read_table(path)
     except FileNotFoundError as error:
         raise RecordingError(path, "does not exist", "check the path") from error
     except (pyarrow.ArrowInvalid, OSError) as error:
