@@ -50,10 +50,13 @@ class Layout:
         return out[:-1]
 
 
-def layout_of(runs: tuple[slice, ...]) -> Layout:
-    """Blocks of nearly equal length in every run, about as many as there are steps in one."""
+def layout_of(runs: tuple[slice, ...], longest: int | None = None) -> Layout:
+    """Blocks of nearly equal length in every run, about as many as there are steps in one.
+
+    longest: rows of a block at most, where not as many
+    """
     count = sum(run.stop - run.start for run in runs)
-    longest = max(16, round(np.sqrt(count)))
+    longest = longest or max(16, round(np.sqrt(count)))
     starts: list[int] = []
     opens: list[bool] = []
     for run in runs:

@@ -8,7 +8,13 @@ of p(x_end | x_start) ~ N(T x_start, C) and of the information J that its readin
 
     P_end = T P (I + J P)^-1 T^T + C
 
-chains the blocks; a second pass from the true starts gives every gain.
+chains the blocks, and one such triple behind another is a triple again:
+
+    T = Tj (I + Ci Jj)^-1 Ti
+    C = Tj (I + Ci Jj)^-1 Ci Tj^T + Cj
+    J = Ti^T (I + Jj Ci)^-1 Jj Ti + Ji
+
+A second pass from the true starts gives every gain.
 """
 
 from __future__ import annotations
@@ -18,8 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.mismatch.blocks import Layout
+from ahrsd.mismatch.blocks import Layout, layout_of
 from ahrsd.samples import Array
+
+#: rows of a block: a step costs nearly the same for hundreds of blocks as for a few
+STEPS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,9 +58,9 @@ class Gains:
     innovation_covariance: Array
 
 
-def gains(model: Linear, layout: Layout) -> Gains:
-    """Gains of all rows."""
-    sweep = _Sweep(model, layout)
+def gains(model: Linear, runs: tuple[slice, ...]) -> Gains:
+    """Gains of all rows of the gap-free runs."""
+    sweep = _Sweep(model, layout_of(runs, STEPS))
     starts = _starts(*sweep.element())
     gain, S = sweep.filter(starts)
     gain[model.blind] = 0.0
@@ -61,69 +70,113 @@ def gains(model: Linear, layout: Layout) -> Gains:
 
 
 def _starts(T: Array, C: Array, J: Array) -> Array:
-    """Covariance at the start of each block (B, s, s); the first block opens a run."""
-    size = T.shape[-1]
-    out = np.empty_like(C)
-    P = np.zeros((size, size))
-    for b in range(len(T)):
-        out[b] = P
-        P = T[b] @ P @ np.linalg.solve(np.eye(size) + J[b] @ P, T[b].T) + C[b]
-        P = (P + P.T) / 2
-    return out
+    """Covariance at the start of each block (s, s, B); the first block opens a run.
+
+    Blocks are chained by twos, fours, ...: from the first to each of them all in log2(B) rounds.
+    """
+    size, _, count = C.shape
+    identity = np.eye(size)[:, :, None]
+    reach = 1
+    while reach < count:
+        before, after = (slice(None, -reach), slice(reach, None))
+        Ti, Ci, Ji = (part[:, :, before] for part in (T, C, J))
+        Tj, Cj, Jj = (part[:, :, after] for part in (T, C, J))
+        through = _solved(
+            identity + _times(Jj, Ci), np.concatenate([_turned(Tj), _times(Jj, Ti)], 1)
+        )
+        carried, seen = _turned(through[:, :size]), through[:, size:]
+        T, C, J = (
+            np.concatenate([part[:, :, :reach], chained], axis=2)
+            for part, chained in (
+                (T, _times(carried, Ti)),
+                (C, _symmetric(_times(_times(carried, Ci), _turned(Tj)) + Cj)),
+                (J, _symmetric(_times(_turned(Ti), seen) + Ji)),
+            )
+        )
+        reach *= 2
+    return np.concatenate([np.zeros((size, size, 1)), C[:, :, :-1]], axis=2)
 
 
 class _Sweep:
-    """All blocks, step by step."""
+    """All blocks, step by step.  Matrices are (i, j, B): thousands of 3 x 3 are quicker so."""
 
     def __init__(self, model: Linear, layout: Layout) -> None:
-        size = model.transition.shape[-1]
+        self._size = model.transition.shape[-1]
         self._layout = layout
         self._A = model.soft_iron
-        self._R = model.variance * np.eye(3)
-        self._steps = layout.padded(model.transition, np.eye(size))
-        self._process = layout.padded(model.process, 0.0)
+        self._R = model.variance * np.eye(3)[:, :, None]
+        self._steps = _blocks_last(layout.padded(model.transition, np.eye(self._size)))
+        self._process = _blocks_last(layout.padded(model.process, 0.0))
         self._blind = layout.padded((model.blind | model.opens).astype(float), 1.0) > 0
         self._any_blind = np.any(self._blind, axis=1)
 
     def _prior(self, j: int, P: Array) -> tuple[Array, Array, Array]:
-        """P-, A P-[:3] as (B, 3, s), and S of step j, from P behind step j - 1."""
+        """P-, A P-[:3] as (3, s, B), and S of step j, from P behind step j - 1."""
         step = self._steps[j]
-        prior = step @ P @ np.swapaxes(step, 1, 2) + self._process[j]
-        cross = self._A @ prior[:, :3]
-        return prior, cross, cross[:, :, :3] @ self._A + self._R
+        moved = _times(step, P)
+        prior = np.einsum("ikb,jkb->ijb", moved, step) + self._process[j]
+        cross = self._seen(prior)
+        return prior, cross, np.einsum("ikb,kj->ijb", cross[:, :3], self._A) + self._R
+
+    def _seen(self, states: Array) -> Array:
+        """A X[:3], (3, s, B)."""
+        field = states[:3]
+        return np.asarray((self._A @ field.reshape(3, -1)).reshape(field.shape))
 
     def element(self) -> tuple[Array, Array, Array]:
-        """(T, C, J) of every block."""
-        count, blocks, size = self._steps.shape[:3]
-        C = np.zeros((blocks, size, size))
+        """(T, C, J) of every block, (s, s, B) each."""
+        (count, blocks), size = self._blind.shape, self._size
+        C = np.zeros(self._steps.shape[1:])
         J = np.zeros_like(C)
-        T: Array = np.broadcast_to(np.eye(size), C.shape)
+        T: Array = np.repeat(np.eye(size)[:, :, None], blocks, axis=2)
         for j in range(count):
             prior, cross, S = self._prior(j, C)
-            moved = self._steps[j] @ T
-            seen = self._A @ moved[:, :3]
-            both = inverse(S) @ np.concatenate([cross, seen], axis=2)
+            moved = _times(self._steps[j], T)
+            seen = self._seen(moved)
+            both = _times(inverse(S), np.concatenate([cross, seen], axis=1))
             if self._any_blind[j]:
-                both[self._blind[j]] = 0.0
-            back = np.swapaxes(cross, 1, 2)
-            C = _symmetric(prior - back @ both[:, :, :size])
-            J = J + np.swapaxes(seen, 1, 2) @ both[:, :, size:]
-            T = moved - back @ both[:, :, size:]
+                both[:, :, self._blind[j]] = 0.0
+            back = np.einsum("kib,kjb->ijb", cross, both)
+            C = _symmetric(prior - back[:, :size])
+            J += np.einsum("kib,kjb->ijb", seen, both[:, size:])
+            T = moved - back[:, size:]
         return T, C, J
 
-    def filter(self, P: Array) -> tuple[Array, Array]:
-        """Gains (N, s, 3) and innovation covariances (N, 3, 3) from the true starts."""
-        count, blocks, size = self._steps.shape[:3]
-        gain = np.empty((count, blocks, size, 3))
-        S = np.empty((count, blocks, 3, 3))
+    def filter(self, starts: Array) -> tuple[Array, Array]:
+        """Gains (N, s, 3) and innovation covariances (N, 3, 3) from the true starts (s, s, B)."""
+        (count, blocks), size = self._blind.shape, self._size
+        gain = np.empty((count, 3, size, blocks))
+        S = np.empty((count, 3, 3, blocks))
+        P = starts
         for j in range(count):
             prior, cross, S[j] = self._prior(j, P)
-            gain_t = inverse(S[j]) @ cross
+            gain[j] = _times(inverse(S[j]), cross)
             if self._any_blind[j]:
-                gain_t[self._blind[j]] = 0.0
-            gain[j] = np.swapaxes(gain_t, 1, 2)
-            P = _symmetric(prior - gain[j] @ cross)
-        return self._layout.unpadded(gain), self._layout.unpadded(S)
+                gain[j][:, :, self._blind[j]] = 0.0
+            P = _symmetric(prior - np.einsum("kib,kjb->ijb", gain[j], cross))
+        unpadded = self._layout.unpadded
+        return unpadded(gain.transpose(0, 3, 2, 1)), unpadded(S.transpose(0, 3, 1, 2))
+
+
+def _times(left: Array, right: Array) -> Array:
+    """(i, j, B) products of (i, k, B) and (k, j, B)."""
+    return np.asarray(np.einsum("ikb,kjb->ijb", left, right))
+
+
+def _turned(matrices: Array) -> Array:
+    """(j, i, B) of (i, j, B)."""
+    return np.swapaxes(matrices, 0, 1)
+
+
+def _solved(left: Array, right: Array) -> Array:
+    """(s, j, B) left^-1 right of (s, s, B) and (s, j, B)."""
+    out = np.linalg.solve(np.moveaxis(left, 2, 0), np.moveaxis(right, 2, 0))
+    return np.ascontiguousarray(np.moveaxis(out, 0, 2))
+
+
+def _blocks_last(matrices: Array) -> Array:
+    """(..., i, j, B) of (..., B, i, j)."""
+    return np.ascontiguousarray(np.moveaxis(matrices, -3, -1))
 
 
 #: entries of a 3 x 3 matrix, row by row, whose products make up its cofactors, row by row
@@ -132,12 +185,12 @@ _SECOND = np.array([5, 3, 4, 8, 6, 7, 2, 0, 1]), np.array([7, 8, 6, 1, 2, 0, 4, 
 
 
 def inverse(S: Array) -> Array:
-    """(B, 3, 3) of well-conditioned (B, 3, 3), by cofactors: LAPACK is called for each."""
-    flat = S.reshape(-1, 9)
-    cofactors = flat[:, _FIRST[0]] * flat[:, _FIRST[1]] - flat[:, _SECOND[0]] * flat[:, _SECOND[1]]
-    determinant = np.einsum("bi,bi->b", flat[:, :3], cofactors[:, :3])
-    return np.asarray(np.swapaxes((cofactors / determinant[:, None]).reshape(-1, 3, 3), 1, 2))
+    """(3, 3, B) of well-conditioned (3, 3, B), by cofactors: LAPACK is called for each."""
+    flat = S.reshape(9, -1)
+    cofactors = flat[_FIRST[0]] * flat[_FIRST[1]] - flat[_SECOND[0]] * flat[_SECOND[1]]
+    determinant = np.einsum("ib,ib->b", flat[:3], cofactors[:3])
+    return _turned((cofactors / determinant).reshape(S.shape))
 
 
 def _symmetric(P: Array) -> Array:
-    return np.asarray((P + np.swapaxes(P, 1, 2)) / 2)
+    return np.asarray((P + _turned(P)) / 2)

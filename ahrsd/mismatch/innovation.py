@@ -120,7 +120,7 @@ def run_filter(
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
         linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
-        found = gains(linear, layout)
+        found = gains(linear, _runs(track))
     else:
         nominal, found = held.nominal_b, held.gains
     if strength_known:
@@ -151,10 +151,14 @@ def run_filter(
 
 def _laid_out(track: Track) -> tuple[Layout, NDArray[np.bool]]:
     """The track's runs as the filter passes them, and (N,) the rows with which a run opens."""
-    layout = layout_of(track.runs or (slice(0, len(track)),))
+    layout = layout_of(_runs(track))
     opens = np.zeros(len(track), dtype=bool)
     opens[layout.starts[layout.opens]] = True
     return layout, opens
+
+
+def _runs(track: Track) -> tuple[slice, ...]:
+    return track.runs or (slice(0, len(track)),)
 
 
 def _log_likelihood(whitened: Array, root: Array) -> Array:
