@@ -125,8 +125,8 @@ def _shapes(context: Context) -> list[tuple[Columns, float]]:
     rests = places(context)
     mag = locate.frame_columns(context, "sensor", rests).mag if len(rests) else None
     if mag is not None:
-        itself = np.repeat(np.arange(len(rests)) % PARTS == PARTS - 1, 3)
-        out += [(Columns(mag=mag[:, :, part]), UNIT_GAUSS) for part in (itself, ~itself)]
+        ways = 3 * (len(rests) // PARTS)  # behind the places themselves
+        out += [(Columns(mag=part), UNIT_GAUSS) for part in np.split(mag, [ways], axis=2)]
     return out
 
 
@@ -172,7 +172,7 @@ def _second(x: Array, y: Array, z: Array) -> list[Array]:
 
 
 def places(context: Context) -> locate.Segments:
-    """The stretches in which the vehicle stands, the longest, and the ways from and to them."""
+    """The stretches in which the vehicle stands, the longest, then the ways from and to them."""
     track = context.track
     still = np.linalg.norm(context.rate_b_rad_s, axis=1) < STILL_RAD_S
     padded = np.concatenate([[False], still, [False]]).astype(int)
@@ -188,7 +188,10 @@ def places(context: Context) -> locate.Segments:
                 count += 1
         index[(track.time_s >= begins_s[k]) & (track.time_s <= ends_s[k])] = count
         count += 1
-    return locate.Segments(np.arange(count + 1.0), index)
+    rest = index // PARTS
+    way = count // PARTS + index - rest
+    number = np.where(index % PARTS == PARTS - 1, rest, way)
+    return locate.Segments(np.arange(count + 1.0), np.where(index < 0, -1, number))
 
 
 def fitted(

@@ -295,7 +295,7 @@ def _predicted(layout: Layout, state: Array, found: Gains, A: Array, field: Arra
     """Predicted fields (N, 3); in a run's first row the reading itself."""
     size = state.shape[-1]
     opens = layout.starts[layout.opens]
-    gain = found.gain @ A
+    gain = (found.gain.reshape(-1, 3) @ A).reshape(found.gain.shape)
     gain[opens, :3] = np.eye(3)  # whatever soft iron the gains were made for
     matrix = np.zeros((len(state), 3 + size, size + 6))
     matrix[:, :3, :size] = state[:, :3]

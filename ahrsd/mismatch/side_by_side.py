@@ -35,3 +35,15 @@ def joined(parts: Sequence[Columns]) -> Columns:
         np.concatenate(mag, axis=2) if mag else None,
         np.concatenate(gyro, axis=2) if gyro else None,
     )
+
+
+def pieces(columns: Columns, most: int) -> list[Columns]:
+    """The columns in parts of at most `most`."""
+    if columns.width <= most:
+        return [columns]
+    cuts = range(0, columns.width, most)
+    mag, gyro = (
+        [None if side is None else side[:, :, at : at + most] for at in cuts]
+        for side in (columns.mag, columns.gyro)
+    )
+    return [Columns(*sides) for sides in zip(mag, gyro, strict=True)]

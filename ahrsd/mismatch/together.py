@@ -10,7 +10,8 @@ import numpy as np
 from ahrsd.mismatch.course_gram import Courses, courses
 from ahrsd.mismatch.gram import RANK_SHARE, solve
 from ahrsd.mismatch.locate import Frame, Segments, frame_columns
-from ahrsd.mismatch.regression import Base, residual
+from ahrsd.mismatch.regression import BATCH_COLUMNS, Base, residual
+from ahrsd.mismatch.side_by_side import pieces
 from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
 
@@ -64,8 +65,24 @@ def together(
     plain = [columns for columns, _ in others]
     if free is None:
         plain = [*(frame_columns(basis.context, frame, cut) for frame, _ in frames), *plain]
-    seen = basis.whitened(plain)
-    return Together(free, np.concatenate(seen, axis=2), np.concatenate(units))
+    return Together(free, _whitened(basis, plain), np.concatenate(units))
+
+
+def _whitened(basis: Base, columns: Sequence[Columns]) -> Array:
+    """(N, 3, q) the columns next to each other, as the innovation sees them.
+
+    Hundreds of them, so a piece at a time into where all of them stay.
+    """
+    parts = [piece for one in columns for piece in pieces(one, BATCH_COLUMNS)]
+    ends = np.cumsum([piece.width for piece in parts])
+    out = np.empty((len(basis.innovation), 3, int(ends[-1])))
+    for batch, seen in basis.passed(parts):
+        first = 0
+        for k in batch:
+            width = parts[k].width
+            out[:, :, ends[k] - width : ends[k]] = seen[:, :, first : first + width]
+            first += width
+    return out
 
 
 def projected(basis: Base, columns: Array) -> tuple[Array, Array]:

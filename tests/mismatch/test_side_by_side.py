@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.mismatch.gains import inverse
-from ahrsd.mismatch.side_by_side import batches, joined
+from ahrsd.mismatch.side_by_side import batches, joined, pieces
 from ahrsd.mismatch.values import Columns
 
 
@@ -35,6 +35,15 @@ def test_batches_are_of_one_side_and_no_wider_than_wanted() -> None:
                 assert own == [None] * len(batch)
             else:
                 np.testing.assert_array_equal(part, np.concatenate(own, axis=2))
+
+
+def test_pieces_are_the_columns_in_order() -> None:
+    rng = np.random.default_rng(2)
+    whole = Columns(mag=rng.normal(size=(5, 3, 8)))
+    parts = pieces(whole, 3)
+    assert [part.width for part in parts] == [3, 3, 2]
+    np.testing.assert_array_equal(joined(parts).mag, whole.mag)
+    assert pieces(whole, 8) == [whole]
 
 
 def test_the_inverse_is_one() -> None:

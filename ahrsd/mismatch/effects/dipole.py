@@ -24,16 +24,19 @@ _TURNS_RAD = (-np.pi / 2, np.pi / 2, np.pi)  # of a frame of positions that is n
 _NEAREST_M = 0.2
 
 
-def unit_fields(away_m: Array, distance_m: float) -> Array:
+def unit_fields(away_m: Array, distance_m: float, axes: Array | None = None) -> Array:
     """Fields (N, 3, 3) of unit moments at offsets (N, 3) from the object.
 
     A moment is given as the field that it makes beside itself at `distance_m`.
+    axes: (N, 3, 3) the world's axes as the fields are wanted, the world's own if None
     """
-    distance = np.maximum(np.linalg.norm(away_m, axis=1), _NEAREST_M / 4)
+    size = np.sqrt(np.einsum("ni,ni->n", away_m, away_m))
+    distance = np.maximum(size, _NEAREST_M / 4)
     r = away_m / distance[:, None]
     strength = (distance_m / distance) ** 3
-    fields = (3 * strength[:, None] * r)[:, :, None] * r[:, None, :]
-    fields[:, [0, 1, 2], [0, 1, 2]] -= strength[:, None]
+    seen = r if axes is None else np.einsum("nij,nj->ni", axes, r)
+    fields = (3 * strength[:, None] * seen)[:, :, None] * r[:, None, :]
+    fields -= strength[:, None, None] * (np.eye(3) if axes is None else axes)
     return np.asarray(fields)
 
 

@@ -147,8 +147,8 @@ class FieldAnomaly(Linear):
         if place is None:
             raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
         away = turned_down(place - setting["place_m"], setting.get("turn_deg", 0.0))
-        field = unit_fields(away, setting["distance_m"])
-        return Columns(mag=_seen(readings, field))
+        axes = shapes.world_axes(readings)
+        return Columns(mag=unit_fields(away, setting["distance_m"], axes))
 
 
 class GeomagneticDrift(Linear):
@@ -355,7 +355,8 @@ def moved_object(context: Context, setting: Setting, place_and_turn: Array) -> S
     way = position_m(readings_of(context))
     if way is None:
         return setting
-    nearest = float(np.linalg.norm(way - place_and_turn[:3], axis=1).min())
+    away = way - place_and_turn[:3]
+    nearest = float(np.sqrt(np.einsum("ni,ni->n", away, away).min()))
     at = _object(place_and_turn[:3], max(nearest, _NEAREST_M), float(place_and_turn[3]))
     return {**setting, **at}
 
