@@ -363,10 +363,11 @@ def _bands(found: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float
 
 def _portmanteau(e: Array) -> float:
     """Sum of squared autocorrelations times their number, over the number of lags."""
-    count = len(e)
-    spectrum = np.abs(np.fft.rfft(e, 2 * count, axis=0)) ** 2
-    lags = np.fft.irfft(spectrum.sum(axis=1))[: min(_LAGS, count - 1) + 1]
-    return float(np.mean((lags[1:] / max(lags[0], _LEAST)) ** 2) * 3 * count)
+    count, axes = e.shape
+    flat = e.ravel()
+    most = min(_LAGS, count - 1)
+    lags = [float(flat[: flat.size - k * axes] @ flat[k * axes :]) for k in range(most + 1)]
+    return float(np.mean((np.array(lags[1:]) / max(lags[0], _LEAST)) ** 2) * 3 * count)
 
 
 def _shift(values: Array, scene: Scene) -> float:

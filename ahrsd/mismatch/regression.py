@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,7 +193,7 @@ def best_settings(
     found = []
     offered: dict[str, tuple[Setting, ...]] = {}
     for name, effect in library.items():
-        options = effect.settings(basis.context) if effect.kind == "mean" else ()
+        options = _settings(effect, basis.context) if effect.kind == "mean" else ()
         offered[name] = tuple(option for option in options if (name, option) not in taken)
     _summed(basis, [(library[name], o) for name, options in offered.items() for o in options])
     for name, options in offered.items():
@@ -206,6 +207,11 @@ def best_settings(
             best = _with_scale(basis, best, options)
         found.append(best)
     return sorted(found, key=lambda candidate: -candidate.evidence)
+
+
+@lru_cache(maxsize=64)  # surveys without one name or another are of the same context
+def _settings(effect: Effect, context: Context) -> tuple[Setting, ...]:
+    return effect.settings(context)
 
 
 def evidence_of(basis: Base, candidate: Candidate) -> float:
