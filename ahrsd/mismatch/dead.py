@@ -23,6 +23,7 @@ from ahrsd.samples import Array
 _AXES = ("x", "y", "z")
 _MOVED = 0.1  # of the field, by which a reading should have moved
 _MOVED_NOISE = 8.0
+_MOVED_STEPS = 20.0  # of coarse readings, which repeat themselves where they turn the least
 _TURNED_RAD = 0.3
 _STUCK_ROWS = 8
 #: usual size of a reading in any unit of a field, from tesla to nanotesla
@@ -113,9 +114,8 @@ def stuck_axes(track: Track, bad: NDArray[np.bool]) -> list[Fact]:
     rows: dict[str, NDArray[np.bool]] = {}
     for k, axis in enumerate(_AXES):
         again = _again(track, mag[:, k : k + 1]) & ~bad
-        spans = [
-            (a, b) for a, b in _long(again) if np.ptp(course[a - 1 : b, k]) > _least_gauss(track)
-        ]
+        least = max(_least_gauss(track), _MOVED_STEPS * _coarseness(mag[:, k]))
+        spans = [(a, b) for a, b in _long(again) if np.ptp(course[a - 1 : b, k]) > least]
         if spans and sum(b - a for a, b in spans) < len(track) - 1:
             rows[axis] = _marked(spans, len(track))
     if not rows:
@@ -172,6 +172,12 @@ def stuck_gyro(track: Track) -> list[Fact]:
             bad=rows,
         )
     ]
+
+
+def _coarseness(values: Array) -> float:
+    """The usual step between the numbers that readings (N,) take: what is finer does not show."""
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    return float(np.median(steps)) if len(steps) else 0.0
 
 
 def _constant(values: Array) -> bool:

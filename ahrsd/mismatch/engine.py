@@ -150,7 +150,8 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)
-    state, surveys, left = without_passing(state, surveys, left)
+    burst_nats = 0.0 if short is None else short.evidence_nats
+    state, surveys, left = without_passing(state, surveys, left, burst_nats)
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
     left = in_even_noise(formed_basis_of(state), left, problem.limits)
     known = max((judged.evidence for judged in state.named), default=0.0)
@@ -194,7 +195,7 @@ def _told(
         recording=recording,
         baseline=_baseline(done.start),
         mismatch=something,
-        p_value=_p_value(seen, found, done.left),
+        p_value=min(_p_value(seen, found, done.left), float(np.exp(-left.evidence_nats))),
         findings=found,
         unexplained=left,
         posterior_predictive=_checked(done, fast, terms, library, (*facts, *noise)),

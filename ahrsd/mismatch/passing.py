@@ -18,21 +18,26 @@ LIKELIER = 2.0
 
 
 def without_passing(
-    state: State, surveys: list[Survey], left: unknown.Remainder
+    state: State, surveys: list[Survey], left: unknown.Remainder, burst_nats: float = 0.0
 ) -> tuple[State, list[Survey], unknown.Remainder]:
-    """The state without such names, where what is left is in another frame; else as it was."""
+    """The state without such names, where what is left is in another frame; else as it was.
+
+    burst_nats: evidence of bursts of no frame's course, where they are what is left
+    """
     limits = state.problem.limits
-    if not unknown.detected(left, limits) or left.strongest.frame == "world":
-        return state, surveys, left
-    passing = [k for k, judged in enumerate(state.named) if _passing(judged, left)]
+    course = unknown.detected(left, limits) and left.strongest.frame != "world"
+    nats = max(burst_nats, left.strongest.evidence if course else 0.0)
+    passing = [k for k, judged in enumerate(state.named) if _passing(judged, nats)]
     if not passing:
         return state, surveys, left
+    if burst_nats >= nats:
+        return dropped(state, surveys, passing, left)
     slim, others, rest = dropped(state, surveys, passing, left)
     rest = framed(formed_basis_of(slim), rest, limits)
     return (slim, others, rest) if unknown.detected(rest, limits) else (state, surveys, left)
 
 
-def _passing(judged: Judged, left: unknown.Remainder) -> bool:
+def _passing(judged: Judged, nats: float) -> bool:
     brief = judged.what.effective_blocks < LONELY_BLOCKS
     outside = judged.candidate.effect.family == "world"
-    return outside and brief and judged.evidence < LIKELIER * left.strongest.evidence
+    return outside and brief and judged.evidence < LIKELIER * nats

@@ -53,8 +53,8 @@ def quick(state: State, whole: Problem) -> Quick:
     last = survey(full)
     while len(full.named) < whole.limits.most_terms:
         accepted = [j for j in last.judged if j.accepted and not _of_its_pulses(j, full)]
-        if not accepted:
-            break
+        if not accepted or accepted[0].evidence < last.judged[0].evidence - whole.limits.lead_nats:
+            break  # what is likelier by far may not be said: nor may this, which stands for it
         surveys.append(last)
         full = refitted(full, (*full.named, accepted[0]))
         last = survey(full)

@@ -15,6 +15,7 @@ from ahrsd.diagnosing import diagnose_recording
 RINGS = {
     "ring120b": (120, 3171823325885559521),
     "ring300b": (300, 7839750651448068454),
+    "ring600b": (600, 5572676686222521739),
 }
 
 
@@ -50,3 +51,22 @@ def test_coarse_steps_are_named_and_nothing_rings_beside_them(tmp_path):
     step = truth["effects"][0]["parameters"][0]["value"]
     assert named.parameters[0].value == pytest.approx(step, rel=1e-3)
     assert not found.unexplained.detected
+
+
+def test_coarse_steps_that_repeat_are_not_stuck(tmp_path):
+    found, _ = answered("ring600b", "f51c6850", tmp_path)
+    assert [one.effect for one in found.findings] == ["mag_quantisation"]
+
+
+def test_bursts_have_no_name_of_something_that_passes(tmp_path):
+    found, _ = answered("ring600b", "5f89b619", tmp_path)
+    assert found.findings == ()
+    assert found.unexplained.detected
+    assert found.p_value < 1e-6
+
+
+def test_a_steady_line_is_named_though_its_copies_are_itself(tmp_path):
+    """A pump that runs evenly: moved in time, a line explains as much as before."""
+    found, _ = answered("ring600b", "5d716fae", tmp_path)
+    assert [one.effect for one in found.findings] == ["ac_interference", "mag_time_lag"]
+    assert min(one.confidence for one in found.findings) > 0.5
