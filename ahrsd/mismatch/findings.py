@@ -19,7 +19,14 @@ from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import LONELY_BLOCKS, Judged
-from ahrsd.mismatch.regression import CALIBRATION, Base, candidate_gram, scale_of, scaled
+from ahrsd.mismatch.regression import (
+    CALIBRATION,
+    Base,
+    Candidate,
+    candidate_gram,
+    scale_of,
+    scaled,
+)
 from ahrsd.mismatch.reweighted import stepped
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
@@ -135,6 +142,7 @@ def whole_term(
     told = _told_in(state, basis, number, beside)
     change, deviation = refined(told, number, _by_scale(state, told, number))
     value = added_value(state, number) + change
+    deviation = with_unseen(state.named[number].candidate, deviation)
     setting = {k: v for k, v in term.setting.items() if k != "searched"}
     if not _is_delay(state, number):
         return Term(term.identifier, value, deviation, setting)
@@ -146,6 +154,13 @@ def whole_term(
         value = value + time_constant_less_lag(basis, term_group(number), float(value[0]))
         setting = {"time_constant_s": float(value[0])}
     return Term(name, value, deviation, setting)
+
+
+def with_unseen(candidate: Candidate, deviation: Array) -> Array:
+    """(p,) deviations with the prior's in the directions that no motion shows."""
+    directions = np.array(candidate.effect.unseen).reshape(-1, len(deviation))
+    prior = np.sum((directions * candidate.scale) ** 2, axis=0)
+    return np.asarray(np.sqrt(deviation**2 + prior))
 
 
 def _by_scale(state: State, basis: Base, number: int) -> Array | None:

@@ -70,6 +70,8 @@ class Effect(ABC):
     kind:        "variance" and "discrete" effects have no columns and no settings
     after_noise: it acts on the finished reading, noise included
     frame:       in which it is told, where that is not the family's name
+    unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
+                 them is the noise of its own columns, and what is known is the prior
     """
 
     identifier: str
@@ -88,6 +90,7 @@ class Effect(ABC):
     kind: Kind = "mean"
     after_noise: bool = False
     frame: str | None = None
+    unseen: tuple[tuple[float, ...], ...] = ()
 
     @property
     def least_information(self) -> float:

@@ -141,6 +141,9 @@ class FlexibleMount(Effect):
     manoeuvre = "pitch and roll to 45 degrees, upside down if it can be"
     size = "0.1 to 2 degrees"
     source = "dossier M22"
+    # C = c I turns about the specific force, which at rest is the vertical: Exp(c g_b) R^T h is
+    # R^T (Exp(c g_n) h), another field in the world, and which one is there nobody knows
+    unseen = (tuple(np.eye(3).ravel() / np.sqrt(3.0)),)
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """Nothing to choose, where there is an accelerometer."""
