@@ -41,7 +41,7 @@ from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, lost_beside
-from ahrsd.mismatch.loudness import in_even_noise
+from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
@@ -154,6 +154,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     state, surveys, left = without_passing(state, surveys, left, burst_nats)
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
     left = in_even_noise(formed_basis_of(state), left, problem.limits)
+    left = beside_bursts(state, left, problem.limits)
     known = max((judged.evidence for judged in state.named), default=0.0)
     left = unknown.beside_names(left, known)
     if short is None and not at_rest(start):

@@ -13,11 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import unknown
+from ahrsd.mismatch.along_field import framed
+from ahrsd.mismatch.cut_out import without
 from ahrsd.mismatch.directions import weighed
 from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.noise import louder
 from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.search import State, formed_basis_of, refitted
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.unknown import Remainder
 
@@ -34,6 +37,22 @@ def in_even_noise(basis: Base, left: Remainder, limits: Limits) -> Remainder:
     if level is basis:
         return left
     again = with_spells(unknown.remainder(level, with_bins=bool(left.bins)))
+    return left if unknown.detected(again, limits) else again
+
+
+def beside_bursts(state: State, left: Remainder, limits: Limits) -> Remainder:
+    """The remainder, or, where bursts of noise are all that is seen, that without their readings.
+
+    What they leave in the filter's state is slow, whatever the rows weigh.
+    """
+    found = louder(state.fit.filtered) if unknown.detected(left, limits) else None
+    if found is None or not found.burst or left.stood_in is not None:
+        return left
+    quiet = replace(state, problem=without(state.problem, found.spans_s))
+    quiet = refitted(quiet, state.named)
+    basis = formed_basis_of(quiet)
+    again = framed(basis, unknown.remainder(basis, with_bins=bool(left.bins)), limits)
+    again = with_spells(again)
     return left if unknown.detected(again, limits) else again
 
 

@@ -33,7 +33,8 @@ def answered(ring, case, folder):
     ("case", "frame"),
     [
         ("66152208", "world"),  # a gradient without a position was a step at the first row
-        ("d1e56b7a", "sensor"),  # iron with two states had an object passed by beside it
+        # iron with two states had an object passed by beside it
+        pytest.param("d1e56b7a", "sensor", marks=pytest.mark.slow),
     ],
 )
 def test_what_nobody_logged_is_an_unknown_without_a_name(case, frame, tmp_path):
@@ -44,6 +45,7 @@ def test_what_nobody_logged_is_an_unknown_without_a_name(case, frame, tmp_path):
     assert found.unexplained.where.frame == frame
 
 
+@pytest.mark.slow
 def test_coarse_steps_are_named_and_nothing_rings_beside_them(tmp_path):
     found, truth = answered("ring300b", "196ca98c", tmp_path)
     (named,) = found.findings
@@ -65,8 +67,16 @@ def test_bursts_have_no_name_of_something_that_passes(tmp_path):
     assert found.p_value < 1e-6
 
 
+@pytest.mark.slow
 def test_a_steady_line_is_named_though_its_copies_are_itself(tmp_path):
     """A pump that runs evenly: moved in time, a line explains as much as before."""
     found, _ = answered("ring600b", "5d716fae", tmp_path)
     assert [one.effect for one in found.findings] == ["ac_interference", "mag_time_lag"]
     assert min(one.confidence for one in found.findings) > 0.5
+
+
+@pytest.mark.parametrize("case", ["9e11d227", pytest.param("ccdde21f", marks=pytest.mark.slow)])
+def test_bursts_of_noise_leave_no_unknown(case, tmp_path):
+    found, _ = answered("ring600b", case, tmp_path)
+    assert [one.effect for one in found.findings] == ["noise_burst"]
+    assert not found.unexplained.detected
