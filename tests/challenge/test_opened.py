@@ -80,3 +80,11 @@ def test_bursts_of_noise_leave_no_unknown(case, tmp_path):
     found, _ = answered("ring600b", case, tmp_path)
     assert [one.effect for one in found.findings] == ["noise_burst"]
     assert not found.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_spin_with_a_coarse_gyro_names_nothing(tmp_path):
+    """The field's own noise was hysteresis of 30 mG."""
+    found, truth = answered("ring600b", "8d9dc4b5", tmp_path)
+    assert truth["kind"] == "unidentifiable"
+    assert found.findings == ()

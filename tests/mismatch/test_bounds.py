@@ -38,6 +38,16 @@ def test_what_is_beyond_its_bound_by_noise_alone_is_believed(beyond, colour, bel
     assert believable(candidate, what, value, colour) == believed
 
 
+@pytest.mark.parametrize(("sigma", "believed"), [(0.05, True), (0.2, False)])
+def test_what_is_known_to_half_its_bound_only_is_not_known(sigma, believed):
+    """Beyond its bound by less than three of its deviations, but those are as large as it."""
+    candidate = Candidate(EFFECTS["mag_gyro_misalignment"], {}, 1, 0.0)
+    G = np.eye(3) / sigma**2
+    value = np.array([0.48, 0.1, -0.1]) if believed else np.array([-0.68, -0.4, -0.3])
+    what = total_score(G, G @ value, np.diag(G), candidate.scale, 0.0)
+    assert believable(candidate, what, value, 1.0) == believed
+
+
 @pytest.fixture(scope="module")
 def track() -> Track:
     return made(Trial(3, ((NAME, 2.0),), samples=6000)).track
