@@ -52,8 +52,9 @@ def quick(state: State, whole: Problem) -> Quick:
     surveys: list[Survey] = []
     last = survey(full)
     while len(full.named) < whole.limits.most_terms:
-        accepted = [j for j in last.judged if j.accepted and not _of_its_pulses(j, full)]
-        if not accepted or accepted[0].evidence < last.judged[0].evidence - whole.limits.lead_nats:
+        judged = [j for j in last.judged if not _of_its_pulses(j, full)]
+        accepted = [j for j in judged if j.accepted]
+        if not accepted or accepted[0].evidence < judged[0].evidence - whole.limits.lead_nats:
             break  # what is likelier by far may not be said: nor may this, which stands for it
         surveys.append(last)
         full = refitted(full, (*full.named, accepted[0]))
