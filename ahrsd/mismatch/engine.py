@@ -40,7 +40,7 @@ from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
-from ahrsd.mismatch.lost import believed, beyond_lost, lost_beside
+from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
@@ -102,7 +102,7 @@ def diagnose(
         problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
     done, fast = _named(problem, cold)
     beside = lost_beside(whole, fast.state)
-    if bool(beside) != bool(lost):
+    if differ(lost, beside):
         other, cold = problem_of(put_right(track, (*facts, *beside)), spec, library, limits)
         again = _named(other, cold)
         if not believed(lost, done.state, again[0].state):

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.missing import LONG, missing_turns
@@ -28,12 +30,22 @@ def lost_beside(whole: Problem, state: State) -> list[Fact]:
     return missing_turns(fit.filtered, rate)
 
 
-def believed(lost: Sequence[Fact], put_right: State, as_it_came: State) -> bool:
-    """Whether lost turns that were seen at first stay, though they are not seen beside the names.
+def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:
+    """Whether the two searches put other turns right."""
+    one, other = (
+        [fact.turned for fact in facts if fact.turned is not None] for facts in (lost, beside)
+    )
+    return len(one) != len(other) or any(
+        not np.array_equal(a, b) for a, b in zip(one, other, strict=True)
+    )
 
-    put_right: the model of the recording with them put right;  as_it_came: without
+
+def believed(lost: Sequence[Fact], put_right: State, otherwise: State) -> bool:
+    """Whether lost turns that were seen at first stay, though others are seen beside the names.
+
+    put_right: the model of the recording with them put right;  otherwise: with the others, if any
     """
-    return bool(lost) and put_right.fit.log_likelihood > as_it_came.fit.log_likelihood
+    return bool(lost) and put_right.fit.log_likelihood > otherwise.fit.log_likelihood
 
 
 def beyond_lost(left: Remainder, facts: Sequence[Fact], problem: Problem) -> bool:

@@ -17,6 +17,7 @@ from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.turns import Turns, recovered
 from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
@@ -54,7 +55,9 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
         enough = len(found.forward) >= _FEWEST + 3 * len(found.backward) + found.others
         jumps = found.forward
         if enough and whole_nats(found.steps[jumps], found.scatter[jumps]) > _SURE_NATS:
-            return [_fact(track, found)]
+            lost = np.zeros(len(track), dtype=np.int64)
+            lost[jumps] = np.round(found.steps[jumps])
+            return [_fact(track, recovered(done, rate_b_rad_s, lost), found.long)]
     return []
 
 
@@ -138,13 +141,13 @@ def _scatter(done: Filtered, jump: Array, samples: int) -> float:
     return max(white, lowest / float(np.sqrt(2.0)))
 
 
-def _fact(track: Track, found: _Jumps) -> Fact:
+def _fact(track: Track, turns: Turns, long: int) -> Fact:
     """The lost samples; where a lost one would not be seen the turn is put right on average."""
-    rows, turns = found.forward, np.round(found.steps[found.forward])
-    per_row = float(turns.sum()) / max(int(np.count_nonzero(found.tell)), 1)
+    rows = np.flatnonzero(turns.lost)
+    per_row = float(turns.lost.sum()) / max(int(np.count_nonzero(turns.shows)), len(rows))
     share = per_row / (per_row + 1.0)
-    turned = np.where(found.tell, 1.0, 1.0 + per_row)
-    turned[rows] = 1.0 + turns
+    turned = np.where(turns.shows, 1.0, 1.0 + per_row)
+    turned[rows] = 1.0 + turns.lost[rows]
     times = tuple((float(track.time_s[k - 1]), float(track.time_s[k])) for k in rows)
     words = (
         f"at {len(rows)} samples the field is ahead by whole steps of the turn: samples are "
@@ -152,7 +155,7 @@ def _fact(track: Track, found: _Jumps) -> Fact:
     )
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
-    setting = {"hidden": True} | ({LONG: found.long} if found.long else {})
+    setting = {"hidden": True} | ({LONG: long} if long else {})
     return Fact("dropped_samples", words, where, 0.98, parameters, setting, turned=turned)
 
 

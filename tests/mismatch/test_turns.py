@@ -1,0 +1,55 @@
+"""Lost turns one by one: which rows, how many steps, and that none is made up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of, true_model
+
+from ahrsd.mismatch.innovation import run_filter
+from ahrsd.mismatch.turns import recovered
+
+GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
+
+
+def lossy(motion: str, share: float, sigma_gauss: float):
+    """The filter's run of a track without some rows, its rate, and how many each row has lost."""
+    made = experiment(motion, samples=9000, seed=3, sigma_mag=sigma_gauss)
+    whole, model = track_of(made), replace(true_model(made), sigma_mag_gauss=sigma_gauss)
+    model = replace(model, sigma_gyro_rad_s=GYRO_RAD_S)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(whole)) > share)
+    time_s = whole.time_s[: len(keep)]
+    cut = replace(
+        whole,
+        time_s=time_s,
+        dt_s=np.diff(time_s, prepend=np.nan),
+        mag_b_gauss=whole.mag_b_gauss[keep],
+        gyro_b_rad_s=whole.gyro_b_rad_s[keep],
+        accel_b_m_s2=None,
+        runs=(slice(0, len(keep)),),
+    )
+    lost = np.diff(keep, prepend=-1) - 1
+    return run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s, lost
+
+
+def near(rows: np.ndarray, others: np.ndarray, within: int) -> int:
+    """How many of the rows have one of the others so near."""
+    return sum(bool(np.any(np.abs(others - row) <= within)) for row in rows)
+
+
+@pytest.mark.parametrize(("motion", "share"), [("mam", 0.01), ("lam", 0.004)])
+def test_what_the_first_ones_hid_is_found_where_it_was_lost(motion: str, share: float) -> None:
+    done, rate, lost = lossy(motion, share, 3e-4)
+    found = recovered(done, rate, np.zeros(len(lost), dtype=np.int64))
+    rows, truth = np.flatnonzero(found.lost), np.flatnonzero(lost)
+    seen = truth[found.shows[truth]]
+    assert near(rows, truth, 2) >= 0.97 * len(rows)  # 83 of 85 and 33 of 34 here
+    assert near(seen, rows, 2) >= 0.9 * len(seen)  # 83 of 91 and 33 of 34 here
+    assert abs(int(found.lost.sum()) - int(lost.sum())) <= 3
+    assert np.mean(found.shows) > 0.8
+
+
+def test_nothing_is_lost_where_nothing_was() -> None:
+    done, rate, lost = lossy("mam", 0.0, 3e-4)
+    assert not lost.any()
+    assert not recovered(done, rate, np.zeros(len(lost), dtype=np.int64)).lost.any()
