@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.mismatch.innovation import Bearings, Filtered
@@ -74,14 +75,35 @@ def build_context(track: Track, fit: Fit) -> Context:
 
 
 def smoothed_rate(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> Array:
-    """(N, 3) low-passed without phase, at the bandwidth of the recording's own motion."""
+    """(N, 3) low-passed without phase, at the bandwidth of the recording's own motion.
+
+    An axis whose rate is the same all along but for the gyro's noise keeps its mean: columns made
+    of the noise would be held against what that very noise did to the field.
+    """
     width = 1.0 / (2 * np.pi * bandwidth_hz(rate, runs, dt_s, sigma) * dt_s)
-    if width < 0.3:
-        return rate.copy()
-    out = np.empty_like(rate)
-    for run in runs:
-        out[run] = _low_passed(rate[run], width)
+    out = rate.copy()
+    if width >= 0.3:
+        for run in runs:
+            out[run] = _low_passed(rate[run], width)
+    still = ~_changes(rate, runs, dt_s, sigma)
+    out[:, still] = rate[:, still].mean(axis=0)
     return out
+
+
+def _changes(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> NDArray[np.bool]:
+    """(3,) whether an axis' rate changes: within segments of four seconds, or from one to another.
+
+    Within: `bandwidth_hz` would find a frequency in it.  From one to another: their means scatter.
+    """
+    longest = max(runs, key=lambda run: int(run.stop - run.start))
+    values = rate[longest]
+    segment = _segment(len(values), dt_s)
+    if len(values) < 2 * segment:
+        return np.ones(3, dtype=np.bool)
+    within = (_density(values, segment) * dt_s > _floor(sigma, dt_s))[:, 1:].any(axis=1)
+    count = len(values) // segment
+    means = values[: count * segment].reshape(count, segment, 3).mean(axis=1)
+    return np.asarray(within | (means.var(axis=0, ddof=1) > SINK * sigma**2 / segment))
 
 
 def _low_passed(values: Array, width: float) -> Array:
@@ -104,12 +126,22 @@ def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) 
     nyquist = 0.5 / dt_s
     if len(values) < 64:
         return nyquist
-    segment = min(len(values), max(64, 2 ** round(np.log2(4.0 / dt_s))))
-    floor = SINK * 2 * sigma**2 * dt_s
-    above = np.flatnonzero(_density(values, segment).max(axis=0) * dt_s > floor)
+    segment = _segment(len(values), dt_s)
+    density = _density(values, segment).max(axis=0) * dt_s
+    above = np.flatnonzero(density > _floor(sigma, dt_s))
     top = float(above[-1]) / (segment * dt_s) if len(above) else 0.0
     # the Gaussian pair is 3 dB down at about 1.3 times its nominal corner
     return float(np.clip(2.0 * top, _SLOWEST_HZ, nyquist))
+
+
+def _segment(count: int, dt_s: float) -> int:
+    """Rows of some four seconds."""
+    return min(count, max(64, 2 ** round(np.log2(4.0 / dt_s))))
+
+
+def _floor(sigma: float, dt_s: float) -> float:
+    """One-sided power density above which a rate is motion, (rad/s)^2/Hz."""
+    return SINK * 2 * sigma**2 * dt_s
 
 
 def _density(values: Array, segment: int) -> Array:

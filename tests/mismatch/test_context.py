@@ -91,3 +91,16 @@ def test_quick_motion_keeps_its_bandwidth() -> None:
     assert np.abs(smooth - clean)[100:-100].max() < 0.06
     slow = clean * 0 + 0.01 * rng.standard_normal(clean.shape)
     assert bandwidth_hz(slow, runs, 0.01, 0.01) == 0.5
+
+
+def test_a_rate_that_does_not_change_is_no_noise() -> None:
+    """Columns made of the gyro's noise would be held against what it did to the field."""
+    rng = np.random.default_rng(1)
+    t = np.arange(40_000) / 100.0
+    slowly = 0.01 * np.sin(2 * np.pi * t / 200)  # far slower than a segment of four seconds
+    clean = np.column_stack([0.2 + 0 * t, 0.1 * np.sin(2 * np.pi * 0.5 * t), slowly])
+    noisy = clean + 0.005 * rng.standard_normal(clean.shape)
+    smooth = smoothed_rate(noisy, (slice(0, 20_000), slice(20_000, 40_000)), 0.01, 0.005)
+    np.testing.assert_array_equal(smooth[:, 0], noisy[:, 0].mean())
+    assert np.corrcoef(smooth[:, 1], clean[:, 1])[0, 1] > 0.99
+    assert np.corrcoef(smooth[:, 2], slowly)[0, 1] > 0.97
