@@ -136,7 +136,7 @@ def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) 
 
 def _segment(count: int, dt_s: float) -> int:
     """Rows of some four seconds."""
-    return min(count, max(64, 2 ** round(np.log2(4.0 / dt_s))))
+    return int(min(count, max(64, 2 ** round(np.log2(4.0 / dt_s)))))
 
 
 def _floor(sigma: float, dt_s: float) -> float:

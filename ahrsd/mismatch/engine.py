@@ -38,22 +38,24 @@ from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.gyro_noise import loud_gyro
+from ahrsd.mismatch.humming import heard
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
+from ahrsd.mismatch.many_names import one_for_many
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
+from ahrsd.mismatch.own_form import free_price_of, price_of, without_trifles
 from ahrsd.mismatch.passing import without_passing
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.resting import resting
-from ahrsd.mismatch.ringing import ringing
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     HARDLY_TURNED,
@@ -146,7 +148,8 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
         done.state, done.surveys, done.left, done.stood_in, hidden=done.hidden
     )
     beside = len(state.named) > len(done.state.named)
-    state, surveys, left = without_unforetold(state, surveys, left, beside=beside)
+    state, surveys, left = without_unforetold(state, surveys, left, asked=len(done.state.named))
+    state, surveys, left = one_for_many(*without_trifles(state, surveys, left))
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)
@@ -155,10 +158,9 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
     left = in_even_noise(formed_basis_of(state), left, problem.limits)
     left = beside_bursts(state, left, problem.limits)
-    known = max((judged.evidence for judged in state.named), default=0.0)
-    left = unknown.beside_names(left, known)
+    left = unknown.beside_names(left, price_of(state), problem.limits)
     if short is None and not at_rest(start):
-        left = with_forms(left, known, problem.limits)
+        left = with_forms(left, free_price_of(state), problem.limits)
     if short is not None and short.evidence_nats <= left.strongest.evidence:
         short = None
     if short is None and unknown.detected(left, problem.limits):
@@ -178,7 +180,7 @@ def _told(
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
     named, terms = _names(done, fast)
-    noise, left = _noise_facts(problem, fast, facts, done), _left(done, problem, facts)
+    noise, left = _noise_facts(problem, fast, facts, done), _left(done, problem, facts, fast)
     if burst := loud_gyro(left, problem.recorded):
         noise, left = [*noise, burst], Unexplained(False)
     found = (
@@ -258,7 +260,7 @@ def _doubted(one: Finding, sure: float) -> Finding:
     return replace(one, confidence=one.confidence * sure, alternatives=others)
 
 
-def _left(done: _Searched, problem: Problem, facts: Sequence[Fact]) -> Unexplained:
+def _left(done: _Searched, problem: Problem, facts: Sequence[Fact], fast: Quick) -> Unexplained:
     """What no name explains."""
     if done.short is not None:
         return done.short
@@ -266,7 +268,7 @@ def _left(done: _Searched, problem: Problem, facts: Sequence[Fact]) -> Unexplain
         return unknown.described(done.left, problem.block_s, problem.limits)
     # a turn put together from what is left, and the error of coarse steps, ring by themselves
     itself = any(fact.turned is not None or fact.effect == "mag_quantisation" for fact in facts)
-    return (None if itself else ringing(formed_basis_of(done.state))) or Unexplained(False)
+    return Unexplained(False) if itself else heard(done.state, fast)
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

@@ -16,16 +16,16 @@ from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate, fitted
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.regression import Base
-from ahrsd.mismatch.rivals import MORE_SHARE, by_matrix
+from ahrsd.mismatch.rivals import by_matrix
 from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.unknown import Remainder, detected
 from ahrsd.samples import Array
 
 
-def with_forms(left: Remainder, named_nats: float, limits: Limits) -> Remainder:
+def with_forms(left: Remainder, price: float, limits: Limits) -> Remainder:
     """The remainder, told of a form's frame where nothing else is left and a form explains it.
 
-    named_nats: evidence of the strongest name; of its own form a hundredth may be left
+    price: nats that the names may leave of their own forms
     """
     if detected(left, limits):
         return left
@@ -37,7 +37,7 @@ def with_forms(left: Remainder, named_nats: float, limits: Limits) -> Remainder:
     }
     frame = max(found, key=lambda one: found[one])
     evidence = found[frame] - float(np.log(len(found)))
-    if evidence <= limits.unknown_nats + MORE_SHARE * named_nats:
+    if evidence <= limits.unknown_nats + price:
         return left
     located = {**left.located, frame: replace(left.located[frame], evidence=evidence)}
     return replace(left, located=located, stood_in=frame)

@@ -10,6 +10,8 @@ windows too.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
@@ -30,6 +32,7 @@ _BESIDE = (1e-5, 1e-2)  # of further ones beside these
 _SEPARATE_S = 1.0
 #: stretches with a vector each that tell the frame: a gyro's error is a field's slope
 _PIECE_S = 0.2
+_PIECES = 100  # at most so many, spread over all: each has columns of its own
 
 
 def ringing(basis: Base) -> Unexplained | None:
@@ -43,7 +46,12 @@ def ringing(basis: Base) -> Unexplained | None:
         return None
     spans, piece = spans_of(rows, gap), _rows(_PIECE_S, basis.rate_hz)
     pieces = [(k, k + piece) for first, end in spans for k in range(first, end - piece + 1, piece)]
-    return told(basis, spans, pieces, FRAMES[:2] if _along_the_field(basis, left, rows) else FRAMES)
+    pieces = pieces[:: 1 + len(pieces) // _PIECES]
+    frames = FRAMES[:2] if _along_the_field(basis, left, rows) else FRAMES
+    found = told(basis, spans, pieces, frames)
+    windows = len(left) / _rows(_PART_S, basis.rate_hz)
+    by_chance = -float(np.log(windows * _LOUD[0]))
+    return replace(found, evidence_nats=max(found.evidence_nats, by_chance))
 
 
 def _along_the_field(basis: Base, left: Array, rows: NDArray[np.bool]) -> bool:

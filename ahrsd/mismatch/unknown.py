@@ -29,8 +29,6 @@ from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
 
 FINE = 80
-#: part of a name's evidence that its own form, which is never exact, may leave
-FORM_SHARE = 1e-3
 #: shifts of the placebo
 SHIFTS = 3
 AXES = ("x", "y", "z")
@@ -152,14 +150,16 @@ def course(left: Remainder) -> Course:
     )
 
 
-def beside_names(left: Remainder, named_nats: float) -> Remainder:
-    """The remainder of a model with names of so much evidence: a thousandth is their own form's.
+def beside_names(left: Remainder, price: float, limits: Limits) -> Remainder:
+    """The remainder of a model with names that leave so many nats of their own forms.
 
-    No column of ours is exact to a thousandth of what it explains, and what it leaves has a place.
+    A form of an error by the rates, or one source, is nothing where it was no more than that.
     """
-    price = FORM_SHARE * named_nats
     located = {k: replace(one, evidence=one.evidence - price) for k, one in left.located.items()}
     bins = tuple((one, evidence - price, p) for one, evidence, p in left.bins)
+    least, before = limits.unknown_nats, left.strongest.evidence
+    if before > least > before - price:
+        return replace(left, located=located, bins=bins, stood_in=None, one_source=False)
     return replace(left, located=located, bins=bins)
 
 

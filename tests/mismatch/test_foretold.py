@@ -15,6 +15,7 @@ from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.foretold import (
     FORETOLD,
     in_time_alone,
+    logged_amid,
     part_of,
     share_foretold,
     without_unforetold,
@@ -49,7 +50,7 @@ def of_current(strength):
     columns = partial(effect.columns, setting=SETTING)
     term = FittedTerm(NAMED, columns, np.zeros(3), 30 * candidate.scale, setting=SETTING)
     fit = fit_null(problem.track, problem.spec, start, (term,), walk=False)
-    what = SimpleNamespace(value=fit.terms[0].value)
+    what = SimpleNamespace(value=fit.terms[0].value, effective_blocks=6.0)
     judged = Judged(candidate, what, 0.0, 0.0, 0.0, Gain(1.0, 1.0), 1.0, 0.0, ())
     state = State(problem, fit, (judged,))
     judged = replace(judged, evidence=evidence_of(without_term(state, 0), candidate))
@@ -68,7 +69,7 @@ def test_what_was_so_in_one_fifth_alone_is_taken_out_and_unknown(once):
     assert state.named[0].evidence > LIMITS.evidence_nats
     assert share_foretold(state, 0, seen) < FORETOLD
     before = unknown.remainder(formed_basis_of(state))
-    slim, surveys, left = without_unforetold(state, [seen], before, beside=False)
+    slim, surveys, left = without_unforetold(state, [seen], before, asked=1)
     assert slim.names == ()
     assert surveys == []
     assert unknown.detected(left, LIMITS)
@@ -77,7 +78,7 @@ def test_what_was_so_in_one_fifth_alone_is_taken_out_and_unknown(once):
 def test_what_is_always_so_stays():
     state, seen = of_current(np.full(SAMPLES, 8e-5))
     before = unknown.remainder(formed_basis_of(state), with_bins=False)
-    kept, _, left = without_unforetold(state, [seen], before, beside=False)
+    kept, _, left = without_unforetold(state, [seen], before, asked=1)
     assert kept is state
     assert left is before
 
@@ -108,3 +109,19 @@ def test_a_diagnosis_asks_and_what_is_refused_is_unknown(monkeypatch):
     found = diagnose(track)
     assert found.findings == ()
     assert found.unexplained.detected
+
+
+def test_a_logged_cause_that_changes_often_is_not_asked_amid_a_louder_rest(once):
+    """The rest bends the calibration of four fifths by more than the name is worth in the fifth."""
+    state, seen = once
+    nats = state.named[0].evidence
+    often = replace(state.named[0], what=SimpleNamespace(value=None, effective_blocks=24.0))
+    seldom = replace(state.named[0], what=SimpleNamespace(value=None, effective_blocks=6.0))
+    assert logged_amid(often, nats)
+    assert not logged_amid(often, 0.4 * nats)
+    assert not logged_amid(seldom, nats)
+    motion = replace(often, candidate=Candidate(EFFECTS["eddy_current"], {}, 1, 0.0))
+    assert not logged_amid(motion, nats)
+    left = unknown.remainder(formed_basis_of(state))
+    kept, _, _ = without_unforetold(state, [seen], left, asked=0)
+    assert kept is state  # found against the spectrum of what is left, where it gained enough

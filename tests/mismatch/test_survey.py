@@ -48,9 +48,9 @@ def test_what_large_names_leave_of_their_own_form_is_no_unknown():
     gyro = replace(left.located["gyro"], evidence=24.2, p_value=1e-12)
     found = replace(left, located={**left.located, "gyro": gyro})
     assert detected(found, LIMITS)
-    assert not detected(beside_names(found, 41_931.0), LIMITS)
-    assert detected(beside_names(found, 6_000.0), LIMITS)
-    assert beside_names(found, 6_000.0).strongest.evidence == pytest.approx(18.2)
+    assert not detected(beside_names(found, 41.931, LIMITS), LIMITS)
+    assert detected(beside_names(found, 6.0, LIMITS), LIMITS)
+    assert beside_names(found, 6.0, LIMITS).strongest.evidence == pytest.approx(18.2)
 
 
 def test_what_begins_has_a_before_and_an_after():

@@ -122,6 +122,7 @@ class Hysteresis(Linear):
     identifier = "hysteresis"
     code = "M16"
     family = "sensor"
+    form_share = 5e-3  # one play stands for a loop, and sampled play misses its turning points
     words = "hysteresis of iron near the sensor"
     equation = "m_i += k_i (play_r[(A h)_i] - (A h)_i) / r"
     # three times the largest that is known: in a spin the field along the axis has no swing but the
