@@ -148,7 +148,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
         done.state, done.surveys, done.left, done.stood_in, hidden=done.hidden
     )
     beside = len(state.named) > len(done.state.named)
-    state, surveys, left = without_unforetold(state, surveys, left, asked=len(done.state.named))
+    state, surveys, left = without_unforetold(state, surveys, left, known=len(done.state.named))
     state, surveys, left = one_for_many(*without_trifles(state, surveys, left))
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):

@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch import unknown
+from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.findings import added_value, with_all_else
 from ahrsd.mismatch.heldout import gain_of
 from ahrsd.mismatch.name import Judged
@@ -41,26 +42,27 @@ OFTEN = 15.0
 
 
 def without_unforetold(
-    state: State, surveys: list[Survey], left: unknown.Remainder, *, asked: int
+    state: State, surveys: list[Survey], left: unknown.Remainder, *, known: int
 ) -> tuple[State, list[Survey], unknown.Remainder]:
     """The state without such names, one at a time, the worst first; what they explained is unknown.
 
-    asked: how many of the names, the first ones, are asked.  Those behind them were found against
-           the spectrum of what is left, in which they gained what was held out; in white noise
-           what is left bends the calibration of four fifths by more than they are worth
+    known: how many of the names, the first ones, were found in white noise, the others against the
+           spectrum of what is left.  A delay among those is not asked: in white noise what is left
+           bends the calibration of four fifths by more than it is worth in the fifth
     """
-    beside = len(state.named) > asked
+    beside = len(state.named) > known
     while True:
         rest = left.strongest.evidence if unknown.detected(left, state.problem.limits) else 0.0
         shares = [
-            1.0 if logged_amid(judged, rest) else share_foretold(state, k, seen)
-            for k, (judged, seen) in enumerate(zip(state.named[:asked], surveys, strict=False))
+            1.0
+            if logged_amid(judged, rest) or (k >= known and judged.candidate.name in DELAYS)
+            else share_foretold(state, k, seen)
+            for k, (judged, seen) in enumerate(zip(state.named, surveys, strict=True))
         ]
         worst = min(range(len(shares)), key=lambda k: shares[k], default=0)
         if not shares or shares[worst] >= FORETOLD:
             return state, surveys, left
-        frame = frame_of(state, worst)
-        asked -= 1
+        frame, known = frame_of(state, worst), known - (worst < known)
         state, surveys, left = dropped(state, surveys, [worst], left)
         if beside and state.named:
             state = reweighted(state)
@@ -73,8 +75,8 @@ def logged_amid(judged: Judged, rest: float) -> bool:
 
     The rest bends the calibration of four fifths by more than the name is worth in the fifth.
     """
-    logged = "covariate" in judged.candidate.setting
-    return logged and judged.what.effective_blocks >= OFTEN and rest > judged.evidence / 2
+    often = "covariate" in judged.candidate.setting and judged.what.effective_blocks >= OFTEN
+    return often and rest > judged.evidence / 2
 
 
 def share_foretold(state: State, number: int, seen: Survey) -> float:

@@ -69,7 +69,7 @@ def test_what_was_so_in_one_fifth_alone_is_taken_out_and_unknown(once):
     assert state.named[0].evidence > LIMITS.evidence_nats
     assert share_foretold(state, 0, seen) < FORETOLD
     before = unknown.remainder(formed_basis_of(state))
-    slim, surveys, left = without_unforetold(state, [seen], before, asked=1)
+    slim, surveys, left = without_unforetold(state, [seen], before, known=1)
     assert slim.names == ()
     assert surveys == []
     assert unknown.detected(left, LIMITS)
@@ -78,7 +78,7 @@ def test_what_was_so_in_one_fifth_alone_is_taken_out_and_unknown(once):
 def test_what_is_always_so_stays():
     state, seen = of_current(np.full(SAMPLES, 8e-5))
     before = unknown.remainder(formed_basis_of(state), with_bins=False)
-    kept, _, left = without_unforetold(state, [seen], before, asked=1)
+    kept, _, left = without_unforetold(state, [seen], before, known=1)
     assert kept is state
     assert left is before
 
@@ -123,5 +123,5 @@ def test_a_logged_cause_that_changes_often_is_not_asked_amid_a_louder_rest(once)
     motion = replace(often, candidate=Candidate(EFFECTS["eddy_current"], {}, 1, 0.0))
     assert not logged_amid(motion, nats)
     left = unknown.remainder(formed_basis_of(state))
-    kept, _, _ = without_unforetold(state, [seen], left, asked=0)
-    assert kept is state  # found against the spectrum of what is left, where it gained enough
+    kept, _, _ = without_unforetold(state, [seen], left, known=1)
+    assert kept.names == ()  # what is left is worth less than the name
