@@ -17,6 +17,8 @@ from ahrsd.mismatch import unknown
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate
 from ahrsd.mismatch.exam import IMITATORS
+from ahrsd.mismatch.foretold import logged_often
+from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.moved import ONSET_SHARE
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.nested import simplest
@@ -216,12 +218,19 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     gain = (noise.nats - plain.nats) / quiet.colour
     evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
     checks = {
-        "evidence": evidence > (STEP_NATS if one.name in STEPS.values() else limits.beside_nats),
+        "evidence": evidence > _least_nats(held, limits),
         SIZE: _material(one, held.what),
     }
     others = (why for why in held.refused if why not in checks)
     refused = (*others, *(why for why, passed in checks.items() if not passed))
     return replace(held, evidence=evidence, refused=refused)
+
+
+def _least_nats(held: Judged, limits: Limits) -> float:
+    """What a name must be worth beside the rest: more, the easier the rest imitates it."""
+    if held.candidate.name in STEPS.values():
+        return STEP_NATS
+    return limits.beside_logged_nats if logged_often(held) else limits.beside_nats
 
 
 def _paid(what: Score, scale: Array) -> float:

@@ -75,8 +75,12 @@ def logged_amid(judged: Judged, rest: float) -> bool:
 
     The rest bends the calibration of four fifths by more than the name is worth in the fifth.
     """
-    often = "covariate" in judged.candidate.setting and judged.what.effective_blocks >= OFTEN
-    return often and rest > judged.evidence / 2
+    return logged_often(judged) and rest > judged.evidence / 2
+
+
+def logged_often(judged: Judged) -> bool:
+    """Whether its cause was logged, and changes so often that nothing slow goes with it."""
+    return "covariate" in judged.candidate.setting and judged.what.effective_blocks >= OFTEN
 
 
 def share_foretold(state: State, number: int, seen: Survey) -> float:

@@ -28,6 +28,7 @@ class Limits:
                     part of the unknown is not known; of real recordings the names that are known
                     to be right have a fifth at least, those that are not a seventh at most
     beside_nats:    and where it is found with the remainder whitened out of everything
+    beside_logged_nats: the same of a logged cause that changes often, which no room imitates
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
     doubt:          what noise model and library do not know, by which every confidence is less:
@@ -47,6 +48,7 @@ class Limits:
     beyond_nats: float = 60.0
     beyond_share: float = 0.15
     beside_nats: float = 35.0
+    beside_logged_nats: float = 20.0
     unknown_nats: float = 12.0
     unknown_p: float = 1e-6
     doubt: float = 0.01
