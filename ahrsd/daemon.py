@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -134,7 +135,10 @@ class Daemon:
 
     def run(self) -> None:
         """Until stopped. Raises PortError only where the port cannot be opened the first time."""
-        try:
+        with ExitStack() as leaving:
+            leaving.callback(self.shell.folded.finish)
+            leaving.callback(self._link.close)
+            leaving.push(self._after_a_bug)
             self._tell_wall()
             if self._terms:
                 self._feed(inputs.TermsKnown(self.clock.now_ns(), self._terms))
@@ -142,14 +146,11 @@ class Daemon:
             while not self._stop_reason:
                 self._turn(_LONGEST_WAIT_S)
             self._finish()
-        except PortError:
-            raise
-        except Exception:  # the one supervisor: whatever it was, the device is put back; it goes on
-            self._make_amends()
-            raise
-        finally:
-            self._link.close()
-            self.shell.folded.finish()
+
+    def _after_a_bug(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """On the way out: whatever it was, the device is put back; what was raised goes on."""
+        if isinstance(error, Exception) and not isinstance(error, PortError):
+            self._make_amends(error)
 
     def _turn(self, longest_s: float) -> None:
         """One wait and what it brought."""
@@ -329,9 +330,9 @@ class Daemon:
             text = f"stopped ({self._stop_reason}) without having put everything back"
             self.shell.say(logging.ERROR, text, self.clock.now_ns())
 
-    def _make_amends(self) -> None:
+    def _make_amends(self, bug: Exception) -> None:
         """After a bug of ours: the device streams again as before, whatever the core believes."""
-        log.exception("internal error; putting the device's output back")
+        log.error("internal error; putting the device's output back", exc_info=bug)
         talk = self.shell.core.conversation
         procedure, port = talk.amends(), self._link.take_port()
         if port is None:

@@ -113,19 +113,8 @@ def test_files_and_functions_are_short_and_catch_what_they_name(path):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = (node.end_lineno or 0) - node.lineno + 1
             assert length <= 60, f"{node.name} has {length} lines"
-        if isinstance(node, ast.ExceptHandler) and path != PROJECT / "ahrsd" / "daemon.py":
+        if isinstance(node, ast.ExceptHandler):
             assert not is_broad(node), f"broad except in line {node.lineno}"
-
-
-def test_the_one_supervisor_lets_nothing_go_unsaid():
-    """The daemon's run puts the device back after any error of ours, and the error goes on."""
-    tree = ast.parse((PROJECT / "ahrsd" / "daemon.py").read_text())
-    (supervisor,) = [
-        node for node in ast.walk(tree) if isinstance(node, ast.ExceptHandler) and is_broad(node)
-    ]
-    last = supervisor.body[-1]
-    assert isinstance(last, ast.Raise)
-    assert last.exc is None
 
 
 def is_broad(handler: ast.ExceptHandler) -> bool:
