@@ -143,9 +143,10 @@ def _no_more_than_a_drift(state: State, judged: Judged) -> bool:
     """Whether a course in time alone is as likely as a name by what was logged.
 
     What was logged may be as smooth as a drift is: then it explains what drifts.  Its own effect
-    follows it more closely than a line or what settles.
+    follows it more closely than a line or what settles.  What changes often is not asked: beside a
+    rest a drift may be likelier for what it explains of that.
     """
-    if "covariate" not in judged.candidate.setting:
+    if "covariate" not in judged.candidate.setting or logged_often(judged):
         return False
     wanted = DRIFTS.get(judged.candidate.effect.family, ())
     courses = {name: one for name, one in state.problem.library.items() if name in wanted}
