@@ -17,11 +17,11 @@ from ahrsd.mismatch import unknown
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate
 from ahrsd.mismatch.exam import IMITATORS
-from ahrsd.mismatch.foretold import logged_often
-from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.moved import ONSET_SHARE
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.nested import simplest
+from ahrsd.mismatch.often import logged_often
+from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.regression import (
     Base,
     Candidate,
@@ -146,7 +146,8 @@ def _no_more_than_a_drift(state: State, judged: Judged) -> bool:
     follows it more closely than a line or what settles.  What changes often is not asked: beside a
     rest a drift may be likelier for what it explains of that.
     """
-    if "covariate" not in judged.candidate.setting or logged_often(judged):
+    often = logged_often(state.problem.track, judged.candidate)
+    if "covariate" not in judged.candidate.setting or often:
         return False
     wanted = DRIFTS.get(judged.candidate.effect.family, ())
     courses = {name: one for name, one in state.problem.library.items() if name in wanted}
@@ -201,7 +202,7 @@ def look(state: State, refused: Sequence[str] | set[str] = ()) -> Survey:
 
 def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: int) -> Judged:
     """A candidate held against the spectrum that is left beside it."""
-    limits = state.problem.limits
+    problem, limits = state.problem, state.problem.limits
     columns = columns_of(basis, [one])[one.name]
     noise = spectrum_of(basis, columns)
     quiet = against(basis, noise)
@@ -219,7 +220,7 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     gain = (noise.nats - plain.nats) / quiet.colour
     evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
     checks = {
-        "evidence": evidence > _least_nats(held, limits),
+        "evidence": evidence > _least_nats(one, problem),
         SIZE: _material(one, held.what),
     }
     others = (why for why in held.refused if why not in checks)
@@ -227,11 +228,12 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     return replace(held, evidence=evidence, refused=refused)
 
 
-def _least_nats(held: Judged, limits: Limits) -> float:
+def _least_nats(one: Candidate, problem: Problem) -> float:
     """What a name must be worth beside the rest: more, the easier the rest imitates it."""
-    if held.candidate.name in STEPS.values():
+    if one.name in STEPS.values():
         return STEP_NATS
-    return limits.beside_logged_nats if logged_often(held) else limits.beside_nats
+    often = logged_often(problem.track, one)
+    return problem.limits.beside_logged_nats if often else problem.limits.beside_nats
 
 
 def _paid(what: Score, scale: Array) -> float:

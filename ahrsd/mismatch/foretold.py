@@ -22,7 +22,7 @@ from ahrsd.mismatch import unknown
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.findings import added_value, with_all_else
 from ahrsd.mismatch.heldout import gain_of
-from ahrsd.mismatch.name import Judged
+from ahrsd.mismatch.often import logged_often
 from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.reweighted import reweighted
 from ahrsd.mismatch.search import WANDERING, State, Survey
@@ -37,8 +37,6 @@ FORETOLD = 0.25
 #: share of the rows with a reading below which nothing is asked: a fifth with a hole in it is not
 #: like the others (a true current whose column has a hole gained less than nothing)
 READ = 0.95
-#: blocks to which what is known of a logged cause is spread at least: what warms up has six
-OFTEN = 15.0
 
 
 def without_unforetold(
@@ -55,9 +53,9 @@ def without_unforetold(
         rest = left.strongest.evidence if unknown.detected(left, state.problem.limits) else 0.0
         shares = [
             1.0
-            if logged_amid(judged, rest) or (k >= known and judged.candidate.name in DELAYS)
+            if _logged_amid(state, k, rest) or (k >= known and state.names[k] in DELAYS)
             else share_foretold(state, k, seen)
-            for k, (judged, seen) in enumerate(zip(state.named, surveys, strict=True))
+            for k, seen in enumerate(surveys)
         ]
         worst = min(range(len(shares)), key=lambda k: shares[k], default=0)
         if not shares or shares[worst] >= FORETOLD:
@@ -70,17 +68,15 @@ def without_unforetold(
             left = replace(left, stood_in=frame)
 
 
-def logged_amid(judged: Judged, rest: float) -> bool:
-    """Whether it is a name by a logged cause that changes often, amid a rest that is worth more.
+def _logged_amid(state: State, number: int, rest: float) -> bool:
+    """Whether it is a strong name by a logged cause that changes often, amid a rest.
 
     The rest bends the calibration of four fifths by more than the name is worth in the fifth.
+    A weak name may be what a moment of the rest has in common with the cause.
     """
-    return logged_often(judged) and rest > judged.evidence / 2
-
-
-def logged_often(judged: Judged) -> bool:
-    """Whether its cause was logged, and changes so often that nothing slow goes with it."""
-    return "covariate" in judged.candidate.setting and judged.what.effective_blocks >= OFTEN
+    judged, limits = state.named[number], state.problem.limits
+    strong = max(limits.beyond_nats, rest / 10) < judged.evidence < 2 * rest
+    return strong and logged_often(state.problem.track, judged.candidate)
 
 
 def share_foretold(state: State, number: int, seen: Survey) -> float:

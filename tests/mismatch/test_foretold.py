@@ -15,7 +15,6 @@ from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.foretold import (
     FORETOLD,
     in_time_alone,
-    logged_amid,
     part_of,
     share_foretold,
     without_unforetold,
@@ -23,6 +22,7 @@ from ahrsd.mismatch.foretold import (
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.null import FittedTerm, fit_null
+from ahrsd.mismatch.often import changes
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.regression import Candidate, evidence_of
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, without_term
@@ -114,14 +114,20 @@ def test_a_diagnosis_asks_and_what_is_refused_is_unknown(monkeypatch):
 def test_a_logged_cause_that_changes_often_is_not_asked_amid_a_louder_rest(once):
     """The rest bends the calibration of four fifths by more than the name is worth in the fifth."""
     state, seen = once
-    nats = state.named[0].evidence
-    often = replace(state.named[0], what=SimpleNamespace(value=None, effective_blocks=24.0))
-    seldom = replace(state.named[0], what=SimpleNamespace(value=None, effective_blocks=6.0))
-    assert logged_amid(often, nats)
-    assert not logged_amid(often, 0.4 * nats)
-    assert not logged_amid(seldom, nats)
-    motion = replace(often, candidate=Candidate(EFFECTS["eddy_current"], {}, 1, 0.0))
-    assert not logged_amid(motion, nats)
     left = unknown.remainder(formed_basis_of(state))
-    kept, _, _ = without_unforetold(state, [seen], left, known=1)
-    assert kept.names == ()  # what is left is worth less than the name
+    rest, slim = left.strongest.evidence, LIMITS.beyond_nats
+    for nats, names in ((5.0, ()), (slim - 1, ()), (slim + 1, (NAMED,)), (3 * rest, ())):
+        judged = replace(state.named[0], evidence=nats)
+        strong = replace(state, named=(judged,))
+        kept, _, _ = without_unforetold(strong, [seen], left, known=1)
+        assert kept.names == names
+
+
+def test_what_changes_often():
+    time_s = np.arange(0.0, 300.0, 0.1)
+    rng = np.random.default_rng(1)
+    throttled = np.repeat(rng.integers(0, 2, 60), 50) + 0.05 * rng.standard_normal(3000)
+    warming = 25 * (1 - np.exp(-time_s / 60)) + 0.3 * rng.standard_normal(3000)
+    assert changes(throttled, 0.1) >= 20
+    assert changes(warming, 0.1) == 1
+    assert changes(rng.standard_normal(3000) * 0.0, 0.1) == 0

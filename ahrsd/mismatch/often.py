@@ -1,0 +1,36 @@
+"""Whether a logged cause changes so often that nothing slow goes with it.
+
+A room, a box that warms up, a day: what they do has the course of any other slow thing, a column
+that drifts among them.  A motor that is throttled up and down twenty times has its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.mismatch.regression import Candidate
+from ahrsd.mismatch.track import Track
+from ahrsd.samples import Array
+
+#: changes from one side of the middle to the other at least
+OFTEN = 15
+_SMOOTHED_S = 1.0
+#: how far from the middle a side begins, in deviations: noise that crosses it changes nothing
+_SIDE = 0.25
+
+
+def logged_often(track: Track, candidate: Candidate) -> bool:
+    """Whether a candidate is driven by a column of the recording that changes sides so often."""
+    values = track.covariates.get(str(candidate.setting.get("covariate")))
+    return values is not None and changes(values, track.step_s) >= OFTEN
+
+
+def changes(values: Array, step_s: float) -> int:
+    """How often (N,), smoothed over a second, goes from one side of its middle to the other."""
+    width = max(1, round(_SMOOTHED_S / step_s))
+    if len(values) < 2 * width or not np.isfinite(values).all():
+        return 0
+    smooth = np.convolve(values, np.full(width, 1.0 / width), mode="valid")
+    away = smooth - (np.quantile(smooth, 0.25) + np.quantile(smooth, 0.75)) / 2
+    side = np.sign(away)[np.abs(away) > _SIDE * float(np.std(smooth))]
+    return int(np.count_nonzero(np.diff(side)))
