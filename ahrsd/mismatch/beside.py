@@ -20,7 +20,7 @@ from ahrsd.mismatch.exam import IMITATORS
 from ahrsd.mismatch.moved import ONSET_SHARE
 from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.nested import simplest
-from ahrsd.mismatch.often import logged_often
+from ahrsd.mismatch.often import OFTEN, logged_often
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.regression import (
     Base,
@@ -232,7 +232,7 @@ def _least_nats(one: Candidate, problem: Problem) -> float:
     """What a name must be worth beside the rest: more, the easier the rest imitates it."""
     if one.name in STEPS.values():
         return STEP_NATS
-    often = logged_often(problem.track, one)
+    often = logged_often(problem.track, one, 2 * OFTEN)
     return problem.limits.beside_logged_nats if often else problem.limits.beside_nats
 
 

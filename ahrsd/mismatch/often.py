@@ -1,7 +1,7 @@
 """Whether a logged cause changes so often that nothing slow goes with it.
 
 A room, a box that warms up, a day: what they do has the course of any other slow thing, a column
-that drifts among them.  A motor that is throttled up and down twenty times has its own.
+that drifts among them.  A motor that is throttled up and down a few times has its own.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
-#: changes from one side of the middle to the other at least
-OFTEN = 15
+#: changes from one side of the middle to the other at least; twice as many are often by any course
+OFTEN = 4
 _SMOOTHED_S = 1.0
 #: how far from the middle a side begins, in deviations: noise that crosses it changes nothing
 _SIDE = 0.25
 
 
-def logged_often(track: Track, candidate: Candidate) -> bool:
+def logged_often(track: Track, candidate: Candidate, least: int = OFTEN) -> bool:
     """Whether a candidate is driven by a column of the recording that changes sides so often."""
     values = track.covariates.get(str(candidate.setting.get("covariate")))
-    return values is not None and changes(values, track.step_s) >= OFTEN
+    return values is not None and changes(values, track.step_s) >= least
 
 
 def changes(values: Array, step_s: float) -> int:
