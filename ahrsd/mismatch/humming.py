@@ -38,21 +38,23 @@ _AXES = ("x", "y", "z")
 
 def heard(state: State, fast: Quick) -> Unexplained:
     """What rings in what a search leaves, or hums at the recorded rate beside what is `fast`."""
-    price, least = free_price_of(fast.state), state.problem.limits.unknown_nats
-    seen = ringing(formed_basis_of(state)) or humming(fast.last.basis, price, least)
+    seen = ringing(formed_basis_of(state)) or humming(fast.state, fast.last.basis)
     return seen or Unexplained(False)
 
 
-def humming(basis: Base, price: float, least_nats: float) -> Unexplained | None:
-    """What the names leave, if a band of it stands out; None where none does.
+def humming(state: State, basis: Base) -> Unexplained | None:
+    """What the names leave, if a band of it stands out by more than their own forms do, else None.
 
-    price: nats that the names may leave of their own forms;  least_nats: evidence to speak at
+    basis: the state's
     """
     left = residual(basis.known, basis.innovation)
     found = loudest_band(left, basis.rate_hz)
-    if found is None or found[2] - price < least_nats:
+    if found is None:
         return None
     low, high, nats = found
+    nats -= free_price_of(state)
+    if nats < state.problem.limits.unknown_nats:
+        return None
     inside = _passed(left, basis.rate_hz, low, high)
     outside = _passed(left, basis.rate_hz, max(0.0, low - (high - low)), low)
     frame = _frame(basis, inside, outside)
@@ -73,7 +75,7 @@ def humming(basis: Base, price: float, least_nats: float) -> Unexplained | None:
         size=float(np.sqrt(2.0 * power.sum())) * sigma,
         unit="gauss",
         single_source_share=float(vectors.eigenvalues[-1] / vectors.eigenvalues.sum()),
-        evidence_nats=nats - price,
+        evidence_nats=nats,
     )
 
 

@@ -32,12 +32,8 @@ def lost_beside(whole: Problem, state: State) -> list[Fact]:
 
 def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:
     """Whether the two searches put other turns right."""
-    one, other = (
-        [fact.turned for fact in facts if fact.turned is not None] for facts in (lost, beside)
-    )
-    return len(one) != len(other) or any(
-        not np.array_equal(a, b) for a, b in zip(one, other, strict=True)
-    )
+    first, then = ([fact.turned for fact in facts] for facts in (lost, beside))
+    return len(first) != len(then) or not all(map(np.array_equal, first, then))
 
 
 def believed(lost: Sequence[Fact], put_right: State, otherwise: State) -> bool:

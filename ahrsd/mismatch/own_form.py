@@ -22,11 +22,15 @@ FORM_SHARE = 1e-3
 
 def strengths(state: State) -> list[float]:
     """Evidence of every name beside the others, nats; at least what it was when it was found."""
-    basis = formed_basis_of(state)
-    return [
-        max(judged.evidence, evidence_of(without_term(state, k, basis), judged.candidate))
-        for k, judged in enumerate(state.named)
-    ]
+    made = state.fit.made
+    if "strengths" not in made:
+        basis = formed_basis_of(state)
+        made["strengths"] = [
+            max(judged.evidence, evidence_of(without_term(state, k, basis), judged.candidate))
+            for k, judged in enumerate(state.named)
+        ]
+    found: list[float] = made["strengths"]
+    return found
 
 
 def price_of(state: State) -> float:

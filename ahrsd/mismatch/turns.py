@@ -88,12 +88,8 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, count: int) -> _Jumps:
     usable = _summed(done.used.astype(np.float64))
     white = float(np.sqrt(np.median(done.gains.innovation_covariance[done.used, 0, 0])))
     n, least = len(v), float(np.log(len(v) / count)) + _SURE_NATS
-    out = _Jumps(
-        np.ones(n, dtype=np.int64),
-        np.full(n, -np.inf),
-        np.ones(n, dtype=np.int64),
-        np.zeros(n, bool),
-    )
+    one = np.ones(n, dtype=np.int64)
+    out = _Jumps(one, np.full(n, -np.inf), one.copy(), np.zeros(n, dtype=np.bool))
     for length in _ROWS:
         k = np.arange(length, n - length)
         k = k[usable[k + length] - usable[k - length] == 2 * length]
