@@ -70,10 +70,10 @@ OF_THE_REST = (
 )
 #: what differs between recordings of one sensor by this much, or is laid to it, says nothing of it
 OF_ITSELF = {
-    "mag_gyro_misalignment": 0.03,
+    "mag_gyro_misalignment": 0.055,
     "gyro_scale": 0.04,
     "clock_rate": 0.03,
-    "gyro_nonorthogonality": 0.03,
+    "gyro_nonorthogonality": 0.055,
 }
 #: why a name is not said that is laid to the sensor itself
 SIZE = "size"
