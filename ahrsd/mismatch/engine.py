@@ -59,6 +59,7 @@ from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     HARDLY_TURNED,
+    STEPS,
     State,
     Survey,
     at_rest,
@@ -144,9 +145,9 @@ class _Searched:
 def _searched(problem: Problem, model: NullModel) -> _Searched:
     start = fit_null(problem.track, problem.spec, model, walk=False)
     done, brief = beside_brief(wandering(sought(State(problem, start))))
-    state, surveys, left = named_beside(
-        done.state, done.surveys, done.left, done.stood_in, hidden=done.hidden
-    )
+    steps = [one for one in done.first.candidates if one.name in STEPS.values()]
+    given = done.state, done.surveys, done.left, done.stood_in
+    state, surveys, left = named_beside(*given, hidden=done.hidden, steps=steps)
     beside = len(state.named) > len(done.state.named)
     state, surveys, left = without_unforetold(state, surveys, left, known=len(done.state.named))
     state, surveys, left = one_for_many(*without_trifles(state, surveys, left))

@@ -32,8 +32,11 @@ def lost_beside(whole: Problem, state: State) -> list[Fact]:
 
 def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:
     """Whether the two searches put other turns right."""
-    first, then = ([fact.turned for fact in facts] for facts in (lost, beside))
-    return len(first) != len(then) or not all(map(np.array_equal, first, then))
+    first, then = (
+        [fact.turned for fact in facts if fact.turned is not None] for facts in (lost, beside)
+    )
+    pairs = zip(first, then, strict=False)
+    return len(first) != len(then) or not all(np.array_equal(a, b) for a, b in pairs)
 
 
 def believed(lost: Sequence[Fact], put_right: State, otherwise: State) -> bool:
