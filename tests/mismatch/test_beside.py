@@ -248,3 +248,16 @@ def test_the_easier_a_rest_imitates_a_name_the_more_it_must_be_worth(name, setti
     if name == "motor_current_field":  # a drift may be likelier for what it explains of the rest
         state = SimpleNamespace(problem=problem)
         assert not beside._no_more_than_a_drift(state, SimpleNamespace(candidate=candidate))
+
+
+def test_a_step_is_looked_for_where_it_was_seen_before_it_counted_as_noise():
+    """In the spectrum that holds it, another onset may be the best: of each name the likelier."""
+    step = Candidate(EFFECTS["hard_iron_step"], {"onset_s": 34.2}, 1, 300.0)
+    assert beside._new(step, [("gyro_bias_step", {"onset_s": 34.0}), ("mag_time_lag", {})])
+    assert not beside._new(step, [("hard_iron_step", {"onset_s": 34.0})])
+    assert beside._new(step, [("hard_iron_step", {"onset_s": 60.0})])
+    names = (("hard_iron_step", 4.0), ("mag_time_lag", 40.0), ("hard_iron_step", 302.0))
+    judged = [
+        SimpleNamespace(candidate=SimpleNamespace(name=name), evidence=nats) for name, nats in names
+    ]
+    assert beside._best_of_each(judged) == [judged[2], judged[1]]
