@@ -236,7 +236,7 @@ def test_a_lamp_that_a_free_course_explains_as_well_is_asked_for_beside_the_rest
         ("mag_bias_temperature", {"covariate": "temperature_c"}, 35.0),
         ("mag_time_lag", {}, 35.0),
         ("hard_iron_step", {"onset_s": 9.0}, 100.0),
-        ("gyro_bias_step", {"onset_s": 9.0}, 50.0),
+        ("gyro_bias_step", {"onset_s": 9.0}, 25.0),
     ],
 )
 def test_the_easier_a_rest_imitates_a_name_the_more_it_must_be_worth(name, setting, least):
