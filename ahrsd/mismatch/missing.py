@@ -28,8 +28,8 @@ _NEAR = 0.3  # of a whole number
 _FEWEST = 5
 _SURE_NATS = 12.0  # by which they must be whole steps rather than noise: others have 160 and more
 #: and that each must be in the mean: a gyro that reads 3 % too little is ahead all the time, and on
-#: a path through a room 13 jumps had 2.4 each; lost turns have 8 and more
-_EACH_NATS = 4.0
+#: a path through a room 13 jumps had 2.4 each; lost turns have 3.8 and more
+_EACH_NATS = 3.0
 #: deviations of a mean that no noise jumps by, and the part of such a jump that is across the turn,
 #: more than a lost one has
 _CLEAR, _ACROSS = 8.0, 0.5

@@ -26,6 +26,7 @@ def state_of(*names: SimpleNamespace) -> SimpleNamespace:
         ("hysteresis", 31_121.0, 76.0, False),  # play that is sampled misses its turning points
         ("hysteresis", 3_000.0, 76.0, True),
         ("mag_time_lag", 31_121.0, 76.0, True),
+        ("hard_iron_step", 5e6, 76.0, True),  # a magnet; beside it a delay
         ("gyro_nonorthogonality", 1.3e6, 104.0, False),  # its second order
     ],
 )

@@ -72,7 +72,7 @@ class Effect(ABC):
     frame:       in which it is told, where that is not the family's name
     unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
                  them is the noise of its own columns, and what is known is the prior
-    form_share:  part of its evidence that its columns, which are not exact, may leave
+    form_share:  part of its evidence that its columns may leave, where they are not exact
     """
 
     identifier: str
@@ -92,7 +92,7 @@ class Effect(ABC):
     after_noise: bool = False
     frame: str | None = None
     unseen: tuple[tuple[float, ...], ...] = ()
-    form_share: float = 1e-4
+    form_share: float = 0.0
 
     @property
     def least_information(self) -> float:
