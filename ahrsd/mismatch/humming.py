@@ -12,12 +12,10 @@ Whittle's likelihood gives the evidence, 3 b (P / C - 1 - ln P / C) nats of ever
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ahrsd.mismatch.diagnosis import Unexplained, Where
+from ahrsd.mismatch.facts import spans_of
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.own_form import free_price_of
 from ahrsd.mismatch.quick import Quick
@@ -30,9 +28,8 @@ _BAND_HZ, _FEWEST_BINS = 0.25, 30
 _SIDE = 8  # bands in which a side's quietest one is sought
 _STANDS_OUT = 3.0  # times as loud as both sides: colour of a few coefficients is not so steep
 _LOWEST_HZ = 0.75  # below, courses in time and the motion's own rates are sought
-_ALONG = (
-    0.1  # part of the power that is along the field, less than a third, in an error of the gyro
-)
+#: part of the power that is along the field, at most, in an error of the gyro; else about a third
+_ALONG = 0.1
 _AXES = ("x", "y", "z")
 
 
@@ -93,7 +90,7 @@ def loudest_band(left: Array, rate_hz: float) -> tuple[float, float, float] | No
     out &= np.arange(count) * bins * width_hz >= _LOWEST_HZ
     ratio = np.where(out, bands / np.where(out, level, 1.0), 1.0)
     nats = 3.0 * bins * (ratio - 1.0 - np.log(ratio))
-    runs = _runs(out)
+    runs = spans_of(out)
     if not runs:
         return None
     a, b = max(runs, key=lambda run: float(nats[slice(*run)].sum()))
@@ -107,11 +104,6 @@ def _usual(bands: Array) -> Array:
         below, above = bands[max(0, k - _SIDE) : k], bands[k + 1 : k + 1 + _SIDE]
         out[k] = max(below.min(), above.min())
     return out
-
-
-def _runs(rows: NDArray[np.bool]) -> Sequence[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _passed(left: Array, rate_hz: float, low_hz: float, high_hz: float) -> Array:

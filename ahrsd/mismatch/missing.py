@@ -17,7 +17,7 @@ from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.track import Track
-from ahrsd.mismatch.turns import Turns, recovered
+from ahrsd.mismatch.turns import QUARTER, Turns, recovered
 from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
@@ -67,7 +67,7 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Jumps:
-    """steps (N,) by which the field is ahead;  tell (N,) where that can be said;  rows of jumps.
+    """steps (N,) by which the field is ahead;  rows of jumps.
 
     scatter (N,): deviation of `steps` that noise makes
     others: how many jumps there are that no lost turn makes
@@ -76,7 +76,6 @@ class _Jumps:
 
     steps: Array
     scatter: Array
-    tell: NDArray[np.bool]
     forward: NDArray[np.intp]
     backward: NDArray[np.intp]
     others: int
@@ -115,7 +114,6 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
     return _Jumps(
         steps,
         sigma / np.maximum(size, 1e-300),
-        tell,
         forward,
         _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
         len(_peaks(across, far, samples)),
@@ -141,7 +139,7 @@ def _scatter(done: Filtered, jump: Array, samples: int) -> float:
     white = float(np.sqrt(np.median(done.gains.innovation_covariance[:, 0, 0]) / samples))
     if not len(jump):
         return white
-    lowest = float(np.quantile(np.abs(jump), 0.25)) / 0.3186  # of a normal deviate
+    lowest = float(np.quantile(np.abs(jump), 0.25)) / QUARTER
     return max(white, lowest / float(np.sqrt(2.0)))
 
 

@@ -27,7 +27,8 @@ _ROWS = (3, 6, 12, 24, 48)  # before and after a jump
 _ROUNDS = 8
 _SURE_NATS = 3.0  # beyond the share
 _ENOUGH = 10  # times as many rows as are averaged: else their spread is not known
-_QUARTER = 0.3186  # the lower quarter of a normal deviate's size
+#: below which a quarter of a normal deviate's sizes are
+QUARTER = 0.3186
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +46,8 @@ def recovered(done: Filtered, rate_b_rad_s: Array, lost: NDArray[np.int64]) -> T
     """
     model, A = done.model, done.model.soft_iron
     clean = done.predicted_b @ A.T + done.innovation + model.hard_iron_gauss
-    mag = np.where((done.used | _opening(done))[:, None], clean, np.nan)
+    read = np.isfinite(done.track.mag_b_gauss).all(axis=1, keepdims=True)
+    mag = np.where(read, clean, np.nan)
     best, most = Turns(lost, lost > 0), -np.inf
     for _ in range(_ROUNDS):
         gyro = model.gyro_bias_rad_s + rate_b_rad_s * (1 + lost)[:, None]
@@ -62,11 +64,6 @@ def recovered(done: Filtered, rate_b_rad_s: Array, lost: NDArray[np.int64]) -> T
         lost = lost.copy()
         lost[picked] += found.steps[picked]
     return best
-
-
-def _opening(done: Filtered) -> NDArray[np.bool]:
-    """(N,) rows whose reading a run starts from: the prediction there is that reading."""
-    return ~done.used & np.isfinite(done.predicted_b).all(axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +93,7 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, count: int) -> _Jumps:
         if len(k) < _ENOUGH * length:
             break
         jump = (total[k + length] - 2 * total[k] + total[k - length]) / length
-        s = float(np.quantile(np.abs(jump), 0.25)) / _QUARTER
+        s = float(np.quantile(np.abs(jump), 0.25)) / QUARTER
         s = max(s, white * float(np.sqrt(2.0 / length)))
         z, size = np.sum(jump * v[k], axis=1) / s**2, np.sum(v[k] ** 2, axis=1) / s**2
         steps = np.maximum(np.round(z / np.maximum(size, 1e-300)), 1.0)

@@ -53,3 +53,15 @@ def test_nothing_is_lost_where_nothing_was() -> None:
     done, rate, lost = lossy("mam", 0.0, 3e-4)
     assert not lost.any()
     assert not recovered(done, rate, np.zeros(len(lost), dtype=np.int64)).lost.any()
+
+
+def test_rows_without_a_reading_say_nothing_and_hide_none_elsewhere() -> None:
+    done, rate, lost = lossy("mam", 0.01, 3e-4)
+    mag = done.track.mag_b_gauss.copy()
+    mag[4000:4200] = np.nan
+    blind = run_filter(replace(done.track, mag_b_gauss=mag), done.model)
+    found = recovered(blind, rate, np.zeros(len(lost), dtype=np.int64))
+    assert not found.lost[4000:4200].any()
+    assert not found.shows[4000:4200].any()
+    seen = np.flatnonzero(lost[:3900])
+    assert near(seen, np.flatnonzero(found.lost), 2) >= 0.8 * len(seen)
