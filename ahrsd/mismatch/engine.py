@@ -72,6 +72,7 @@ from ahrsd.mismatch.sought import sought
 from ahrsd.mismatch.spectrum import against, spectrum_of
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.track import Spec, Track
+from ahrsd.mismatch.unplaced import without_unplaced
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.mismatch.wandering import wandering
 from ahrsd.samples import Array
@@ -150,7 +151,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     state, surveys, left = named_beside(*given, hidden=done.hidden, steps=steps)
     beside = len(state.named) > len(done.state.named)
     state, surveys, left = without_unforetold(state, surveys, left, known=len(done.state.named))
-    state, surveys, left = one_for_many(*without_trifles(state, surveys, left))
+    state, surveys, left = one_for_many(*without_trifles(*without_unplaced(state, surveys, left)))
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)

@@ -51,19 +51,38 @@ def test_a_start_up_between_the_grids_time_constants() -> None:
     assert np.abs(got - value).max() < 1e-4
 
 
-def test_a_slow_pulsation_of_the_outside_field_of_any_phase_is_one_name() -> None:
+def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_logged() -> None:
+    """Without them it may as well be the way through a field that differs from place to place."""
     track, readings = _quiet(5)
     effect = EFFECTS["geomagnetic_drift"]
     span_s = float(np.ptp(track.time_s))
     wave = {"start_s": float(track.time_s[0]), "span_s": span_s, "shape": "wave"}
     setting = {**wave, "length_s": 0.55 * span_s, "turn_deg": 67.0}
     changed = effect.simulate(readings, np.array([2.5e-3, -1e-3, 2e-3]), setting).mag_b_gauss
-    answer = diagnose(
-        replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
-    )
+    pulsed = replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
+    logged = made(Trial(seed=5, samples=7000)).track.covariates
+    placed = {name: values for name, values in logged.items() if name.startswith("position")}
+    answer = diagnose(replace(pulsed, covariates=placed))
     assert [one.effect for one in answer.findings] == ["geomagnetic_drift"]
     assert not answer.unexplained.detected
     assert abs(answer.findings[0].setting["length_s"] / setting["length_s"] - 1) < 0.1
+    nowhere = diagnose(pulsed)
+    assert nowhere.findings == ()
+    assert nowhere.unexplained.detected
+    assert nowhere.unexplained.where.frame == "world"
+
+
+def test_a_way_through_a_gradient_is_unknown_where_no_position_is_logged() -> None:
+    """Most of it is a wave, and a bump beside it has 45 nats: the course as a whole has 250."""
+    track, readings = _quiet(5)
+    logged = made(Trial(seed=5, samples=7000)).track.covariates
+    north, east = logged["position_north_m"], logged["position_east_m"]
+    course = np.column_stack([0.1 * north + 0.05 * east, -0.06 * north, 0.08 * north]) * 1e-3
+    changed = np.einsum("nji,nj->ni", readings.R_nb, course) @ readings.soft_iron.T
+    answer = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + changed))
+    assert answer.findings == ()
+    assert answer.unexplained.detected
+    assert answer.unexplained.where.frame == "world"
 
 
 def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
