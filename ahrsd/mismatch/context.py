@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from ahrsd import so3
 from ahrsd.mismatch.innovation import Bearings, Filtered
 from ahrsd.mismatch.recursive import both_ways, gaussian
+from ahrsd.mismatch.specific_force import without_noise
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context
 from ahrsd.samples import Array
@@ -71,7 +73,15 @@ def build_context(track: Track, fit: Fit) -> Context:
         field_dot_b=np.cross(done.nominal_b, _at_the_sample(smooth, runs)),
         R_nb=R_nb,
         world_levelled=levelled,
+        force_b_m_s2=_force(track),
     )
+
+
+@lru_cache(maxsize=2)
+def _force(track: Track) -> Array | None:
+    """(N, 3) specific force without the accelerometer's noise, the same for every fit."""
+    runs = track.runs or (slice(0, len(track)),)
+    return None if track.accel_b_m_s2 is None else without_noise(track.accel_b_m_s2, runs)
 
 
 def smoothed_rate(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> Array:

@@ -93,6 +93,7 @@ class Context:
     R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
                   is an accelerometer or a reference attitude (`world_levelled`), else fixed but
                   of unknown orientation
+    force_b_m_s2: (N, 3) specific force without the accelerometer's noise, None without one
     """
 
     track: Track
@@ -102,6 +103,7 @@ class Context:
     field_dot_b: Array
     R_nb: Array
     world_levelled: bool
+    force_b_m_s2: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,6 +40,7 @@ class Readings:
     time_s, dt_s (N,), dt_s nan in the first row of each gap-free run; mag_b_gauss, gyro_b_rad_s,
     accel_b_m_s2 (nan where there is none), rate_b_rad_s (true mean rate over the step that ends at
     the sample), field_b (true, gauss) (N, 3); R_nb (N, 3, 3); soft_iron (3, 3); covariates (N,).
+    force_b_m_s2 (N, 3): specific force without the accelerometer's noise, None: as it reads.
     """
 
     time_s: Array
@@ -52,6 +53,7 @@ class Readings:
     R_nb: Array
     soft_iron: Array
     covariates: dict[str, Array]
+    force_b_m_s2: Array | None = None
 
 
 class Effect(ABC):
@@ -226,6 +228,7 @@ def readings_of(context: Context) -> Readings:
         R_nb=context.R_nb,
         soft_iron=model.soft_iron,
         covariates=track.covariates,
+        force_b_m_s2=context.force_b_m_s2,
     )
 
 

@@ -191,7 +191,7 @@ def _shaking(readings: Readings, window_s: float) -> Array:
     """Variance (N,) in g^2 of the specific force about its mean over the window, all axes."""
     rows = max(round(window_s / series.median_step(readings.dt_s)), 3)
     total = np.zeros(len(readings.time_s))
-    for axis in shapes.specific_force_g(readings).T:
+    for axis in readings.accel_b_m_s2.T / shapes.GRAVITY_M_S2:
         slow = series.moving_mean(axis, readings.dt_s, rows)
         total += series.moving_mean((axis - slow) ** 2, readings.dt_s, rows)
     return total

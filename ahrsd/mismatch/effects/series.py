@@ -190,6 +190,7 @@ def kept(readings: Readings, rows: NDArray[np.bool]) -> Readings:
     run = np.cumsum(np.isnan(readings.dt_s))[index]
     time_s = readings.time_s[index]
     step = np.concatenate([[np.nan], np.where(np.diff(run) > 0, np.nan, np.diff(time_s))])
+    force = readings.force_b_m_s2
     return replace(
         readings,
         time_s=time_s,
@@ -201,6 +202,7 @@ def kept(readings: Readings, rows: NDArray[np.bool]) -> Readings:
         field_b=readings.field_b[index],
         R_nb=readings.R_nb[index],
         covariates={name: values[index] for name, values in readings.covariates.items()},
+        force_b_m_s2=None if force is None else force[index],
     )
 
 

@@ -124,7 +124,8 @@ def elapsed(readings: Readings, setting: Setting) -> Array:
 
 def specific_force_g(readings: Readings) -> Array:
     """Specific force (N, 3) in g."""
-    return np.asarray(readings.accel_b_m_s2 / GRAVITY_M_S2)
+    force = readings.force_b_m_s2
+    return np.asarray((readings.accel_b_m_s2 if force is None else force) / GRAVITY_M_S2)
 
 
 def has_accel(readings: Readings) -> bool:
