@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.mismatch import unknown
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
+from ahrsd.mismatch.evidence import CLEAR_PEAK
 from ahrsd.mismatch.name import believable, judge
 from ahrsd.mismatch.nested import contained, without_wider
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
@@ -20,6 +22,7 @@ from ahrsd.mismatch.search import (
     term_group,
     without_term,
 )
+from ahrsd.mismatch.slow_noise import lawful
 from ahrsd.samples import Array
 
 #: names of iron and metal that remember or follow the turns: half of any unlogged course looks so
@@ -92,7 +95,29 @@ def rest_of(state: State, basis: Base) -> Discrepancy | None:
     if not state.named:
         return None
     found = random_effects(state, basis)
-    return found if found.nats > state.problem.limits.unknown_nats else None
+    if found.nats <= state.problem.limits.unknown_nats or _is_slow_noise(state, basis, found):
+        return None
+    return found
+
+
+def _is_slow_noise(state: State, basis: Base, found: Discrepancy) -> bool:
+    """Whether it is noise that forgets within seconds, beside which every name holds."""
+    if basis.colour <= CLEAR_PEAK:
+        return False
+    made = state.fit.made
+    if "slow noise" not in made:
+        limits = state.problem.limits
+        quiet = lawful(basis, unknown.remainder(basis, with_bins=False))
+        worth = [
+            evidence_of(without_term(state, k, quiet), one.candidate)
+            for k, one in enumerate(state.named)
+        ]
+        made["slow noise"] = discrepancy(quiet).nats <= limits.unknown_nats and all(
+            nats > limits.evidence_nats and not _imitates(name, nats, found)
+            for name, nats in zip(state.names, worth, strict=True)
+        )
+    noise: bool = made["slow noise"]
+    return noise
 
 
 def random_effects(state: State, basis: Base) -> Discrepancy:

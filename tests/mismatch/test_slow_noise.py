@@ -92,3 +92,14 @@ def test_a_source_is_told_beside_slow_noise(quiet: Track) -> None:
     where = answer.unexplained.where
     assert where is not None
     assert where.frame == "sensor"
+
+
+def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> None:
+    """Seen as white, what such noise leaves is a rest that no name of this size stands out of."""
+    one = made(Trial(12, (("gyro_scale", 1.0),), samples=10_000, rate_hz=40.0, noise="red"))
+    answer = diagnose(one.track)
+    assert [found.effect for found in answer.findings] == ["gyro_scale"]
+    assert not answer.unexplained.detected
+    values = answer.findings[0].parameters
+    z = [(v.value - t) / v.std for v, t in zip(values, one.truth[0][1], strict=True)]
+    assert np.abs(z).max() < 3.0
