@@ -45,6 +45,8 @@ from ahrsd.samples import Array
 #: shares below this are not worth a line
 SMALLEST_SHARE = 0.005
 _SCALE_STEP = 0.05
+#: deviations by which two weightings of one recording differ at most where the model is true
+AGREE = 3.0
 #: seconds that are dealt in turn where an effect shows no longer than some of them
 SECOND_S = 1.0
 
@@ -141,6 +143,8 @@ def whole_term(
     term = state.fit.terms[number]
     told = _told_in(state, basis, number, beside)
     change, deviation = refined(told, number, _by_scale(state, told, number))
+    if told is not basis:
+        deviation = of_both(change, deviation, refined(basis, number)[1])
     value = added_value(state, number) + change
     deviation = with_unseen(state.named[number].candidate, deviation)
     setting = {k: v for k, v in term.setting.items() if k != "searched"}
@@ -154,6 +158,18 @@ def whole_term(
         value = value + time_constant_less_lag(basis, term_group(number), float(value[0]))
         setting = {"time_constant_s": float(value[0])}
     return Term(name, value, deviation, setting)
+
+
+def of_both(change: Array, deviation: Array, before: Array) -> Array:
+    """(p,) deviations that hold what two weightings of one recording disagree in.
+
+    change: from the value in the one to that in the other;  before, deviation: of the two.  Where
+    the model is true they differ by no more than both are uncertain.  A cause that was logged with
+    noise is told too small by the one that looks at quick changes, with a deviation that knows
+    nothing of it.
+    """
+    excess = np.maximum(np.abs(change) - AGREE * np.hypot(deviation, before), 0.0)
+    return np.asarray(np.hypot(deviation, excess))
 
 
 def with_unseen(candidate: Candidate, deviation: Array) -> Array:

@@ -41,6 +41,8 @@ from ahrsd.samples import Array
 LOOKED_AT = 8
 #: prior of a term in the joint fit, in its own prior deviations: next to none
 LOOSE = 30.0
+#: settings that are a form of the course, of which another may be likelier once all is fitted
+FORMS = ("power", "form", "shape", "of", "products")
 #: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
 REST_SPREAD = 4e-3
 HARDLY_TURNED = (
@@ -214,7 +216,7 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
     """
     at = state.named[number].candidate
     key = scale_of(at)
-    if key is None and "onset_s" not in at.setting:
+    if key is None and not any(name in at.setting for name in ("onset_s", *FORMS)):
         return None
     if "place_m" in at.setting:
         return replace(closest_scale(left, at, SCALE_AGAIN), tried=1)

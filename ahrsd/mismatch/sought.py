@@ -1,6 +1,7 @@
 """All names of one state: named one after the other, pruned, examined, swapped, held to their form.
 
-forward -> prune -> examine -> swap -> stand-ins; the same again beside a bias that wanders.
+forward -> prune -> without imitators -> examine -> swap -> stand-ins;
+the same again beside a bias that wanders.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ahrsd.mismatch.exam import examined, paired, pruned
+from ahrsd.mismatch.imitators import without_imitators
 from ahrsd.mismatch.nested import eddies_alone
 from ahrsd.mismatch.search import State, Survey, survey, swapped
 from ahrsd.mismatch.selection import forward
@@ -38,7 +40,7 @@ class Sought:
 def sought(state: State) -> Sought:
     """Every name that the state's fit allows beside what it has."""
     more, first, last = forward(state)
-    given = paired(pruned(more))
+    given = paired(without_imitators(pruned(more)))
     slim, beside = examined(given)
     hidden = len(slim.named) < len(given.named)
     slim = eddies_alone(slim)
