@@ -9,6 +9,7 @@ import numpy as np
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.discrepancy import Discrepancy, beyond, discrepancy
 from ahrsd.mismatch.evidence import CLEAR_PEAK
+from ahrsd.mismatch.foretold import in_time_alone
 from ahrsd.mismatch.name import believable, judge
 from ahrsd.mismatch.nested import contained, without_wider
 from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
@@ -112,9 +113,14 @@ def _is_slow_noise(state: State, basis: Base, found: Discrepancy) -> bool:
             evidence_of(without_term(state, k, quiet), one.candidate)
             for k, one in enumerate(state.named)
         ]
+        # what has a moment of its own was sought at many
+        least = [
+            limits.beyond_nats if in_time_alone(one.candidate) else limits.unknown_nats
+            for one in state.named
+        ]
         made["slow noise"] = discrepancy(quiet).nats <= limits.unknown_nats and all(
-            nats > limits.evidence_nats and not _imitates(name, nats, found)
-            for name, nats in zip(state.names, worth, strict=True)
+            nats > bar and not _imitates(name, nats, found)
+            for name, nats, bar in zip(state.names, worth, least, strict=True)
         )
     noise: bool = made["slow noise"]
     return noise

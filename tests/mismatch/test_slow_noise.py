@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 from scipy.signal import lfilter
 
+from ahrsd.mismatch import exam
 from ahrsd.mismatch.coloured import Coloured, Law, coloured
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.track import Track
 
 RATE_HZ, COUNT = 10.0, 4000
@@ -103,3 +106,29 @@ def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> 
     values = answer.findings[0].parameters
     z = [(v.value - t) / v.std for v, t in zip(values, one.truth[0][1], strict=True)]
     assert np.abs(z).max() < 3.0
+
+
+@pytest.mark.parametrize(
+    ("name", "nats", "is_noise"),
+    [
+        ("gyro_scale", 20.0, True),
+        ("gyro_scale", 9.0, False),
+        ("hard_iron_step", 20.0, False),  # sought at many moments
+        ("hard_iron_step", 139.7, True),
+        ("hysteresis", 20.0, False),  # half of any course looks so
+    ],
+)
+def test_what_a_name_must_be_worth_beside_slow_noise(monkeypatch, name, nats, is_noise) -> None:
+    setting = {"onset_s": 9.0} if name == "hard_iron_step" else {}
+    candidate = SimpleNamespace(name=name, setting=setting)
+    fit = SimpleNamespace(made={"rest": SimpleNamespace(nats=42.0, unknown=42.0)})
+    problem = SimpleNamespace(limits=LIMITS)
+    named = (SimpleNamespace(candidate=candidate),)
+    state = SimpleNamespace(fit=fit, problem=problem, named=named, names=(name,))
+    monkeypatch.setattr(exam, "lawful", lambda *_: None)
+    monkeypatch.setattr(exam.unknown, "remainder", lambda *_, **__: None)
+    monkeypatch.setattr(exam, "without_term", lambda *_: None)
+    monkeypatch.setattr(exam, "evidence_of", lambda *_: nats)
+    monkeypatch.setattr(exam, "discrepancy", lambda _: SimpleNamespace(nats=3.0))
+    found = exam.rest_of(state, SimpleNamespace(colour=3.0))
+    assert (found is None) is is_noise
