@@ -21,6 +21,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from ahrsd import so3
 from ahrsd.mismatch.innovation import Bearings, Filtered
@@ -32,6 +33,8 @@ from ahrsd.samples import Array
 
 DRIFT_S = 20.0
 SINK = 4.0
+#: chance with which noise alone may stand above the floor at one frequency
+BY_CHANCE = 1e-5
 _SLOWEST_HZ = 0.5  # the smoothing is never longer than about a second
 _REFERENCE = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
 
@@ -130,15 +133,22 @@ def _low_passed(values: Array, width: float) -> Array:
 
 
 def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> float:
-    """Highest frequency at which the motion stands above SINK times the gyro's noise."""
-    longest = max(runs, key=lambda run: int(run.stop - run.start))
-    values = rate[longest]
+    """Highest frequency at which the motion stands above SINK times the gyro's noise.
+
+    Of all runs that are as long as the segments of the longest: where samples were lost a hundred
+    times no run is long, and the spectrum of one alone scatters beyond any floor.
+    """
+    rows = max(int(run.stop - run.start) for run in runs)
     nyquist = 0.5 / dt_s
-    if len(values) < 64:
+    if rows < 64:
         return nyquist
-    segment = _segment(len(values), dt_s)
-    density = _density(values, segment).max(axis=0) * dt_s
-    above = np.flatnonzero(density > _floor(sigma, dt_s))
+    segment = _segment(rows, dt_s)
+    long = [rate[run] for run in runs if run.stop - run.start >= segment]
+    count = np.array([len(part) // segment for part in long])  # of segments, overlaps apart
+    densities = np.array([_density(part, segment) for part in long])
+    density = np.average(densities, axis=0, weights=count).max(axis=0) * dt_s
+    floor = max(SINK, float(chdtri(2.0 * count.sum(), BY_CHANCE) / (2 * count.sum()))) / SINK
+    above = np.flatnonzero(density > floor * _floor(sigma, dt_s))
     top = float(above[-1]) / (segment * dt_s) if len(above) else 0.0
     # the Gaussian pair is 3 dB down at about 1.3 times its nominal corner
     return float(np.clip(2.0 * top, _SLOWEST_HZ, nyquist))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -104,3 +105,15 @@ def test_a_rate_that_does_not_change_is_no_noise() -> None:
     np.testing.assert_array_equal(smooth[:, 0], noisy[:, 0].mean())
     assert np.corrcoef(smooth[:, 1], clean[:, 1])[0, 1] > 0.99
     assert np.corrcoef(smooth[:, 2], slowly)[0, 1] > 0.97
+
+
+def test_noise_alone_has_no_bandwidth_where_no_run_is_long() -> None:
+    """A hundred lost rows: the spectrum of the longest run alone crossed any floor by chance."""
+    rng = np.random.default_rng(4)
+    edges = np.unique(np.concatenate([[0, 3200], rng.integers(0, 3200, 110)]))
+    runs = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+    assert 64 < max(run.stop - run.start for run in runs) < 320
+    still = 2e-3 * rng.standard_normal((3200, 3))
+    assert bandwidth_hz(still, runs, 0.1, 2e-3) == 0.5
+    shaken = still + 4e-2 * np.sin(2 * np.pi * 2.1 * 0.1 * np.arange(3200))[:, None]
+    assert bandwidth_hz(shaken, runs, 0.1, 2e-3) >= 4.2
