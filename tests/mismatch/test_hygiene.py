@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mismatch_trials import Trial, made
 from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd.mismatch.clipping import clipping
 from ahrsd.mismatch.diagnosis import Where
 from ahrsd.mismatch.facts import Fact, around_lost_turns, spans_of
 from ahrsd.mismatch.frames import ranked, windows
-from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
+from ahrsd.mismatch.hygiene import as_recorded, hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.missing import missing_turns, whole_nats
 from ahrsd.mismatch.stamps import regular
@@ -379,3 +380,15 @@ def test_a_burst_around_a_lost_turn_is_what_that_leaves() -> None:
     assert not around_lost_turns(
         told("noise_burst", (313.0, 314.0)), [told("stuck_magnetometer", (313.0, 314.0))]
     )
+
+
+def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
+    """And radians are none, however loud the noise is."""
+    track = made(Trial(seed=5, samples=8000, rate_hz=40.0, scenario="wam")).track
+    noise = 0.06 * np.random.default_rng(1).standard_normal((len(track), 3))
+    loud = replace(track, mag_b_gauss=track.mag_b_gauss + noise)
+    degrees = replace(loud, gyro_b_rad_s=np.degrees(loud.gyro_b_rad_s))
+    assert 0.6 < ranked(windows(degrees))[0].cost < 0.95
+    found = [fact for fact in as_recorded(degrees) if fact.effect == "unit_error"]
+    assert [fact.setting for fact in found] == [{"sensor": "gyro", "unit": "deg/s"}]
+    assert as_recorded(loud) == []
