@@ -147,8 +147,8 @@ def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) 
     count = np.array([len(part) // segment for part in long])  # of segments, overlaps apart
     densities = np.array([_density(part, segment) for part in long])
     density = np.average(densities, axis=0, weights=count).max(axis=0) * dt_s
-    floor = max(SINK, float(chdtri(2.0 * count.sum(), BY_CHANCE) / (2 * count.sum()))) / SINK
-    above = np.flatnonzero(density > floor * _floor(sigma, dt_s))
+    by_chance = float(chdtri(2.0 * count.sum(), BY_CHANCE)) / (2 * count.sum())  # of its mean
+    above = np.flatnonzero(density > max(1.0, by_chance / SINK) * _floor(sigma, dt_s))
     top = float(above[-1]) / (segment * dt_s) if len(above) else 0.0
     # the Gaussian pair is 3 dB down at about 1.3 times its nominal corner
     return float(np.clip(2.0 * top, _SLOWEST_HZ, nyquist))
