@@ -5,7 +5,8 @@ measured it.  A regressor with noise in it is told too small, by the noise's sha
 (errors in variables): a mount that bends by 22 mrad/g was 12 (d3ffb7ea of the sealed `ring300c`),
 and the rest had other names.  What the force is expected to be, given the readings, is Wiener's
 filter of them: of every frequency the part S - N of the power S, where the noise's power N is that
-of the upper half of the frequencies.  What shakes all frequencies alike counts as noise: nothing that follows it can be seen in it.
+of the upper half of the frequencies.  What shakes all frequencies alike counts as noise: nothing
+that follows it can be seen in it.
 """
 
 from __future__ import annotations
