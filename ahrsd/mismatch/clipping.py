@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from ahrsd.mismatch.coarse import noise_of
 from ahrsd.mismatch.diagnosis import Value, Where
@@ -14,7 +15,8 @@ from ahrsd.samples import Array
 _AXES = ("x", "y", "z")
 _FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
 _PILED = 6.0  # times as many at the limit as at each number just inside it
-_MARGIN, _NEAR = 3.0, 0.02  # noise levels, and share of the limit, at which it begins to act
+_MARGIN, _NEAR = 5.0, 0.02  # noise levels, and share of the limit, at which it begins to act
+_BESIDE = 2  # rows before and after such readings: noise that is added behind the limit hides a few
 _TOP_STEPS = 1.5  # of coarse numbers, as many at the top as one step below are no limit
 _FINE = 0.5  # share of the readings that differ from all others, where numbers are fine
 _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
@@ -40,9 +42,8 @@ def clipping(track: Track) -> list[Fact]:
         found = [(rows | at_limit[:, axis], level) for axis, (rows, level) in enumerate(found)]
         rows = np.any([rows for rows, _ in found], axis=0)
         # of readings at the limit only those that noise made small are left: they are biased
-        near = np.asarray(
-            np.any(np.abs(values) > limit - min(_MARGIN * noise, _NEAR * limit), axis=1)
-        )
+        near = np.any(np.abs(values) > limit - min(_MARGIN * noise, _NEAR * limit), axis=1)
+        near = binary_dilation(near, iterations=_BESIDE)
         intervals = tuple(
             (float(track.time_s[a]), float(track.time_s[b - 1])) for a, b in spans_of(rows, 5)
         )

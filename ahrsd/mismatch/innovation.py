@@ -16,6 +16,8 @@ gain held the sensitivities are exact:
 
 Whitened by S = L L^T: under the null L^-1 e = L^-1 X dtheta + white of variance 1.
 A run's first row starts the field from its reading (`used` is false there): h+ = A^-1 (m - b).
+Where that row has no reading the field starts from the nominal one, unsure by half of its size: the
+first reading decides.
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
 TRACELESS.flags.writeable = False
 #: of the field's direction where it is not taken from the first reading
 _UNSURE_RAD = 0.1
+#: of the field's size, in all directions, where a run's first row has no reading
+_UNSURE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,11 +127,11 @@ def run_filter(
         found = gains(linear, _runs(track))
     else:
         nominal, found = held.nominal_b, held.gains
-    if strength_known:
-        found.gain[opens] = 0.0
-        field = np.where(opens[:, None], nominal, field)
+    guessed = opens if strength_known else opens & blind
+    found.gain[guessed] = 0.0
+    field = np.where(guessed[:, None], nominal, field)
     state, used = _transition(motion, nominal, opens, model), ~(opens | blind)
-    readings = np.where(blind[:, None], 0, field)
+    readings = np.where((blind & ~guessed)[:, None], 0, field)
     predicted = _predicted(layout, state, found, model.soft_iron, readings)
     innovation = np.where(used[:, None], (field - predicted) @ model.soft_iron, 0.0)
     root = _inverse_root(found.innovation_covariance) * used[:, None, None]
@@ -286,6 +290,8 @@ def _linear(
         process[:, [3, 4, 5], [3, 4, 5]] = model.gyro_walk_rad_s_sqrt_s**2 * motion.dt_s[:, None]
     C = np.linalg.inv(model.soft_iron)
     process[opens, :3, :3] = model.sigma_mag_gauss**2 * C @ C.T
+    lost = opens & blind
+    process[lost, :3, :3] = np.eye(3) * (_UNSURE * size[lost, :, None]) ** 2
     if strength_known:
         process[opens, :3, :3] = _UNSURE_RAD**2 * tangent[opens]
     return Linear(transition, process, model.soft_iron, model.sigma_mag_gauss**2, opens, blind)

@@ -1,4 +1,4 @@
-"""A diagnosis with columns that were logged badly: with holes, or by a clock of their own.
+"""A diagnosis with columns that were logged badly: with holes, noise, or by a clock of their own.
 
 What a column can still say is asked first; it counts only if an effect is named by it.  Else the
 answer is the one that the recording gives without it.
@@ -18,12 +18,13 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.hygiene import hygiene, put_right
 from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.logger_noise import cleaned
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.search import State, formed_basis_of
 from ahrsd.mismatch.track import Spec, Track
 
-#: of the unknown that may be left when a column is at its true time
+#: of the unknown that may be left when a column is at its true time, or without its noise
 LEFT = 0.5
 #: columns whose clock is sought, the likeliest first
 MOST_ASKED = 2
@@ -42,12 +43,34 @@ def diagnose_logged(track: Track, spec: Spec | None = None, *, recording: str = 
         missing = np.zeros(len(track), dtype=bool)
         for one in holed.values():
             missing |= one.missing
-        found = _on_time(_blind(filled, missing), spec, recording)
+        found = _as_logged(_blind(filled, missing), spec, recording)
         used = [name for name in holed if name in causes(found)]
         if used:
             notes = tuple(holed[name].words for name in used)
             return replace(found, notes=(*notes, *found.notes))
-    return _on_time(track, spec, recording)
+    return _as_logged(track, spec, recording)
+
+
+def _as_logged(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+    """The diagnosis, with the logger's noise taken out of a cause where that leaves less.
+
+    Noise in a cause is told too small, and itself as a source that nobody knows.
+    """
+    found = _on_time(track, spec, recording)
+    usable = roles.prepared(track)[0]
+    by = tuple(name for name in causes(found) if name in usable.covariates)
+    clean = cleaned(usable, by) if found.unexplained.detected else None
+    if clean is None:
+        return found
+    again = _on_time(clean, spec, recording)
+    said = [[one.effect for one in each.findings] for each in (again, found)]
+    return again if said[0] == said[1] and _less(again, found) else found
+
+
+def _less(again: Diagnosis, found: Diagnosis) -> bool:
+    """Whether less than half of the unknown is left."""
+    before, after = found.unexplained, again.unexplained
+    return not after.detected or after.evidence_nats < LEFT * before.evidence_nats
 
 
 def _on_time(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
@@ -58,11 +81,9 @@ def _on_time(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
     if clock is None:
         return found
     again = diagnose(clock.moved(usable), spec, recording=recording)
-    before, after = found.unexplained, again.unexplained
-    less = not after.detected or after.evidence_nats < LEFT * before.evidence_nats
     by_it = [one for one in again.findings if one.setting.get("covariate") == clock.column]
     worth = max((one.evidence_nats for one in by_it), default=0.0)
-    if not by_it or not (less or worth > before.evidence_nats):
+    if not by_it or not (_less(again, found) or worth > found.unexplained.evidence_nats):
         return found
     said = f"{clock.words}: its cause is judged at the sensor's time"
     return replace(again, notes=(said, *again.notes))

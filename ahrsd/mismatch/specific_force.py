@@ -34,12 +34,15 @@ def without_noise(accel_b_m_s2: Array, runs: Sequence[slice]) -> Array:
     out = accel_b_m_s2.copy()
     for run in runs:
         if run.stop - run.start >= FEWEST and np.isfinite(out[run]).all():
-            out[run] = _expected(accel_b_m_s2[run])
+            out[run] = expected(accel_b_m_s2[run])
     return out
 
 
-def _expected(values: Array) -> Array:
-    """Wiener's filter of (N, k), in cosines: no step from the end to the beginning."""
+def expected(values: Array) -> Array:
+    """(N, k) courses as they are expected to be, given values (N, k) with white noise.
+
+    Wiener's filter, in cosines: no step from the end to the beginning.
+    """
     mean = values.mean(axis=0)
     cosines = fft.dct(values - mean, axis=0, norm="ortho")
     power = cosines**2

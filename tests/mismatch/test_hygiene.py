@@ -201,6 +201,19 @@ def test_the_tail_of_noise_is_no_whole_step() -> None:
     )
 
 
+def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(track: Track) -> None:
+    """A sensor at its limit whose converter adds noise: some readings are well below the limit."""
+    rng = np.random.default_rng(6)
+    clean = np.clip(track.mag_b_gauss, -0.3, 0.3)
+    mag = np.clip(clean + 8e-4 * rng.standard_normal(clean.shape), -0.3, 0.3)
+    (fact,) = clipping(replace(track, mag_b_gauss=mag))
+    at_limit = (np.abs(clean) == 0.3).any(axis=1)
+    assert np.count_nonzero(at_limit) > 500
+    assert fact.bad is not None
+    assert fact.bad[at_limit].all()
+    assert not fact.bad[(np.abs(clean) < 0.28).all(axis=1)].any()
+
+
 def test_saturation_of_both_sensors(track: Track) -> None:
     mag = np.clip(track.mag_b_gauss, -np.inf, 0.3)
     fact = _only(hygiene(replace(track, mag_b_gauss=mag)))

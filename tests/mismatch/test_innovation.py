@@ -102,6 +102,35 @@ def test_rows_without_a_reading_are_passed_over() -> None:
     assert np.linalg.norm(done.predicted_b[220] - made_field(made)[220]) < 2e-3
 
 
+def test_a_run_that_begins_without_a_reading_begins_with_its_first_one() -> None:
+    """A magnetometer at its limit as the recording begins: the field was zero there, and sure."""
+    made = experiment(samples=900)
+    track = track_of(made)
+    model = true_model(made)
+    mag = track.mag_b_gauss.copy()
+    mag[:130] = np.nan
+    done = run_filter(replace(track, mag_b_gauss=mag), model)
+    late = slice(130, len(track))
+    later = Track(
+        track.time_s[late],
+        np.r_[np.nan, track.dt_s[131:]],
+        track.mag_b_gauss[late],
+        track.gyro_b_rad_s[late],
+        None,
+        {},
+        (slice(0, 770),),
+    )
+    alone = run_filter(later, model)
+    assert not done.used[:130].any()
+    assert done.used[130:].all()
+    # the first innovation is as unsure as the start; from then on they are the same
+    assert np.abs(done.whitened[130]).max() < 1.0
+    assert np.abs(done.whitened[131:] - alone.whitened[1:]).max() < 0.05
+    columns = nuisance_columns(done)
+    seen, own = sensitivities(done, columns), sensitivities(alone, nuisance_columns(alone))
+    assert np.abs(seen[140:] - own[10:]).max() < 0.02 * np.abs(own).max()
+
+
 def made_field(made: object) -> Array:
     """True field of an experiment in the units of trace A = 3."""
     scale = np.trace(made.truth.soft_iron) / 3  # type: ignore[attr-defined]
