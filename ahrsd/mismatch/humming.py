@@ -45,7 +45,9 @@ def humming(state: State, basis: Base) -> Unexplained | None:
     basis: the state's
     """
     left = residual(basis.known, basis.innovation)
-    found = loudest_band(left, basis.rate_hz)
+    # of readings that repeat, what is slow is seen a second time around the rate of the new ones
+    highest_hz = 0.5 * basis.rate_hz * float(np.mean(basis.filtered.used))
+    found = loudest_band(left, basis.rate_hz, highest_hz)
     if found is None:
         return None
     low, high, nats = found
@@ -76,7 +78,9 @@ def humming(state: State, basis: Base) -> Unexplained | None:
     )
 
 
-def loudest_band(left: Array, rate_hz: float) -> tuple[float, float, float] | None:
+def loudest_band(
+    left: Array, rate_hz: float, highest_hz: float
+) -> tuple[float, float, float] | None:
     """(from Hz, to Hz, nats) of the run of bands that stands out most of (N, 3); None for none."""
     power = np.mean(np.abs(np.fft.rfft(left, axis=0)) ** 2, axis=1)[1:] / len(left)
     width_hz = rate_hz / len(left)
@@ -87,7 +91,8 @@ def loudest_band(left: Array, rate_hz: float) -> tuple[float, float, float] | No
     bands = power[: count * bins].reshape(count, bins).mean(axis=1)
     level = _usual(bands)
     out = np.isfinite(level) & (bands > _STANDS_OUT * level)
-    out &= np.arange(count) * bins * width_hz >= _LOWEST_HZ
+    edges = np.arange(count + 1) * bins * width_hz
+    out &= (edges[:-1] >= _LOWEST_HZ) & (edges[1:] <= highest_hz)
     ratio = np.where(out, bands / np.where(out, level, 1.0), 1.0)
     nats = 3.0 * bins * (ratio - 1.0 - np.log(ratio))
     runs = spans_of(out)

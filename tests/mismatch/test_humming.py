@@ -23,14 +23,25 @@ def turning(time_s: np.ndarray, rate_hz: float, spread_hz: float) -> np.ndarray:
 def test_a_band_stands_out_and_colour_does_not() -> None:
     rng = np.random.default_rng(3)
     white = rng.standard_normal((10_000, 3))
-    assert loudest_band(white, 25.0) is None
-    assert loudest_band(rng.standard_t(3, (10_000, 3)), 25.0) is None
+    assert loudest_band(white, 25.0, 12.5) is None
+    assert loudest_band(rng.standard_t(3, (10_000, 3)), 25.0, 12.5) is None
     for taps in ([1, -0.9], [1, -0.5, 0.2], [1, 0.6]):
-        assert loudest_band(lfilter([1], taps, white, axis=0), 25.0) is None
+        assert loudest_band(lfilter([1], taps, white, axis=0), 25.0, 12.5) is None
     phase = turning(np.arange(10_000) / 25.0, 5.0, 0.15)
-    low, high, nats = loudest_band(white + np.outer(np.cos(phase), [1.5, 0.5, 0.0]), 25.0)
+    seen = white + np.outer(np.cos(phase), [1.5, 0.5, 0.0])
+    low, high, nats = loudest_band(seen, 25.0, 12.5)
     assert 4.0 < low < 5.0 < high < 6.0
     assert nats > 100.0
+
+
+def test_slow_noise_is_not_heard_again_at_the_rate_of_new_readings() -> None:
+    """Every third row has a new reading: a red noise seemed to ring at 16.7 Hz (one of 126)."""
+    rng = np.random.default_rng(4)
+    red = lfilter([1], [1, -0.98], rng.standard_normal((12_000, 3)), axis=0)
+    seen = np.where(np.arange(12_000)[:, None] % 3 == 0, rng.standard_normal((12_000, 3)) + red, 0)
+    low, high, _ = loudest_band(seen, 50.0, 25.0)
+    assert low < 50.0 / 3 < high
+    assert loudest_band(seen, 50.0, 25.0 / 3) is None
 
 
 def test_a_propeller_that_nobody_logged_is_located_by_its_frequency() -> None:
