@@ -10,6 +10,7 @@ every name is compared with
     memory    a field in sensor axes that depends on where the field has been: relays (Preisach's
               model of hysteresis) in directions all over the sphere
     matrix    a mount, soft iron or scales that change slowly: a matrix on the field, any in time
+    spell     of a jump or a bump of the field outside: an error of the gyro for a while around it
 
 each a random effect whose size is found by marginal likelihood, which makes it pay for its
 coefficients.  Where a free form is more likely than the name, or is there beside it and takes most
@@ -35,8 +36,8 @@ from ahrsd.mismatch.discrepancy import (
 )
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.locate import frame_columns
-from ahrsd.mismatch.regression import Base
-from ahrsd.mismatch.search import State, term_group, without_term
+from ahrsd.mismatch.regression import Base, Candidate
+from ahrsd.mismatch.search import STEPS, State, term_group, without_term
 from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.unknown import Remainder
 from ahrsd.mismatch.values import Columns, Context
@@ -53,6 +54,8 @@ PARTS = 6
 RELAYS = (0.3, 0.55)
 #: half waves in time with which a matrix may change
 SLOW = 3
+#: reach of a spell to either side, and its stretches, seconds
+SPELL_S, STRETCH_S = 60.0, 10.0
 _SMALL = -5.0  # logarithm of a deviation to begin with: next to nothing
 
 
@@ -75,8 +78,9 @@ def of_another_form(
         left = without_term(state, k, basis)
         own = [] if name in courses else _varied(mine, added_value(state, k) / scale)
         own = own[:1] if beside else own
+        spell = _spell(basis, state.named[k].candidate, mine)
         if any(_rivals(left, mine, part, noise, 1.0) for part in own) or any(
-            _rivals(left, mine, part, noise, OWN_SHARE, alone=beside) for part in free
+            _rivals(left, mine, part, noise, OWN_SHARE, alone=beside) for part in (*free, *spell)
         ):
             out.append(k)
     return out
@@ -131,6 +135,33 @@ def _rivals(
 def more(name: float) -> float:
     """Nats by which a form must be more than a name of so many."""
     return MORE_NATS + MORE_SHARE * max(name, 0.0)
+
+
+def _spell(basis: Base, name: Candidate, mine: Array) -> list[Array]:
+    """Whitened columns of an error of the gyro around a jump or a bump of the field outside.
+
+    A bias that comes and goes turns the carried field away and leaves it there: a field that jumped
+    halfway through it explains half of that, a bump some.  Of a jump or a bump, an error of the
+    gyro that lasts explains little.
+    mine: (N, 3, p) the name's columns
+    """
+    if name.name == STEPS["world"]:
+        moment_s = name.setting["onset_s"]
+    elif name.name == "field_anomaly":
+        power = np.cumsum(np.sum(mine**2, axis=(1, 2)))
+        moment_s = basis.context.track.time_s[np.searchsorted(power, power[-1] / 2)]
+    else:
+        return []
+    (columns,) = basis.whitened([by_spell(basis.context, moment_s)])
+    return [np.asarray(columns * UNIT_RAD_S)]
+
+
+def by_spell(context: Context, moment_s: float) -> Columns:
+    """An error of the gyro in stretches around a moment."""
+    edges = moment_s + np.arange(-SPELL_S, SPELL_S + 1.0, STRETCH_S)
+    stretch = np.searchsorted(edges, context.track.time_s, side="right")
+    inside = stretch[:, None] == np.arange(1, len(edges))
+    return every_direction(inside[:, inside.any(axis=0)].astype(float), gyro=True)
 
 
 def _varied(columns: Array, value: Array) -> list[Array]:

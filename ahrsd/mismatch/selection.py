@@ -103,7 +103,7 @@ def borne_out(state: State, tried: State, judged: Judged, seen: Survey) -> bool:
     """
     if judged.candidate.name in DELAYS:
         return True  # another track
-    gained = _likelihood(tried) - _likelihood(state)
+    gained = likelihood(tried) - likelihood(state)
     gained = max(gained, tried.fit.log_likelihood - state.fit.log_likelihood)
     strongest = seen.candidates[0]
     noise = quieter(seen.basis, columns_of(seen.basis, [strongest])[strongest.name]).colour
@@ -126,8 +126,8 @@ def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
     named = added(state, judged)
     largest = replace(noisy.fit.model, gyro_walk_rad_s_sqrt_s=noise_fit.WALK_CAP_RAD_S_SQRT_S)
     wider = replace(noisy, fit=at_model(state.problem.track, largest, noisy.fit.terms))
-    best = max(_likelihood(noisy), _likelihood(wider))
-    return named if _likelihood(named) > best + limits.unknown_nats else noisy
+    best = max(likelihood(noisy), likelihood(wider))
+    return named if likelihood(named) > best + limits.unknown_nats else noisy
 
 
 def _cause_after_all(state: State, seen: Survey) -> State:
@@ -149,7 +149,7 @@ def _cause_after_all(state: State, seen: Survey) -> State:
     return state if tried.walk else shaped_again(tried, newest=True)
 
 
-def _likelihood(state: State) -> float:
+def likelihood(state: State) -> float:
     """Log likelihood of a fit with its noise scaled to what it leaves, nats."""
     fit = state.fit
     size, count = fit.filtered.normalised_innovation, 3 * np.count_nonzero(fit.filtered.used)

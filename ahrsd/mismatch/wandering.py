@@ -23,6 +23,7 @@ from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     FRAME_LEAD,
     ORDINARY_WALK_RAD_S_SQRT_S,
+    STEPS,
     WANDERING,
     State,
     refitted,
@@ -30,12 +31,15 @@ from ahrsd.mismatch.search import (
     survey,
     without_term,
 )
+from ahrsd.mismatch.selection import likelihood
 from ahrsd.mismatch.sought import Sought, sought
-from ahrsd.mismatch.stand_ins import LEAST_SHARE
+from ahrsd.mismatch.stand_ins import LEAST_SHARE, end_where_they_began
 
 NAME = "gyro_bias_drift"
 #: of that size, which are tried
 FACTORS = (1.0, 2.0)
+#: nats by which a jump and one back must be likelier than a walk: eight numbers at about four each
+THERE_AND_BACK = 32.0
 
 
 def wandering(found: Sought) -> Sought:
@@ -54,6 +58,8 @@ def wandering(found: Sought) -> Sought:
         return found
     for factor in FACTORS:
         wider = settled(refitted(replace(state, walk=factor * size), ()))
+        if went_and_came(found.before, wider):
+            return found
         beside = sought(wider)
         if not unknown.detected(beside.left, limits) and not _named(beside.state):
             named = _with_its_name(beside)
@@ -79,6 +85,16 @@ def _with_its_name(found: Sought) -> Sought | None:
     if shares_of(state, len(names), seen, found.last)[NAME] <= LEAST_SHARE:
         return None
     return replace(found, state=state, surveys=[*found.surveys, seen])
+
+
+def went_and_came(before: State, walking: State) -> bool:
+    """Whether the bias jumped and jumped back, which has no name, rather than walked.
+
+    before: with the steps that were found and taken out again
+    """
+    steps = [before.fit.terms[k].value for k, n in enumerate(before.names) if n == STEPS["gyro"]]
+    back = len(steps) > 1 and end_where_they_began(steps)
+    return back and likelihood(before) > likelihood(walking) + THERE_AND_BACK
 
 
 def _named(state: State) -> bool:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.wandering import went_and_came
 
 
 @pytest.fixture(scope="module")
@@ -60,3 +62,22 @@ def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
     found = diagnose(walked)
     assert {one.effect for one in found.findings} == {"gyro_bias_drift", "gyro_scale"}
     assert all(one.confidence > 0.5 for one in found.findings)
+
+
+def fitted(log_likelihood: float, *steps: tuple[float, float, float]):
+    """What the comparison asks of a state with these steps of the gyro's bias."""
+    used = np.ones(100, dtype=bool)
+    filtered = SimpleNamespace(normalised_innovation=1.0, used=used)
+    terms = [SimpleNamespace(value=np.array(one)) for one in steps]
+    fit = SimpleNamespace(log_likelihood=log_likelihood, filtered=filtered, terms=terms)
+    return SimpleNamespace(names=("gyro_bias_step",) * len(steps), fit=fit)
+
+
+def test_a_bias_that_jumped_and_jumped_back_did_not_walk():
+    """Two steps that cancel, likelier than any walk by more than their eight numbers cost."""
+    there, back = (4e-4, -1.0e-3, -3.1e-3), (-4e-4, 1.1e-3, 3.1e-3)
+    walk = fitted(43492.0)
+    assert went_and_came(fitted(43576.7, there, back), walk)
+    assert not went_and_came(fitted(43500.0, there, back), walk)
+    assert not went_and_came(fitted(43576.7, there, there), walk)
+    assert not went_and_came(fitted(43576.7, there), walk)
