@@ -187,6 +187,10 @@ def _of_unknowns(by_kind: dict[str, list[Verdict]]) -> list[Score]:
             )
             for kind in ("withheld", "outside")
         ),
+        share(
+            "unknown called unknown, withheld, 2 x limit",
+            [v.word == RIGHT for v in by_kind.get("withheld", []) if (v.multiple or 0) >= STRONG],
+        ),
         share("unknown: frame right", _said(unknown, lambda v: v.frame_right), least=0.9),
         least_median("unknown: overlap, median", _numbers(unknown, "overlap"), 0.8),
         share("unidentifiable: nothing invented", [not v.error for v in blind], least=0.95),

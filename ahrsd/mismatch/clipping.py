@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from ahrsd.mismatch.coarse import noise_of
 from ahrsd.mismatch.diagnosis import Value, Where
@@ -43,7 +42,7 @@ def clipping(track: Track) -> list[Fact]:
         rows = np.any([rows for rows, _ in found], axis=0)
         # of readings at the limit only those that noise made small are left: they are biased
         near = np.any(np.abs(values) > limit - min(_MARGIN * noise, _NEAR * limit), axis=1)
-        near = binary_dilation(near, iterations=_BESIDE)
+        near = np.convolve(near, np.ones(2 * _BESIDE + 1), mode="same") > 0.5
         intervals = tuple(
             (float(track.time_s[a]), float(track.time_s[b - 1])) for a, b in spans_of(rows, 5)
         )
