@@ -63,8 +63,15 @@ def _as_logged(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
     if clean is None:
         return found
     again = _on_time(clean, spec, recording)
-    said = [[one.effect for one in each.findings] for each in (again, found)]
-    return again if said[0] == said[1] and _less(again, found) else found
+    if not (_names(again) == _names(found) and _less(again, found)):
+        return found
+    own = [name for name in by if clean.covariates[name] is not usable.covariates[name]]
+    said = f"column {', '.join(own)} has noise of its own: what follows it is judged without it"
+    return replace(again, notes=(said, *again.notes))
+
+
+def _names(found: Diagnosis) -> list[str]:
+    return [one.effect for one in found.findings]
 
 
 def _less(again: Diagnosis, found: Diagnosis) -> bool:

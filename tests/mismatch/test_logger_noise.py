@@ -79,5 +79,6 @@ def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
     found = diagnose_logged(replace(track, mag_b_gauss=mag).with_columns({"speed_m_s": noisy}))
     assert [one.effect for one in found.findings] == ["speed_field"]
     assert not found.unexplained.detected
+    assert found.notes[0].startswith("column speed_m_s has noise of its own: ")
     for value, truth in zip(found.findings[0].parameters, FIELD_PER_M_S, strict=True):
         assert value.value == pytest.approx(truth, rel=0.05)
