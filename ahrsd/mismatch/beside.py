@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.delays import DELAYS
-from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate, every_direction
 from ahrsd.mismatch.effects.base import Setting
 from ahrsd.mismatch.exam import IMITATORS
 from ahrsd.mismatch.moved import ONSET_SHARE
@@ -48,6 +48,7 @@ from ahrsd.mismatch.search import (
 )
 from ahrsd.mismatch.spectrum import Spectrum, against, spectrum_of
 from ahrsd.mismatch.stand_ins import TIME_SHAPED
+from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
 #: of what has the shape of time: what is logged, and steps that are sharp
@@ -283,9 +284,11 @@ def _of_another_form(state: State, number: int, quiet: Base) -> bool:
     left = without_term(state, number, quiet)
     scale = state.named[number].candidate.scale
     mine = quiet.known[:, :, quiet.groups[term_group(number)]] * scale
-    columns = quiet.whitened([by_rate(context), by_memory(context), by_matrix(context)])
-    units = (UNIT_RAD_S, UNIT_GAUSS, UNIT_GAUSS)
-    free = [part * unit for part, unit in zip(columns, units, strict=True)]
+    forms = [by_rate(context), by_memory(context), by_matrix(context)]
+    units = [UNIT_RAD_S, UNIT_GAUSS, UNIT_GAUSS]
+    if (gain := _as_a_gain(state, number, context)) is not None:
+        forms, units = [*forms, gain], [*units, UNIT_GAUSS]
+    free = [part * unit for part, unit in zip(quiet.whitened(forms), units, strict=True)]
     slow = np.cos(np.linspace(0.0, np.pi, len(mine)))[:, None, None]
     noise = max(1.0, quiet.colour)
     for part in (slow * mine, *free):
@@ -293,3 +296,17 @@ def _of_another_form(state: State, number: int, quiet: Base) -> bool:
         if form > name + more(name) and both - form < OWN_SHARE * name:
             return True
     return False
+
+
+def _as_a_gain(state: State, number: int, context: Context) -> Columns | None:
+    """A matrix on the field that follows a field's logged cause; None where there is no such cause.
+
+    A supply that sags changes the scale of what is read, and the offset by what that is.
+    """
+    term = state.fit.terms[number]
+    columns = term.columns(context).mag
+    if columns is None or "covariate" not in state.named[number].candidate.setting:
+        return None
+    added = columns @ term.value
+    course = added @ np.linalg.svd(added.T @ added)[0][:, 0]
+    return every_direction(course[:, None] * context.field_b)

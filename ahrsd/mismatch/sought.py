@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from ahrsd.mismatch.exam import examined, paired, pruned
 from ahrsd.mismatch.imitators import without_imitators
 from ahrsd.mismatch.nested import eddies_alone
+from ahrsd.mismatch.often import logged_often
 from ahrsd.mismatch.search import State, Survey, survey, swapped
 from ahrsd.mismatch.selection import forward
 from ahrsd.mismatch.stand_ins import TIME_SHAPED, without_stand_ins, without_unlikely
@@ -23,7 +24,8 @@ class Sought:
 
     first, last: the surveys before and after the names
     before: the state before any name was taken out again
-    stood_in: names by a logged cause that were taken out since they only stood in for another form
+    stood_in: names by a logged cause that were taken out since they only stood in for another form,
+              but for causes that change often
     hidden: whether names were taken out that were worth no more than what they leave
     """
 
@@ -47,7 +49,12 @@ def sought(state: State) -> Sought:
     last = last if slim.names == more.names else survey(slim)
     named, surveys, last = without_unlikely(*swapped(slim, last))
     true, surveys, left = without_stand_ins(named, surveys, beside)
-    logged = (j.candidate.name for j in named.named if "covariate" in j.candidate.setting)
+    # what changes often is asked again: no slow thing of another form goes with it
+    logged = (
+        j.candidate.name
+        for j in named.named
+        if "covariate" in j.candidate.setting and not logged_often(state.problem.track, j.candidate)
+    )
     # a course in time is held against a free one, which explains what is left with it
     courses = {name for names in TIME_SHAPED.values() for name in names}
     stood_in = frozenset(logged) - courses - frozenset(true.names)

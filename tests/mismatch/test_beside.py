@@ -119,6 +119,23 @@ def test_a_temperature_that_has_a_course_of_its_own_is_named_beside_a_room():
     assert beside_a_room(bent, degrees) == ("mag_bias_temperature",)
 
 
+@pytest.mark.parametrize(("form", "said"), [("field", True), ("gain", False)])
+def test_a_gain_that_follows_a_current_is_no_field_of_it(form, said, monkeypatch):
+    """A supply that sags with the motor's current: what is read grows with the field."""
+    track = room()
+    amps = 9.0 * switched(track)
+    parts = {"field": np.ones_like(track.mag_b_gauss), "gain": (track.mag_b_gauss + 0.15) / 0.25}
+    reading = track.mag_b_gauss + amps[:, None] * [1e-3, -0.8e-3, 1.2e-3] * parts[form]
+    track = replace(track, mag_b_gauss=reading, covariates={"motor_current_a": amps})
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    left = unknown.remainder(formed_basis_of(state), with_bins=False)
+    current = ("motor_current_field",)
+    assert named_beside(state, [], left, hidden=True)[0].names == (current if said else ())
+    monkeypatch.setattr(beside, "_as_a_gain", lambda *_: None)
+    assert named_beside(state, [], left, hidden=True)[0].names == current
+
+
 @pytest.mark.parametrize(
     ("eddy", "kept"), [(0.1, ("mag_time_lag", "eddy_current")), (1.0, ("eddy_current",))]
 )
@@ -207,21 +224,26 @@ def test_directions_that_are_not_paid_for_explain_nothing():
 
 
 def test_a_lamp_that_a_free_course_explains_as_well_is_asked_for_beside_the_rest(monkeypatch):
-    """Any course in time is explained by a free one, and the rest with it; other forms are not."""
+    """Any course in time is explained by a free one, and the rest with it; other forms are not.
+
+    What is throttled up and down often is asked for as well: nothing slow goes with it.
+    """
 
     def named(*names: str) -> SimpleNamespace:
         setting = {"covariate": "logged"}
         candidates = [SimpleNamespace(name=name, setting=setting) for name in names]
         judged = tuple(SimpleNamespace(candidate=one) for one in candidates)
-        return SimpleNamespace(named=judged, names=names)
+        return SimpleNamespace(named=judged, names=names, problem=SimpleNamespace(track=None))
 
-    found = named("switched_device", "mag_bias_temperature")
+    found = named("switched_device", "mag_bias_temperature", "motor_current_field")
     steps = {
         "forward": lambda _: (found, None, None),
         "examined": lambda state: (state, True),
         "swapped": lambda state, last: (state, [], last),
         "without_unlikely": lambda *all_of: all_of,
         "without_stand_ins": lambda *_: (named(), [], None),
+        "without_imitators": lambda state: state,
+        "logged_often": lambda _, candidate: candidate.name == "motor_current_field",
         **{name: lambda state: state for name in ("pruned", "paired", "eddies_alone")},
     }
     for name, step in steps.items():
