@@ -29,12 +29,12 @@ def answered(ring, case, folder):
     return diagnose_recording(made / "case.csv.gz", spec=made / "spec.json"), truth
 
 
+@pytest.mark.slow  # a shorter form: test_scales, test_rivals
 @pytest.mark.parametrize(
     ("case", "frame"),
     [
         ("66152208", "world"),  # a gradient without a position was a step at the first row
-        # iron with two states had an object passed by beside it
-        pytest.param("d1e56b7a", "sensor", marks=pytest.mark.slow),
+        ("d1e56b7a", "sensor"),  # iron with two states had an object passed by beside it
     ],
 )
 def test_what_nobody_logged_is_an_unknown_without_a_name(case, frame, tmp_path):

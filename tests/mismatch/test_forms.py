@@ -21,6 +21,7 @@ def test_a_gyro_that_turns_more_to_one_side_is_an_unknown_of_the_gyro():
     assert found.unexplained.evidence_nats > 15.0
 
 
+@pytest.mark.slow  # a shorter form: test_rivals
 def test_a_bias_that_swells_and_fades_is_no_steps():
     """Three steps that end where they began say nothing but that it came and went."""
     track = made(Trial(12, samples=8_000, rate_hz=25.0)).track
