@@ -2,9 +2,9 @@
 
 A speed, a depth or a temperature is often logged with a noise of its own, a few times a second,
 and held or drawn straight between.  The noise is then in the regressor: what follows the column is
-told too small, and the noise itself is left over as a source that nobody knows (a speed's field was
-a quarter of what it is, beside an unknown).  Where the noise can be told from the course, the
-column is what it is expected to be, given what was logged (`specific_force.expected`).
+told too small, and the noise itself is left over as a source that nobody knows.  Where the noise
+can be told from the course, the column is what it is expected to be, given what was logged
+(`wiener`).
 
 It can be told where the values' upper half of frequencies is flat and Gaussian, as what a sensor
 adds is, and next to nothing of the course.  A throttle has steps, a gust is not flat: these are
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from ahrsd.mismatch.specific_force import FEWEST, expected
 from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.wiener import FEWEST, expected
 from ahrsd.samples import Array
 
 #: deviations of its own scatter by which the noise may depart from flat, and from Gaussian
