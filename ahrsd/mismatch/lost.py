@@ -13,7 +13,7 @@ import numpy as np
 
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.facts import Fact
-from ahrsd.mismatch.missing import LONG, missing_turns
+from ahrsd.mismatch.missing import LONG, UNSEEN, missing_turns
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.search import State
@@ -51,10 +51,10 @@ def beyond_lost(left: Remainder, facts: Sequence[Fact], problem: Problem) -> boo
     """Whether something is left that is more than the turns lost where no jump shows them.
 
     Those are an error of the gyro: of slow turns only their number is known, and not when.  Where
-    a second was lost, how far the sensor turned meanwhile is not known either: the field jumps, and
-    what the filter makes of that on its way back is in every frame.
+    a second was lost, or most of them stand out nowhere, how far the sensor turned meanwhile is not
+    known either: the field jumps, and what the filter makes of that is in every frame.
     """
     lost = [fact for fact in facts if fact.turned is not None]
     unseen = bool(lost) and left.strongest.frame == "gyro"
-    unseen |= any(LONG in fact.setting for fact in lost)
+    unseen |= any(key in fact.setting for fact in lost for key in (LONG, UNSEEN))
     return detected(left, problem.limits) and not unseen

@@ -7,6 +7,7 @@ Noise does that as often backwards as forwards, which tells how many of the jump
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.mismatch.track import Track
-from ahrsd.mismatch.turns import QUARTER, Turns, recovered
+from ahrsd.mismatch.turns import QUARTER, Turns, recovered, some_lost
 from ahrsd.mismatch.values import NullModel
 from ahrsd.samples import Array
 
@@ -37,6 +38,8 @@ _CLEAR, _ACROSS = 8.0, 0.5
 _LONG = 30.0
 #: entry of the setting: how many of these there are
 LONG = "long"
+#: entry of the setting where only all jumps together say that turns were lost: how many about
+UNSEEN = "unseen"
 
 
 def lost_turns(track: Track, model: NullModel) -> list[Fact]:
@@ -48,7 +51,8 @@ def lost_turns(track: Track, model: NullModel) -> list[Fact]:
 def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
     """Where the filter jumps by whole steps.  rate_b_rad_s (N, 3) without bias.
 
-    Over few samples first, which tells the quick turns, then over more, which tells slower ones.
+    Over few samples first, which tells the quick turns, then over more, which tells slower ones;
+    and where too few stand out alone, all together.
     """
     track = done.track
     for samples, least in _AVERAGED:
@@ -61,7 +65,12 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
         if enough and whole_nats(found.steps[jumps], found.scatter[jumps]) > sure:
             lost = np.zeros(len(track), dtype=np.int64)
             lost[jumps] = np.round(found.steps[jumps])
-            return [_fact(track, recovered(done, rate_b_rad_s, lost), found.long)]
+            setting = {LONG: found.long} if found.long else {}
+            return [_fact(track, recovered(done, rate_b_rad_s, lost), setting)]
+    if expected := some_lost(done, rate_b_rad_s):
+        turns = recovered(done, rate_b_rad_s, np.zeros(len(track), dtype=np.int64), expected)
+        if np.count_nonzero(turns.lost) >= _FEWEST:
+            return [_fact(track, turns, {UNSEEN: expected})]
     return []
 
 
@@ -143,7 +152,7 @@ def _scatter(done: Filtered, jump: Array, samples: int) -> float:
     return max(white, lowest / float(np.sqrt(2.0)))
 
 
-def _fact(track: Track, turns: Turns, long: int) -> Fact:
+def _fact(track: Track, turns: Turns, setting: Mapping[str, float]) -> Fact:
     """The lost samples; where a lost one would not be seen the turn is put right on average."""
     rows = np.flatnonzero(turns.lost)
     per_row = float(turns.lost.sum()) / max(int(np.count_nonzero(turns.shows)), len(rows))
@@ -155,10 +164,12 @@ def _fact(track: Track, turns: Turns, long: int) -> Fact:
         f"at {len(rows)} samples the field is ahead by whole steps of the turn: samples are "
         "missing that the time stamps do not show"
     )
+    if UNSEEN in setting:
+        words += "; most are known by all jumps together, and not one by one"
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
-    setting = {"hidden": True} | ({LONG: long} if long else {})
-    return Fact("dropped_samples", words, where, 0.98, parameters, setting, turned=turned)
+    told = {"hidden": True, **setting}
+    return Fact("dropped_samples", words, where, 0.98, parameters, told, turned=turned)
 
 
 def _peaks(rows: NDArray[np.bool], size: Array, samples: int) -> NDArray[np.intp]:

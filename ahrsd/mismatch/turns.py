@@ -7,14 +7,24 @@ A lost step ahead of row k moves the field that the filter predicts by v = h x w
 Carried by the gyro into one frame v stands still, so the mean over `L` rows from k on, less that
 over the `L` before, is m v for m lost steps, with a deviation s that the differences show:
 
-    nats(m) = m z - m^2 I / 2 - ln(1 / share) - 3,   z = v . jump / s^2,   I = |v|^2 / s^2
+    nats(m) = m z - m^2 I / 2 - ln(1 / share) - 3 - (m - 1) ln 4,   z = v . jump / s^2,
+                                                                    I = |v|^2 / s^2
 
-share: of the rows, that turns were lost before.  Quick turns show over few rows, slow ones over
-many, where they are not so many that the next jump is among them.
+share: of the rows, that turns were lost before; one in four such gaps is longer by one more.  Quick
+turns show over few rows, slow ones over many, where they are not so many that the next jump is
+among them.
+
+Where none stands out they still may be there: of all rows the share p has a jump by one step,
+
+    nats(p) = 1/L sum log(1 - p + p exp(z - I / 2)),
+
+and of noise or a field that changes those by minus one step have as much, or those by much more or
+less than one.  A gyro that reads too little has z = e I in all rows: that is taken out before.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +37,14 @@ _ROWS = (3, 6, 12, 24, 48)  # before and after a jump
 _ROUNDS = 8
 _SURE_NATS = 3.0  # beyond the share
 _ENOUGH = 10  # times as many rows as are averaged: else their spread is not known
+_LONGER = float(np.log(4.0))  # what each further step of a gap costs
+_SHARES = (0.01, 0.03, 0.1)  # of the rows, that a jump is so near that its mean is in it
+_ACROSS = 12.0  # chi square that one in 400 is beyond
+_EACH = 6.0  # nats that one jump is worth at most: several must say it, not a field that jumps once
+_PART, _OTHERS = 0.7, (0.3, 1.4)  # of a step, in the mean over the rows that have a part of it
+#: nats by which that must be, less so many times those backward: 3.5 is the most of 370 recordings
+#: with none lost
+_MANY_NATS, _BACKWARD = 12.0, 3.0
 #: below which a quarter of a normal deviate's sizes are
 QUARTER = 0.3186
 
@@ -39,10 +57,13 @@ class Turns:
     shows: NDArray[np.bool]
 
 
-def recovered(done: Filtered, rate_b_rad_s: Array, lost: NDArray[np.int64]) -> Turns:
+def recovered(
+    done: Filtered, rate_b_rad_s: Array, lost: NDArray[np.int64], expected: float = 1.0
+) -> Turns:
     """The lost steps put right in rounds, as long as that makes the recording likelier.
 
     rate_b_rad_s: (N, 3) without bias;  lost: (N,) what stood out at first
+    expected: how many there are, if all together say so (`some_lost`)
     """
     model, A = done.model, done.model.soft_iron
     clean = done.predicted_b @ A.T + done.innovation + model.hard_iron_gauss
@@ -56,7 +77,7 @@ def recovered(done: Filtered, rate_b_rad_s: Array, lost: NDArray[np.int64]) -> T
         likelihood = float(np.sum(seen.log_likelihood[seen.used]))
         if likelihood < most:
             break
-        found = _jumps(seen, rate_b_rad_s, max(int(lost.sum()), 1))
+        found = _jumps(seen, rate_b_rad_s, max(float(lost.sum()), expected))
         best, most = Turns(lost, found.shows), likelihood
         picked = _peaks(found.nats, found.rows)
         if not len(picked):
@@ -76,19 +97,29 @@ class _Jumps:
     shows: NDArray[np.bool]
 
 
-def _jumps(done: Filtered, rate_b_rad_s: Array, count: int) -> _Jumps:
-    """Jumps by whole steps.  count: how many steps are known to be lost."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Means:
+    """What means over `length` rows say: of rows k (n,) z (n,) and I (n,) of one step.
+
+    across (n,): chi square, of two axes, of the jump's part that no turn makes
+    """
+
+    length: int
+    k: NDArray[np.int64]
+    z: Array
+    size: Array
+    across: Array
+
+
+def _means(done: Filtered, rate_b_rad_s: Array) -> Iterator[Means]:
     dt = np.nan_to_num(done.track.dt_s, nan=0.0)[:, None]
     v = np.einsum("nij,nj->ni", done.orientation, np.cross(done.predicted_b, rate_b_rad_s * dt))
     left = done.innovation @ np.linalg.inv(done.model.soft_iron).T
     total = _summed(np.einsum("nij,nj->ni", done.orientation, left))
     usable = _summed(done.used.astype(np.float64))
     white = float(np.sqrt(np.median(done.gains.innovation_covariance[done.used, 0, 0])))
-    n, least = len(v), float(np.log(len(v) / count)) + _SURE_NATS
-    one = np.ones(n, dtype=np.int64)
-    out = _Jumps(one, np.full(n, -np.inf), one.copy(), np.zeros(n, dtype=np.bool))
     for length in _ROWS:
-        k = np.arange(length, n - length)
+        k = np.arange(length, len(v) - length)
         k = k[usable[k + length] - usable[k - length] == 2 * length]
         if len(k) < _ENOUGH * length:
             break
@@ -96,12 +127,54 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, count: int) -> _Jumps:
         s = float(np.quantile(np.abs(jump), 0.25)) / QUARTER
         s = max(s, white * float(np.sqrt(2.0 / length)))
         z, size = np.sum(jump * v[k], axis=1) / s**2, np.sum(v[k] ** 2, axis=1) / s**2
-        steps = np.maximum(np.round(z / np.maximum(size, 1e-300)), 1.0)
-        nats = steps * z - steps**2 * size / 2 - least
-        better = nats > out.nats[k]
-        at = k[better]
-        out.nats[at], out.steps[at], out.rows[at] = nats[better], steps[better], length
-        out.shows[k] |= size / 2 > least
+        along = z**2 / np.maximum(size, 1e-300)
+        yield Means(length, k, z, size, np.sum(jump**2, axis=1) / s**2 - along)
+
+
+def some_lost(done: Filtered, rate_b_rad_s: Array) -> float:
+    """How many turns all jumps together say are lost, though none may stand out alone; or 0."""
+    told = [surplus(mean) for mean in _means(done, rate_b_rad_s)]
+    nats, count = max(told, default=(0.0, 0.0))
+    return count if nats > _MANY_NATS else 0.0
+
+
+def surplus(mean: Means) -> tuple[float, float]:
+    """Nats of jumps by one step ahead, beyond backward ones, and how many there are about.
+
+    No nats where jumps of another size are likelier.  The mean is over rows near a jump, and most
+    have only a part of it in them.
+    """
+    tells = mean.size > 1.0
+    scale = float(np.median(mean.z[tells] / mean.size[tells])) if tells.any() else 0.0
+    like = mean.across < _ACROSS
+    z, size = mean.z[like] - scale * mean.size[like], mean.size[like]
+
+    def nats(step: float) -> tuple[float, float]:
+        odds = np.exp(np.minimum(step * z - step**2 * size / 2, _EACH)) - 1.0
+        told = [(float(np.sum(np.log1p(share * odds))), share) for share in _SHARES]
+        total, share = max(told)
+        return total / mean.length, share * len(z) / mean.length
+
+    forward, count = nats(_PART)
+    if forward < _MANY_NATS or forward < max(nats(step)[0] for step in _OTHERS):
+        return 0.0, 0.0
+    return forward - _BACKWARD * max(nats(-_PART)[0], 0.0), count
+
+
+def _jumps(done: Filtered, rate_b_rad_s: Array, count: float) -> _Jumps:
+    """Jumps by whole steps.  count: how many steps are known to be lost."""
+    n = len(done.track)
+    least = float(np.log(n / count)) + _SURE_NATS
+    one = np.ones(n, dtype=np.int64)
+    out = _Jumps(one, np.full(n, -np.inf), one.copy(), np.zeros(n, dtype=np.bool))
+    for mean in _means(done, rate_b_rad_s):
+        z, size = mean.z, mean.size
+        steps = np.maximum(np.round((z - _LONGER) / np.maximum(size, 1e-300)), 1.0)
+        nats = steps * z - steps**2 * size / 2 - least - _LONGER * (steps - 1)
+        better = nats > out.nats[mean.k]
+        at = mean.k[better]
+        out.nats[at], out.steps[at], out.rows[at] = nats[better], steps[better], mean.length
+        out.shows[mean.k] |= size / 2 > least
     return out
 
 

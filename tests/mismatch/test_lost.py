@@ -13,6 +13,7 @@ from ahrsd.mismatch.lost import believed, beyond_lost
 
 LOST = Fact("dropped_samples", "", Where((), (), "link"), 0.98, turned=np.ones(3))
 LONG = replace(LOST, setting={"hidden": True, "long": 2})
+UNSEEN = replace(LOST, setting={"hidden": True, "unseen": 38.0})
 STAMPED = Fact("dropped_samples", "", Where((), (), "link"), 0.98)
 
 
@@ -36,6 +37,7 @@ def test_lost_turns_stay_where_the_recording_is_likelier_with_them(
         ([LOST], "gyro", False),
         ([LOST], "sensor", True),
         ([LONG], "sensor", False),
+        ([UNSEEN], "world", False),
         ([STAMPED], "gyro", True),
         ([], "gyro", True),
     ],
