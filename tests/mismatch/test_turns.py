@@ -8,7 +8,7 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.missing import UNSEEN, missing_turns
-from ahrsd.mismatch.turns import recovered, some_lost
+from ahrsd.mismatch.turns import Means, recovered, some_lost, surplus
 
 GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
 
@@ -88,11 +88,19 @@ def test_a_gyro_that_reads_too_little_has_lost_nothing(motion: str, sigma_gauss:
     assert some_lost(slow, 0.98 * rate) == 0.0
 
 
-def test_a_field_that_jumps_five_times_has_lost_nothing() -> None:
-    done, rate, _ = lossy("mam", 0.0, 3e-3)
-    mag = done.track.mag_b_gauss.copy()
-    mag[1500:3000] += [0.03, 0.0, 0.02]
-    mag[4500:6000] -= [0.0, 0.03, 0.02]
-    mag[7500:] += 0.02
-    jumps = run_filter(replace(done.track, mag_b_gauss=mag), done.model)
-    assert some_lost(jumps, rate) == 0.0
+def jumps_at(starts: list[int], step: float) -> float:
+    """The surplus of means over 24 rows with jumps by so much of a lost step at some of 9000."""
+    size, near = np.full(9000, 20.0), np.zeros(9000)
+    for start in starts:
+        near[start - 24 : start + 24] = 1.0 - np.abs(np.arange(-24, 24)) / 24.0
+    z = step * size * near + np.sqrt(size) * np.random.default_rng(4).normal(size=9000)
+    return surplus(Means(24, np.arange(9000), z, size, np.full(9000, 2.0)))[0]
+
+
+def test_many_jumps_of_one_step_ahead_are_lost_turns_and_others_are_not() -> None:
+    many = list(range(500, 8500, 200))
+    assert jumps_at(many, 1.0) > 12.0
+    assert jumps_at([], 1.0) == 0.0
+    assert jumps_at(many[:3], 1.0) == 0.0  # a field that jumps
+    assert jumps_at(many, 0.3) == 0.0
+    assert jumps_at(many, -1.0) == 0.0
