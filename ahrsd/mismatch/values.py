@@ -86,10 +86,13 @@ class Context:
     """The recording as the present model sees it: all that an effect may build its columns from.
 
     model:        calibration and noise at which everything is linearised
-    field_b:      (N, 3) gauss, true field in body axes as filtered (A field_b + b ~ mag)
+    field_b:      (N, 3) gauss, true field in body axes as the readings before foretell it
+                  (A field_b + b ~ mag): what is made of it row by row shares no noise with the
+                  innovation, of which a coefficient of 1 would explain a part
+    smooth_b:     (N, 3) the same smoothed both ways: for what is made of its differences
     rate_b_rad_s: (N, 3) true rate: gyro minus bias and terms, zero-phase smoothed: it shares
                   next to no noise with a single innovation
-    field_dot_b:  (N, 3) gauss/s, field_b x rate_b_rad_s
+    field_dot_b:  (N, 3) gauss/s, smooth_b x rate_b_rad_s
     R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
                   is an accelerometer or a reference attitude (`world_levelled`), else fixed but
                   of unknown orientation
@@ -99,6 +102,7 @@ class Context:
     track: Track
     model: NullModel
     field_b: Array
+    smooth_b: Array
     rate_b_rad_s: Array
     field_dot_b: Array
     R_nb: Array

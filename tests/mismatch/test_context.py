@@ -117,3 +117,19 @@ def test_noise_alone_has_no_bandwidth_where_no_run_is_long() -> None:
     assert bandwidth_hz(still, runs, 0.1, 2e-3) == 0.5
     shaken = still + 4e-2 * np.sin(2 * np.pi * 2.1 * 0.1 * np.arange(3200))[:, None]
     assert bandwidth_hz(shaken, runs, 0.1, 2e-3) >= 4.2
+
+
+def test_the_field_of_the_columns_has_none_of_the_readings_own_noise() -> None:
+    """Beside a poor gyro the smooth field is a good part the reading itself."""
+    made = experiment("mam", samples=3000, sigma_gyro=2e-2, sigma_mag=4e-4)
+    track, row = track_of(made), 1500
+    noisy = track.mag_b_gauss.copy()
+    noisy[row] += [1e-3, 0.0, 0.0]
+    before, after = (
+        _context(replace(track, mag_b_gauss=m), made) for m in (track.mag_b_gauss, noisy)
+    )
+    foretold, smooth = after.field_b - before.field_b, after.smooth_b - before.smooth_b
+    assert np.abs(foretold[: row + 1]).max() < 1e-6  # by the gains alone
+    assert np.linalg.norm(foretold[row + 1]) > 1e-4
+    assert np.linalg.norm(smooth[row]) > 1e-4
+    np.testing.assert_allclose(after.field_b[0], after.smooth_b[0])  # nothing was foretold

@@ -46,7 +46,7 @@ def moving(seed: int = 0, rows: int = 600, rate_hz: float = 20.0, gap_at: int | 
     track = Track(time_s, dt_s, mag, rate + GYRO_BIAS, accel, covariates, runs)
     model = NullModel(SOFT_IRON, HARD_IRON, GYRO_BIAS, 1e-3, 5e-4)
     zero = np.zeros((rows, 3))
-    context = Context(track, model, field_b, rate, zero, R_nb, True)
+    context = Context(track, model, field_b, field_b, rate, zero, R_nb, True)
     return context, readings
 
 

@@ -235,7 +235,7 @@ def readings_of(context: Context) -> Readings:
 def left_over(context: Context) -> Array:
     """(N, 3) gauss, readings less what field and calibration make of them; 0 without a reading."""
     model = context.model
-    expected = context.field_b @ model.soft_iron.T + model.hard_iron_gauss
+    expected = context.smooth_b @ model.soft_iron.T + model.hard_iron_gauss
     return np.nan_to_num(context.track.mag_b_gauss - expected)
 
 

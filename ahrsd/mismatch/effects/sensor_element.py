@@ -264,8 +264,8 @@ class MagSampleHold(Effect):
 
     def columns(self, context: Context, setting: Setting) -> Columns:
         """From the present field to that of the last update."""
-        held = context.field_b[_last_update(context.track.dt_s, setting)]
-        return Columns(mag=((held - context.field_b) @ context.model.soft_iron.T)[:, :, None])
+        held = context.smooth_b[_last_update(context.track.dt_s, setting)]
+        return Columns(mag=((held - context.smooth_b) @ context.model.soft_iron.T)[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Readings of the last update, noise included."""

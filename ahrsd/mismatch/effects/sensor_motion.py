@@ -108,6 +108,10 @@ class MagLowPass(Linear):
         """Time constants a factor of three apart."""
         return tuple({"time_constant_s": tau} for tau in (0.03, 0.1, 0.3))
 
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """Of the smooth field: the differences of another would be its noise."""
+        return self.terms(replace(readings_of(context), field_b=context.smooth_b), setting)
+
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """What the filter takes away, per second of its time constant."""
         tau0 = setting["time_constant_s"]
