@@ -86,11 +86,10 @@ def build_context(track: Track, fit: Fit) -> Context:
 
 
 def _foretold(done: Filtered | Bearings) -> Array:
-    """(N, 3) the predicted field, the smooth one where a run opens or nothing was predicted yet."""
+    """(N, 3) the predicted field; where no reading was held against it, the smooth one."""
     if isinstance(done, Bearings):
         return done.nominal_b
-    there = np.any(done.predicted_b != 0.0, axis=1, keepdims=True)
-    return np.where(there, done.predicted_b, done.nominal_b)
+    return np.where(done.used[:, None], done.predicted_b, done.nominal_b)
 
 
 @lru_cache(maxsize=2)

@@ -1,9 +1,13 @@
 """A track at a lower rate with next to all of its information.
 
-Every m samples (m odd) become one: readings carried to the middle sample by the gyro and averaged
-there, the gyro's turns from middle to middle multiplied.  Noise stays white.  Carried needs a
-calibration, h = C (m - b), turned, m = A h + b; one near the truth will do, since a group turns by
-a few degrees only.
+Every m samples become one: readings carried to the middle sample by the gyro and averaged there,
+the gyro's turns from middle to middle multiplied.  Noise stays white.  Carried needs a calibration,
+h = C (m - b), turned, m = A h + b; one near the truth will do, since a group turns by a few degrees
+only.
+
+The middle of an even number is the later of two.  What was logged besides is averaged over the
+group, as what it does to the readings is; what tells the attitude is averaged about the middle
+sample, with half a sample at either end.
 """
 
 from __future__ import annotations
@@ -18,31 +22,31 @@ from ahrsd.samples import Array
 #: rows per second that a search works with, and what is enough where a group of samples hardly
 #: turns, root mean square
 WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
+_ATTITUDE = "ref_q"
 
 
 def thin_factor(track: Track, wanted_hz: float) -> int:
-    """The largest odd m that leaves at least `wanted_hz`, 1 where nothing can be saved."""
+    """The largest m that leaves at least `wanted_hz`, 1 where nothing can be saved."""
     steps = track.dt_s[np.isfinite(track.dt_s)]
     rate_hz = 1.0 / float(np.median(steps)) if len(steps) else wanted_hz
-    ratio = max(1, int(rate_hz / wanted_hz))
-    return ratio if ratio % 2 else ratio - 1
+    return max(1, int(rate_hz / wanted_hz))
 
 
 def working_factor(track: Track) -> int:
-    """The largest odd m for which a group hardly turns, or that leaves WORKING_HZ."""
+    """The largest m for which a group hardly turns, or that leaves WORKING_HZ."""
     least, most = (thin_factor(track, hz) for hz in (WORKING_HZ, SLOWEST_HZ))
     step = np.linalg.norm(track.gyro_b_rad_s, axis=1) * np.nan_to_num(track.dt_s)
     turn_rad = float(np.sqrt(np.mean(step**2)))
-    return next((m for m in range(most, least, -2) if m * turn_rad < GROUP_TURN_RAD), least)
+    return next((m for m in range(most, least, -1) if m * turn_rad < GROUP_TURN_RAD), least)
 
 
 def thinned(track: Track, m: int, model: NullModel) -> Track:
     """The track with every m samples made one; runs shorter than 2 m samples are left out.
 
-    ValueError where m is not odd and positive.
+    ValueError where m is not positive.
     """
-    if m < 1 or m % 2 == 0:
-        raise ValueError(f"thinning by {m}: an odd number is needed")
+    if m < 1:
+        raise ValueError(f"thinning by {m}: one sample of so many cannot be")
     if m == 1:
         return track
     runs = [run for run in track.runs if run.stop - run.start >= 2 * m]
@@ -66,10 +70,6 @@ def thinned(track: Track, m: int, model: NullModel) -> Track:
 def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str, Array]:
     groups = (run.stop - run.start) // m
     rows = slice(run.start, run.start + groups * m)
-
-    def mean(values: Array) -> Array:
-        return np.asarray(values[rows].reshape(groups, m, *values.shape[1:]).mean(axis=1))
-
     half = m // 2
     step = track.dt_s[rows]
     increments = so3.exp(track.gyro_b_rad_s[rows] * np.nan_to_num(step)[:, None])
@@ -89,8 +89,21 @@ def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str
         "gyro": gyro,
     }
     if track.accel_b_m_s2 is not None:
-        out["accel"] = mean(track.accel_b_m_s2)
-    return out | {name: mean(values) for name, values in track.covariates.items()}
+        out["accel"] = _about_middle(track.accel_b_m_s2[rows], m)
+    for name, values in track.covariates.items():
+        turns = name.startswith(_ATTITUDE)
+        out[name] = _about_middle(values[rows], m) if turns else values[rows].reshape(-1, m).mean(1)
+    return out
+
+
+def _about_middle(values: Array, m: int) -> Array:
+    """Means of (n m, ...) about the middle sample of each m; the last even one has one end."""
+    groups = values.reshape(-1, m, *values.shape[1:])
+    mean = groups.mean(axis=1)
+    if m % 2 == 0:
+        mean[:-1] += (groups[1:, 0] - groups[:-1, 0]) / (2 * m)
+        mean[-1] = groups[-1, 1:].mean(axis=0)
+    return np.asarray(mean)
 
 
 def _mean_of_known(values: Array) -> Array:
@@ -111,9 +124,10 @@ def _carried(track: Track, rows: slice, m: int, model: NullModel) -> Array:
     h = field.reshape(-1, m, 3).copy()
     half = m // 2
     ahead = behind = np.broadcast_to(np.eye(3), (len(h), 3, 3))
-    for k in range(1, half + 1):
+    for k in range(1, m - half):
         behind = behind @ np.swapaxes(back[:, half + k], 1, 2)
         h[:, half + k] = np.einsum("nij,nj->ni", behind, h[:, half + k])
+    for k in range(1, half + 1):
         ahead = ahead @ back[:, half - k + 1]
         h[:, half - k] = np.einsum("nij,nj->ni", ahead, h[:, half - k])
     return np.asarray(h.reshape(-1, 3) @ model.soft_iron + model.hard_iron_gauss)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,8 @@ from ahrsd import so3
 from ahrsd.mismatch.thin import thin_factor, thinned
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import NullModel
+
+FIELD = np.array([0.3, 0.1, 0.4])
 
 
 def turning(count: int = 450, dt: float = 0.02) -> tuple[Track, np.ndarray]:
@@ -24,7 +28,8 @@ def turning(count: int = 450, dt: float = 0.02) -> tuple[Track, np.ndarray]:
     mag = np.einsum("nji,j->ni", R_nb, [0.2, 0.1, 0.4]) @ A + [0.05, -0.02, 0.1]
     step = np.full(count, dt)
     step[0] = np.nan
-    track = Track(t, step, mag, rate, None, {"a": t.copy()}, (slice(0, count),))
+    logged = {"a": t.copy(), "ref_qw": t.copy()}
+    track = Track(t, step, mag, rate, np.outer(t, [0.0, 1.0, -2.0]), logged, (slice(0, count),))
     return track, R_nb
 
 
@@ -32,13 +37,16 @@ def model(hard_iron: list[float]) -> NullModel:
     return NullModel(np.diag([1.1, 0.9, 1.0]), np.array(hard_iron), np.zeros(3), 1e-3, 1e-3)
 
 
-@pytest.mark.parametrize("m", [3, 5, 7])
+@pytest.mark.parametrize("m", [2, 3, 4, 5, 6, 7])
 def test_turns_and_readings_are_those_of_the_middle_samples(m):
     track, R_nb = turning()
     thin = thinned(track, m, model([0.05, -0.02, 0.1]))
     middle = np.arange(len(thin)) * m + m // 2
     np.testing.assert_allclose(thin.time_s, track.time_s[middle], atol=1e-12)
-    np.testing.assert_allclose(thin.covariates["a"], track.time_s[middle], atol=1e-12)
+    centre = track.time_s[middle] - (0.0 if m % 2 else track.time_s[1] / 2)
+    np.testing.assert_allclose(thin.covariates["a"], centre, atol=1e-12)
+    np.testing.assert_allclose(thin.covariates["ref_qw"], track.time_s[middle], atol=1e-12)
+    np.testing.assert_allclose(thin.accel_b_m_s2[:, 1], track.time_s[middle], atol=1e-12)
     np.testing.assert_allclose(thin.mag_b_gauss, track.mag_b_gauss[middle], atol=1e-12)
     turn = so3.exp(thin.gyro_b_rad_s[1:] * thin.dt_s[1:, None])
     expected = np.swapaxes(R_nb[middle[:-1]], 1, 2) @ R_nb[middle[1:]]
@@ -58,12 +66,28 @@ def test_rate_is_kept_above_what_is_wanted():
         1,
         1,
         3,
-        3,
+        4,
         5,
         7,
     ]
 
 
-def test_even_factors_are_refused():
-    with pytest.raises(ValueError, match="odd"):
-        thinned(turning()[0], 4, model([0.0, 0.0, 0.0]))
+def test_a_factor_below_one_is_refused():
+    with pytest.raises(ValueError, match="thinning by 0"):
+        thinned(turning()[0], 0, model([0.0, 0.0, 0.0]))
+
+
+def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
+    """Half a sample apart a current that changes would look late."""
+    track, _ = turning()
+    current = np.sin(2 * track.time_s)
+    still = replace(
+        track,
+        gyro_b_rad_s=np.zeros_like(track.gyro_b_rad_s),
+        mag_b_gauss=np.outer(current, [0.01, 0.02, -0.01]) + FIELD,
+        covariates={"current_a": current},
+    )
+    for m in (3, 4):
+        thin = thinned(still, m, model([0.05, -0.02, 0.1]))
+        expected = np.outer(thin.covariates["current_a"], [0.01, 0.02, -0.01]) + FIELD
+        np.testing.assert_allclose(thin.mag_b_gauss, expected, atol=1e-12)
