@@ -1,6 +1,6 @@
 """All names of one state: named one after the other, pruned, examined, swapped, held to their form.
 
-forward -> prune -> without imitators -> examine -> swap -> stand-ins;
+forward -> prune -> without imitators -> examine -> swap -> twins -> stand-ins;
 the same again beside a bias that wanders.
 """
 
@@ -15,6 +15,7 @@ from ahrsd.mismatch.often import logged_often
 from ahrsd.mismatch.search import State, Survey, survey, swapped
 from ahrsd.mismatch.selection import forward
 from ahrsd.mismatch.stand_ins import TIME_SHAPED, without_stand_ins, without_unlikely
+from ahrsd.mismatch.twins import told_apart
 from ahrsd.mismatch.unknown import Remainder
 
 
@@ -47,7 +48,7 @@ def sought(state: State) -> Sought:
     hidden = len(slim.named) < len(given.named)
     slim = eddies_alone(slim)
     last = last if slim.names == more.names else survey(slim)
-    named, surveys, last = without_unlikely(*swapped(slim, last))
+    named, surveys, last = without_unlikely(*told_apart(*swapped(slim, last)))
     true, surveys, left = without_stand_ins(named, surveys, beside)
     # what changes often is asked again: no slow thing of another form goes with it
     logged = (

@@ -241,6 +241,7 @@ def test_a_lamp_that_a_free_course_explains_as_well_is_asked_for_beside_the_rest
         "examined": lambda state: (state, True),
         "swapped": lambda state, last: (state, [], last),
         "without_unlikely": lambda *all_of: all_of,
+        "told_apart": lambda *all_of: all_of,
         "without_stand_ins": lambda *_: (named(), [], None),
         "without_imitators": lambda state: state,
         "logged_often": lambda _, candidate: candidate.name == "motor_current_field",
