@@ -59,6 +59,13 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", str(mount)], check=True)
 
 
+@pytest.fixture(autouse=True)
+def plain_logging() -> None:
+    """Levels as in a new process: a command that ran in this one may have set its own."""
+    for name in ("ahrsd", "drivers"):
+        logging.getLogger(name).setLevel(logging.NOTSET)
+
+
 @pytest.fixture
 def run() -> Iterator[Callable[..., int]]:
     """`run(*arguments)`: the exit code of `ahrsd ARGUMENTS`, in this process."""
