@@ -52,7 +52,8 @@ def told_apart(
 def _likelier(state: State, number: int, seen: Survey) -> tuple[State, float] | None:
     """The state with a term or with its twin, each in its best shape, and by how many nats.
 
-    None where it has no twin.  Coefficients are paid for as in the survey without it, `seen`.
+    None where it has no twin that may be said.  Coefficients are paid for as in the survey without
+    the term, `seen`.
     """
     name = state.names[number]
     judged = {one.candidate.name: one for one in seen.judged}
@@ -60,7 +61,7 @@ def _likelier(state: State, number: int, seen: Survey) -> tuple[State, float] | 
         return None
     mine = judged[name]
     its = judged[next(one for one in _NAMES if one != name)]
-    if its.evidence < (1.0 - _NEAR) * mine.evidence:
+    if not its.accepted or its.evidence < (1.0 - _NEAR) * mine.evidence:
         return None
     named = list(state.named)
     named[number] = its

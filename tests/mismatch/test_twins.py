@@ -1,5 +1,7 @@
 """A drift of the hard iron and a compensation on board, each forced in the other's place."""
 
+from dataclasses import replace
+
 import pytest
 from mismatch_trials import Trial, made
 
@@ -50,6 +52,16 @@ def test_a_twin_that_cannot_be_told_apart_is_said_with_the_name() -> None:
     shares = shares_of(kept, 0, seen[0], after)
     assert shares[DRIFT] + shares[ON_BOARD] > 0.99
     assert min(shares[DRIFT], shares[ON_BOARD]) > 0.02
+
+
+def test_a_twin_that_a_gate_refused_takes_no_place() -> None:
+    state, (seen,), last = forced(ON_BOARD, 0.06, DRIFT)
+    refused = tuple(
+        replace(one, refused=("held-out gain",)) if one.candidate.name == ON_BOARD else one
+        for one in seen.judged
+    )
+    kept, _, _ = told_apart(state, [replace(seen, judged=refused)], last)
+    assert kept is state
 
 
 def test_others_are_left_alone() -> None:
