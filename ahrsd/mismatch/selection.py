@@ -105,10 +105,14 @@ def borne_out(state: State, tried: State, judged: Judged, seen: Survey) -> bool:
         return True  # another track
     gained = likelihood(tried) - likelihood(state)
     gained = max(gained, tried.fit.log_likelihood - state.fit.log_likelihood)
-    strongest = seen.candidates[0]
-    noise = quieter(seen.basis, columns_of(seen.basis, [strongest])[strongest.name]).colour
-    short = max(0.0, judged.what.statistic / 2 - gained) / noise
+    short = max(0.0, judged.what.statistic / 2 - gained) / noise_in(seen)
     return judged.evidence - short > state.problem.limits.evidence_nats
+
+
+def noise_in(seen: Survey) -> float:
+    """Power of the noise in which a survey's evidence is, over white: what its strongest leaves."""
+    strongest = seen.candidates[0]
+    return quieter(seen.basis, columns_of(seen.basis, [strongest])[strongest.name]).colour
 
 
 def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
