@@ -51,7 +51,6 @@ def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Trac
     assert found.unexplained.detected
 
 
-@pytest.mark.slow  # shorter: a gyro that is off for a while, below
 def test_a_gyro_bias_that_comes_and_goes_is_no_pair_of_steps(track: Track) -> None:
     phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
     bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([6e-4, -5e-4, 7e-4])
