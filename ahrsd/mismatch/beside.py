@@ -250,7 +250,7 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
     checks = {
         "evidence": evidence > _least_nats(one, problem),
-        SIZE: _material(one, held.what),
+        SIZE: material(one, held.what.value),
     }
     others = (why for why in held.refused if why not in checks)
     refused = (*others, *(why for why, passed in checks.items() if not passed))
@@ -273,9 +273,9 @@ def _paid(what: Score, scale: Array) -> float:
     return 0.5 * float(np.sum(np.log1p(max(size2, 1e-4) * what.information)))
 
 
-def _material(one: Candidate, what: Score) -> bool:
-    """Whether it is larger than what sensors have by themselves that look like it."""
-    return float(np.linalg.norm(what.value)) > OF_ITSELF.get(one.name, 0.0)
+def material(one: Candidate, value: Array) -> bool:
+    """Whether a value (p,) is larger than what sensors have by themselves that looks like it."""
+    return float(np.linalg.norm(value)) > OF_ITSELF.get(one.name, 0.0)
 
 
 def _of_another_form(state: State, number: int, quiet: Base) -> bool:

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ahrsd.mismatch import roles, unknown
 from ahrsd.mismatch.along_field import framed
@@ -25,7 +24,6 @@ from ahrsd.mismatch.diagnosis import (
     Diagnosis,
     Drawn,
     Finding,
-    Limit,
     Unexplained,
     Whiteness,
 )
@@ -40,6 +38,7 @@ from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.humming import heard
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
+from ahrsd.mismatch.likelier_forms import without_likelier_forms
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
@@ -54,9 +53,8 @@ from ahrsd.mismatch.passing import without_passing
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
-from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.resting import resting
-from ahrsd.mismatch.score import score
 from ahrsd.mismatch.search import (
     HARDLY_TURNED,
     STEPS,
@@ -75,10 +73,7 @@ from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.unplaced import without_unplaced
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.mismatch.wandering import wandering
-from ahrsd.samples import Array
-
-#: a detection limit is this many standard deviations: what the gate would pass 9 times in 10
-DETECTED_AT = 6.5
+from ahrsd.mismatch.would_show import would_show
 
 
 def diagnose(
@@ -157,17 +152,32 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
         left = framed(formed_basis_of(state), left, problem.limits)
     burst_nats = 0.0 if short is None else short.evidence_nats
     state, surveys, left = without_passing(state, surveys, left, burst_nats)
-    left = in_its_noise(formed_basis_of(state), with_spells(left), problem.limits)
-    left = in_even_noise(formed_basis_of(state), left, problem.limits)
-    left = beside_bursts(state, left, problem.limits)
-    left = unknown.beside_names(left, price_of(state), problem.limits)
-    if short is None and not at_rest(start):
-        left = with_forms(left, free_price_of(state), problem.limits)
+    left = _refined(start, state, left, short)
+    fewer = without_likelier_forms(state, surveys, left)
+    if fewer[0] is not state:
+        state, surveys, rest = fewer
+        left = _refined(start, state, framed(formed_basis_of(state), rest, problem.limits), short)
+        if not unknown.detected(left, problem.limits):
+            left = replace(left, stood_in=rest.strongest.frame)
     if short is not None and short.evidence_nats <= left.strongest.evidence:
         short = None
     if short is None and unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
     return _Searched(start, settled(state), surveys, done.first, done.last, left, short, beside)
+
+
+def _refined(
+    start: NullFit, state: State, left: unknown.Remainder, short: Unexplained | None
+) -> unknown.Remainder:
+    """What is left, in its own noise, beyond what names leave of their forms, by its own form."""
+    limits = state.problem.limits
+    left = in_its_noise(formed_basis_of(state), with_spells(left), limits)
+    left = in_even_noise(formed_basis_of(state), left, limits)
+    left = beside_bursts(state, left, limits)
+    left = unknown.beside_names(left, price_of(state), limits)
+    if short is None and not at_rest(start):
+        left = with_forms(left, free_price_of(state), limits)
+    return left
 
 
 def _told(
@@ -204,7 +214,7 @@ def _told(
         findings=found,
         unexplained=left,
         posterior_predictive=_checked(done, fast, terms, library, (*facts, *noise)),
-        sensitivity=() if something else _limits(problem, basis, done.first, fast),
+        sensitivity=() if something else would_show(problem, basis, done.first, fast),
         notes=(*notes, *lesser, *(() if something else would_have_shown(problem.recorded))),
         model=model_at_rate(state.fit.model, problem),
         noise=usual_noise(
@@ -286,14 +296,6 @@ def _least_gain(one: Finding) -> float:
     return 0.0 if one.heldout is None else -one.heldout.nll_gain_per_sample
 
 
-def _limits(problem: Problem, basis: Base, first: Survey, fast: Quick) -> tuple[Limit, ...]:
-    """What the search would have shown, and what only the recorded rate shows."""
-    quickly = sensitivity(fast.state.problem, fast.last.basis, fast.last)
-    slowly = sensitivity(problem, basis, first)
-    told = {(limit.effect, limit.parameter) for limit in slowly}
-    return (*slowly, *(one for one in quickly if (one.effect, one.parameter) not in told))
-
-
 def _stopped(recording: str, facts: list[Fact], notes: tuple[str, ...]) -> Diagnosis:
     """The answer where nothing that is fitted would mean anything."""
     return Diagnosis(
@@ -342,28 +344,6 @@ def _loud(facts: Sequence[Fact]) -> list[tuple[float, float]]:
     """Where the noise is at another level, seconds."""
     levels = ("noise_burst", "noise_level")
     return [span for fact in facts if fact.effect in levels for span in fact.where.intervals_s]
-
-
-def sensitivity(problem: Problem, basis: Base, first: Survey) -> tuple[Limit, ...]:
-    """The smallest value of every parameter that this recording would have shown."""
-    columns = columns_of(basis, first.candidates)
-    gram = candidate_gram(basis, columns, problem.track.duration_s)
-    projected = gram.project(list(basis.groups))
-    out = []
-    for candidate in first.candidates:
-        what = score(projected, candidate.name, candidate.scale, candidate.effect.least_information)
-        sigma = np.sqrt(np.diag(what.covariance)) if what.rank else np.zeros(len(candidate.scale))
-        hidden = _hidden(what.basis, candidate.scale)
-        for k, parameter in enumerate(candidate.effect.parameters):
-            smallest = None if hidden[k] else float(DETECTED_AT * sigma[k] * basis.colour**0.5)
-            out.append(Limit(candidate.name, parameter.name, smallest, parameter.unit))
-    return tuple(out)
-
-
-def _hidden(directions: Array, scale: Array) -> NDArray[np.bool]:
-    """(p,) parameters that are mostly outside the observable directions (p, r)."""
-    seen = np.sum((directions / scale[:, None]) ** 2, axis=1)
-    return np.asarray(seen < 0.5)
 
 
 def _baseline(start: NullFit) -> Baseline:

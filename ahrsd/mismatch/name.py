@@ -35,6 +35,8 @@ MINIMUM_SHIFT_SHARE = 0.05
 LONELY_BLOCKS, LONELY_NATS = 5.0, 20.0
 #: deviations beyond which a reading says no more: three axes of it are 13 nats, a place costs them
 OUTLIER = 3.0
+#: the check that needs many blocks
+ROBUST = "block-robust probability"
 #: what is shorter turns too little to tell a field outside from one on the vehicle
 LONELY_S = 8.0
 
@@ -106,7 +108,7 @@ def judge(
     lonely = _lonely(candidate, what, evidence)
     checks = (
         ("family-wise probability", family < limits.family_p),
-        ("block-robust probability", robust < limits.robust_family_p),
+        (ROBUST, robust < limits.robust_family_p),
         ("evidence", evidence > limits.evidence_nats),
         ("held-out gain", gain.nats_per_sample > limits.cv_gain or lonely),
         ("without outliers", _without_outliers(candidate, own, left, basis) > limits.evidence_nats),

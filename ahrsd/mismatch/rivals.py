@@ -9,7 +9,8 @@ every name is compared with
     rate      an error of the gyro that depends on the rates in any way
     memory    a field in sensor axes that depends on where the field has been: relays (Preisach's
               model of hysteresis) in directions all over the sphere
-    matrix    a mount, soft iron or scales that change slowly: a matrix on the field, any in time
+    matrix    a mount, soft iron or scales that change slowly: a matrix on the field, any in time,
+              about one that stays
     spell     of a jump or a bump of the field outside: an error of the gyro for a while around it
 
 each a random effect whose size is found by marginal likelihood, which makes it pay for its
@@ -54,6 +55,8 @@ PARTS = 6
 RELAYS = (0.3, 0.55)
 #: half waves in time with which a matrix may change
 SLOW = 3
+#: the name of a turn of the mount that stays: none is held against itself
+MOUNT = "mag_gyro_misalignment"
 #: reach of a spell to either side, and its stretches, seconds
 SPELL_S, STRETCH_S = 60.0, 10.0
 _SMALL = -5.0  # logarithm of a deviation to begin with: next to nothing
@@ -68,9 +71,12 @@ def of_another_form(
     beside: whether more is left than the names explain
     """
     noise, context = max(1.0, basis.colour), basis.context
-    columns = basis.whitened([by_rate(context), by_memory(context), by_matrix(context)])
-    units = (UNIT_RAD_S, UNIT_GAUSS, UNIT_GAUSS)
-    free = [part * unit for part, unit in zip(columns, units, strict=True)]
+    columns = basis.whitened(
+        [by_rate(context), by_memory(context), by_matrix(context), by_mount(context)]
+    )
+    units = (UNIT_RAD_S, UNIT_GAUSS, UNIT_GAUSS, UNIT_GAUSS)
+    *free, changing, mount = [part * unit for part, unit in zip(columns, units, strict=True)]
+    bending = np.concatenate([mount, changing], axis=2)
     out = []
     for k, name in enumerate(state.names):
         scale = state.named[k].candidate.scale
@@ -79,8 +85,10 @@ def of_another_form(
         own = [] if name in courses else _varied(mine, added_value(state, k) / scale)
         own = own[:1] if beside else own
         spell = _spell(basis, state.named[k].candidate, mine)
+        matrix = changing if name == MOUNT else bending
+        others = (*free, matrix, *spell)
         if any(_rivals(left, mine, part, noise, 1.0) for part in own) or any(
-            _rivals(left, mine, part, noise, OWN_SHARE, alone=beside) for part in (*free, *spell)
+            _rivals(left, mine, part, noise, OWN_SHARE, alone=beside) for part in others
         ):
             out.append(k)
     return out
@@ -195,3 +203,8 @@ def by_matrix(context: Context) -> Columns:
     slow = np.cos(phase[:, None] * np.arange(1, SLOW + 1))
     values = slow[:, :, None] * context.field_b[:, None, :]
     return every_direction(values.reshape(len(phase), -1))
+
+
+def by_mount(context: Context) -> Columns:
+    """The field times a matrix that stays: where a mount that bends is, on the average."""
+    return every_direction(context.field_b)

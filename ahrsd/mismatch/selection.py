@@ -8,7 +8,7 @@ import numpy as np
 
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.delays import DELAYS
-from ahrsd.mismatch.name import Judged, judge
+from ahrsd.mismatch.name import ROBUST, Judged, judge
 from ahrsd.mismatch.nested import simplest
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, columns_of, quieter
@@ -65,7 +65,7 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
                 break
             state, last = more, survey(more)
             continue
-        best = simplest(accepted)
+        best = _which_change(simplest(accepted), state, last)
         if best.candidate.name in state.names and closer < len(state.named):
             state, closer = shaped_again(state, newest=True), len(state.named)
         elif best.candidate.name in WANDERING and not state.walk:
@@ -78,6 +78,20 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
             state = tried
         broken, last = set(), survey(state)
     return state, first, last
+
+
+def _which_change(best: Judged, state: State, seen: Survey) -> Judged:
+    """Of a gyro bias that surely changes the likeliest name, though few blocks show it.
+
+    That the bias changes beyond what an ordinary one wanders is proven by a name that passes.  How
+    is for the evidence to say, also of a name whose own blocks are too few to know each other.
+    """
+    if best.candidate.name != WANDERING[0] or not state.walk:
+        return best
+    likeliest = max(seen.judged, key=lambda judged: judged.evidence)
+    few = likeliest.candidate.name in CAUSED and likeliest.refused == (ROBUST,)
+    ahead = likeliest.evidence > best.evidence + state.problem.limits.lead_nats
+    return likeliest if few and ahead else best
 
 
 def _measured_again(state: State, judged: Judged) -> bool:

@@ -26,6 +26,7 @@ from ahrsd.mismatch.search import (
     STEPS,
     WANDERING,
     State,
+    formed_basis_of,
     refitted,
     settled,
     survey,
@@ -40,6 +41,8 @@ NAME = "gyro_bias_drift"
 FACTORS = (1.0, 2.0)
 #: nats by which a jump and one back must be likelier than a walk: eight numbers at about four each
 THERE_AND_BACK = 32.0
+#: nats that the walk's size costs, one of 25 that are tried
+SIZE_NATS = 3.2
 
 
 def wandering(found: Sought) -> Sought:
@@ -54,6 +57,8 @@ def wandering(found: Sought) -> Sought:
     if not clear or not unknown.detected(left, limits) or _named(state):
         return found
     size = max(_size(left, limits), _size(_without_the_walk(found.before), limits))
+    if size < ORDINARY_WALK_RAD_S_SQRT_S and state.walk:
+        size = _size(_with_a_bias_that_stays(state), limits)
     if size < ORDINARY_WALK_RAD_S_SQRT_S:
         return found
     for factor in FACTORS:
@@ -70,7 +75,8 @@ def wandering(found: Sought) -> Sought:
 def _with_its_name(found: Sought) -> Sought | None:
     """The bias that wanders in the filter named, as it is judged where it wanders less.
 
-    None where another name is likelier there.
+    None where another name is likelier there.  Of a walk the few modes of the name explain a part:
+    it has the nats by which the wider walk in the filter is likelier, if those are more.
     """
     names = found.state.named
     ordinary = refitted(replace(found.state, walk=ORDINARY_WALK_RAD_S_SQRT_S), names)
@@ -81,6 +87,8 @@ def _with_its_name(found: Sought) -> Sought | None:
     judged = judge(
         mine, gram, columns[NAME], seen.basis, len(seen.candidates), found.state.problem.limits
     )
+    wider = likelihood(found.state) - likelihood(ordinary) - SIZE_NATS
+    judged = replace(judged, evidence=max(judged.evidence, wider))
     state = refitted(found.state, (*names, judged))
     if shares_of(state, len(names), seen, found.last)[NAME] <= LEAST_SHARE:
         return None
@@ -110,6 +118,12 @@ def _without_the_walk(state: State) -> unknown.Remainder | None:
         return None
     k = state.names.index(NAME)
     return unknown.remainder(without_term(state, k), with_bins=False)
+
+
+def _with_a_bias_that_stays(state: State) -> unknown.Remainder:
+    """What the names leave where the bias does not wander: of a walk the filter follows a part."""
+    still = refitted(replace(state, walk=0.0), state.named)
+    return unknown.remainder(formed_basis_of(still), with_bins=False)
 
 
 def _size(left: unknown.Remainder | None, limits: Limits) -> float:

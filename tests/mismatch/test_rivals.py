@@ -10,12 +10,18 @@ from mismatch_trials import Trial, made
 from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of
 
+from ahrsd.mismatch import rivals
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS
+from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.regression import base
-from ahrsd.mismatch.rivals import by_memory, compared
+from ahrsd.mismatch.rivals import by_matrix, by_memory, by_mount, compared, of_another_form
+from ahrsd.mismatch.search import State, formed_basis_of, refitted, survey
 from ahrsd.mismatch.together import projected
-from ahrsd.mismatch.track import Track
+from ahrsd.mismatch.track import Spec, Track
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +55,39 @@ def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Trac
     found = diagnose(turned(track, warmth * np.array([12e-3, -8e-3, 10e-3])))
     assert found.findings == ()
     assert found.unexplained.detected
+
+
+def test_a_mount_that_bends_is_crooked_on_the_average(track: Track) -> None:
+    """A turn that grows from none is a mean turn and a change: neither alone is likely."""
+    share = np.linspace(0.0, 1.0, len(track))[:, None]
+    fit = fit_null(turned(track, share * np.array([3e-3, -2e-3, 2.5e-3])), walk=False)
+    basis = base(fit.context(), fit.filtered, [], 25.0)
+    mount, change = basis.whitened([by_mount(basis.context), by_matrix(basis.context)])
+    mean, changed, both = compared(basis, UNIT_GAUSS * mount, UNIT_GAUSS * change, 1.0)
+    bending = UNIT_GAUSS * np.concatenate([mount, change], axis=2)
+    _, form, _ = compared(basis, UNIT_GAUSS * mount, bending, 1.0)
+    assert form > max(mean, changed) + 7.0
+    assert form == pytest.approx(both, rel=0.02)
+
+
+def test_a_mount_that_stays_crooked_is_held_against_no_other_that_stays(track: Track) -> None:
+    """The name itself is a matrix that stays: amid a rest that form would always be likelier."""
+    state = named(turned(track, np.full((len(track), 3), 3e-3)), "mag_gyro_misalignment")
+    asked = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rivals, "_rivals", lambda *given, **_: asked.append(given[2].shape[2]))
+        of_another_form(state, formed_basis_of(state), (), beside=True)
+    widths = [by(formed_basis_of(state).context).mag.shape[2] for by in (by_mount, by_matrix)]
+    assert widths == [9, 27]
+    assert asked[-1] == 27
+    assert asked.count(36) == 1  # by the rate
+
+
+def named(track: Track, name: str) -> State:
+    """The state with this name for what is in the recording."""
+    problem, cold = problem_of(track, Spec(), {name: EFFECTS[name]}, LIMITS)
+    start = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    return refitted(start, (survey(start).judged[0],))
 
 
 def test_a_gyro_bias_that_comes_and_goes_is_no_pair_of_steps(track: Track) -> None:

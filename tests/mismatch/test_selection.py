@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from mismatch_trials import Trial, made
 from ahrsd.mismatch import selection
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.name import ROBUST
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S, State, added, refitted, survey
-from ahrsd.mismatch.selection import _cause_after_all, borne_out, forward
+from ahrsd.mismatch.selection import _cause_after_all, _which_change, borne_out, forward
 from ahrsd.mismatch.track import Spec, Track
 
 SCALE = 1 + np.array([-1.2e-3, 2.3e-3, -1.6e-3])
@@ -52,6 +54,42 @@ def test_a_bias_that_wanders_stays_noise(track: Track) -> None:
     wandered = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + np.cumsum(steps, axis=0))
     state = _beside_a_walk(wandered)
     assert _cause_after_all(state, survey(state)) is state
+
+
+def judged(name: str, evidence: float, *refused: str) -> SimpleNamespace:
+    return SimpleNamespace(candidate=SimpleNamespace(name=name), evidence=evidence, refused=refused)
+
+
+DRIFT = judged("gyro_bias_drift", 20.4)
+
+
+@pytest.mark.parametrize(
+    ("walk", "others", "said"),
+    [
+        # a start-up of forty seconds: three of four blocks have nothing of it
+        (5e-6, [judged("gyro_startup", 28.6, ROBUST)], "gyro_startup"),
+        (0.0, [judged("gyro_startup", 28.6, ROBUST)], "gyro_bias_drift"),
+        (5e-6, [judged("gyro_startup", 22.0, ROBUST)], "gyro_bias_drift"),
+        (5e-6, [judged("gyro_startup", 28.6, ROBUST, "held-out gain")], "gyro_bias_drift"),
+        (5e-6, [judged("field_step", 28.6, ROBUST)], "gyro_bias_drift"),
+        (
+            5e-6,
+            [judged("gyro_startup", 28.6, ROBUST), judged("gyro_bias_step", 30.0, "held-out gain")],
+            "gyro_bias_drift",
+        ),
+    ],
+)
+def test_how_a_bias_changes_is_for_the_evidence_to_say(walk, others, said) -> None:
+    state = SimpleNamespace(walk=walk, problem=SimpleNamespace(limits=LIMITS))
+    seen = SimpleNamespace(judged=(*others, DRIFT))
+    assert _which_change(DRIFT, state, seen).candidate.name == said
+
+
+def test_no_other_name_is_asked_how_a_bias_changes() -> None:
+    state = SimpleNamespace(walk=5e-6, problem=SimpleNamespace(limits=LIMITS))
+    scale = judged("gyro_scale", 12.0)
+    seen = SimpleNamespace(judged=(judged("gyro_startup", 28.6, ROBUST), scale))
+    assert _which_change(scale, state, seen) is scale
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,23 @@ def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
     assert not found.unexplained.detected
 
 
+@pytest.mark.parametrize(
+    ("seed", "size"),
+    [
+        # the few modes of the name explain a tenth of what the filter gains by walking as much
+        (19, 1.2e-5),
+        # where the filter walks as an ordinary bias does, what is left of it looks like no walk
+        (21, 2.6e-5),
+    ],
+)
+def test_a_walk_that_the_names_few_modes_hardly_show_is_named_too(track, seed, size):
+    steps = np.random.default_rng(seed).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + size * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
+    assert not found.unexplained.detected
+
+
 @pytest.mark.slow
 def test_a_bias_that_swings_is_no_walk(track):
     swing = 6e-4 * np.sin(2 * np.pi * track.time_s / 37.0)[:, None] * np.array([1.0, -0.5, 0.7])

@@ -1,0 +1,63 @@
+"""Names amid a rest, asked once more when all names are in.
+
+A name is held against other forms when it is found.  By then the rest has no frame yet, or another
+name had taken a part of it; beside a rest, its spectrum stands for it, in which a slow course is
+noise that happens to look like the name.  In the end what is left has a frame.  Where that frame's
+course, or another free form, is likelier than a name, which keeps less than half of its evidence
+beside it (and, beside a course in time, which is free to follow any slow cause, no more than would
+be an unknown), the name has only a part of the rest.  And a name that is worth less than the rest,
+no larger than what every sensor has of itself, is not said, as beside a real room (`beside`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ahrsd.mismatch import unknown
+from ahrsd.mismatch.beside import material
+from ahrsd.mismatch.locate import UNITS, coarse_cut, frame_columns
+from ahrsd.mismatch.rivals import OWN_SHARE, compared, more
+from ahrsd.mismatch.search import State, Survey, formed_basis_of, term_group, without_term
+from ahrsd.mismatch.stand_ins import dropped, frame_of, wrong_in_form
+
+
+def without_likelier_forms(
+    state: State, surveys: list[Survey], left: unknown.Remainder
+) -> tuple[State, list[Survey], unknown.Remainder]:
+    """The state without such names, and what is then left; as it was where no rest is."""
+    limits = state.problem.limits
+    while state.named and unknown.detected(left, limits):
+        wrong = wrong_in_form(state, beside=True) or _parts_of_the_rest(state, left)
+        wrong = wrong or _of_sensors_themselves(state, left)
+        if not wrong:
+            break
+        frame = frame_of(state, wrong[0])
+        state, surveys, left = dropped(state, surveys, wrong, left)
+        if not unknown.detected(left, limits):
+            left = replace(left, stood_in=frame)
+    return state, surveys, left
+
+
+def _parts_of_the_rest(state: State, left: unknown.Remainder) -> list[int]:
+    """Names that the course of the strongest frame explains better, and that add little to it."""
+    basis, frame = formed_basis_of(state), left.strongest.frame
+    noise, cut = max(1.0, basis.colour), coarse_cut(basis.context.track)
+    course = basis.whitened([frame_columns(basis.context, frame, cut)])[0] * UNITS[frame]
+    out = []
+    for k, judged in enumerate(state.named):
+        mine = basis.known[:, :, basis.groups[term_group(k)]] * judged.candidate.scale
+        name, form, both = compared(without_term(state, k, basis), mine, course, noise)
+        kept = min(OWN_SHARE * name, state.problem.limits.unknown_nats)
+        if form > name + more(name) and both - form < kept:
+            out.append(k)
+    return out
+
+
+def _of_sensors_themselves(state: State, left: unknown.Remainder) -> list[int]:
+    """Names worth less than the rest that are no larger than what sensors have by themselves."""
+    rest = left.strongest.evidence
+    return [
+        k
+        for k, judged in enumerate(state.named)
+        if judged.evidence < rest and not material(judged.candidate, state.fit.terms[k].value)
+    ]
