@@ -275,7 +275,7 @@ def _paid(what: Score, scale: Array) -> float:
 
 def material(one: Candidate, value: Array) -> bool:
     """Whether a value (p,) is larger than what sensors have by themselves that looks like it."""
-    return float(np.linalg.norm(value)) > OF_ITSELF.get(one.name, 0.0)
+    return one.name not in OF_ITSELF or float(np.linalg.norm(value)) > OF_ITSELF[one.name]
 
 
 def _of_another_form(state: State, number: int, quiet: Base) -> bool:

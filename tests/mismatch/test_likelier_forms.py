@@ -9,11 +9,13 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.mismatch import likelier_forms, unknown
+from ahrsd.mismatch.beside import material
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.likelier_forms import without_likelier_forms
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, refitted, survey
 from ahrsd.mismatch.track import Spec, Track
 
@@ -88,6 +90,18 @@ def test_where_nothing_is_left_nothing_is_asked(track: Track, monkeypatch) -> No
     given = named(swung(with_field(track, (warm - 20.0) / 5.0, 3e-3), warm), TEMPERATURE)
     assert not unknown.detected(given[2], LIMITS)
     assert without_likelier_forms(*given) == given
+
+
+def test_only_what_every_sensor_has_of_itself_has_a_bar() -> None:
+    """A delay has been taken out of the track: its term is next to nothing, and it stays."""
+    delay, mount, scale = (
+        Candidate(EFFECTS[name], {}, 1, 0.0)
+        for name in ("mag_time_lag", "mag_gyro_misalignment", "gyro_scale")
+    )
+    assert material(delay, np.zeros(1))
+    assert not material(mount, np.array([0.03, 0.0, 0.04]))
+    assert material(mount, np.array([0.04, 0.0, 0.04]))
+    assert not material(scale, np.array([0.0, 0.039, 0.0]))
 
 
 def test_a_mount_no_worse_than_any_is_not_said_amid_more(track: Track) -> None:
