@@ -4,8 +4,8 @@ A name is held against other forms when it is found.  By then the rest has no fr
 name had taken a part of it; beside a rest, its spectrum stands for it, in which a slow course is
 noise that happens to look like the name.  In the end what is left has a frame.  Where that frame's
 course, or another free form, is likelier than a name, which keeps less than half of its evidence
-beside it (and, beside a course in time, which is free to follow any slow cause, no more than would
-be an unknown), the name has only a part of the rest.  And a name that is worth less than the rest,
+beside it (one by a logged cause, which a course is free to follow, no more than would be an
+unknown), the name has only a part of the rest.  And a name that is worth less than the rest,
 no larger than what every sensor has of itself, is not said, as beside a real room (`beside`).
 """
 
@@ -16,9 +16,11 @@ from dataclasses import replace
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.beside import material
 from ahrsd.mismatch.locate import UNITS, coarse_cut, frame_columns
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import OWN_SHARE, compared, more
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, term_group, without_term
 from ahrsd.mismatch.stand_ins import dropped, frame_of, wrong_in_form
+from ahrsd.samples import Array
 
 
 def without_likelier_forms(
@@ -39,18 +41,28 @@ def without_likelier_forms(
 
 
 def _parts_of_the_rest(state: State, left: unknown.Remainder) -> list[int]:
-    """Names that the course of the strongest frame explains better, and that add little to it."""
-    basis, frame = formed_basis_of(state), left.strongest.frame
-    noise, cut = max(1.0, basis.colour), coarse_cut(basis.context.track)
-    course = basis.whitened([frame_columns(basis.context, frame, cut)])[0] * UNITS[frame]
-    out = []
-    for k, judged in enumerate(state.named):
-        mine = basis.known[:, :, basis.groups[term_group(k)]] * judged.candidate.scale
-        name, form, both = compared(without_term(state, k, basis), mine, course, noise)
-        kept = min(OWN_SHARE * name, state.problem.limits.unknown_nats)
-        if form > name + more(name) and both - form < kept:
-            out.append(k)
-    return out
+    """Names that the course of a frame explains better, and that add little to it."""
+    basis, limits = formed_basis_of(state), state.problem.limits
+    cut = coarse_cut(basis.context.track)
+    frames = [frame for frame, one in left.located.items() if one.evidence > limits.unknown_nats]
+    columns = basis.whitened([frame_columns(basis.context, frame, cut) for frame in frames])
+    courses = [part * UNITS[frame] for part, frame in zip(columns, frames, strict=True)]
+    return [k for k in range(len(state.named)) if any(_part(state, k, basis, c) for c in courses)]
+
+
+def _part(state: State, number: int, basis: Base, course: Array) -> bool:
+    """Whether a term is a part of a course (N, 3, q), whitened and in its unit.
+
+    A course is free to follow a slow cause that was logged: such a name may add less to it.
+    """
+    candidate, limits = state.named[number].candidate, state.problem.limits
+    mine = basis.known[:, :, basis.groups[term_group(number)]] * candidate.scale
+    noise = max(1.0, basis.colour)
+    name, form, both = compared(without_term(state, number, basis), mine, course, noise)
+    kept = OWN_SHARE * name
+    if "covariate" in candidate.setting:
+        kept = min(kept, limits.unknown_nats)
+    return form > name + more(name) and both - form < kept
 
 
 def _of_sensors_themselves(state: State, left: unknown.Remainder) -> list[int]:

@@ -11,6 +11,8 @@ every name is compared with
               model of hysteresis) in directions all over the sphere
     matrix    a mount, soft iron or scales that change slowly: a matrix on the field, any in time,
               about one that stays
+    shape     of a curved reading: a field in sensor axes that depends on the field's direction in
+              any smooth way, as one does that goes with the vehicle's heading
     spell     of a jump or a bump of the field outside: an error of the gyro for a while around it
 
 each a random effect whose size is found by marginal likelihood, which makes it pay for its
@@ -24,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 
@@ -57,6 +59,9 @@ RELAYS = (0.3, 0.55)
 SLOW = 3
 #: the name of a turn of the mount that stays: none is held against itself
 MOUNT = "mag_gyro_misalignment"
+#: names of a reading that is curved in the field, and degrees of a smooth function of direction
+CURVED = ("mag_nonlinearity", "mag_cross_axis")
+DEGREES = (3, 4)
 #: reach of a spell to either side, and its stretches, seconds
 SPELL_S, STRETCH_S = 60.0, 10.0
 _SMALL = -5.0  # logarithm of a deviation to begin with: next to nothing
@@ -86,7 +91,8 @@ def of_another_form(
         own = own[:1] if beside else own
         spell = _spell(basis, state.named[k].candidate, mine)
         matrix = changing if name == MOUNT else bending
-        others = (*free, matrix, *spell)
+        shape = [_shape(basis)] if name in CURVED else []
+        others = (*free, matrix, *spell, *shape)
         if any(_rivals(left, mine, part, noise, 1.0) for part in own) or any(
             _rivals(left, mine, part, noise, OWN_SHARE, alone=beside) for part in others
         ):
@@ -203,6 +209,22 @@ def by_matrix(context: Context) -> Columns:
     slow = np.cos(phase[:, None] * np.arange(1, SLOW + 1))
     values = slow[:, :, None] * context.field_b[:, None, :]
     return every_direction(values.reshape(len(phase), -1))
+
+
+def _shape(basis: Base) -> Array:
+    """Whitened columns of a field that depends on the field's direction."""
+    return np.asarray(basis.whitened([by_shape(basis.context)])[0] * UNIT_GAUSS)
+
+
+def by_shape(context: Context) -> Columns:
+    """A field in sensor axes by products of three and four components of the field's direction.
+
+    Lower degrees are the calibration and, on a sphere, contained in these.
+    """
+    unit = context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True)
+    chosen = [one for degree in DEGREES for one in combinations_with_replacement(range(3), degree)]
+    values = np.column_stack([np.prod(unit[:, one], axis=1) for one in chosen])
+    return every_direction(values - values.mean(axis=0))
 
 
 def by_mount(context: Context) -> Columns:

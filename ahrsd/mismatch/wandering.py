@@ -32,11 +32,13 @@ from ahrsd.mismatch.search import (
     survey,
     without_term,
 )
-from ahrsd.mismatch.selection import likelihood
+from ahrsd.mismatch.selection import likelihood, noise_in
 from ahrsd.mismatch.sought import Sought, sought
 from ahrsd.mismatch.stand_ins import LEAST_SHARE, end_where_they_began
 
 NAME = "gyro_bias_drift"
+#: no gyro's bias wanders by more: a degree per second in five minutes
+LARGEST_WALK_RAD_S_SQRT_S = 1e-3
 #: of that size, which are tried
 FACTORS = (1.0, 2.0)
 #: nats by which a jump and one back must be likelier than a walk: eight numbers at about four each
@@ -59,7 +61,7 @@ def wandering(found: Sought) -> Sought:
     size = max(_size(left, limits), _size(_without_the_walk(found.before), limits))
     if size < ORDINARY_WALK_RAD_S_SQRT_S and state.walk:
         size = _size(_with_a_bias_that_stays(state), limits)
-    if size < ORDINARY_WALK_RAD_S_SQRT_S:
+    if not ORDINARY_WALK_RAD_S_SQRT_S <= size <= LARGEST_WALK_RAD_S_SQRT_S:
         return found
     for factor in FACTORS:
         wider = settled(refitted(replace(state, walk=factor * size), ()))
@@ -76,7 +78,8 @@ def _with_its_name(found: Sought) -> Sought | None:
     """The bias that wanders in the filter named, as it is judged where it wanders less.
 
     None where another name is likelier there.  Of a walk the few modes of the name explain a part:
-    it has the nats by which the wider walk in the filter is likelier, if those are more.
+    it has the nats by which the wider walk in the filter is likelier, if those are more, in the
+    noise that the evidence is in.
     """
     names = found.state.named
     ordinary = refitted(replace(found.state, walk=ORDINARY_WALK_RAD_S_SQRT_S), names)
@@ -87,7 +90,7 @@ def _with_its_name(found: Sought) -> Sought | None:
     judged = judge(
         mine, gram, columns[NAME], seen.basis, len(seen.candidates), found.state.problem.limits
     )
-    wider = likelihood(found.state) - likelihood(ordinary) - SIZE_NATS
+    wider = (likelihood(found.state) - likelihood(ordinary)) / noise_in(seen) - SIZE_NATS
     judged = replace(judged, evidence=max(judged.evidence, wider))
     state = refitted(found.state, (*names, judged))
     if shares_of(state, len(names), seen, found.last)[NAME] <= LEAST_SHARE:

@@ -17,8 +17,16 @@ from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import base
-from ahrsd.mismatch.rivals import by_matrix, by_memory, by_mount, compared, of_another_form
+from ahrsd.mismatch.regression import base, columns_of
+from ahrsd.mismatch.rivals import (
+    _shape,
+    by_matrix,
+    by_memory,
+    by_mount,
+    compared,
+    more,
+    of_another_form,
+)
 from ahrsd.mismatch.search import State, formed_basis_of, refitted, survey
 from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.track import Spec, Track
@@ -81,6 +89,30 @@ def test_a_mount_that_stays_crooked_is_held_against_no_other_that_stays(track: T
     assert widths == [9, 27]
     assert asked[-1] == 27
     assert asked.count(36) == 1  # by the rate
+
+
+def test_a_field_that_goes_with_the_heading_is_no_curved_reading(track: Track) -> None:
+    """A turret that turns against the heading: the fourth harmonic, in the vehicle's own axes."""
+    R_nb = fit_null(track, walk=False).context().R_nb
+    yaw = Rotation.from_matrix(R_nb).as_euler("ZYX")[:, :1]
+    field = np.cos(4 * yaw) * np.array([0.6, -0.8, 0.0]) + np.sin(4 * yaw) * np.array([0, 0.6, 0.8])
+    turret = replace(track, mag_b_gauss=track.mag_b_gauss + 1.5e-3 * field)
+    told, form, both = held_against_shape(turret, "mag_cross_axis")
+    assert form > told + more(told)
+    assert both < form + 7.0
+    curved = made(Trial(11, (("mag_cross_axis", 2.0),), samples=7500)).track
+    told, form, _ = held_against_shape(curved, "mag_cross_axis")
+    assert told > 100.0
+    assert form < told + more(told)
+
+
+def held_against_shape(track: Track, name: str) -> tuple[float, float, float]:
+    """Nats of a name, of a field by the field's direction, and of both."""
+    problem, cold = problem_of(track, Spec(), {name: EFFECTS[name]}, LIMITS)
+    seen = survey(State(problem, fit_null(problem.track, problem.spec, cold, walk=False)))
+    (one,) = seen.candidates
+    mine = columns_of(seen.basis, [one])[name] * one.scale
+    return compared(seen.basis, mine, _shape(seen.basis), 1.0)
 
 
 def named(track: Track, name: str) -> State:

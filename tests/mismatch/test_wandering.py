@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.mismatch import wandering as walks
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.search import State
 from ahrsd.mismatch.wandering import went_and_came
 
 
@@ -41,6 +45,26 @@ def test_a_walk_that_the_names_few_modes_hardly_show_is_named_too(track, seed, s
     found = diagnose(walked)
     assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
     assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize(("size", "asked"), [(2e-6, False), (2e-5, True), (1e-2, False)])
+def test_a_walk_is_asked_for_that_a_gyro_can_have(monkeypatch, size, asked):
+    """A room that a real recording cannot explain looks like a walk of ten mrad/s a root second."""
+    fitted_walks = []
+
+    def refit(state, named):
+        fitted_walks.append(state.walk)
+        raise LookupError
+
+    monkeypatch.setattr(walks, "_size", lambda *_: size)
+    monkeypatch.setattr(walks, "refitted", refit)
+    monkeypatch.setattr(walks.unknown, "detected", lambda *_: True)
+    located = {"gyro": SimpleNamespace(evidence=90.0), "sensor": SimpleNamespace(evidence=1.0)}
+    state = State(SimpleNamespace(limits=LIMITS), None)
+    found = SimpleNamespace(state=state, before=state, left=SimpleNamespace(located=located))
+    with pytest.raises(LookupError) if asked else nullcontext():
+        assert walks.wandering(found) is found
+    assert fitted_walks == ([size] if asked else [])
 
 
 @pytest.mark.slow
