@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
@@ -65,7 +66,7 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
                 break
             state, last = more, survey(more)
             continue
-        best = _which_change(simplest(accepted), state, last)
+        best = _which_change(simplest(accepted), state, last, broken)
         if best.candidate.name in state.names and closer < len(state.named):
             state, closer = shaped_again(state, newest=True), len(state.named)
         elif best.candidate.name in WANDERING and not state.walk:
@@ -80,15 +81,18 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
     return state, first, last
 
 
-def _which_change(best: Judged, state: State, seen: Survey) -> Judged:
+def _which_change(best: Judged, state: State, seen: Survey, broken: Set[str]) -> Judged:
     """Of a gyro bias that surely changes the likeliest name, though few blocks show it.
+
+    broken: names that the joint fit does not bear out
 
     That the bias changes beyond what an ordinary one wanders is proven by a name that passes.  How
     is for the evidence to say, also of a name whose own blocks are too few to know each other.
     """
     if best.candidate.name != WANDERING[0] or not state.walk:
         return best
-    likeliest = max(seen.judged, key=lambda judged: judged.evidence)
+    asked = [judged for judged in seen.judged if judged.candidate.name not in broken]
+    likeliest = max(asked, key=lambda judged: judged.evidence, default=best)
     few = likeliest.candidate.name in CAUSED and likeliest.refused == (ROBUST,)
     ahead = likeliest.evidence > best.evidence + state.problem.limits.lead_nats
     return likeliest if few and ahead else best

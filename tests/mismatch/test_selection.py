@@ -82,14 +82,35 @@ DRIFT = judged("gyro_bias_drift", 20.4)
 def test_how_a_bias_changes_is_for_the_evidence_to_say(walk, others, said) -> None:
     state = SimpleNamespace(walk=walk, problem=SimpleNamespace(limits=LIMITS))
     seen = SimpleNamespace(judged=(*others, DRIFT))
-    assert _which_change(DRIFT, state, seen).candidate.name == said
+    assert _which_change(DRIFT, state, seen, set()).candidate.name == said
+    # what the joint fit does not bear out is not asked again
+    assert _which_change(DRIFT, state, seen, {"gyro_startup"}) is DRIFT
+
+
+def test_a_cause_that_the_joint_fit_does_not_bear_out_is_tried_once(monkeypatch) -> None:
+    """Then the bias wanders: the search ends."""
+    drift, cause = judged("gyro_bias_drift", 20.4), judged("gyro_startup", 28.6, ROBUST)
+    for one, accepted in ((drift, True), (cause, False)):
+        one.accepted = accepted
+    tried, problem = [], SimpleNamespace(limits=LIMITS)
+
+    def add(state: State, what) -> State:
+        tried.append(what.candidate.name)
+        return SimpleNamespace(named=(what,) * 5, problem=problem)
+
+    seen = SimpleNamespace(judged=(cause, drift), candidates=())
+    monkeypatch.setattr(selection, "survey", lambda _: seen)
+    monkeypatch.setattr(selection, "added", add)
+    monkeypatch.setattr(selection, "borne_out", lambda _a, _b, what, _c: what is drift)
+    forward(SimpleNamespace(named=(), names=(), walk=5e-6, problem=problem))
+    assert tried == ["gyro_startup", "gyro_bias_drift"]
 
 
 def test_no_other_name_is_asked_how_a_bias_changes() -> None:
     state = SimpleNamespace(walk=5e-6, problem=SimpleNamespace(limits=LIMITS))
     scale = judged("gyro_scale", 12.0)
     seen = SimpleNamespace(judged=(judged("gyro_startup", 28.6, ROBUST), scale))
-    assert _which_change(scale, state, seen) is scale
+    assert _which_change(scale, state, seen, set()) is scale
 
 
 @pytest.fixture(scope="module")
