@@ -6,6 +6,7 @@ namespaces. Needs root, `unshare`, `nsenter` and systemd; `why_not()` says which
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -25,6 +26,7 @@ e2scrub_all fstrim
 # $1: working folder (a tmpfs); $2: folder with the unit files
 _BOOT = r"""
 set -e
+PATH="$PATH:/usr/sbin:/sbin"  # chroot is there
 mount --make-rprivate /
 mkdir -p $1/upper $1/work $1/root
 mount -t overlay overlay -o lowerdir=/,upperdir=$1/upper,workdir=$1/work $1/root
@@ -152,7 +154,8 @@ class RealSystemd:
 
     def __exit__(self, *_: object) -> None:
         if self._init:
-            os.kill(self._init, signal.SIGKILL)  # PID 1 of the namespace: everything in it ends
+            with contextlib.suppress(ProcessLookupError):  # it may have ended by itself
+                os.kill(self._init, signal.SIGKILL)  # PID 1 of the namespace: all in it ends
         if self._process is not None:
             self._process.kill()
             self._process.wait(10)
