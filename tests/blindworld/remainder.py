@@ -18,7 +18,11 @@ All that is taken as noise, and measured: two spectra, across the field and alon
   noise with them.  A delay of the magnetometer is fitted beside them: it is no noise.
 * Signal to noise of a difference (mag, gyro), with w = 1/power and the calibration's columns
   projected out: the root of  min over columns N of  sum_k w_k |D_k - N_k z|^2.  For D:
-      u changes by R M dm + x cross u,    x_k = sum_(j<=k) R_j dw_j dt.
+      u changes by R M dm + x cross h,    x_k = sum_(j<=k) R_j dw_j dt.
+  There and in the columns stands the field h that does not move (mean direction and usual size of
+  u), not u itself: a turn of half a radian would show as half of the noise, at all frequencies,
+  though noise that is turned is the same noise; and a soft iron that takes up an effect would be
+  as dear as that.
 
 * What a spectrum does not say.  A remainder that is not stationary (a room walked through, iron
   that creeps) looks more like a step than noise of its spectrum does.  `score` measures that with
@@ -79,7 +83,7 @@ def steps_of(time_s):
 
 
 def _transformed(u):
-    """Cosine coefficients (K - 1, 3) of a series (K, 3), without the mean's."""
+    """Cosine coefficients (K - 1, ...) of a series (K, ...), without the mean's."""
     return dct(u, type=2, axis=0, norm="ortho")[1:]
 
 
@@ -135,13 +139,15 @@ def spectrum(coefficients, free=None):
 class Remainder:
     """A fitted recording.
 
-    turn (K, 3, 3), inverse soft iron (3, 3), reading in the world (K, 3), noise power (K - 1, 3),
-    the calibration's columns (K - 1, 3, 11), steps (K,) s, own delay of the magnetometer in s
+    turn (K, 3, 3), inverse soft iron (3, 3), reading in the world (K, 3), field there (3,), noise
+    power (K - 1, 3), the calibration's columns (K - 1, 3, 11), steps (K,) s, own delay of the
+    magnetometer in s
     """
 
     turn: np.ndarray
     inverse: np.ndarray
     world: np.ndarray
+    field: np.ndarray
     power: np.ndarray
     columns: np.ndarray
     steps_s: np.ndarray
@@ -164,7 +170,7 @@ class Remainder:
         """Differences in units of the noise, without what a calibration would take up."""
         turned = np.cumsum(np.einsum("kij,kj->ki", self.turn, gyro * self.steps_s[:, None]), axis=0)
         seen = np.einsum("kij,jl,kl->ki", self.turn, self.inverse, mag)
-        seen = seen + np.cross(turned, self.world)
+        seen = seen + np.cross(turned, self.field)
         weight = 1 / np.sqrt(self.power)
         left = (weight * _transformed(seen)).ravel()
         N = (weight[:, :, None] * self.columns).reshape(len(left), -1)
@@ -227,4 +233,8 @@ def fit(time_s, mag, gyro):
         if number >= len(_FIRST_HZ) - 1:
             taken = np.einsum("ij,jk,ik->i", C_w, np.linalg.inv(G), C_w).reshape(power.shape)
             power = spectrum(left + C @ step, 1 - taken)
-    return Remainder(turn, inverse, world, power, C[:, :, :11], steps, delay)
+    field = np.mean(world, axis=0)
+    field *= np.sqrt(np.mean(np.sum(world**2, axis=1))) / np.linalg.norm(field)
+    reading = (np.einsum("kji,j->ki", turn, field) + c) @ np.linalg.inv(inverse)
+    columns = _columns(turn, reading, inverse, field, steps)[:, :, :11]
+    return Remainder(turn, inverse, world, field, power, _transformed(columns), steps, delay)

@@ -71,6 +71,14 @@ def test_bands_cover_everything_once():
         assert np.min(np.diff(edges)) >= min(count, 14)
 
 
+def test_noise_that_is_turned_does_not_show(simulated):
+    """All is turned by half a radian once, before the first reading: nothing tells of it."""
+    own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
+    once = np.zeros_like(simulated.gyro)
+    once[0] = np.array([0.3, -0.4, 0.0]) / own.steps_s[0]
+    assert own.signal_to_noise(np.zeros_like(simulated.mag), once) < 3.0
+
+
 def test_signal_to_noise_is_the_ideal_observers_where_noise_is_white(simulated):
     own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
     ratio = np.array([own.signal_to_noise(*d) for d in simulated.differences]) / simulated.ideal
