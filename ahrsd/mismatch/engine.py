@@ -153,7 +153,8 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     burst_nats = 0.0 if short is None else short.evidence_nats
     state, surveys, left = without_passing(state, surveys, left, burst_nats)
     left = _refined(start, state, left, short)
-    fewer = without_likelier_forms(state, surveys, left)
+    against_rest = frozenset(state.names) - frozenset(done.state.names)
+    fewer = without_likelier_forms(state, surveys, left, against_rest)
     if fewer[0] is not state:
         state, surveys, rest = fewer
         left = _refined(start, state, framed(formed_basis_of(state), rest, problem.limits), short)

@@ -7,14 +7,20 @@ course, or another free form, is likelier than a name, which keeps less than hal
 beside it (one by a logged cause, which a course is free to follow, no more than would be an
 unknown), the name has only a part of the rest.  And a name that is worth less than the rest,
 no larger than what every sensor has of itself, is not said, as beside a real room (`beside`).
+
+What was found against the spectrum of the rest and is worth more than the rest is not asked: a step
+of 1500 nats is no part of a rest of 700, though in white noise, which a room is not, a course in
+time is likelier still.  Nor is a delay: it follows the turns and no course.
 """
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.beside import material
+from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.locate import UNITS, coarse_cut, frame_columns
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import OWN_SHARE, compared, more
@@ -24,13 +30,18 @@ from ahrsd.samples import Array
 
 
 def without_likelier_forms(
-    state: State, surveys: list[Survey], left: unknown.Remainder
+    state: State, surveys: list[Survey], left: unknown.Remainder, beside: Set[str] = frozenset()
 ) -> tuple[State, list[Survey], unknown.Remainder]:
-    """The state without such names, and what is then left; as it was where no rest is."""
+    """The state without such names, and what is then left; as it was where no rest is.
+
+    beside: names that were found against the spectrum of what is left
+    """
     limits = state.problem.limits
     while state.named and unknown.detected(left, limits):
-        wrong = wrong_in_form(state, beside=True) or _parts_of_the_rest(state, left)
-        wrong = wrong or _of_sensors_themselves(state, left)
+        asked = _asked(state, left, beside)
+        wrong = [k for k in wrong_in_form(state, beside=True) if k in asked] if asked else []
+        wrong = wrong or _parts_of_the_rest(state, left, asked)
+        wrong = wrong or _of_sensors_themselves(state, left, asked)
         if not wrong:
             break
         frame = frame_of(state, wrong[0])
@@ -40,14 +51,26 @@ def without_likelier_forms(
     return state, surveys, left
 
 
-def _parts_of_the_rest(state: State, left: unknown.Remainder) -> list[int]:
-    """Names that the course of a frame explains better, and that add little to it."""
+def _asked(state: State, left: unknown.Remainder, beside: Set[str]) -> list[int]:
+    """Names that may be parts of what is left."""
+    rest = left.strongest.evidence
+    return [
+        k
+        for k, name in enumerate(state.names)
+        if name not in DELAYS and not (name in beside and state.named[k].evidence > rest)
+    ]
+
+
+def _parts_of_the_rest(state: State, left: unknown.Remainder, asked: list[int]) -> list[int]:
+    """Of the names asked those that the course of a frame explains better, and that add little."""
+    if not asked:
+        return []
     basis, limits = formed_basis_of(state), state.problem.limits
     cut = coarse_cut(basis.context.track)
     frames = [frame for frame, one in left.located.items() if one.evidence > limits.unknown_nats]
     columns = basis.whitened([frame_columns(basis.context, frame, cut) for frame in frames])
     courses = [part * UNITS[frame] for part, frame in zip(columns, frames, strict=True)]
-    return [k for k in range(len(state.named)) if any(_part(state, k, basis, c) for c in courses)]
+    return [k for k in asked if any(_part(state, k, basis, course) for course in courses)]
 
 
 def _part(state: State, number: int, basis: Base, course: Array) -> bool:
@@ -65,11 +88,12 @@ def _part(state: State, number: int, basis: Base, course: Array) -> bool:
     return form > name + more(name) and both - form < kept
 
 
-def _of_sensors_themselves(state: State, left: unknown.Remainder) -> list[int]:
-    """Names worth less than the rest that are no larger than what sensors have by themselves."""
+def _of_sensors_themselves(state: State, left: unknown.Remainder, asked: list[int]) -> list[int]:
+    """Of the names asked those worth less than the rest that are no larger than sensors' own."""
     rest = left.strongest.evidence
     return [
         k
-        for k, judged in enumerate(state.named)
-        if judged.evidence < rest and not material(judged.candidate, state.fit.terms[k].value)
+        for k in asked
+        if state.named[k].evidence < rest
+        and not material(state.named[k].candidate, state.fit.terms[k].value)
     ]

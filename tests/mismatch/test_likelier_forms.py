@@ -114,8 +114,36 @@ def test_a_mount_no_worse_than_any_is_not_said_amid_more(track: Track) -> None:
     nats = 2 * state.named[0].evidence
     sensor = replace(left.located["sensor"], evidence=nats, p_value=1e-30)
     loud = replace(left, located={**left.located, "sensor": sensor})
-    assert likelier_forms._of_sensors_themselves(state, loud) == [0]
-    assert likelier_forms._of_sensors_themselves(state, left) == []
+    assert likelier_forms._of_sensors_themselves(state, loud, [0]) == [0]
+    assert likelier_forms._of_sensors_themselves(state, loud, []) == []
+    assert likelier_forms._of_sensors_themselves(state, left, [0]) == []
     term = replace(state.fit.terms[0], value=10 * angle + 0.05)
     large = replace(state, fit=replace(state.fit, terms=(term,)))
-    assert likelier_forms._of_sensors_themselves(large, loud) == []
+    assert likelier_forms._of_sensors_themselves(large, loud, [0]) == []
+
+
+def test_what_is_worth_more_than_the_rest_it_was_found_in_stays(track: Track) -> None:
+    """A bump of the gyro beside a step: in white noise one is the other's, in a room it is not."""
+    phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
+    bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([8e-4, -6e-4, 9e-4])
+    bumped = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + bump, covariates={})
+    state, surveys, left = named(bumped, "field_step")
+    rest = left.strongest.evidence
+    found = replace(state, named=(replace(state.named[0], evidence=rest + 1.0),))
+    beside = frozenset({"field_step"})
+    assert without_likelier_forms(found, surveys, left)[0].names == ()
+    assert without_likelier_forms(found, surveys, left, beside)[0] is found
+    weaker = replace(state, named=(replace(state.named[0], evidence=rest - 1.0),))
+    assert without_likelier_forms(weaker, surveys, left, beside)[0].names == ()
+
+
+def test_a_delay_is_no_part_of_a_rest(track: Track) -> None:
+    late = replace(
+        track,
+        mag_b_gauss=np.column_stack(
+            [np.interp(track.time_s - 0.03, track.time_s, one) for one in track.mag_b_gauss.T]
+        ),
+        covariates={},
+    )
+    state, _, left = named(late, "mag_time_lag")
+    assert likelier_forms._asked(state, left, frozenset()) == []
