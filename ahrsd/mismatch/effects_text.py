@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
+import numpy as np
+
 from ahrsd.mismatch import roles
 from ahrsd.mismatch.effects.base import Effect, Parameter
 from ahrsd.mismatch.effects.library import EFFECTS
@@ -97,7 +99,8 @@ def _row(alike: Sequence[tuple[Parameter, float]]) -> str:
     first = alike[0][0]
     names = ", ".join(f"`{parameter.name}`" for parameter, _ in alike)
     typical = ", ".join(f"{value:.3g}" for _, value in alike)
-    return f"| {names} | {first.unit} | {typical} | {first.scale:.3g} | {first.bound:.3g} |"
+    least = "" if np.isinf(first.least) else f"{first.least:.3g} to "
+    return f"| {names} | {first.unit} | {typical} | {first.scale:.3g} | {least}{first.bound:.3g} |"
 
 
 def _anchor(identifier: str) -> str:

@@ -8,9 +8,9 @@ beside it (one by a logged cause, which a course is free to follow, no more than
 unknown), the name has only a part of the rest.  And a name that is worth less than the rest,
 no larger than what every sensor has of itself, is not said, as beside a real room (`beside`).
 
-What was found against the spectrum of the rest and is worth more than the rest is not asked: a step
-of 1500 nats is no part of a rest of 700, though in white noise, which a room is not, a course in
-time is likelier still.  Nor is a delay: it follows the turns and no course.
+A step that was found against the spectrum of the rest and is worth more than the rest is not asked:
+1500 nats are no part of 700, though in white noise, which a room is not, a course in time is yet
+likelier.  Nor is a delay: it follows the turns and no course.
 """
 
 from __future__ import annotations
@@ -24,7 +24,14 @@ from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.locate import UNITS, coarse_cut, frame_columns
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import OWN_SHARE, compared, more
-from ahrsd.mismatch.search import State, Survey, formed_basis_of, term_group, without_term
+from ahrsd.mismatch.search import (
+    STEPS,
+    State,
+    Survey,
+    formed_basis_of,
+    term_group,
+    without_term,
+)
 from ahrsd.mismatch.stand_ins import dropped, frame_of, wrong_in_form
 from ahrsd.samples import Array
 
@@ -53,11 +60,11 @@ def without_likelier_forms(
 
 def _asked(state: State, left: unknown.Remainder, beside: Set[str]) -> list[int]:
     """Names that may be parts of what is left."""
-    rest = left.strongest.evidence
+    rest, sharp = left.strongest.evidence, beside & set(STEPS.values())
     return [
         k
         for k, name in enumerate(state.names)
-        if name not in DELAYS and not (name in beside and state.named[k].evidence > rest)
+        if name not in DELAYS and not (name in sharp and state.named[k].evidence > rest)
     ]
 
 
@@ -89,11 +96,14 @@ def _part(state: State, number: int, basis: Base, course: Array) -> bool:
 
 
 def _of_sensors_themselves(state: State, left: unknown.Remainder, asked: list[int]) -> list[int]:
-    """Of the names asked those worth less than the rest that are no larger than sensors' own."""
-    rest = left.strongest.evidence
+    """Of the names asked those worth less than the rest that are no larger than sensors' own.
+
+    Of a small rest even the form is not much: they must be beyond doubt there, too.
+    """
+    least = max(left.strongest.evidence, state.problem.limits.beyond_nats)
     return [
         k
         for k in asked
-        if state.named[k].evidence < rest
+        if state.named[k].evidence < least
         and not material(state.named[k].candidate, state.fit.terms[k].value)
     ]

@@ -137,8 +137,10 @@ def believable(candidate: Candidate, what: Score, value: Array, colour: float) -
     of 40 degrees, in a spin that shows next to nothing of mounts.
     """
     bounds = np.array([parameter.bound for parameter in candidate.effect.parameters])
+    least = np.array([parameter.least for parameter in candidate.effect.parameters])
     sigma = np.sqrt(np.diag(what.covariance) * colour) if what.rank else np.zeros(len(bounds))
-    return bool(np.all(np.abs(value) <= bounds + np.minimum(BOUND_DEVIATIONS * sigma, bounds / 2)))
+    slack = np.minimum(BOUND_DEVIATIONS * sigma, bounds / 2)
+    return bool(np.all(np.abs(value) <= bounds + slack) and np.all(value >= least - slack))
 
 
 def _without_outliers(candidate: Candidate, columns: Array, left: Array, basis: Base) -> float:

@@ -39,8 +39,6 @@ from ahrsd.samples import Array
 
 #: candidates that are held against the gate in one round, strongest first
 LOOKED_AT = 8
-#: prior of a term in the joint fit, in its own prior deviations: next to none
-LOOSE = 30.0
 #: settings that are a form of the course, of which another may be likelier once all is fitted
 FORMS = ("power", "form", "shape", "of", "products")
 #: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
@@ -306,33 +304,9 @@ def fitted_term(candidate: Candidate, value: Array) -> FittedTerm:
         identifier=candidate.name,
         columns=partial(candidate.effect.columns, setting=candidate.setting),
         value=value,
-        scale=LOOSE * candidate.scale,
+        scale=candidate.effect.loose * candidate.scale,
         setting=dict(candidate.setting),
     )
-
-
-def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
-    """Each term held against every other name for what it explains; surveys without each term.
-
-    A term gives way to another that explains the same better; the new one is fitted in its place.
-    last: the survey of the state, renewed if need be.
-    """
-    surveys: list[Survey] = []
-    for k in range(len(state.named)):
-        name = state.named[k].candidate.name
-        seen, mine = _without(state, k, last.basis)
-        rivals = [
-            (in_its_place(j.candidate, last), j)
-            for j in seen.judged
-            if j.accepted and j.candidate.name != name
-        ]
-        most, best = max(rivals, key=lambda one: one[0], default=(mine, state.named[k]))
-        if most > mine and name not in DELAYS and counterpart(state, k) is None:
-            state = refitted(state, (*state.named[:k], best, *state.named[k + 1 :]))
-            last = survey(state)
-            seen, _ = _without(state, k, last.basis)
-        surveys.append(seen)
-    return state, surveys, last
 
 
 def counterpart(state: State, number: int) -> int | None:
@@ -362,12 +336,3 @@ def without_term(state: State, number: int, basis: Base | None = None) -> Base:
     if state.named[number].candidate.name in DELAYS:
         value = np.array([state.lag_s(number)])
     return basis.without(term_group(number), value)
-
-
-def _without(state: State, number: int, basis: Base) -> tuple[Survey, float]:
-    """The survey without one term of the state's basis, and the term's own evidence in it."""
-    left = without_term(state, number, basis)
-    others = tuple(j for i, j in enumerate(state.named) if i != number)
-    own = state.named[number].candidate
-    seen, name = survey(replace(state, named=others), left, own), own.name
-    return seen, max((c.evidence for c in seen.candidates if c.name == name), default=0.0)

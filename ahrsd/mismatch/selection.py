@@ -178,6 +178,20 @@ def likelihood(state: State) -> float:
     return fit.log_likelihood + 0.5 * float(count * (size - 1.0 - np.log(max(size, 1e-12))))
 
 
+def ahead(one: tuple[State, Judged], other: tuple[State, Judged], seen: Survey) -> float:
+    """Nats by which a state with one name is likelier than one with another in its place.
+
+    By the joint fits.  Coefficients are paid for as in the survey without either, `seen`.
+    """
+    noise = noise_in(seen)
+
+    def nats(state: State, judged: Judged) -> float:
+        paid = float(judged.what.statistic) / 2 / noise - judged.evidence
+        return likelihood(state) / noise - paid
+
+    return nats(*one) - nats(*other)
+
+
 def stepped(state: State) -> State:
     """Steps where the strongest frame's course changes, if a few of them explain nearly all of it.
 

@@ -12,9 +12,10 @@ from ahrsd.mismatch.exam import examined, paired, pruned
 from ahrsd.mismatch.imitators import without_imitators
 from ahrsd.mismatch.nested import eddies_alone
 from ahrsd.mismatch.often import logged_often
-from ahrsd.mismatch.search import State, Survey, survey, swapped
+from ahrsd.mismatch.search import State, Survey, survey
 from ahrsd.mismatch.selection import forward
 from ahrsd.mismatch.stand_ins import TIME_SHAPED, without_stand_ins, without_unlikely
+from ahrsd.mismatch.swapping import swapped
 from ahrsd.mismatch.twins import told_apart
 from ahrsd.mismatch.unknown import Remainder
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.search import (
     State,
     Survey,
@@ -20,7 +19,7 @@ from ahrsd.mismatch.search import (
     survey,
     without_term,
 )
-from ahrsd.mismatch.selection import likelihood, noise_in
+from ahrsd.mismatch.selection import ahead
 
 _NAMES = ("hard_iron_drift", "onboard_calibration_active")
 _NEAR = 0.1  # part of a name's evidence by which its twin's may be less and the joint fit is asked
@@ -67,13 +66,8 @@ def _likelier(state: State, number: int, seen: Survey) -> tuple[State, float] | 
     named[number] = its
     here = shaped_again(state, newest=True)
     there = shaped_again(refitted(state, tuple(named)), newest=True)
-    noise = noise_in(seen)
-    more = (likelihood(there) - likelihood(here)) / noise - _paid(its, noise) + _paid(mine, noise)
+    more = ahead((there, its), (here, mine), seen)
     return (there if more > 0.0 else here), abs(more)
-
-
-def _paid(judged: Judged, noise: float) -> float:
-    return float(judged.what.statistic) / 2 / noise - judged.evidence
 
 
 def _behind(seen: Survey, name: str, nats: float) -> Survey:

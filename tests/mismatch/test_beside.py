@@ -258,7 +258,7 @@ def test_a_lamp_that_a_free_course_explains_as_well_is_asked_for_beside_the_rest
         ("motor_current_field", {"covariate": "motor_current_a"}, 20.0),
         ("mag_bias_temperature", {"covariate": "temperature_c"}, 35.0),
         ("mag_time_lag", {}, 35.0),
-        ("hard_iron_step", {"onset_s": 9.0}, 100.0),
+        ("hard_iron_step", {"onset_s": 9.0}, 75.0),
         ("gyro_bias_step", {"onset_s": 9.0}, 25.0),
     ],
 )

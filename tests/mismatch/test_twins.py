@@ -9,8 +9,9 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.search import State, Survey, added, refitted, survey, swapped
+from ahrsd.mismatch.search import State, Survey, added, refitted, survey
 from ahrsd.mismatch.stand_ins import shares_of
+from ahrsd.mismatch.swapping import swapped
 from ahrsd.mismatch.track import Spec
 from ahrsd.mismatch.twins import told_apart
 

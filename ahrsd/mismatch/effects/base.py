@@ -24,13 +24,15 @@ BOUND_DEVIATIONS = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One coefficient: its name, unit, how large it physically is (one prior deviation), and the
-    size beyond which it is not believed."""
+    """One coefficient: its name, unit, how large it physically is (one prior deviation), the size
+    beyond which it is not believed, and the value below which it is not, of either sign if left
+    out."""
 
     name: str
     unit: str
     scale: float
     bound: float
+    least: float = -np.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +77,8 @@ class Effect(ABC):
     unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
                  them is the noise of its own columns, and what is known is the prior
     form_share:  part of its evidence that its columns may leave, where they are not exact
+    loose:       prior of its parameters in the joint fit, in their own prior deviations: next to
+                 none, unless the columns themselves follow what is fitted
     """
 
     identifier: str
@@ -95,6 +99,7 @@ class Effect(ABC):
     frame: str | None = None
     unseen: tuple[tuple[float, ...], ...] = ()
     form_share: float = 0.0
+    loose: float = 30.0
 
     @property
     def least_information(self) -> float:

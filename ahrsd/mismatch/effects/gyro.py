@@ -19,6 +19,9 @@ from ahrsd.mismatch.effects.base import (
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
+#: by which the earth turns among the stars: no axis has more of it
+SIDEREAL_RAD_S = 7.292e-5
+
 
 class GyroScale(Linear):
     """G1."""
@@ -147,7 +150,7 @@ class EarthRotation(Linear):
     words = "the turning of the earth, which the gyro reads and the field does not show"
     equation = "w += R^T omega_E"
     parameters = tuple(
-        Parameter(f"rate_{e}", "rad/s", 5e-5, 2e-4) for e in ("north", "east", "down")
+        Parameter(f"rate_{e}", "rad/s", 5e-5, SIDEREAL_RAD_S) for e in ("north", "east", "down")
     )
     typical = (4.7e-5, 0.0, -5.6e-5)
     signature = "a gyro bias that is constant in the world"

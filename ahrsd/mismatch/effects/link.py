@@ -288,7 +288,8 @@ class OnboardCalibrationActive(Effect):
     equation = (
         "m += s(t) (k (h - m) + g h), h = A^-1 (m - b), s ~ 1 - exp(-(t - t0)/tau), 1 at the end"
     )
-    parameters = (Parameter("part", "1", 1.0, 2.0), Parameter("gain", "1", 0.1, 0.5))
+    # a compensation takes hard iron away: less than a hundredth of it, or more of it, is a drift
+    parameters = (Parameter("part", "1", 1.0, 2.0, least=0.01), Parameter("gain", "1", 0.1, 0.5))
     typical = (0.8, 0.0)
     frame = "sensor"
     signature = "hard and soft iron creep or jump with no cause outside"
