@@ -75,3 +75,26 @@ def test_a_name_goes_only_where_its_coefficients_are_beyond_doubt(track):
     assert examined(added(state, near))[0].names == (NAME,)
     _, far = _bounded(track, float(size[largest] - 2 * BOUND_DEVIATIONS * sigma))
     assert far.refused == ("physical bounds",)
+
+
+@pytest.mark.parametrize(
+    ("part", "sigma", "believed"),
+    [(0.05, 1e-3, True), (8e-3, 1e-3, True), (2e-3, 3e-4, False), (-0.012, 1e-3, False)],
+)
+def test_a_compensation_takes_hard_iron_away(part: float, sigma: float, believed: bool) -> None:
+    """Next to nothing of it, or more of it, is a drift."""
+    candidate = Candidate(EFFECTS["onboard_calibration_active"], {}, 1, 0.0)
+    G = np.diag([sigma**-2, 1e8])
+    value = np.array([part, 1e-3])
+    what = total_score(G, G @ value, np.diag(G), candidate.scale, 0.0)
+    np.testing.assert_allclose(what.value, value, atol=1e-9)
+    assert believable(candidate, what, value, 1.0) == believed
+
+
+def test_no_axis_turns_faster_than_the_earth() -> None:
+    candidate = Candidate(EFFECTS["earth_rotation"], {}, 1, 0.0)
+    G = np.eye(3) * 5e-6**-2
+    for east, believed in ((7.2e-5, True), (8.6e-5, True), (9.2e-5, False)):
+        value = np.array([1e-5, east, -1e-5])
+        what = total_score(G, G @ value, np.diag(G), candidate.scale, 0.0)
+        assert believable(candidate, what, value, 1.0) == believed

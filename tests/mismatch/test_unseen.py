@@ -1,16 +1,22 @@
-"""A mount that bends by the same in all directions turns the outside field, and nothing else."""
+"""A mount that bends alike in all directions turns the outside field; what else no motion shows."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from mismatch_trials import Trial, made
 from scipy.spatial.transform import Rotation
 
 from ahrsd.mismatch.effects.base import Readings
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.effects.shapes import GRAVITY_M_S2
 from ahrsd.mismatch.findings import with_unseen
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.regression import Candidate
+from ahrsd.mismatch.search import State, added, survey
+from ahrsd.mismatch.track import Spec
 
 MOUNT = EFFECTS["flexible_mount"]
 
@@ -44,3 +50,18 @@ def test_what_no_motion_shows_is_known_as_the_prior_knows_it():
     assert told[~np.eye(3, dtype=bool)] == pytest.approx(np.full(6, 3e-4))
     plain = Candidate(EFFECTS["hard_iron_step"], {"onset_s": 1.0}, 1, 0.0)
     assert with_unseen(plain, np.full(3, 2e-4)) == pytest.approx(np.full(3, 2e-4))
+
+
+def test_a_change_of_the_outside_field_does_not_turn_the_world(monkeypatch) -> None:
+    """North is where the field points: what turns it is not seen, and must not run away."""
+    name = "geomagnetic_drift"
+    trial = Trial(6, samples=9_000, sigma_gyro=5e-3, effects=((name, 1.0),))
+    problem, cold = problem_of(made(trial).track, Spec(), {name: EFFECTS[name]}, LIMITS)
+    start = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    judged = survey(start).judged[0]
+    held = added(start, judged)
+    assert np.linalg.norm(held.fit.terms[0].value) < 2.5e-3  # 2.0e-3 is true
+    monkeypatch.setattr(type(EFFECTS[name]), "loose", 30.0)
+    loose = added(start, judged)
+    assert np.linalg.norm(loose.fit.terms[0].value) > 4.5e-3
+    assert held.fit.log_likelihood > loose.fit.log_likelihood
