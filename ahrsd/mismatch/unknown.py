@@ -158,9 +158,11 @@ def beside_names(left: Remainder, price: float, limits: Limits) -> Remainder:
     located = {k: replace(one, evidence=one.evidence - price) for k, one in left.located.items()}
     bins = tuple((one, evidence - price, p) for one, evidence, p in left.bins)
     least, before = limits.unknown_nats, left.strongest.evidence
+    left = replace(left, located=located, bins=bins)
     if before > least > before - price:
-        return replace(left, located=located, bins=bins, stood_in=None, one_source=False)
-    return replace(left, located=located, bins=bins)
+        return replace(left, stood_in=None, one_source=False)
+    # a source needs less than a course: what is left of it must be more than nothing
+    return replace(left, one_source=left.one_source and before > price)
 
 
 def detected(left: Remainder, limits: Limits) -> bool:

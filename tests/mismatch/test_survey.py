@@ -51,6 +51,11 @@ def test_what_large_names_leave_of_their_own_form_is_no_unknown():
     assert not detected(beside_names(found, 41.931, LIMITS), LIMITS)
     assert detected(beside_names(found, 6.0, LIMITS), LIMITS)
     assert beside_names(found, 6.0, LIMITS).strongest.evidence == pytest.approx(18.2)
+    quick = replace(left.located["sensor"], evidence=7.4, p_value=6e-4)
+    source = replace(left, located={**left.located, "sensor": quick}, one_source=True)
+    assert detected(source, LIMITS)
+    assert not detected(beside_names(source, 8.6, LIMITS), LIMITS)
+    assert detected(beside_names(source, 2.0, LIMITS), LIMITS)
 
 
 def test_what_begins_has_a_before_and_an_after():
