@@ -48,9 +48,8 @@ def swapped(state: State, last: Survey) -> tuple[State, list[Survey], Survey]:
 def _replaced(state: State, number: int, judged: Judged, seen: Survey) -> State:
     """The state with a name in another one's place; as it was where the joint fit is worse with it.
 
-    What one name explains, held against the columns of a model fitted with it, looks at another
-    one's size as if that were small: a slow change of the outside field that had 1587 nats before
-    any was named had 118 behind 129 of a drift in the sensor, whose fit was 135 nats worse.
+    Evidence is of columns at a fit that another name has bent: it proposes, and the joint fit with
+    the other name in its best shape decides.
     seen: the survey without the term
     """
     named = list(state.named)

@@ -173,8 +173,8 @@ class GeomagneticDrift(Linear):
     manoeuvre = "all headings throughout; compare with an observatory"
     size = "0.2 to 1 mG a day when quiet, several mG within minutes in storms"
     source = "dossier W3"
-    # north is where the field points: its turn about the vertical is what the world is turned by,
-    # and each fit would let it run further (1.4 mG to 25 over three)
+    # north is where the field points: what turns it about the vertical turns the world as well, is
+    # seen by nothing, and would run away in the joint fit (from 2 mG to 25, dfc55efa of `ring600f`)
     loose = 3.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
