@@ -58,8 +58,8 @@ SAID = ("switched_device", "hard_iron_step", "gyro_bias_step")
 SHARPER_THAN = 5.0
 #: nats that a step must be worth: the largest change of any course is one, to some extent.  Of 20
 #: real recordings three had one of the field of 63 to 106 of their own, none one of the gyro of 15;
-#: of the 50 controls of five semi-real rounds none had one of the hard iron that passed all else and
-#: was worth more than 53
+#: of the 50 controls of five semi-real rounds none had one of the hard iron that passed all else
+#: and was worth more than 53
 STEP_NATS = {"hard_iron_step": 75.0, "field_step": 100.0, "gyro_bias_step": 25.0}
 #: what a room or an unlogged source does from place to place and from minute to minute, and what a
 #: sensor does that is not quite linear: beside a rest such names say no more than the rest does
