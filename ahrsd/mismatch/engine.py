@@ -30,10 +30,10 @@ from ahrsd.mismatch.diagnosis import (
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import rest_of
+from ahrsd.mismatch.explained import explained
 from ahrsd.mismatch.facts import Fact, around_lost_turns, matters
 from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, whole_term
 from ahrsd.mismatch.foretold import without_unforetold
-from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.humming import heard
@@ -41,18 +41,18 @@ from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.likelier_forms import without_likelier_forms
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
-from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
 from ahrsd.mismatch.many_names import one_for_many
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
 from ahrsd.mismatch.null import NullFit, fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
-from ahrsd.mismatch.own_form import free_price_of, price_of, without_trifles
+from ahrsd.mismatch.own_form import without_trifles
 from ahrsd.mismatch.passing import without_passing
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
+from ahrsd.mismatch.refined import left_alone, refined
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.search import (
@@ -65,10 +65,8 @@ from ahrsd.mismatch.search import (
     formed_basis_of,
     settled,
 )
-from ahrsd.mismatch.slow_noise import in_its_noise
 from ahrsd.mismatch.sought import sought
 from ahrsd.mismatch.spectrum import against, spectrum_of
-from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.unplaced import without_unplaced
 from ahrsd.mismatch.values import NullModel, Term
@@ -126,6 +124,7 @@ class _Searched:
     """The null fit, the state with all names, the surveys without each of them, what is left.
 
     short: bursts, where they are what is left;  beside: whether all was fitted anew against a rest
+    alone: what is left where nothing is named, by the limits of that
     """
 
     start: NullFit
@@ -136,6 +135,7 @@ class _Searched:
     left: unknown.Remainder
     short: Unexplained | None = None
     beside: bool = False
+    alone: unknown.Remainder | None = None
 
 
 def _searched(problem: Problem, model: NullModel) -> _Searched:
@@ -152,33 +152,29 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
         left = framed(formed_basis_of(state), left, problem.limits)
     burst_nats = 0.0 if short is None else short.evidence_nats
     state, surveys, left = without_passing(state, surveys, left, burst_nats)
-    left = _refined(start, state, left, short)
+    left = refined(start, state, left, short, problem.limits)
     against_rest = frozenset(state.names) - frozenset(done.state.names)
     fewer = without_likelier_forms(state, surveys, left, against_rest)
     if fewer[0] is not state:
         state, surveys, rest = fewer
-        left = _refined(start, state, framed(formed_basis_of(state), rest, problem.limits), short)
+        rest_framed = framed(formed_basis_of(state), rest, problem.limits)
+        left = refined(start, state, rest_framed, short, problem.limits)
         if not unknown.detected(left, problem.limits):
             left = replace(left, stood_in=rest.strongest.frame)
     if short is not None and short.evidence_nats <= left.strongest.evidence:
         short = None
+    alone = None
+    if short is None and not state.named:
+        state, left, alone = left_alone(start, state, left)
+        named = None if alone is None else explained(state, alone, problem.limits.alone())
+        if named is not None:
+            state, surveys, left = named
+            alone = None
     if short is None and unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
-    return _Searched(start, settled(state), surveys, done.first, done.last, left, short, beside)
-
-
-def _refined(
-    start: NullFit, state: State, left: unknown.Remainder, short: Unexplained | None
-) -> unknown.Remainder:
-    """What is left, in its own noise, beyond what names leave of their forms, by its own form."""
-    limits = state.problem.limits
-    left = in_its_noise(formed_basis_of(state), with_spells(left), limits)
-    left = in_even_noise(formed_basis_of(state), left, limits)
-    left = beside_bursts(state, left, limits)
-    left = unknown.beside_names(left, price_of(state), limits)
-    if short is None and not at_rest(start):
-        left = with_forms(left, free_price_of(state), limits)
-    return left
+    return _Searched(
+        start, settled(state), surveys, done.first, done.last, left, short, beside, alone
+    )
 
 
 def _told(
@@ -204,6 +200,9 @@ def _told(
     )
     seen = (*state.named, *fast.state.named[fast.known :])
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
+    if not (found or left.detected) and done.alone is not None:
+        done = replace(done, left=with_free_course(state, done.alone))
+        left = unknown.described(done.left, problem.block_s, limits.alone())
     something = bool(found) or left.detected
     steps = rounding(facts)
     lesser = (fact.words for fact in facts if not matters(fact))

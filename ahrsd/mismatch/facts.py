@@ -24,6 +24,7 @@ class Fact:
     bad:        (N,) rows whose magnetometer reading is not one, None where all are
     turned:     (N,) how many times as far as the gyro says the sensor turned in the step that ends
                 at the row, nan where nobody knows; None where the gyro is right
+    unseen:     (N,) how many steps are expected to be lost beyond those, in the mean put right too
     stops:      nothing that is fitted before it is put right means anything
     """
 
@@ -35,6 +36,7 @@ class Fact:
     setting: dict[str, Any] = field(default_factory=dict)
     bad: NDArray[np.bool] | None = None
     turned: Array | None = None
+    unseen: Array | None = None
     stops: bool = False
 
 

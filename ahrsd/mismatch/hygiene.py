@@ -163,7 +163,7 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
     where the turn is not known a run ends.  Rows stay as they are in number and order.
     """
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
-    time_s, dt_s = track.time_s, track.dt_s
+    time_s, dt_s, unseen = track.time_s, track.dt_s, track.lost_turns
     for fact in facts:
         if fact.effect == "frame_error":
             gyro = gyro[:, fact.setting["axes"]] * np.array(fact.setting["signs"])
@@ -180,10 +180,19 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
             known = np.isfinite(fact.turned)
             gyro[known] *= fact.turned[known, None]
             dt_s = np.where(known, dt_s, np.nan)
+            unseen = fact.unseen if fact.unseen is not None else unseen
         if fact.bad is not None:
             mag[fact.bad] = np.nan
     runs = track.runs if dt_s is track.dt_s else tuple(series.runs(dt_s))
-    return replace(track, time_s=time_s, dt_s=dt_s, mag_b_gauss=mag, gyro_b_rad_s=gyro, runs=runs)
+    return replace(
+        track,
+        time_s=time_s,
+        dt_s=dt_s,
+        mag_b_gauss=mag,
+        gyro_b_rad_s=gyro,
+        runs=runs,
+        lost_turns=unseen,
+    )
 
 
 def would_have_shown(track: Track) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 State: the field in body axes h, and where the null says so the gyro's wandering bias.
 
     predict  h- = Exp(-(w_k - w_b) dt) h+,   process noise (sigma_gyro dt)^2 (|n|^2 I - n n^T)
+                                             + q q^T,  q = n x (w_k - w_b) dt s
     update   e = m - A h- - b,  S = A P- A^T + sigma_mag^2 I,  K = P- A^T S^-1,  h+ = h- + K e
 
 A gyro turns the field, it does not stretch it, so its noise is tangential to the sphere |h| = r.
@@ -10,7 +11,8 @@ Tangential to the filter's own h, additive updates lengthen h by |step|^2 / 2 r 
 field trend" on every recording.  So n is not the filter's h but a nominal field: the readings,
 smoothed both ways in the frame that the gyro carries along, on the sphere, in the middle of the
 step.  The filter is then linear with gains that do not depend on a single innovation, and with the
-gain held the sensitivities are exact:
+gain held the sensitivities are exact (s: deviation of a turn by those of
+`Track.lost_turns`, a Poisson number, in parts of itself):
 
     T = F H+ - dt [h-]x Jl W_k,   X_k = A T + D_k,   H+ = T - K X_k
 
@@ -195,11 +197,15 @@ def nuisance_columns(filtered: Filtered) -> Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
-    """dt_s (N,), 0 where unknown; turn Exp(-w dt) and lever Jl(-w dt) dt, (N, 3, 3)."""
+    """dt_s (N,), 0 where unknown; turn Exp(-w dt) and lever Jl(-w dt) dt, (N, 3, 3).
+
+    off_rad (N, 3): deviation of the turn, along itself, where turns were lost; None where none were
+    """
 
     dt_s: Array
     turn: Array
     lever: Array
+    off_rad: Array | None = None
 
 
 def _readings(track: Track, model: NullModel, terms: Array | None) -> Array:
@@ -214,7 +220,9 @@ def _motion(track: Track, model: NullModel, terms: Array | None) -> _Motion:
         rate = rate - terms
     dt = np.nan_to_num(track.dt_s, nan=0.0)
     turn, left = so3.exp_and_left_jacobian(-rate * dt[:, None])
-    return _Motion(dt, turn, left * dt[:, None, None])
+    lost = track.lost_turns
+    off = None if lost is None else rate * (track.step_share * dt * np.sqrt(lost))[:, None]
+    return _Motion(dt, turn, left * dt[:, None, None], off)
 
 
 def _orientation(layout: Layout, motion: _Motion, opens: NDArray[np.bool]) -> Array:
@@ -286,6 +294,9 @@ def _linear(
     tangent = np.eye(3) * (size**2)[:, :, None] - middle[:, :, None] * middle[:, None, :]
     process = np.zeros_like(transition)
     process[:, :3, :3] = tangent * np.square(model.sigma_gyro_rad_s * motion.dt_s)[:, None, None]
+    if motion.off_rad is not None:
+        off = np.cross(middle, motion.off_rad)
+        process[:, :3, :3] += off[:, :, None] * off[:, None, :]
     if transition.shape[-1] == 6:
         process[:, [3, 4, 5], [3, 4, 5]] = model.gyro_walk_rad_s_sqrt_s**2 * motion.dt_s[:, None]
     C = np.linalg.inv(model.soft_iron)

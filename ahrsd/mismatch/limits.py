@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,9 @@ class Limits:
     beside_logged_nats: the same of a logged cause that changes often, which no room imitates
     unknown_nats:   evidence of an agnostic frame beyond the names, for "not in my library"
     unknown_p:      its probability under coloured noise
+    alone_nats, alone_p: the same where nothing at all was found, so that no name's own misfit can
+                    be what is left: odds of 8000 to 1.  Of 300 nulls of five noise laws three have
+                    more, errors of a gyro whose bias walks, which are held against a walk besides
     doubt:          what noise model and library do not know, by which every confidence is less:
                     about the share of names with all of the evidence that sealed rings found wrong
                     (docs/challenge.md, "calibration error of the confidence")
@@ -51,8 +54,14 @@ class Limits:
     beside_logged_nats: float = 20.0
     unknown_nats: float = 12.0
     unknown_p: float = 1e-6
+    alone_nats: float = 9.0
+    alone_p: float = 1e-4
     doubt: float = 0.01
     most_terms: int = 5
+
+    def alone(self) -> Limits:
+        """The limits of what is left where nothing was found."""
+        return replace(self, unknown_nats=self.alone_nats, unknown_p=self.alone_p)
 
 
 LIMITS = Limits()

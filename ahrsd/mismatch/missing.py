@@ -153,12 +153,12 @@ def _scatter(done: Filtered, jump: Array, samples: int) -> float:
 
 
 def _fact(track: Track, turns: Turns, setting: Mapping[str, float]) -> Fact:
-    """The lost samples; where a lost one would not be seen the turn is put right on average."""
+    """The lost samples; where one may have been missed the turn is put right on average."""
     rows = np.flatnonzero(turns.lost)
-    per_row = float(turns.lost.sum()) / max(int(np.count_nonzero(turns.shows)), len(rows))
+    per_row = float(turns.lost.sum()) / max(float(np.sum(1.0 - turns.missed)), len(rows))
     share = per_row / (per_row + 1.0)
-    turned = np.where(turns.shows, 1.0, 1.0 + per_row)
-    turned[rows] = 1.0 + turns.lost[rows]
+    missed = np.where(turns.lost > 0, 0.0, per_row * turns.missed)
+    turned = np.asarray(1.0 + turns.lost + missed, np.float64)
     times = tuple((float(track.time_s[k - 1]), float(track.time_s[k])) for k in rows)
     words = (
         f"at {len(rows)} samples the field is ahead by whole steps of the turn: samples are "
@@ -169,7 +169,9 @@ def _fact(track: Track, turns: Turns, setting: Mapping[str, float]) -> Fact:
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
     told = {"hidden": True, **setting}
-    return Fact("dropped_samples", words, where, 0.98, parameters, told, turned=turned)
+    return Fact(
+        "dropped_samples", words, where, 0.98, parameters, told, turned=turned, unseen=missed
+    )
 
 
 def _peaks(rows: NDArray[np.bool], size: Array, samples: int) -> NDArray[np.intp]:

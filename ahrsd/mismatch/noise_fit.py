@@ -114,6 +114,8 @@ def pieces(track: Track) -> Track:
         accel,
         {},
         tuple(runs),
+        None if track.lost_turns is None else track.lost_turns[rows],
+        track.step_share,
     )
 
 

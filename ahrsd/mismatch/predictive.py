@@ -199,13 +199,28 @@ def _innovations(
     seed: int,
 ) -> list[Array]:
     """Whitened innovations (N, 3) of simulations along the recording's motion."""
-    truth = forward.truth_along(fit.context())
+    truth, track = forward.truth_along(fit.context()), fit.filtered.track
+    seeds = [1000 * seed + k for k in range(copies)]
     made = [
-        forward.track_of(forward.simulated(truth, terms, noise, 1000 * seed + k, library))
-        for k in range(copies)
+        _losing(track, forward.track_of(forward.simulated(truth, terms, noise, one, library)), one)
+        for one in seeds
     ]
     whole = [track for track in made if len(track) == len(fit.filtered.track)]
     return np.split(_filtered(whole, fit), len(whole))
+
+
+def _losing(track: Track, made: Track, seed: int) -> Track:
+    """A simulation that loses as many turns as the recording is expected to have lost unseen.
+
+    They are put right on average: a step that loses n of them, where so many are expected, turned
+    by n less those more than its gyro says.
+    """
+    expected = track.lost_turns
+    if expected is None or len(made) != len(track):
+        return made
+    lost = np.random.default_rng([seed, len(made)]).poisson(expected)
+    short = track.step_share * (lost - expected)
+    return replace(made, gyro_b_rad_s=made.gyro_b_rad_s * (1.0 - short)[:, None])
 
 
 def _inside(value: float, band: tuple[float, float]) -> bool:

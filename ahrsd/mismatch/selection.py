@@ -70,7 +70,7 @@ def forward(state: State) -> tuple[State, Survey, Survey]:
         if best.candidate.name in state.names and closer < len(state.named):
             state, closer = shaped_again(state, newest=True), len(state.named)
         elif best.candidate.name in WANDERING and not state.walk:
-            state = _noise_or_cause(state, best, last)
+            state = noise_or_cause(state, best, last)
         else:
             tried = added(state, best)
             if not borne_out(state, tried, best, last):
@@ -133,7 +133,7 @@ def noise_in(seen: Survey) -> float:
     return quieter(seen.basis, columns_of(seen.basis, [strongest])[strongest.name]).colour
 
 
-def _noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
+def noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
     """The state with a bias that wanders, or with its cause where that is likelier by far.
 
     A walk is free to follow any cause, and then none is needed.  Nor is one where the few modes of
@@ -167,7 +167,7 @@ def _cause_after_all(state: State, seen: Survey) -> State:
     accepted = [judged for judged in again.judged if judged.accepted]
     if not accepted or accepted[0].candidate.name != likeliest[0].name:
         return state
-    tried = _noise_or_cause(still, accepted[0], again)
+    tried = noise_or_cause(still, accepted[0], again)
     return state if tried.walk else shaped_again(tried, newest=True)
 
 

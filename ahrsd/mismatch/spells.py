@@ -63,9 +63,12 @@ def with_spells(left: Remainder) -> Remainder:
     """The remainder with the frame whose course comes and goes, where that is the likeliest.
 
     What the free courses show by themselves keeps its frame: of a real recording a few jumps, on
-    the ground before and after a flight, are not the source that runs all the time.
+    the ground before and after a flight, are not the source that runs all the time.  Where turns
+    were lost and nobody knows at which steps, a few jumps are what they leave.
     """
     basis = left.basis
+    if left.spells_s or basis.context.track.lost_turns is not None:
+        return left
     count = min(COUNT, int(basis.context.track.duration_s / SHORTEST_S))
     cut = segments(basis.context.track.time_s, count)
     plain = left.one_source or left.strongest.evidence > LIMITS.unknown_nats

@@ -55,6 +55,7 @@ def thinned(track: Track, m: int, model: NullModel) -> Track:
     ends = np.cumsum(lengths).tolist()
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     accel = joined.pop("accel") if track.accel_b_m_s2 is not None else None
+    unseen = joined.pop("unseen") if track.lost_turns is not None else None
     fields = {name: joined.pop(name) for name in ("time_s", "dt_s", "mag", "gyro")}
     return Track(
         fields["time_s"],
@@ -64,6 +65,8 @@ def thinned(track: Track, m: int, model: NullModel) -> Track:
         accel,
         joined,
         tuple(slice(end - size, end) for end, size in zip(ends, lengths, strict=True)),
+        unseen,
+        track.step_share / m,
     )
 
 
@@ -90,6 +93,8 @@ def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str
     }
     if track.accel_b_m_s2 is not None:
         out["accel"] = _about_middle(track.accel_b_m_s2[rows], m)
+    if track.lost_turns is not None:
+        out["unseen"] = np.concatenate([[0.0], track.lost_turns[rows][shifted].sum(axis=1)])
     for name, values in track.covariates.items():
         turns = name.startswith(_ATTITUDE)
         out[name] = _about_middle(values[rows], m) if turns else values[rows].reshape(-1, m).mean(1)

@@ -20,6 +20,9 @@ class Track:
     accel_b_m_s2:  (N, 3) specific force, None where it was not recorded
     covariates:    (N,) columns by name (`motor_current_a`, `temperature_c`, ...); may hold nan
     runs:          slices of the gap-free runs, in order, which cover every row
+    lost_turns:    (N,) how many of the device's steps are expected to be lost in a step, nobody
+                   knows in which, beyond those that were put right; None where none are
+    step_share:    part of a step's turn that one step of the device is
     """
 
     time_s: Array
@@ -29,6 +32,8 @@ class Track:
     accel_b_m_s2: Array | None
     covariates: dict[str, Array] = field(default_factory=dict)
     runs: tuple[slice, ...] = ()
+    lost_turns: Array | None = None
+    step_share: float = 1.0
 
     def __len__(self) -> int:
         return len(self.time_s)

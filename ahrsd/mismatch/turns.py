@@ -1,7 +1,8 @@
 """Lost turns one by one: by how many steps more than its gyro says the sensor turned in each step.
 
 That turns were lost is known (`missing.py`).  Jumps that stand out are put right, and what they hid
-is looked for again: the filter takes long to forget one, and the next lies on its way back.
+is looked for again: the filter takes long to forget one, and the next lies on its way back.  A jump
+back by one step, beside one that was put right, takes that back: it was counted twice.
 
 A lost step ahead of row k moves the field that the filter predicts by v = h x w dt from there on.
 Carried by the gyro into one frame v stands still, so the mean over `L` rows from k on, less that
@@ -29,17 +30,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from ahrsd.mismatch.innovation import Filtered, run_filter
 from ahrsd.samples import Array
 
 _ROWS = (3, 6, 12, 24, 48)  # before and after a jump
-_ROUNDS = 8
+_ROUNDS = 20
 _SURE_NATS = 3.0  # beyond the share
 _ENOUGH = 10  # times as many rows as are averaged: else their spread is not known
 _LONGER = float(np.log(4.0))  # what each further step of a gap costs
 _SHARES = (0.01, 0.03, 0.1)  # of the rows, that a jump is so near that its mean is in it
 _ACROSS = 12.0  # chi square that one in 400 is beyond
+_BESIDE = 0.25  # of a mean's rows: so near to its jump is the step that made it
+_TWICE_NATS = 6.0  # that a step counts twice: one in twenty does, and must be surer than chance
 _EACH = 6.0  # nats that one jump is worth at most: several must say it, not a field that jumps once
 _PART, _OTHERS = 0.7, (0.3, 1.4)  # of a step, in the mean over the rows that have a part of it
 #: nats by which that must be, less so many times those backward: 3.5 is the most of 370 recordings
@@ -51,10 +55,14 @@ QUARTER = 0.3186
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turns:
-    """lost (N,): how many steps were lost before each row;  shows (N,): where one would show."""
+    """lost (N,): how many steps were lost before each row;  missed (N,): how likely one is missed.
+
+    A step that is lost has I / 2 nats in the mean, with a deviation of sqrt(I): below the share's
+    own nats it is missed.
+    """
 
     lost: NDArray[np.int64]
-    shows: NDArray[np.bool]
+    missed: Array
 
 
 def recovered(
@@ -69,32 +77,56 @@ def recovered(
     clean = done.predicted_b @ A.T + done.innovation + model.hard_iron_gauss
     read = np.isfinite(done.track.mag_b_gauss).all(axis=1, keepdims=True)
     mag = np.where(read, clean, np.nan)
-    best, most = Turns(lost, lost > 0), -np.inf
+    best, most = Turns(lost, np.where(lost > 0, 0.0, 1.0)), -np.inf
+    found, picked = None, np.zeros(0, dtype=np.int64)
     for _ in range(_ROUNDS):
         gyro = model.gyro_bias_rad_s + rate_b_rad_s * (1 + lost)[:, None]
         track = replace(done.track, mag_b_gauss=mag, gyro_b_rad_s=gyro)
         seen = run_filter(track, model, sensitive=False)
         likelihood = float(np.sum(seen.log_likelihood[seen.used]))
-        if likelihood < most:
+        if likelihood > most:
+            found = _jumps(seen, rate_b_rad_s, max(float(lost.sum()), expected), lost)
+            best, most = Turns(lost, found.missed), likelihood
+            picked = _peaks(found.nats, found.rows)
+        else:  # some of them were none: half of them, the surer ones
+            picked = picked[: len(picked) // 2]
+        if found is None or not len(picked):
             break
-        found = _jumps(seen, rate_b_rad_s, max(float(lost.sum()), expected))
-        best, most = Turns(lost, found.shows), likelihood
-        picked = _peaks(found.nats, found.rows)
-        if not len(picked):
-            break
-        lost = lost.copy()
-        lost[picked] += found.steps[picked]
+        lost = _put_right(best.lost, found, picked)
     return best
+
+
+def _put_right(
+    lost: NDArray[np.int64], found: _Jumps, picked: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The lost steps with those of the picked rows; one back is taken from the nearest."""
+    lost = lost.copy()
+    for row in picked.tolist():
+        lost[row if found.steps[row] > 0 else _nearest(lost, row)] += found.steps[row]
+    return lost
+
+
+def _about(lost: NDArray[np.int64], reach: int) -> NDArray[np.bool]:
+    """(N,) rows with a lost step so near."""
+    ends = np.concatenate([np.zeros(reach + 1, np.int64), np.cumsum(lost > 0)])
+    last = np.minimum(np.arange(len(lost)) + 2 * reach + 1, len(ends) - 1)
+    return np.asarray(ends[last] > ends[: len(lost)])
+
+
+def _nearest(lost: NDArray[np.int64], row: int) -> int:
+    """The row with a lost step that is nearest to this one."""
+    rows = np.flatnonzero(lost)
+    return int(rows[np.argmin(np.abs(rows - row))])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Jumps:
-    """Of each row, by the number of rows about it that tells most; shows: one step would."""
+    """Of each row, by the number of rows about it that tells most; missed: as in `Turns`."""
 
     steps: NDArray[np.int64]
     nats: Array
     rows: NDArray[np.int64]
-    shows: NDArray[np.bool]
+    missed: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,20 +193,27 @@ def surplus(mean: Means) -> tuple[float, float]:
     return forward - _BACKWARD * max(nats(-_PART)[0], 0.0), count
 
 
-def _jumps(done: Filtered, rate_b_rad_s: Array, count: float) -> _Jumps:
-    """Jumps by whole steps.  count: how many steps are known to be lost."""
+def _jumps(done: Filtered, rate_b_rad_s: Array, count: float, lost: NDArray[np.int64]) -> _Jumps:
+    """Jumps by whole steps, and by one step back near those that were put right, `lost`.
+
+    count: how many steps are known to be lost
+    """
     n = len(done.track)
     least = float(np.log(n / count)) + _SURE_NATS
     one = np.ones(n, dtype=np.int64)
-    out = _Jumps(one, np.full(n, -np.inf), one.copy(), np.zeros(n, dtype=np.bool))
+    out = _Jumps(one, np.full(n, -np.inf), one.copy(), np.ones(n))
     for mean in _means(done, rate_b_rad_s):
         z, size = mean.z, mean.size
         steps = np.maximum(np.round((z - _LONGER) / np.maximum(size, 1e-300)), 1.0)
         nats = steps * z - steps**2 * size / 2 - least - _LONGER * (steps - 1)
+        about = _about(lost, 1 + int(_BESIDE * mean.length))
+        back = np.where(about[mean.k], -z - size / 2 - _TWICE_NATS, -np.inf)
+        steps, nats = np.where(back > nats, -1, steps), np.maximum(nats, back)
         better = nats > out.nats[mean.k]
         at = mean.k[better]
         out.nats[at], out.steps[at], out.rows[at] = nats[better], steps[better], mean.length
-        out.shows[mean.k] |= size / 2 > least
+        missed = ndtr((least - size / 2) / np.sqrt(np.maximum(size, 1e-12)))
+        out.missed[mean.k] = np.minimum(out.missed[mean.k], missed)
     return out
 
 
@@ -184,10 +223,13 @@ def _summed(values: Array) -> Array:
 
 
 def _peaks(nats: Array, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows with more than 0 nats, of those nearer than their means reach the one with most."""
+    """Rows with more than 0 nats, of those nearer than their means reach the one with most.
+
+    The surest first.
+    """
     out: list[int] = []
     candidates = np.flatnonzero(nats > 0)
     for k in candidates[np.argsort(-nats[candidates], kind="stable")].tolist():
         if all(abs(k - other) > 2 * rows[k] for other in out):
             out.append(k)
-    return np.array(sorted(out), dtype=np.int64)
+    return np.array(out, dtype=np.int64)
