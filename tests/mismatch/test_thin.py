@@ -91,3 +91,13 @@ def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
         thin = thinned(still, m, model([0.05, -0.02, 0.1]))
         expected = np.outer(thin.covariates["current_a"], [0.01, 0.02, -0.01]) + FIELD
         np.testing.assert_allclose(thin.mag_b_gauss, expected, atol=1e-12)
+
+
+def test_lost_turns_are_added_up_and_each_is_a_smaller_part_of_the_step():
+    track, _ = turning()
+    lost = np.linspace(0.0, 0.02, len(track))
+    thin = thinned(replace(track, lost_turns=lost), 3, model([0.05, -0.02, 0.1]))
+    assert thin.step_share == pytest.approx(1 / 3)
+    middle = np.arange(1, len(thin)) * 3 + 1
+    np.testing.assert_allclose(thin.lost_turns[1:], 3 * (lost[middle] - lost[1]), atol=1e-12)
+    assert thinned(track, 3, model([0.05, -0.02, 0.1])).lost_turns is None

@@ -104,3 +104,38 @@ def test_many_jumps_of_one_step_ahead_are_lost_turns_and_others_are_not() -> Non
     assert jumps_at(many[:3], 1.0) == 0.0  # a field that jumps
     assert jumps_at(many, 0.3) == 0.0
     assert jumps_at(many, -1.0) == 0.0
+
+
+def test_a_step_that_was_counted_twice_is_taken_back_and_none_that_was_lost() -> None:
+    done, rate, lost = lossy("mam", 0.004, 3e-4)
+    right = recovered(done, rate, np.zeros(len(lost), dtype=np.int64))
+    rows = np.flatnonzero(right.lost)
+    twice = right.lost.copy()
+    twice[rows[5:25:5] + 1] += 1
+    again = recovered(done, rate, twice)
+    assert np.array_equal(again.lost[rows], right.lost[rows])
+    others = np.setdiff1d(np.flatnonzero(again.lost), rows)  # one, of a slow turn, here
+    assert len(others) <= 1
+    assert near(others, rows, 40) == 0
+
+
+def test_what_may_have_been_missed_is_noise_of_the_turn() -> None:
+    """As loud as turns that were lost unseen make it, along the turn and not across."""
+    done, _, lost = lossy("mam", 0.03, 1e-3)
+    assert done.normalised_innovation > 1.5
+    expected = np.full(len(lost), float(lost.mean()))
+    on_average = done.track.gyro_b_rad_s * (1.0 + expected[:, None])
+    told = replace(done.track, gyro_b_rad_s=on_average, lost_turns=expected)
+    seen = run_filter(told, done.model)
+    assert seen.normalised_innovation == pytest.approx(1.0, abs=0.12)
+    never = run_filter(replace(told, lost_turns=np.zeros(len(lost))), done.model)
+    assert never.normalised_innovation > 1.4
+
+
+def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
+    done, rate, lost = lossy("wam", 0.004, 1e-3)
+    (fact,) = missing_turns(done, rate)
+    found = np.round(fact.turned) - 1
+    assert (fact.unseen[found > 0] == 0.0).all()
+    assert (fact.unseen >= 0.0).all()
+    assert found.sum() + fact.unseen.sum() == pytest.approx(lost.sum(), rel=0.35)

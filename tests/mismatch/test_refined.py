@@ -1,0 +1,97 @@
+"""What stands alone: less is asked where nothing is named, a walk is nothing, a name is a name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.mismatch import unknown
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.explained import explained
+from ahrsd.mismatch.limits import LIMITS, Limits
+from ahrsd.mismatch.name import ROBUST
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.refined import left_alone, refined
+from ahrsd.mismatch.search import State, formed_basis_of, survey
+from ahrsd.mismatch.track import Spec, Track
+from ahrsd.mismatch.unknown import Remainder
+
+BEGIN_S, END_S = 120.0, 160.0
+
+
+def left_of(track: Track, limits: Limits = LIMITS) -> tuple[State, Remainder]:
+    """A state without names and what it leaves."""
+    problem, cold = problem_of(track, Spec(), {"hard_iron_step": EFFECTS["hard_iron_step"]}, limits)
+    state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    left = unknown.remainder(formed_basis_of(state))
+    return state, refined(state.fit, state, left, None, limits)
+
+
+def switched(gauss: float) -> Track:
+    """Something on the vehicle is on for 40 s."""
+    track = made(Trial(4)).track
+    on = (track.time_s >= BEGIN_S) & (track.time_s < END_S)
+    field = gauss * np.array([0.48, -0.6, 0.64])
+    return replace(track, mag_b_gauss=track.mag_b_gauss + on[:, None] * field)
+
+
+def drifting(rad_s_sqrt_s: float) -> Track:
+    """A gyro whose bias walks by so much."""
+    track = made(Trial(4)).track
+    step = np.sqrt(np.nan_to_num(track.dt_s))[:, None]
+    walk = np.random.default_rng(8).normal(size=(len(track), 3)) * step * rad_s_sqrt_s
+    return replace(track, gyro_b_rad_s=track.gyro_b_rad_s + np.cumsum(walk, axis=0))
+
+
+@pytest.mark.parametrize(("gauss", "alone", "beside"), [(0.0, 0, 0), (2.2e-4, 1, 0), (4e-4, 1, 1)])
+def test_alone_less_is_asked_of_it_than_beside_a_name(gauss, alone, beside) -> None:
+    state, left = left_of(switched(gauss))
+    assert unknown.detected(left, LIMITS) == bool(beside)
+    same, rest, seen = left_alone(state.fit, state, left)
+    assert same is state
+    assert rest is left
+    assert (seen is not None) == bool(alone)
+    if seen is not None:
+        ((begin, end),) = seen.spells_s
+        assert (begin, end) == pytest.approx((BEGIN_S, END_S), abs=6.0)
+        assert seen.strongest.evidence > LIMITS.alone_nats
+
+
+def test_an_ordinary_walk_of_the_gyro_is_nothing_and_a_large_one_is() -> None:
+    state, left = left_of(drifting(1.2e-5))
+    assert left.strongest.frame == "gyro"
+    assert left.strongest.evidence > LIMITS.alone_nats
+    walking, rest, seen = left_alone(state.fit, state, left)
+    assert walking.walk > 0.0
+    assert seen is None
+    assert not unknown.detected(rest, LIMITS.alone())
+    state, left = left_of(drifting(1e-4))
+    assert left_alone(state.fit, state, left)[2] is not None
+
+
+@pytest.mark.parametrize(("times", "named"), [(5.0, True), (50.0, False)])
+def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named) -> None:
+    track = made(Trial(7, effects=(("hard_iron_step", 0.6),))).track
+    state, left = left_of(track)
+    assert unknown.detected(left, LIMITS)
+    strict = replace(LIMITS, robust_family_p=survey(state).judged[0].robust_family_p / times)
+    state, left = left_of(track, strict)
+    assert survey(state).judged[0].refused == (ROBUST,)
+    found = explained(state, left, strict.alone())
+    assert (found is not None) == named
+    if found is not None:
+        tried, surveys, rest = found
+        assert tried.names == ("hard_iron_step",)
+        assert len(surveys) == 1
+        assert not unknown.detected(rest, strict.alone())
+
+
+def test_a_name_that_leaves_something_is_none() -> None:
+    """A jump and one back: a step explains a part of it, and is accepted by all tests."""
+    state, left = left_of(switched(8e-4))
+    assert survey(state).judged[0].accepted
+    assert explained(state, left, LIMITS.alone()) is None
