@@ -27,6 +27,7 @@ from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, se
 from ahrsd.mismatch.noise import before, colour_of, tails_of
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.probabilities import student_quantile
+from ahrsd.mismatch.rounded import before_rounding
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, Noise, Term
 from ahrsd.samples import Array
@@ -40,8 +41,6 @@ _LAGS = 50
 _LEAST = 1e-12
 _TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
 _ROUNDED = "mag_quantisation"
-_PASSES = 3
-_QUIETEST = 0.1  # of the noise that is seen: what is left at least where most of it is rounding
 _BEYOND = 2.0  # times what noise has in means over segments
 
 
@@ -97,7 +96,7 @@ def noise_law(
         if np.any(rows & done.used):
             level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
     if steps := [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]:
-        return _before_rounding(fit, replace(law, colour=(), level=level), steps[0], terms, library)
+        return before_rounding(fit, replace(law, colour=(), level=level), steps[0], terms, library)
     tails = tails_of(replace(done, whitened=done.whitened / level[:, None]))
     law = replace(law, freedom=tails.freedom, level=level)
     if not law.colour:
@@ -121,29 +120,6 @@ def usual_noise(
     law = noise_law(fit, loud, terms, library)
     usual = 1.0 if law.level is None else float(np.median(law.level))
     return replace(law, mag_gauss=law.mag_gauss * usual, level=None)
-
-
-def _before_rounding(
-    fit: NullFit,
-    seen: Noise,
-    step_gauss: float,
-    terms: Sequence[Term],
-    library: Mapping[str, Effect],
-) -> Noise:
-    """The noise of readings before they were rounded to such steps.
-
-    seen: with what rounding adds, which has bounds, and a colour that follows the motion: it is
-    simulated, not drawn.  About a twelfth of the step's square; so much that simulations are as
-    loud as the recording.
-    """
-    whole = np.ones(len(fit.filtered.track)) if seen.level is None else seen.level**2
-    left = whole - step_gauss**2 / 12 / seen.mag_gauss**2
-    law = seen
-    for _ in range(_PASSES):
-        law = replace(seen, level=np.sqrt(np.maximum(left, _QUIETEST**2 * whole)))
-        made = _innovations(fit, law, terms, library, 1, _TRIAL_SEED)[0][fit.filtered.used]
-        left = left + fit.filtered.normalised_innovation - float(np.mean(made**2))
-    return law
 
 
 def _quick(fit: NullFit, whitened: Array) -> Filtered:
