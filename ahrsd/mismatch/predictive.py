@@ -27,7 +27,7 @@ from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, se
 from ahrsd.mismatch.noise import before, colour_of, tails_of
 from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.probabilities import student_quantile
-from ahrsd.mismatch.rounded import before_rounding
+from ahrsd.mismatch.rounded import before_rounding, bent, calibration_covariance
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context, Noise, Term
 from ahrsd.samples import Array
@@ -96,7 +96,14 @@ def noise_law(
         if np.any(rows & done.used):
             level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
     if steps := [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]:
-        return before_rounding(fit, replace(law, colour=(), level=level), steps[0], terms, library)
+        truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
+
+        def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
+            known = bent(truth, unsure, seed) if seed else truth
+            made = forward.track_of(forward.simulated(known, terms, noise, seed, library))
+            return made.mag_b_gauss, _filtered([made], fit)
+
+        return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
     tails = tails_of(replace(done, whitened=done.whitened / level[:, None]))
     law = replace(law, freedom=tails.freedom, level=level)
     if not law.colour:
@@ -177,9 +184,13 @@ def _innovations(
     """Whitened innovations (N, 3) of simulations along the recording's motion."""
     truth, track = forward.truth_along(fit.context()), fit.filtered.track
     seeds = [1000 * seed + k for k in range(copies)]
+    truths = [truth] * copies
+    if any(term.identifier == _ROUNDED for term in terms):
+        unsure = calibration_covariance(fit)
+        truths = [bent(truth, unsure, one) for one in seeds]
     made = [
-        _losing(track, forward.track_of(forward.simulated(truth, terms, noise, one, library)), one)
-        for one in seeds
+        _losing(track, forward.track_of(forward.simulated(along, terms, noise, one, library)), one)
+        for along, one in zip(truths, seeds, strict=True)
     ]
     whole = [track for track in made if len(track) == len(fit.filtered.track)]
     return np.split(_filtered(whole, fit), len(whole))
