@@ -166,10 +166,11 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     alone = None
     if short is None and not state.named:
         state, left, alone = left_alone(start, state, left)
-        named = None if alone is None else explained(state, alone, problem.limits.alone())
+        named = None
+        if alone is not None and not done.before.named:
+            named = explained(state, alone, problem.limits.alone())
         if named is not None:
-            state, surveys, left = named
-            alone = None
+            (state, surveys, left), alone = named, None
     if short is None and unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
     return _Searched(

@@ -26,7 +26,8 @@ def explained(
 ) -> tuple[State, list[Survey], Remainder] | None:
     """The state with the one name that leaves nothing of the rest, if there is one.
 
-    state: without names;  left: its rest, which is there;  limits: those by which it is
+    state: without names, to which none was ever given;  left: its rest, which is there
+    limits: those by which it is
     """
     seen = survey(state)
     rest = max(left.strongest.evidence, limits.unknown_nats, state.problem.limits.unknown_nats)
@@ -54,4 +55,4 @@ def _with(state: State, judged: Judged, seen: Survey) -> State:
 def _but_for_blocks(judged: Judged, limits: Limits) -> bool:
     """Whether nothing speaks against it but that few blocks show it."""
     slack = judged.robust_family_p < ROBUST_SLACK * limits.robust_family_p
-    return judged.accepted or (judged.refused == (ROBUST,) and slack)
+    return judged.refused == (ROBUST,) and slack

@@ -91,7 +91,17 @@ def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named)
 
 
 def test_a_name_that_leaves_something_is_none() -> None:
-    """A jump and one back: a step explains a part of it, and is accepted by all tests."""
-    state, left = left_of(switched(8e-4))
+    """A jump and one back: a step explains a part of it, and only the blocks refuse it."""
+    track = switched(8e-4)
+    strict = replace(
+        LIMITS, robust_family_p=survey(left_of(track)[0]).judged[0].robust_family_p / 5
+    )
+    state, left = left_of(track, strict)
+    assert survey(state).judged[0].refused == (ROBUST,)
+    assert explained(state, left, strict.alone()) is None
+
+
+def test_a_name_that_passes_everything_was_asked_before_and_is_not_told_here() -> None:
+    state, left = left_of(made(Trial(7, effects=(("hard_iron_step", 0.6),))).track)
     assert survey(state).judged[0].accepted
     assert explained(state, left, LIMITS.alone()) is None
