@@ -31,7 +31,7 @@ from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import rest_of
 from ahrsd.mismatch.explained import explained
-from ahrsd.mismatch.facts import Fact, around_lost_turns, matters
+from ahrsd.mismatch.facts import Fact, around, lost_at, matters
 from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, whole_term
 from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.free_course import with_free_course
@@ -72,6 +72,9 @@ from ahrsd.mismatch.unplaced import without_unplaced
 from ahrsd.mismatch.values import NullModel, Term
 from ahrsd.mismatch.wandering import wandering
 from ahrsd.mismatch.would_show import would_show
+
+#: of the outside field: an object that is passed by
+_MOMENT_S = 30.0
 
 
 def diagnose(
@@ -190,7 +193,8 @@ def _told(
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
     named, terms = _names(done, fast)
-    noise, left = _noise_facts(problem, fast, facts, done), _left(done, problem, facts, fast)
+    noise = _noise_facts(problem, fast, facts, done, named)
+    left = _left(done, problem, facts, fast)
     if burst := loud_gyro(left, problem.recorded):
         noise, left = [*noise, burst], Unexplained(False)
     found = (
@@ -247,24 +251,35 @@ def _names(done: _Searched, fast: Quick) -> tuple[list[Finding], tuple[Term, ...
 
 
 def _noise_facts(
-    problem: Problem, fast: Quick, facts: Sequence[Fact], done: _Searched
+    problem: Problem,
+    fast: Quick,
+    facts: Sequence[Fact],
+    done: _Searched,
+    named: Sequence[Finding],
 ) -> list[Fact]:
     """What is to be said of the noise's level; coarse numbers scatter by themselves.
 
     What no name explains is noise to the fit: beside it the level says nothing, and where all was
-    fitted anew against it, nor does its coming and going.
+    fitted anew against it, nor does its coming and going.  What a moment leaves of its form is a
+    burst there.
     """
     if done.beside or any(fact.effect == "mag_quantisation" for fact in facts):
         return []
     beside_unknown = unknown.detected(done.left, problem.limits)
     given = problem.spec.sigma_mag_gauss is not None
     found = level_facts(fast.state.fit.filtered, spec_given=given)
+    moments = [*lost_at(facts), *(span for one in named for span in _moments(one))]
     return [
         fact
         for fact in found
-        if not (beside_unknown and fact.effect == "noise_level")
-        and not around_lost_turns(fact, facts)
+        if not (beside_unknown and fact.effect == "noise_level") and not around(fact, moments)
     ]
+
+
+def _moments(one: Finding) -> list[tuple[float, float]]:
+    """Where a name of the outside field shows, if for a moment only."""
+    spans = one.where.intervals_s if one.where.frame == "world" else ()
+    return [(begin, end) for begin, end in spans if end - begin < _MOMENT_S]
 
 
 def _doubted(one: Finding, sure: float) -> Finding:

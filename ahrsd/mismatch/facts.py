@@ -57,12 +57,19 @@ def matters(fact: Fact) -> bool:
     return True
 
 
-def around_lost_turns(burst: Fact, facts: Sequence[Fact]) -> bool:
-    """Whether every span of a burst of noise has a lost turn in it: then it is what that leaves."""
-    lost = [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
+def around(burst: Fact, moments: Sequence[tuple[float, float]]) -> bool:
+    """Whether every span of a burst of noise has one of these in it: then it is what that leaves.
+
+    moments: seconds, of lost turns and of names that show for a moment only
+    """
     spans = burst.where.intervals_s if burst.effect == "noise_burst" else ()
-    beside = [any(a <= end and begin <= b for begin, end in lost) for a, b in spans]
+    beside = [any(a <= end and begin <= b for begin, end in moments) for a, b in spans]
     return bool(beside) and all(beside)
+
+
+def lost_at(facts: Sequence[Fact]) -> list[tuple[float, float]]:
+    """Where turns were lost, seconds."""
+    return [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
 
 
 def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:

@@ -11,7 +11,7 @@ from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd.mismatch.clipping import clipping
 from ahrsd.mismatch.diagnosis import Where
-from ahrsd.mismatch.facts import Fact, around_lost_turns, spans_of
+from ahrsd.mismatch.facts import Fact, around, lost_at, spans_of
 from ahrsd.mismatch.frames import ranked, windows
 from ahrsd.mismatch.hygiene import as_recorded, hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
@@ -387,12 +387,13 @@ def test_a_burst_around_a_lost_turn_is_what_that_leaves() -> None:
         return Fact(effect, "", Where(spans, ("x",), "link"), 1.0, turned=turned)
 
     lost = told("dropped_samples", (20.0, 20.04), (313.1, 313.14), turned=np.ones(3))
-    assert around_lost_turns(told("noise_burst", (313.0, 314.0)), [lost])
-    assert not around_lost_turns(told("noise_burst", (313.0, 314.0), (400.0, 402.0)), [lost])
-    assert not around_lost_turns(told("noise_level", (0.0, 400.0)), [lost])
-    assert not around_lost_turns(
-        told("noise_burst", (313.0, 314.0)), [told("stuck_magnetometer", (313.0, 314.0))]
-    )
+    moments = lost_at([lost])
+    assert moments == [(20.0, 20.04), (313.1, 313.14)]
+    assert around(told("noise_burst", (313.0, 314.0)), moments)
+    assert not around(told("noise_burst", (313.0, 314.0), (400.0, 402.0)), moments)
+    assert not around(told("noise_level", (0.0, 400.0)), moments)
+    stuck = told("stuck_magnetometer", (313.0, 314.0))
+    assert not around(told("noise_burst", (313.0, 314.0)), lost_at([stuck]))
 
 
 def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
