@@ -104,8 +104,10 @@ def noise_law(
             return made.mag_b_gauss, _filtered([made], fit)
 
         return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
-    tails = tails_of(replace(done, whitened=done.whitened / level[:, None]))
-    law = replace(law, freedom=tails.freedom, level=level)
+    law = replace(law, level=level)
+    if done.track.lost_turns is None:  # else what is lost makes the tails, and is simulated
+        tails = tails_of(replace(done, whitened=done.whitened / level[:, None]))
+        law = replace(law, freedom=tails.freedom)
     if not law.colour:
         return law
     tried = int(np.clip(_TRIED_ROWS // len(level), 1, _TRIED))

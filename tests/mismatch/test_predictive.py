@@ -171,3 +171,31 @@ def test_without_columns_nothing_is_said_of_them():
     bare = replace(context, track=replace(context.track, covariates=still))
     e = np.random.default_rng(0).standard_normal((400, 3))
     assert "covariates" not in predictive.statistics(e, predictive.scene_of(bare))
+
+
+def test_simulations_lose_the_turns_that_nobody_saw():
+    context, _ = moving(11, rows=4000)
+    expected = np.where(np.arange(4000) < 3000, 0.05, 0.0)
+    track = replace(context.track, lost_turns=expected, step_share=0.5)
+    made = replace(context.track, gyro_b_rad_s=np.ones((4000, 3)))
+    assert predictive._losing(context.track, made, 1) is made
+    gyro = predictive._losing(track, made, 1).gyro_b_rad_s[:, 0]
+    assert np.all(gyro[3000:] == 1.0)
+    lost = (1.0 + 0.5 * 0.05 - gyro[:3000]) / 0.5
+    assert np.all(np.abs(lost - np.round(lost)) < 1e-9)
+    assert lost.mean() == pytest.approx(0.05, abs=0.015)
+    assert gyro.mean() == pytest.approx(1.0, abs=0.006)
+    assert not np.array_equal(gyro, predictive._losing(track, made, 2).gyro_b_rad_s[:, 0])
+
+
+def test_a_recording_that_lost_turns_looks_like_its_simulations():
+    """What is lost unseen jumps by a few deviations of a reading: here by 2, at 3 rows in 100."""
+    context, _ = moving(11, rows=4000)
+    model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
+    truth = forward.truth_along(context)
+    made = forward.track_of(forward.simulated(truth, (), forward.noise_of(model), 5))
+    told = replace(made, lost_turns=np.full(4000, 0.03), step_share=0.15)
+    track = replace(told, gyro_b_rad_s=predictive._losing(told, made, 77).gyro_b_rad_s)
+    fit = fit_null(track, start=model, walk=False)
+    found = predictive.checks(fit, fit, ())
+    assert [name for name, check in found.items() if not check.inside_after] == []

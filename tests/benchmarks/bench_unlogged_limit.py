@@ -1,0 +1,174 @@
+"""How well a cause that nobody logged can be seen at all: by one who knows all but its course.
+
+    python tests/benchmarks/bench_unlogged_limit.py docs/challenge/ring600g/key.json [--cases N]
+
+For every case of an opened ring whose cause was withheld: the generator draws the same kind of
+cause `DRAWS` times more, with other courses, directions and places, along the very motion of the
+case.  Their covariance, at the case's strength, is all that anyone can know of a course that was
+not logged.  The observer knows it, besides the noise, the attitude and the field; calibration,
+gyro bias and the outside field are projected out, as of all that `blindworld.ideal` sees.
+
+Of tests that know no more of a signal than its covariance the best is the likelihood ratio
+
+    L = 1/2 sum_i ( z_i^2 l_i / (1 + l_i) - ln(1 + l_i) ),
+
+l_i the signal's variances in the noise's units, z_i what is seen.  Its bar is what noise alone
+passes once in `1 / FALSE` recordings; told is how often the case's own signal passes, over draws of
+the noise.  An engine knows none of that law, and looks for all kinds of causes at once.  Prints a
+line per case, and means by kind and strength.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+from blindworld import cases, ideal
+from blindworld.__main__ import case_ids
+from blindworld.chain import Stages, body_field, readings
+from blindworld.curves import wave
+from blindworld.limits import EFFECTS
+from blindworld.motion import MOTIONS, _box, _course
+from blindworld.rings import orders
+from blindworld.rotations import to_body
+from blindworld.world import _joint, _throttle
+
+DRAWS, NOISES = 240, 4000
+FALSE = 0.002  # a quarter of what is allowed for recordings in which nothing is
+STRENGTHS = (1.0, 1.25, 1.6, 2.0, 6.0)
+
+
+def told(order, entropy, rng):
+    """(probability that the observer tells it, its signal to noise) for one case."""
+    world, setting, strength, seed = _made(order, entropy)
+    ((key, _),) = order.effects
+    at, mag, gyro = readings(world, Stages(), setting.rate_hz)
+    index = np.rint(at * 1000).astype(int)
+    R_nb, h_b = world.motion.R_nb[index], body_field(world, Stages())[index]
+    step = 1 / setting.rate_hz
+    column, gram = ideal.observer(
+        R_nb, h_b, world.soft_iron, step, setting.sigma_mag, setting.sigma_gyro
+    )
+    others = ideal.nuisances(column, R_nb, h_b, world.soft_iron)
+    own = cases._alone(key, world, strength, seed, setting.rate_hz)
+    signals = [column(own[0] - mag, own[1] - gyro)]
+    for _ in range(DRAWS):
+        drawn = _other_course(key, world, rng)
+        signals.append(column(*_signal(key, drawn, index, rng)))
+    G = _projected(gram([*others, *signals]), len(others))
+    return _power(G, rng)
+
+
+def _made(order, entropy):
+    """World, setting, strength and seed of the case, as the generator has them."""
+    seen = {}
+    kept = cases._strengths
+
+    def strengths(order, world, setting, seeds):
+        found = kept(order, world, setting, seeds)
+        seen.update(world=world, setting=setting, strength=found[0][0], seed=seeds[0])
+        return found
+
+    cases._strengths = strengths
+    try:
+        cases.make_case(order, entropy)
+    finally:
+        cases._strengths = kept
+    return seen["world"], seen["setting"], seen["strength"], seen["seed"]
+
+
+def _other_course(key, world, rng):
+    """The same world with another course of what was withheld; it turns as it did."""
+    t, motion = world.time_s, world.motion
+    if key == "motor_current_field":
+        return replace(world, current=10.0 * _throttle(rng, t) ** 1.5)
+    if key == "moving_iron":
+        return replace(world, joint=_joint(rng, t))
+    if key in ("mag_bias_temperature", "gyro_bias_temperature"):
+        warm = rng.uniform(5, 10)
+        weather = wave(rng, 0.05 * warm, 0.005, 0.01).at(t)[0]
+        return replace(world, temperature=warm * (1 - np.exp(-t / rng.uniform(90, 250))) + weather)
+    _, (kind, size) = MOTIONS[motion.name]
+    position, _, speed = (_box if kind == "box" else _course)(rng, t, size, motion.yaw)
+    return replace(world, motion=replace(motion, position_n=position, speed=speed))
+
+
+def _signal(key, world, index, rng):
+    """What the effect adds to the readings (K, 3) of magnetometer and gyro, at its limit."""
+    stages = Stages()
+    EFFECTS[key].make(world, stages, EFFECTS[key].limit, rng)
+    mag, gyro = np.zeros((len(index), 3)), np.zeros((len(index), 3))
+    for extra in stages.body:
+        mag = mag + extra[index]
+    for extra in stages.field_n:
+        mag = mag + to_body(world.motion.R_nb[index], extra[index]) @ world.soft_iron.T
+    for extra in stages.gyro_bias:
+        gyro = gyro + extra[index]
+    return mag, gyro
+
+
+def _projected(G, count):
+    """The Gram matrix of the columns behind the first `count`, those projected out."""
+    scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    whole = G / np.outer(scale, scale)
+    inner, cross = whole[:count, :count], whole[:count, count:]
+    left = whole[count:, count:] - cross.T @ np.linalg.pinv(inner, rcond=1e-9) @ cross
+    return left * np.outer(scale[count:], scale[count:])
+
+
+def _power(G, rng):
+    """Probability that the first signal passes the bar, all others its law; and its s/n."""
+    own = float(G[0, 0])
+    rest, cross = G[1:, 1:], G[1:, 0]
+    size = np.sqrt(np.maximum(np.diag(rest), 1e-12))
+    rest, cross = rest / np.outer(size, size), cross / size
+    values, vectors = np.linalg.eigh(rest)
+    kept = values > 1e-9 * values[-1]
+    values, vectors = values[kept], vectors[:, kept]
+    mean = vectors.T @ cross / np.sqrt(values)
+    variance = own * values / len(rest)
+
+    def ratio(z):
+        return 0.5 * np.sum(z**2 * variance / (1 + variance) - np.log1p(variance), axis=1)
+
+    noise = rng.normal(size=(NOISES, len(values)))
+    bar = float(np.quantile(ratio(noise), 1 - FALSE))
+    return float(np.mean(ratio(mean + rng.normal(size=noise.shape)) > bar)), float(np.sqrt(own))
+
+
+def main():
+    """Print a line per case, then means."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("key", type=Path)
+    parser.add_argument("--cases", type=int, default=10**9, help="only the first so many")
+    asked = parser.parse_args()
+    key = json.loads(asked.key.read_text(encoding="utf-8"))
+    count, seed = len(key["cases"]), key["seed"]
+    work = zip(case_ids(count, seed), orders(key["ring"], count, seed), strict=True)
+    wanted = [(n, name, order) for n, (name, order) in enumerate(work) if order.kind == "withheld"]
+    found = defaultdict(list)
+    print("case      source                 limits  s/n   told by one who knows all but the course")
+    for n, name, order in wanted[: asked.cases]:
+        power, snr = told(order, [seed, n], np.random.default_rng([seed, n, 99]))
+        ((source, multiple),) = order.effects
+        print(f"{name}  {source:22s} {multiple:5.2f} {snr:6.1f}   {power:.3f}", flush=True)
+        found[source].append(power)
+        found["all"].append(power)
+        for low, high in pairwise(STRENGTHS):
+            if low <= multiple < high:
+                found[f"{low:g} to {high:g} limits"].append(power)
+    for name, powers in found.items():
+        print(f"{name:24s} {np.mean(powers):.3f} of {len(powers)}")
+
+
+if __name__ == "__main__":
+    main()
