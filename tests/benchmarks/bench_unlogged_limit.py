@@ -1,6 +1,6 @@
 """How well a cause that nobody logged can be seen at all: by one who knows all but its course.
 
-    python tests/benchmarks/bench_unlogged_limit.py docs/challenge/ring600g/key.json [--cases N]
+    python tests/benchmarks/bench_unlogged_limit.py docs/challenge/ring600g/key.json ... [--below 2]
 
 For every case of an opened ring whose cause was withheld: the generator draws the same kind of
 cause `DRAWS` times more, with other courses, directions and places, along the very motion of the
@@ -148,26 +148,37 @@ def _power(G, rng):
 def main():
     """Print a line per case, then means."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("key", type=Path)
-    parser.add_argument("--cases", type=int, default=10**9, help="only the first so many")
+    parser.add_argument("keys", type=Path, nargs="+", metavar="key.json")
+    parser.add_argument("--below", type=float, default=np.inf, help="only cases of fewer limits")
     asked = parser.parse_args()
-    key = json.loads(asked.key.read_text(encoding="utf-8"))
-    count, seed = len(key["cases"]), key["seed"]
-    work = zip(case_ids(count, seed), orders(key["ring"], count, seed), strict=True)
-    wanted = [(n, name, order) for n, (name, order) in enumerate(work) if order.kind == "withheld"]
-    found = defaultdict(list)
+    found, strong = defaultdict(list), 0
     print("case      source                 limits  s/n   told by one who knows all but the course")
-    for n, name, order in wanted[: asked.cases]:
-        power, snr = told(order, [seed, n], np.random.default_rng([seed, n, 99]))
-        ((source, multiple),) = order.effects
-        print(f"{name}  {source:22s} {multiple:5.2f} {snr:6.1f}   {power:.3f}", flush=True)
-        found[source].append(power)
-        found["all"].append(power)
-        for low, high in pairwise(STRENGTHS):
-            if low <= multiple < high:
-                found[f"{low:g} to {high:g} limits"].append(power)
+    for path in asked.keys:
+        key = json.loads(path.read_text(encoding="utf-8"))
+        count, seed = len(key["cases"]), key["seed"]
+        work = zip(case_ids(count, seed), orders(key["ring"], count, seed), strict=True)
+        for n, (name, order) in enumerate(work):
+            if order.kind != "withheld":
+                continue
+            ((source, multiple),) = order.effects
+            if multiple >= asked.below:
+                strong += 1
+                continue
+            power, snr = told(order, [seed, n], np.random.default_rng([seed, n, 99]))
+            print(f"{name}  {source:22s} {multiple:5.2f} {snr:6.1f}   {power:.3f}", flush=True)
+            for group in (source, *_groups(multiple), "all of these"):
+                found[group].append(power)
     for name, powers in found.items():
         print(f"{name:24s} {np.mean(powers):.3f} of {len(powers)}")
+    powers = found["all of these"]
+    share = (sum(powers) + strong) / (len(powers) + strong)
+    print(f"{'if all others are told':24s} {share:.3f} of {len(powers) + strong}")
+
+
+def _groups(multiple):
+    """The span of strengths that it is in."""
+    spans = pairwise(STRENGTHS)
+    return [f"{low:g} to {high:g} limits" for low, high in spans if low <= multiple < high]
 
 
 if __name__ == "__main__":
