@@ -199,3 +199,17 @@ def test_a_recording_that_lost_turns_looks_like_its_simulations():
     fit = fit_null(track, start=model, walk=False)
     found = predictive.checks(fit, fit, ())
     assert [name for name, check in found.items() if not check.inside_after] == []
+
+
+def test_the_largest_of_many_is_below_its_band_as_often_as_is_said():
+    """One more largest value beyond 16: at most once in 1,000 by Gumbel's law, in 10 statistics."""
+    drawn = np.random.default_rng(5).gumbel(size=(200_000, predictive.COPIES + 1))
+    known, other = drawn[:, :-1], drawn[:, -1]
+    beyond = other > known.mean(axis=1) + predictive._LARGEST_REACH * known.std(axis=1, ddof=1)
+    assert np.mean(beyond) == pytest.approx(1e-3, rel=0.1)
+    for size in (60, 5000):  # segments in three axes; lines of a periodogram
+        share = np.random.default_rng(size).random((20_000, predictive.COPIES + 1))
+        drawn = -np.log1p(-(share ** (1 / size)))  # of so many powers, by their distribution
+        bands = [predictive._bands([{"line": float(x)} for x in row[:-1]]) for row in drawn]
+        outside = [not b["line"][0] <= row[-1] <= b["line"][1] for b, row in zip(bands, drawn)]
+        assert np.mean(outside) < 3e-3
