@@ -6,7 +6,8 @@ For every case of an opened ring whose cause was withheld: the generator draws t
 cause `DRAWS` times more, with other courses, directions and places, along the very motion of the
 case.  Their covariance, at the case's strength, is all that anyone can know of a course that was
 not logged.  The observer knows it, besides the noise, the attitude and the field; calibration,
-gyro bias and the outside field are projected out, as of all that `blindworld.ideal` sees.
+gyro bias and the outside field are projected out, as of all that `blindworld.ideal` sees.  Of a
+gyro's bias the noise is also a walk of an ordinary gyro (5e-6 rad/s per root second).
 
 Of tests that know no more of a signal than its covariance the best is the likelihood ratio
 
@@ -43,6 +44,7 @@ from blindworld.rotations import to_body
 from blindworld.world import _joint, _throttle
 
 DRAWS, NOISES = 240, 4000
+WALKS, WALK_RAD_S_SQRT_S = 100, 5e-6
 FALSE = 0.002  # a quarter of what is allowed for recordings in which nothing is
 STRENGTHS = (1.0, 1.25, 1.6, 2.0, 6.0)
 
@@ -64,8 +66,13 @@ def told(order, entropy, rng):
     for _ in range(DRAWS):
         drawn = _other_course(key, world, rng)
         signals.append(column(*_signal(key, drawn, index, rng)))
+    if (
+        key == "gyro_bias_temperature"
+    ):  # an ordinary gyro's bias walks, and nobody can know its path
+        walks = rng.normal(size=(WALKS, len(at), 3)).cumsum(axis=1) * WALK_RAD_S_SQRT_S * step**0.5
+        signals += [column(np.zeros_like(mag), walk) for walk in walks]
     G = _projected(gram([*others, *signals]), len(others))
-    return _power(G, rng)
+    return _power(G, DRAWS, rng)
 
 
 def _made(order, entropy):
@@ -125,24 +132,34 @@ def _projected(G, count):
     return left * np.outer(scale[count:], scale[count:])
 
 
-def _power(G, rng):
-    """Probability that the first signal passes the bar, all others its law; and its s/n."""
+def _power(G, draws, rng):
+    """Probability that the first signal passes the bar, the next so many its law; and its s/n.
+
+    What comes behind those is noise, besides the white one.
+    """
     own = float(G[0, 0])
-    rest, cross = G[1:, 1:], G[1:, 0]
-    size = np.sqrt(np.maximum(np.diag(rest), 1e-12))
-    rest, cross = rest / np.outer(size, size), cross / size
-    values, vectors = np.linalg.eigh(rest)
+    values, vectors = np.linalg.eigh(G[1:, 1:])
     kept = values > 1e-9 * values[-1]
     values, vectors = values[kept], vectors[:, kept]
-    mean = vectors.T @ cross / np.sqrt(values)
-    variance = own * values / len(rest)
+    coordinates = vectors.T * np.sqrt(values)[:, None]  # of the drawn signals, one per column
+    mean = vectors.T @ G[1:, 0] / np.sqrt(values)
+    size = np.sqrt(np.maximum(np.diag(G)[1 : draws + 1], 1e-12))
+    drawn = coordinates[:, :draws] * np.sqrt(own / draws) / size
+    noise = np.eye(len(values))
+    if coordinates.shape[1] > draws:
+        others = coordinates[:, draws:]
+        noise += others @ others.T / others.shape[1]
+    root = np.linalg.cholesky(noise)
+    drawn, mean = np.linalg.solve(root, drawn), np.linalg.solve(root, mean)
+    axes, sizes, _ = np.linalg.svd(drawn, full_matrices=False)
+    variance, mean = sizes**2, axes.T @ mean
 
     def ratio(z):
         return 0.5 * np.sum(z**2 * variance / (1 + variance) - np.log1p(variance), axis=1)
 
-    noise = rng.normal(size=(NOISES, len(values)))
-    bar = float(np.quantile(ratio(noise), 1 - FALSE))
-    return float(np.mean(ratio(mean + rng.normal(size=noise.shape)) > bar)), float(np.sqrt(own))
+    seen = rng.normal(size=(NOISES, len(variance)))
+    bar = float(np.quantile(ratio(seen), 1 - FALSE))
+    return float(np.mean(ratio(mean + rng.normal(size=seen.shape)) > bar)), float(np.sqrt(own))
 
 
 def main():
