@@ -45,8 +45,8 @@ KINDS = {
 #: functions of the engine that are timed, in the order in which they run
 PHASES = (
     "problem_of", "fit_null", "sought", "wandering", "named_beside", "bursts", "framed",
-    "with_spells", "in_its_noise", "in_even_noise", "with_forms", "with_free_course", "quick",
-    "checks", "usual_noise", "omnibus",
+    "refined", "left_alone", "explained", "with_free_course", "quick", "checks", "usual_noise",
+    "omnibus",
 )  # fmt: skip
 
 
