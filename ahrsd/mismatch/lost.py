@@ -8,6 +8,7 @@ likelier of the two models is it: turns that were taken for a jump leave the jum
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.missing import LONG, UNSEEN, missing_turns
 from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.problem import Problem
-from ahrsd.mismatch.search import State
+from ahrsd.mismatch.search import State, refitted
 from ahrsd.mismatch.unknown import Remainder, detected
 
 
@@ -43,8 +44,18 @@ def believed(lost: Sequence[Fact], put_right: State, otherwise: State) -> bool:
     """Whether lost turns that were seen at first stay, though others are seen beside the names.
 
     put_right: the model of the recording with them put right;  otherwise: with the others, if any
+    By what is put right alone: that more may have been lost is noise, which explains anything.
     """
-    return bool(lost) and put_right.fit.log_likelihood > otherwise.fit.log_likelihood
+    return bool(lost) and _as_seen(put_right) > _as_seen(otherwise)
+
+
+def _as_seen(state: State) -> float:
+    """Log likelihood of a model fitted as if no more turns were lost than those put right."""
+    track = state.problem.track
+    if track.lost_turns is None:
+        return state.fit.log_likelihood
+    problem = replace(state.problem, track=replace(track, lost_turns=None))
+    return refitted(replace(state, problem=problem), state.named).fit.log_likelihood
 
 
 def beyond_lost(left: Remainder, facts: Sequence[Fact], problem: Problem) -> bool:

@@ -5,11 +5,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mismatch_trials import Trial, made
 
 from ahrsd.mismatch.diagnosis import Where
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.limits import LIMITS
-from ahrsd.mismatch.lost import believed, beyond_lost
+from ahrsd.mismatch.lost import _as_seen, believed, beyond_lost
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.problem import problem_of
+from ahrsd.mismatch.search import State
+from ahrsd.mismatch.track import Spec
 
 LOST = Fact("dropped_samples", "", Where((), (), "link"), 0.98, turned=np.ones(3))
 LONG = replace(LOST, setting={"hidden": True, "long": 2})
@@ -18,7 +23,8 @@ STAMPED = Fact("dropped_samples", "", Where((), (), "link"), 0.98)
 
 
 def fitted(nats: float) -> SimpleNamespace:
-    return SimpleNamespace(fit=SimpleNamespace(log_likelihood=nats))
+    problem = SimpleNamespace(track=SimpleNamespace(lost_turns=None))
+    return SimpleNamespace(fit=SimpleNamespace(log_likelihood=nats), problem=problem)
 
 
 @pytest.mark.parametrize(
@@ -29,6 +35,21 @@ def test_lost_turns_stay_where_the_recording_is_likelier_with_them(
     lost, put_right, as_it_came, stays
 ):
     assert believed(lost, fitted(put_right), fitted(as_it_came)) is stays
+
+
+def test_that_more_may_be_lost_makes_no_claim_likelier() -> None:
+    """A field that swings: noise of the turn explains some of it, and is no proof."""
+    track = made(Trial(3, samples=4_000)).track
+    swing = 5e-3 * np.sin(2 * np.pi * track.time_s / 12.0)[:, None] * np.array([0.6, -0.8, 0.0])
+    problem, cold = problem_of(
+        replace(track, mag_b_gauss=track.mag_b_gauss + swing), Spec(), {}, LIMITS
+    )
+    plain = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+    loose = replace(problem.track, lost_turns=np.full(len(problem.track), 0.05))
+    free = replace(problem, track=loose)
+    claimed = State(free, fit_null(loose, problem.spec, cold, walk=False))
+    assert claimed.fit.log_likelihood > plain.fit.log_likelihood + 100.0
+    assert _as_seen(claimed) == pytest.approx(plain.fit.log_likelihood, abs=20.0)
 
 
 @pytest.mark.parametrize(
