@@ -24,6 +24,7 @@ from ahrsd.samples import Array
 _TRIED = np.geomspace(0.25, 4.0, 9)
 _COPIES = 8
 _FINE = 400  # sizes between those
+_LEAST = 1e-8  # of a moment's variance: readings that never differ do not scatter
 _QUIETEST = 0.1  # of the noise that is seen: the first guess is that at least
 
 
@@ -58,7 +59,8 @@ def before_rounding(
     wanted = _moments(done.track.mag_b_gauss, done.whitened[done.used], step_gauss)
     fine = np.geomspace(sizes[0], sizes[-1], _FINE)
     first = fine[int(np.argmin(_distance(_between(fine, sizes, found) - wanted, np.eye(2))))]
-    scatter = np.cov(np.array([moments(first, 1 + k) for k in range(_COPIES)]).T)
+    copies = np.array([moments(first, 1 + k) for k in range(_COPIES)])
+    scatter = np.cov(copies.T) + _LEAST * np.eye(2)
     off = _between(fine, sizes, found) - wanted
     return law(float(fine[int(np.argmin(_distance(off, scatter)))]))
 

@@ -99,11 +99,14 @@ def recovered(
 def _put_right(
     lost: NDArray[np.int64], found: _Jumps, picked: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The lost steps with those of the picked rows; one back is taken from the nearest."""
+    """The lost steps with those of the picked rows; one back is taken from the nearest.
+
+    Two jumps back may be near the same one: it is taken back once.
+    """
     lost = lost.copy()
     for row in picked.tolist():
         lost[row if found.steps[row] > 0 else _nearest(lost, row)] += found.steps[row]
-    return lost
+    return np.maximum(lost, 0)
 
 
 def _about(lost: NDArray[np.int64], reach: int) -> NDArray[np.bool]:

@@ -33,9 +33,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from blindworld import cases, ideal
+from blindworld import cases
 from blindworld.__main__ import case_ids
-from blindworld.chain import Stages, body_field, readings
+from blindworld.chain import Stages, readings
 from blindworld.curves import wave
 from blindworld.limits import EFFECTS
 from blindworld.motion import MOTIONS, _box, _course
@@ -54,22 +54,17 @@ def told(order, entropy, rng):
     world, setting, strength, seed = _made(order, entropy)
     ((key, _),) = order.effects
     at, mag, gyro = readings(world, Stages(), setting.rate_hz)
+    column, gram, others = cases.watched(world, setting, at)
     index = np.rint(at * 1000).astype(int)
-    R_nb, h_b = world.motion.R_nb[index], body_field(world, Stages())[index]
-    step = 1 / setting.rate_hz
-    column, gram = ideal.observer(
-        R_nb, h_b, world.soft_iron, step, setting.sigma_mag, setting.sigma_gyro
-    )
-    others = ideal.nuisances(column, R_nb, h_b, world.soft_iron)
     own = cases._alone(key, world, strength, seed, setting.rate_hz)
     signals = [column(own[0] - mag, own[1] - gyro)]
     for _ in range(DRAWS):
         drawn = _other_course(key, world, rng)
         signals.append(column(*_signal(key, drawn, index, rng)))
-    if (
-        key == "gyro_bias_temperature"
-    ):  # an ordinary gyro's bias walks, and nobody can know its path
-        walks = rng.normal(size=(WALKS, len(at), 3)).cumsum(axis=1) * WALK_RAD_S_SQRT_S * step**0.5
+    if key == "gyro_bias_temperature":
+        # an ordinary gyro's bias walks, and nobody can know its path
+        size = WALK_RAD_S_SQRT_S / setting.rate_hz**0.5
+        walks = size * rng.normal(size=(WALKS, len(at), 3)).cumsum(axis=1)
         signals += [column(np.zeros_like(mag), walk) for walk in walks]
     G = _projected(gram([*others, *signals]), len(others))
     return _power(G, DRAWS, rng)

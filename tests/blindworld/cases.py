@@ -142,13 +142,7 @@ def _strengths(order, world, setting, seeds):
     if not order.effects:
         return [], []
     at, mag, gyro = readings(world, Stages(), setting.rate_hz)
-    index = np.rint(at * 1000).astype(int)
-    R_nb, h_b = world.motion.R_nb[index], body_field(world, Stages())[index]
-    step = 1 / setting.rate_hz
-    column, gram = ideal.observer(
-        R_nb, h_b, world.soft_iron, step, setting.sigma_mag, setting.sigma_gyro
-    )
-    others = ideal.nuisances(column, R_nb, h_b, world.soft_iron)
+    column, gram, others = watched(world, setting, at)
     strengths, shown = [], []
     for (key, multiple), seed in zip(order.effects, seeds):
         effect = EFFECTS[key]
@@ -166,6 +160,16 @@ def _strengths(order, world, setting, seeds):
         gain = ideal.held_out_gain(gram, effect_column * strength / effect.limit, others, len(at))
         shown.append({"limit": limit, "snr": float(snr), "gain": gain})
     return strengths, shown
+
+
+def watched(world, setting, at):
+    """What an ideal observer of the world has at these instants: column, Gram, nuisances."""
+    index = np.rint(at * 1000).astype(int)
+    R_nb, h_b = world.motion.R_nb[index], body_field(world, Stages())[index]
+    column, gram = ideal.observer(
+        R_nb, h_b, world.soft_iron, 1 / setting.rate_hz, setting.sigma_mag, setting.sigma_gyro
+    )
+    return column, gram, ideal.nuisances(column, R_nb, h_b, world.soft_iron)
 
 
 def _limit(effect, seen, order):

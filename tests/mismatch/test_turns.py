@@ -8,7 +8,7 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.missing import UNSEEN, missing_turns
-from ahrsd.mismatch.turns import Means, recovered, some_lost, surplus
+from ahrsd.mismatch.turns import Means, _Jumps, _put_right, recovered, some_lost, surplus
 
 GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
 
@@ -139,3 +139,10 @@ def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
     assert (fact.unseen[found > 0] == 0.0).all()
     assert (fact.unseen >= 0.0).all()
     assert found.sum() + fact.unseen.sum() == pytest.approx(lost.sum(), rel=0.35)
+
+
+def test_a_step_is_not_taken_back_twice() -> None:
+    lost = np.array([0, 0, 1, 0, 0])
+    none = np.zeros(5)
+    found = _Jumps(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
+    assert _put_right(lost, found, np.array([1, 3])).tolist() == [0, 0, 0, 0, 0]
