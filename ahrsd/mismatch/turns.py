@@ -103,10 +103,10 @@ def _put_right(
 
     Two jumps back may be near the same one: it is taken back once.
     """
-    lost = lost.copy()
+    now = lost.copy()
     for row in picked.tolist():
-        lost[row if found.steps[row] > 0 else _nearest(lost, row)] += found.steps[row]
-    return np.maximum(lost, 0)
+        now[row if found.steps[row] > 0 else _nearest(lost, row)] += found.steps[row]
+    return np.maximum(now, 0)
 
 
 def _about(lost: NDArray[np.int64], reach: int) -> NDArray[np.bool]:
