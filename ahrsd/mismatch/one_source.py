@@ -8,13 +8,17 @@ one stretch to half a minute, of any size: the ratio of their evidences is what 
 says, and noise of whatever colour has none.
 
 One direction noise does have: the filter remembers the field's size for good and its direction for
-seconds, so slow noise stays along the field.  Where that hardly turns in a frame, in the world
-never, a source along it is none.
+seconds, so slow noise stays along the field.  A course along the field, wherever that points, is
+held against it, too: where the field hardly turns in a frame, in the world never, a source along
+it is none.
+
+Where the noise is white nothing has to be held against slow noise: a course of whatever direction
+that is likelier than white noise is something (`with_any_course`), asked where nothing else is.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +27,8 @@ from ahrsd.mismatch.locate import (
     FRAMES,
     UNITS,
     Frame,
+    Located,
+    Segments,
     group_name,
     locate,
     segments,
@@ -37,8 +43,6 @@ SHORTEST_S = 3.0
 FEWEST = 20
 #: odds of 1000 to 1 (Markov's inequality: noise has them once in 1000 recordings at most)
 NATS = float(np.log(1000.0))
-#: mean square of the cosine between the source and the field, at most
-ALONG = 0.5
 #: times within which a course forgets, in stretches
 TIMES = (0.25, 1.0, 2.5, 6.0)
 #: of a prior course's modes, those kept
@@ -60,44 +64,81 @@ def with_one_source(left: Remainder) -> Remainder:
     cut = segments(basis.context.track.time_s, count)
     grams = {frame: course_gram(basis, frame, cut) for frame in FRAMES[:2]}
     found: dict[Frame, float] = {}
+    seen: dict[Frame, Located] = {}
     for frame, gram in grams.items():
         where = gram.groups[group_name(frame)]
         information, score = gram.total[where, where], gram.total[where, -1]
-        unit = UNITS[frame]
-        nats, direction = directed(information, score, unit, basis.colour)
-        if along_field(_field_in(basis, frame), direction) <= ALONG:
-            found[frame] = nats
-    frame = max(found, key=lambda one: found[one], default=FRAMES[0])
-    nats = found.get(frame, -np.inf)
+        field = field_in(basis, frame, cut)
+        told = directed(information, score, UNITS[frame], basis.colour, field)
+        found[frame] = told.beyond_noise
+        course = locate(gram, frame, cut, basis.colour)
+        seen[frame] = replace(course, evidence=told.beyond_white)
+    left = replace(left, quick=seen)
+    frame = max(found, key=lambda one: found[one])
+    nats = found[frame]
     if nats < NATS:
         return left
     one = left.located[frame]
     if one.evidence < nats:
-        seen = locate(grams[frame], frame, cut, basis.colour)
-        one = replace(seen, evidence=nats, p_value=float(np.exp(-nats)))
+        one = _sure(seen[frame], nats)
     return replace(left, located={**left.located, frame: one}, one_source=True)
 
 
-def directed(information: Array, score: Array, unit: float, most: float) -> tuple[float, Array]:
-    """Nats by which one direction is likelier than three, and none at all; the direction (3,).
+def with_any_course(left: Remainder) -> Remainder:
+    """The remainder with the frame of a quick course of whatever direction, if there is one.
+
+    Of 200 nulls with white noise none has more than three nats.
+    """
+    best = max(left.quick.values(), key=lambda one: one.evidence, default=left.strongest)
+    if best.evidence < max(NATS, left.strongest.evidence) or not left.quick:
+        return left
+    located = {**left.located, best.frame: _sure(best, best.evidence)}
+    return replace(left, located=located, one_source=True)
+
+
+def _sure(one: Located, nats: float) -> Located:
+    return replace(one, evidence=nats, p_value=float(np.exp(-nats)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directed:
+    """What a frame's quick course is likely to be.
+
+    beyond_noise: nats by which one direction is likelier than three, the field's and none at all
+    beyond_white: nats by which a course, whichever of them, is likelier than white noise
+    direction: (3,) of the one
+    """
+
+    beyond_noise: float
+    beyond_white: float
+    direction: Array
+
+
+def directed(information: Array, score: Array, unit: float, most: float, field: Array) -> Directed:
+    """Held against each other: one direction, three, the field's, none.
 
     information (3 J, 3 J) and score (3 J,), stretch-major, of white noise of unit power.
     most: power of the noise, at most: a quick source counts as its colour, so less is tried too
+    field: (J, 3) unit vectors of the stretches, along which slow noise stays
     """
     count = len(score) // 3
     sizes = unit * np.asarray(SIZES)
     blocks, scores = information.reshape(count, 3, count, 3), score.reshape(count, 3)
     powers = np.geomspace(1.0, most, max(1, round(np.log(most) / np.log(POWER_STEP)) + 1))
     noise = _likelihood(information, score, powers)
-    free, inners = [], []
+    within = np.einsum("ja,jakb,kb->jk", field, blocks, field, optimize=True)
+    along = np.sum(field * scores, axis=1)
+    three, fields, inners = [], [], []
     for time in TIMES:
         root = course_root(count, time)
         inner = np.einsum("jr,jakb,ks->rasb", root, blocks, root, optimize=True)
         turned = root.T @ scores
         width = turned.size
-        free.append(_evidence(inner.reshape(width, width), turned.ravel(), sizes, powers) + noise)
+        three.append(_evidence(inner.reshape(width, width), turned.ravel(), sizes, powers) + noise)
+        fields.append(_evidence(root.T @ within @ root, root.T @ along, sizes, powers) + noise)
         inners.append((inner, turned))
-    other = max(_mean(noise), _mean(np.asarray(free)))
+    none, slow = _mean(noise), [_mean(np.asarray(one)) for one in (three, fields)]
+    other = max(none, *slow)
     for number in (COARSE, DIRECTIONS):
         directions = half_sphere(number)
         likely = np.asarray([_along(*one, directions, sizes, powers) for one in inners]) + noise
@@ -105,7 +146,8 @@ def directed(information: Array, score: Array, unit: float, most: float) -> tupl
         if float(likely.max()) - other < NATS / 2:
             break
     best = directions[np.unravel_index(int(np.argmax(likely)), likely.shape)[1]]
-    return _mean(likely) - other, best
+    one = _mean(likely)
+    return Directed(one - other, _mean(np.array([one, *slow])) - none, best)
 
 
 def _along(inner: Array, turned: Array, directions: Array, sizes: Array, powers: Array) -> Array:
@@ -141,17 +183,17 @@ def half_sphere(count: int) -> Array:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
 
 
-def along_field(field: Array, direction: Array) -> float:
-    """Mean square of the cosine between a field (N, 3) and a direction (3,)."""
-    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
-    return float(np.mean((unit @ direction) ** 2))
-
-
-def _field_in(basis: Base, frame: Frame) -> Array:
+def field_in(basis: Base, frame: Frame, cut: Segments) -> Array:
+    """(J, 3) unit vectors of the field in the stretches."""
     context = basis.context
-    if frame == "sensor":
-        return context.field_b
-    return np.asarray(np.einsum("nij,nj->ni", context.R_nb, context.field_b))
+    field = context.field_b
+    if frame == "world":
+        field = np.einsum("nij,nj->ni", context.R_nb, field)
+    inside = cut.index >= 0
+    sums = np.zeros((len(cut), 3))
+    np.add.at(sums, cut.index[inside], field[inside])
+    size = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.asarray(sums / np.maximum(size, _SMALLEST))
 
 
 def _evidence(information: Array, score: Array, sizes: Array, powers: Array) -> Array:

@@ -9,11 +9,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
+from ahrsd.mismatch.along_field import MOSTLY_SLOW, slowness
 from ahrsd.mismatch.diagnosis import Unexplained
+from ahrsd.mismatch.evidence import CLEAR_PEAK
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
 from ahrsd.mismatch.null import NullFit
+from ahrsd.mismatch.one_source import with_any_course, with_one_source
 from ahrsd.mismatch.own_form import free_price_of, price_of
 from ahrsd.mismatch.search import (
     ORDINARY_WALK_RAD_S_SQRT_S,
@@ -49,17 +52,29 @@ def left_alone(
     """What is left where nothing is named, by the limits of that: the last one, None for nothing.
 
     state: without names.  A course of the gyro's bias is nothing where an ordinary one's walk does
-    as well: the state with that, and what it leaves.
+    as well: the state with that, and what it leaves.  So is a quick course.
     """
     limits = state.problem.limits.alone()
     seen = left
     if not unknown.detected(left, state.problem.limits):
         seen = refined(start, state, left, None, limits)
+    slow = unknown.detected(seen, limits)
+    if not slow:
+        seen = _of_any_course(state, seen)
     if not unknown.detected(seen, limits):
         return state, left, None
-    if seen.strongest.frame != "gyro" or seen.stood_in is not None or state.walk:
+    field = seen.strongest.frame != "gyro" or seen.stood_in is not None
+    if (slow and field) or state.walk:
         return state, left, seen
     walking = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), ())
     rest = unknown.remainder(formed_basis_of(walking), with_bins=bool(left.bins))
-    rest = refined(start, walking, rest, None, limits)
-    return (state, left, seen) if unknown.detected(rest, limits) else (walking, rest, None)
+    rest = refined(start, walking, with_one_source(rest), None, limits)
+    still = unknown.detected(_of_any_course(walking, rest), limits)
+    return (state, left, seen) if still else (walking, rest, None)
+
+
+def _of_any_course(state: State, left: Remainder) -> Remainder:
+    """The remainder with a quick course where that cannot be slow noise of the magnetometer."""
+    white = left.basis.rest is None and left.basis.colour <= CLEAR_PEAK
+    no_noise = white or slowness(formed_basis_of(state)) >= MOSTLY_SLOW
+    return with_any_course(left) if no_noise else left

@@ -137,19 +137,23 @@ def noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
     """The state with a bias that wanders, or with its cause where that is likelier by far.
 
     A walk is free to follow any cause, and then none is needed.  Nor is one where the few modes of
-    a walk explain nearly as much.
+    a walk explain nearly as much; a step that may be anywhere is what a walk looks like soonest.
+    Where the lead is small the fit must gain by as much more.
     """
     noisy = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), state.named)
     limits = state.problem.limits
     walk = max((c.evidence for c in seen.candidates if c.name == WANDERING[0]), default=0.0)
     lead = judged.candidate.evidence - walk
-    if judged.candidate.name not in CAUSED or lead < 2 * limits.lead_nats:
+    clear = 2.0 * limits.lead_nats
+    least = clear if judged.candidate.name == STEPS["gyro"] else limits.lead_nats
+    if judged.candidate.name not in CAUSED or lead < least:
         return noisy
     named = added(state, judged)
     largest = replace(noisy.fit.model, gyro_walk_rad_s_sqrt_s=noise_fit.WALK_CAP_RAD_S_SQRT_S)
     wider = replace(noisy, fit=at_model(state.problem.track, largest, noisy.fit.terms))
     best = max(likelihood(noisy), likelihood(wider))
-    return named if likelihood(named) > best + limits.unknown_nats else noisy
+    gained = likelihood(named) - best
+    return named if gained > limits.unknown_nats + max(0.0, clear - lead) else noisy
 
 
 def _cause_after_all(state: State, seen: Survey) -> State:

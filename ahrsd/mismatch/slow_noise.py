@@ -36,7 +36,7 @@ def in_its_noise(basis: Base, left: Remainder, limits: Limits) -> Remainder:
     again = unknown.tested(lawful(basis, left), with_bins=bool(left.bins))
     again = with_spells(in_a_field(basis, again) if unknown.detected(again, limits) else again)
     agreed = unknown.detected(left, limits) and unknown.detected(again, limits)
-    return left if agreed else again
+    return left if agreed else replace(again, quick=left.quick)
 
 
 def lawful(basis: Base, left: Remainder) -> Base:

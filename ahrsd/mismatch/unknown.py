@@ -9,7 +9,7 @@ nonparametric repair.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -42,7 +42,8 @@ class Remainder:
     bins: (regime, evidence, p-value), the strongest first
     free: the strongest frame with its course as a joint fit has it (`free_course`)
     stood_in: the frame of a name that was taken out again though the tests show nothing there
-    one_source: whether a quick source of one direction is among them (`one_source`)
+    one_source: whether a quick source is among them (`one_source`)
+    quick: each frame's course that changes within seconds, in nats over white noise, where asked
     spells_s: (begin, end) where a course that comes and goes is away (`spells`)
     """
 
@@ -52,6 +53,7 @@ class Remainder:
     free: Located | None = None
     stood_in: Frame | None = None
     one_source: bool = False
+    quick: Mapping[Frame, Located] = field(default_factory=dict)
     spells_s: tuple[tuple[float, float], ...] = ()
 
     @property

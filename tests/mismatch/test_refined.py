@@ -14,6 +14,7 @@ from ahrsd.mismatch.explained import explained
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.name import ROBUST
 from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.one_source import NATS, with_one_source
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.refined import left_alone, refined
 from ahrsd.mismatch.search import State, formed_basis_of, survey
@@ -27,7 +28,7 @@ def left_of(track: Track, limits: Limits = LIMITS) -> tuple[State, Remainder]:
     """A state without names and what it leaves."""
     problem, cold = problem_of(track, Spec(), {"hard_iron_step": EFFECTS["hard_iron_step"]}, limits)
     state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
-    left = unknown.remainder(formed_basis_of(state))
+    left = with_one_source(unknown.remainder(formed_basis_of(state)))
     return state, refined(state.fit, state, left, None, limits)
 
 
@@ -71,6 +72,38 @@ def test_an_ordinary_walk_of_the_gyro_is_nothing_and_a_large_one_is() -> None:
     assert not unknown.detected(rest, LIMITS.alone())
     state, left = left_of(drifting(1e-4))
     assert left_alone(state.fit, state, left)[2] is not None
+
+
+def wobbling(gauss: float, noise: str = "white") -> Track:
+    """Every reading is longer and shorter by so much, in turns of 8.5 s."""
+    track = made(Trial(4, noise=noise)).track
+    unit = track.mag_b_gauss / np.linalg.norm(track.mag_b_gauss, axis=1, keepdims=True)
+    turns = np.sign(np.sin(2 * np.pi * track.time_s / 17.0))
+    return replace(track, mag_b_gauss=track.mag_b_gauss + gauss * turns[:, None] * unit)
+
+
+@pytest.mark.parametrize(
+    ("gauss", "noise", "told"),
+    [
+        (0.9e-4, "white", False),
+        (1.3e-4, "white", True),
+        # what is red may be the noise's own
+        (0.0, "red", False),
+        # but no noise of a magnetometer is mostly slow
+        (8e-4, "white", True),
+        (8e-4, "red", True),
+    ],
+)
+def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, told) -> None:
+    state, left = left_of(wobbling(gauss, noise))
+    assert not unknown.detected(left, LIMITS)
+    _, rest, seen = left_alone(state.fit, state, left)
+    assert (seen is not None) is told
+    if seen is not None:
+        assert seen.one_source
+        assert seen.strongest.frame in ("sensor", "world")
+        assert seen.strongest.evidence > NATS
+        assert not rest.one_source
 
 
 @pytest.mark.parametrize(("times", "named"), [(5.0, True), (50.0, False)])
