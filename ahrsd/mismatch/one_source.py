@@ -74,10 +74,11 @@ def with_one_source(left: Remainder) -> Remainder:
         course = locate(gram, frame, cut, basis.colour)
         seen[frame] = replace(course, evidence=told.beyond_white)
     left = replace(left, quick=seen)
-    frame = max(found, key=lambda one: found[one])
-    nats = found[frame]
-    if nats < NATS:
+    clear = [frame for frame, nats in found.items() if nats >= NATS]
+    if not clear:
         return left
+    frame = max(clear, key=lambda one: seen[one].evidence)
+    nats = found[frame]
     one = left.located[frame]
     if one.evidence < nats:
         one = _sure(seen[frame], nats)
