@@ -101,7 +101,7 @@ def diagnose(
     if lost:
         problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
     done, fast = _named(problem, cold)
-    beside = lost_beside(whole, fast.state)
+    beside = lost_beside(whole, fast.state, lost)
     if differ(lost, beside):
         other, cold = problem_of(put_right(track, (*facts, *beside)), spec, library, limits)
         again = _named(other, cold)

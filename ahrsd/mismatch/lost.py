@@ -3,6 +3,9 @@
 A field that jumps looks like lost turns now and then, and hides those that are.  So they are looked
 for once more in the recording as it came, beside the names; and where the two answers differ, the
 likelier of the two models is it: turns that were taken for a jump leave the jump's noise.
+
+A step that is named just where a turn was put right may be no more than that turn's answer, where
+it was none: beside it the same turn would be found again.
 """
 
 from __future__ import annotations
@@ -15,20 +18,40 @@ import numpy as np
 from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.missing import LONG, UNSEEN, missing_turns
-from ahrsd.mismatch.null import at_model
+from ahrsd.mismatch.null import FittedTerm, at_model
 from ahrsd.mismatch.problem import Problem
-from ahrsd.mismatch.search import State, refitted
+from ahrsd.mismatch.search import STEPS, State, refitted
 from ahrsd.mismatch.unknown import Remainder, detected
 
+#: a step so near to a turn that was put right may be its answer
+NEAR_S = 2.0
 
-def lost_beside(whole: Problem, state: State) -> list[Fact]:
-    """Lost turns of the recording as it came, `whole`, beside the terms of a state."""
-    fit = state.fit
-    if state.problem.recorded is not whole.recorded:
+
+def lost_beside(whole: Problem, state: State, lost: Sequence[Fact]) -> list[Fact]:
+    """Lost turns of the recording as it came, `whole`, beside the terms of a state.
+
+    lost: those that were put right before the terms were found
+    """
+    fit, terms = state.fit, _without_answers(state, lost)
+    if state.problem.recorded is not whole.recorded or len(terms) < len(fit.terms):
         track = delayed_gyro(whole.recorded, state.problem.lag_s)
-        fit = at_model(track, fit.model, fit.terms)
+        fit = at_model(track, fit.model, terms)
     rate = fit.filtered.track.gyro_b_rad_s - fit.model.gyro_bias_rad_s
     return missing_turns(fit.filtered, rate)
+
+
+def _without_answers(state: State, lost: Sequence[Fact]) -> tuple[FittedTerm, ...]:
+    """The terms without steps that begin where a turn was put right."""
+    begin_s = [end for fact in lost if fact.turned is not None for _, end in fact.where.intervals_s]
+    onsets_s = [
+        judged.candidate.setting.get("onset_s") if judged.candidate.name in STEPS.values() else None
+        for judged in state.named
+    ]
+    return tuple(
+        term
+        for term, onset_s in zip(state.fit.terms, onsets_s, strict=True)
+        if onset_s is None or all(abs(onset_s - at) > NEAR_S for at in begin_s)
+    )
 
 
 def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:

@@ -64,8 +64,9 @@ def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None
     assert found.unexplained.detected
 
 
-@pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("seed", [5, 6])
 def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
+    """Without the current turns are put right where none was lost; of 5, steps are named there."""
     track = track_of(experiment("wam", seed=seed, samples=3000))
     track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
