@@ -105,7 +105,7 @@ def diagnose(
     if differ(lost, beside):
         other, cold = problem_of(put_right(track, (*facts, *beside)), spec, library, limits)
         again = _named(other, cold)
-        if not believed(lost, done.state, again[0].state):
+        if not believed(lost, done.state, beside, again[0].state):
             lost, problem, (done, fast) = beside, other, again
     still = (HARDLY_TURNED,) if at_rest(done.start) else ()
     notes = (*notes, *still, *done.state.problem.notes)

@@ -10,7 +10,8 @@ no larger than what every sensor has of itself, is not said, as beside a real ro
 
 A step that was found against the spectrum of the rest and is worth more than the rest is not asked:
 1500 nats are no part of 700, though in white noise, which a room is not, a course in time is yet
-likelier.  Nor is a delay: it follows the turns and no course.
+likelier.  Nor, whatever the rest, is what was logged and changes often: the spectrum knows how
+often a room does.  Nor is a delay: it follows the turns and no course.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from ahrsd.mismatch import unknown
 from ahrsd.mismatch.beside import material
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.locate import UNITS, coarse_cut, frame_columns
+from ahrsd.mismatch.name import Judged
+from ahrsd.mismatch.often import OFTEN, logged_often
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import OWN_SHARE, compared, more
 from ahrsd.mismatch.search import (
@@ -60,12 +63,19 @@ def without_likelier_forms(
 
 def _asked(state: State, left: unknown.Remainder, beside: Set[str]) -> list[int]:
     """Names that may be parts of what is left."""
-    rest, sharp = left.strongest.evidence, beside & set(STEPS.values())
+    rest = left.strongest.evidence
     return [
         k
-        for k, name in enumerate(state.names)
-        if name not in DELAYS and not (name in sharp and state.named[k].evidence > rest)
+        for k, one in enumerate(state.named)
+        if one.candidate.name not in DELAYS
+        and not (one.candidate.name in beside and _sharp(state, one, rest))
     ]
+
+
+def _sharp(state: State, judged: Judged, rest: float) -> bool:
+    """Whether a name changes at moments that the course of a rest of so many nats does not know."""
+    step = judged.candidate.name in STEPS.values() and judged.evidence > rest
+    return step or logged_often(state.problem.track, judged.candidate, 2 * OFTEN)
 
 
 def _parts_of_the_rest(state: State, left: unknown.Remainder, asked: list[int]) -> list[int]:

@@ -2,7 +2,8 @@
 
 A field that jumps looks like lost turns now and then, and hides those that are.  So they are looked
 for once more in the recording as it came, beside the names; and where the two answers differ, the
-likelier of the two models is it: turns that were taken for a jump leave the jump's noise.
+likelier of the two models is it: turns that were taken for a jump leave the jump's noise.  Every
+turn has its price, which row it is and how many steps: many that are free explain anything.
 
 A step that is named just where a turn was put right may be no more than that turn's answer, where
 it was none: beside it the same turn would be found again.
@@ -21,6 +22,7 @@ from ahrsd.mismatch.missing import LONG, UNSEEN, missing_turns
 from ahrsd.mismatch.null import FittedTerm, at_model
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.search import STEPS, State, refitted
+from ahrsd.mismatch.turns import LONGER_NATS
 from ahrsd.mismatch.unknown import Remainder, detected
 
 #: a step so near to a turn that was put right may be its answer
@@ -63,13 +65,28 @@ def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:
     return len(first) != len(then) or not all(np.array_equal(a, b) for a, b in pairs)
 
 
-def believed(lost: Sequence[Fact], put_right: State, otherwise: State) -> bool:
+def believed(
+    lost: Sequence[Fact], put_right: State, beside: Sequence[Fact], otherwise: State
+) -> bool:
     """Whether lost turns that were seen at first stay, though others are seen beside the names.
 
-    put_right: the model of the recording with them put right;  otherwise: with the others, if any
+    put_right: the model of the recording with them put right;  otherwise: with those `beside`
     By what is put right alone: that more may have been lost is noise, which explains anything.
     """
-    return bool(lost) and _as_seen(put_right) > _as_seen(otherwise)
+    if not lost:
+        return False
+    return _as_seen(put_right) - price(lost) > _as_seen(otherwise) - price(beside)
+
+
+def price(facts: Sequence[Fact]) -> float:
+    """Nats that lost turns cost: their rows among all, and a quarter as many for each more step."""
+    turned = [fact.turned for fact in facts if fact.turned is not None]
+    steps = np.round(np.concatenate([[1.0], *turned]) - 1.0)
+    rows = int(np.count_nonzero(steps > 0))
+    if not rows:
+        return 0.0
+    longer = float(np.sum(steps[steps > 0] - 1.0))
+    return rows * float(np.log((len(steps) - 1) / rows)) + longer * LONGER_NATS
 
 
 def _as_seen(state: State) -> float:

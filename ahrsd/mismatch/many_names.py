@@ -2,7 +2,8 @@
 
 On parallel legs a position is a function of the headings before it: a field that differs from place
 to place was iron that takes its time, the earth's turn and hysteresis, 99 % sure each.  One source
-that is free in time was likelier than any of the three, and they left nothing of it.
+that is free in time was likelier than any of the three, and they left nothing of it.  On another
+such path one of them had 444 nats and left 211: a source free in time had 676 at once.
 """
 
 from __future__ import annotations
@@ -11,25 +12,30 @@ from ahrsd.mismatch import unknown
 from ahrsd.mismatch.foretold import in_time_alone
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, refitted
 
-#: names from which on it is asked: pairs of effects are seen on vehicles
+#: names from which on it is asked where they leave nothing: pairs of effects are seen on vehicles
 MANY = 3
+#: by which it must be likelier than names and what they leave
+LIKELIER_NATS = 7.0
 
 
 def one_for_many(
     state: State, surveys: list[Survey], left: unknown.Remainder
 ) -> tuple[State, list[Survey], unknown.Remainder]:
-    """The state without names, and that source, where there are three or more; else as it was.
+    """The state without names, and that source, where it is likelier; else as it was.
 
-    Names by a logged cause, or with a course in time, are not asked, nor is anything where more is
-    left: then there is a source, and names beside it.
+    Than each of three or more, or than all and what they leave.  Names by a logged cause, or with a
+    course in time, are not asked.
     """
     names = [judged.candidate for judged in state.named]
     own = any("covariate" in name.setting or in_time_alone(name) for name in names)
-    if len(names) < MANY or own or unknown.detected(left, state.problem.limits):
+    rest = unknown.detected(left, state.problem.limits)
+    if own or not names or (len(names) < MANY and not rest):
         return state, surveys, left
+    nats = [judged.evidence for judged in state.named]
+    other = sum(nats) + left.strongest.evidence + LIKELIER_NATS if rest else max(nats)
     bare = refitted(state, ())
     source = unknown.remainder(formed_basis_of(bare))
-    likelier = source.strongest.evidence > max(judged.evidence for judged in state.named)
+    likelier = source.strongest.evidence > other
     if not (likelier and unknown.detected(source, state.problem.limits)):
         return state, surveys, left
     return bare, [], source

@@ -3,6 +3,9 @@
 Iron that has two states, or a source that switches unseen, is for ten seconds what an object is
 that is passed by.  Such a name has the evidence of that one moment; where what no name explains is
 as likely as a whole, the moment is a part of it.
+
+So are bumps, wherever they are, where what is left beside them is a quick source: a current is on
+now and then.  Where the source alone is likelier than the bumps and what they leave of it, it is.
 """
 
 from __future__ import annotations
@@ -10,8 +13,9 @@ from __future__ import annotations
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.along_field import framed
 from ahrsd.mismatch.name import LONELY_BLOCKS, Judged
+from ahrsd.mismatch.rivals import MORE_NATS
 from ahrsd.mismatch.search import State, Survey, formed_basis_of
-from ahrsd.mismatch.stand_ins import dropped
+from ahrsd.mismatch.stand_ins import BUMP, dropped
 
 #: by which such a name must be likelier than what is left
 LIKELIER = 2.0
@@ -29,7 +33,7 @@ def without_passing(
     nats = max(burst_nats, left.strongest.evidence if course else 0.0)
     passing = [k for k, judged in enumerate(state.named) if _passing(judged, nats)]
     if not passing:
-        return state, surveys, left
+        return _without_bumps(state, surveys, left)
     if burst_nats >= nats:
         return dropped(state, surveys, passing, left)
     slim, others, rest = dropped(state, surveys, passing, left)
@@ -41,3 +45,22 @@ def _passing(judged: Judged, nats: float) -> bool:
     brief = judged.what.effective_blocks < LONELY_BLOCKS
     outside = judged.candidate.effect.family == "world"
     return outside and brief and judged.evidence < LIKELIER * nats
+
+
+def _without_bumps(
+    state: State, surveys: list[Survey], left: unknown.Remainder
+) -> tuple[State, list[Survey], unknown.Remainder]:
+    """The state without bumps that are parts of a quick source; else as it was."""
+    bumps = [k for k, name in enumerate(state.names) if name == BUMP]
+    if not bumps or not left.one_source:
+        return state, surveys, left
+    slim, others, rest = dropped(state, surveys, bumps, left)
+    rest = framed(formed_basis_of(slim), rest, state.problem.limits)
+    parts = sum(state.named[k].evidence for k in bumps) + _nats(left)
+    likelier = rest.one_source and _nats(rest) > parts + MORE_NATS
+    return (slim, others, rest) if likelier else (state, surveys, left)
+
+
+def _nats(left: unknown.Remainder) -> float:
+    """Of the likeliest quick course."""
+    return max((one.evidence for one in left.quick.values()), default=0.0)

@@ -145,7 +145,7 @@ def noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
     walk = max((c.evidence for c in seen.candidates if c.name == WANDERING[0]), default=0.0)
     lead = judged.candidate.evidence - walk
     clear = 2.0 * limits.lead_nats
-    least = clear if judged.candidate.name == STEPS["gyro"] else limits.lead_nats
+    least = clear if judged.candidate.name == STEPS["gyro"] else 0.0
     if judged.candidate.name not in CAUSED or lead < least:
         return noisy
     named = added(state, judged)

@@ -39,7 +39,7 @@ _ROWS = (3, 6, 12, 24, 48)  # before and after a jump
 _ROUNDS = 20
 _SURE_NATS = 3.0  # beyond the share
 _ENOUGH = 10  # times as many rows as are averaged: else their spread is not known
-_LONGER = float(np.log(4.0))  # what each further step of a gap costs
+LONGER_NATS = float(np.log(4.0))  # what each further step of a gap costs
 _SHARES = (0.01, 0.03, 0.1)  # of the rows, that a jump is so near that its mean is in it
 _ACROSS = 12.0  # chi square that one in 400 is beyond
 _BESIDE = 0.25  # of a mean's rows: so near to its jump is the step that made it
@@ -207,8 +207,8 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, count: float, lost: NDArray[np.i
     out = _Jumps(one, np.full(n, -np.inf), one.copy(), np.ones(n))
     for mean in _means(done, rate_b_rad_s):
         z, size = mean.z, mean.size
-        steps = np.maximum(np.round((z - _LONGER) / np.maximum(size, 1e-300)), 1.0)
-        nats = steps * z - steps**2 * size / 2 - least - _LONGER * (steps - 1)
+        steps = np.maximum(np.round((z - LONGER_NATS) / np.maximum(size, 1e-300)), 1.0)
+        nats = steps * z - steps**2 * size / 2 - least - LONGER_NATS * (steps - 1)
         about = _about(lost, 1 + int(_BESIDE * mean.length))
         back = np.where(about[mean.k], -z - size / 2 - _TWICE_NATS, -np.inf)
         steps, nats = np.where(back > nats, -1, steps), np.maximum(nats, back)

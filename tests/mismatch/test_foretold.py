@@ -131,3 +131,11 @@ def test_what_changes_often():
     assert changes(throttled, 0.1) >= 20
     assert changes(warming, 0.1) == 1
     assert changes(rng.standard_normal(3000) * 0.0, 0.1) == 0
+
+
+def test_a_change_at_a_known_moment_counts_twice():
+    time_s = np.arange(0.0, 300.0, 0.1)
+    switched = np.where(time_s % 100.0 < 50.0, 0.0, 1.0)
+    swung = np.sin(2 * np.pi * time_s / 100.0)
+    assert changes(swung, 0.1) == 5
+    assert changes(switched, 0.1) == 10

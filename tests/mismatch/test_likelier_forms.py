@@ -147,3 +147,17 @@ def test_a_delay_is_no_part_of_a_rest(track: Track) -> None:
     )
     state, _, left = named(late, "mag_time_lag")
     assert likelier_forms._asked(state, left, frozenset()) == []
+
+
+@pytest.mark.parametrize(("period_s", "asked"), [(40.0, []), (200.0, [0])])
+def test_what_was_logged_and_changes_often_is_no_part_of_a_rest(
+    track: Track, period_s: float, asked: list[int]
+) -> None:
+    on = np.where((track.time_s - track.time_s[0]) % period_s < period_s / 2, 0.0, 1.0)
+    switched = replace(with_field(track, on, 2e-3), covariates={"lamp_on": on})
+    state, _, left = named(switched, "switched_device")
+    nats = 2 * state.named[0].evidence
+    sensor = replace(left.located["sensor"], evidence=nats, p_value=1e-30)
+    left = replace(left, located={**left.located, "sensor": sensor})
+    assert likelier_forms._asked(state, left, frozenset({"switched_device"})) == asked
+    assert likelier_forms._asked(state, left, frozenset()) == [0]

@@ -68,7 +68,11 @@ MANY = (
         (MANY, 63.2, -9.0, True),
         (MANY[:2], 63.2, -9.0, False),  # two effects are seen on vehicles
         (MANY, 40.0, -9.0, False),
+        # beside a rest it must be likelier than all of them and the rest
         (MANY, 63.2, 30.0, False),
+        (MANY[:1], 42.6 + 30.0 + 6.9, 30.0, False),
+        (MANY[:1], 42.6 + 30.0 + 7.1, 30.0, True),
+        ((), 80.0, 30.0, False),
         ((*MANY[:2], named("motor_current_field", 9.0, covariate="i")), 63.2, -9.0, False),
         ((*MANY[:2], named("hard_iron_step", 9.0, onset_s=9.0)), 63.2, -9.0, False),
     ],
