@@ -79,7 +79,7 @@ def believed(
 
 
 def price(facts: Sequence[Fact]) -> float:
-    """Nats that lost turns cost: their rows among all, and a quarter as many for each more step."""
+    """Nats that lost turns cost: which rows of all they are, and each further step of a gap."""
     turned = [fact.turned for fact in facts if fact.turned is not None]
     steps = np.round(np.concatenate([[1.0], *turned]) - 1.0)
     rows = int(np.count_nonzero(steps > 0))

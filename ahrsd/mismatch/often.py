@@ -18,6 +18,7 @@ OFTEN = 4
 _SMOOTHED_S = 1.0
 #: how far from the middle a side begins, in deviations: noise that crosses it changes nothing
 _SIDE = 0.25
+#: a change at a known moment: through this part of its range within so long
 _SUDDEN_S, _SUDDEN_PART = 1.0, 0.5
 
 
