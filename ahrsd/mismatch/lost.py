@@ -81,12 +81,12 @@ def believed(
 def price(facts: Sequence[Fact]) -> float:
     """Nats that lost turns cost: which rows of all they are, and each further step of a gap."""
     turned = [fact.turned for fact in facts if fact.turned is not None]
-    steps = np.round(np.concatenate([[1.0], *turned]) - 1.0)
+    steps = np.round(np.concatenate([np.empty(0), *turned]) - 1.0)
     rows = int(np.count_nonzero(steps > 0))
     if not rows:
         return 0.0
     longer = float(np.sum(steps[steps > 0] - 1.0))
-    return rows * float(np.log((len(steps) - 1) / rows)) + longer * LONGER_NATS
+    return rows * float(np.log(len(steps) / rows)) + longer * LONGER_NATS
 
 
 def _as_seen(state: State) -> float:

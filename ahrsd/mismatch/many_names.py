@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.foretold import in_time_alone
+from ahrsd.mismatch.rivals import MORE_NATS
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, refitted
 
 #: names from which on it is asked where they leave nothing: pairs of effects are seen on vehicles
 MANY = 3
-#: by which it must be likelier than names and what they leave
-LIKELIER_NATS = 7.0
 
 
 def one_for_many(
@@ -32,7 +31,7 @@ def one_for_many(
     if own or not names or (len(names) < MANY and not rest):
         return state, surveys, left
     nats = [judged.evidence for judged in state.named]
-    other = sum(nats) + left.strongest.evidence + LIKELIER_NATS if rest else max(nats)
+    other = sum(nats) + left.strongest.evidence + MORE_NATS if rest else max(nats)
     bare = refitted(state, ())
     source = unknown.remainder(formed_basis_of(bare))
     likelier = source.strongest.evidence > other

@@ -86,10 +86,7 @@ def with_one_source(left: Remainder) -> Remainder:
 
 
 def with_any_course(left: Remainder) -> Remainder:
-    """The remainder with the frame of a quick course of whatever direction, if there is one.
-
-    Of 179 nulls of two rings whose noise is white none has more than three nats.
-    """
+    """The remainder with the frame of a quick course of whatever direction, if there is one."""
     best = max(left.quick.values(), key=lambda one: one.evidence, default=left.strongest)
     if best.evidence < max(NATS, left.strongest.evidence) or not left.quick:
         return left
