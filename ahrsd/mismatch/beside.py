@@ -23,16 +23,7 @@ from ahrsd.mismatch.name import Judged, judge
 from ahrsd.mismatch.nested import simplest
 from ahrsd.mismatch.often import OFTEN, logged_often
 from ahrsd.mismatch.problem import Problem
-from ahrsd.mismatch.regression import (
-    Base,
-    Candidate,
-    best_settings,
-    candidate_gram,
-    closest_onset,
-    columns_of,
-    evidence_of,
-    quieter,
-)
+from ahrsd.mismatch.regression import Base, Candidate, candidate_gram, columns_of, quieter
 from ahrsd.mismatch.reweighted import reweighted
 from ahrsd.mismatch.rivals import OWN_SHARE, by_matrix, by_memory, compared, more
 from ahrsd.mismatch.score import Score
@@ -46,6 +37,7 @@ from ahrsd.mismatch.search import (
     term_group,
     without_term,
 )
+from ahrsd.mismatch.settings import best_settings, closest_onset, evidence_of
 from ahrsd.mismatch.spectrum import Spectrum, against, spectrum_of
 from ahrsd.mismatch.stand_ins import TIME_SHAPED
 from ahrsd.mismatch.values import Columns, Context
@@ -249,7 +241,7 @@ def _judged(state: State, basis: Base, plain: Spectrum, one: Candidate, tried: i
     if held.what.rank < len(one.scale):  # directions that are not paid for explain nothing
         noise = spectrum_of(basis, columns @ held.what.basis)
     gain = (noise.nats - plain.nats) / quiet.colour
-    evidence = gain - _paid(held.what, one.scale) - float(np.log(one.tried))
+    evidence = gain - _paid(held.what, one.scale) - one.paid
     checks = {
         "evidence": evidence > _least_nats(one, problem),
         SIZE: material(one, held.what.value),

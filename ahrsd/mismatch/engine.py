@@ -166,19 +166,17 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
             left = replace(left, stood_in=rest.strongest.frame)
     if short is not None and short.evidence_nats <= left.strongest.evidence:
         short = None
-    alone = None
+    last, alone = done.last, None
     if short is None and not state.named:
         state, left, alone = left_alone(start, state, left)
         named = None
         if alone is not None and not done.before.named:
             named = explained(state, alone, problem.limits.alone())
         if named is not None:
-            (state, surveys, left), alone = named, None
+            (state, surveys, last, left), alone = named, None
     if short is None and unknown.detected(left, problem.limits):
         left = with_free_course(state, left)
-    return _Searched(
-        start, settled(state), surveys, done.first, done.last, left, short, beside, alone
-    )
+    return _Searched(start, settled(state), surveys, done.first, last, left, short, beside, alone)
 
 
 def _told(

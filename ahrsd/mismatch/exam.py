@@ -12,7 +12,7 @@ from ahrsd.mismatch.evidence import CLEAR_PEAK
 from ahrsd.mismatch.foretold import in_time_alone
 from ahrsd.mismatch.name import believable, judge
 from ahrsd.mismatch.nested import contained, without_wider
-from ahrsd.mismatch.regression import Base, candidate_gram, columns_of, evidence_of
+from ahrsd.mismatch.regression import Base, candidate_gram, columns_of
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
     STEPS,
@@ -23,6 +23,7 @@ from ahrsd.mismatch.search import (
     term_group,
     without_term,
 )
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.mismatch.slow_noise import lawful
 from ahrsd.samples import Array
 

@@ -23,8 +23,10 @@ ROBUST_SLACK = 20.0
 
 def explained(
     state: State, left: Remainder, limits: Limits
-) -> tuple[State, list[Survey], Remainder] | None:
+) -> tuple[State, list[Survey], Survey, Remainder] | None:
     """The state with the one name that leaves nothing of the rest, if there is one.
+
+    And the surveys without it and with it, and what is left.
 
     state: without names, to which none was ever given;  left: its rest, which is there
     limits: those by which it is
@@ -42,7 +44,9 @@ def explained(
     if not borne_out(state, tried, best, seen):
         return None
     after = unknown.remainder(formed_basis_of(tried))
-    return None if unknown.detected(after, limits) else (tried, [seen] * len(tried.named), after)
+    if unknown.detected(after, limits):
+        return None
+    return tried, [seen] * len(tried.named), survey(tried), after
 
 
 def _with(state: State, judged: Judged, seen: Survey) -> State:

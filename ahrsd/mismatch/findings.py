@@ -19,14 +19,7 @@ from ahrsd.mismatch.intervals import spans
 from ahrsd.mismatch.itself import beside_itself
 from ahrsd.mismatch.locate import segments
 from ahrsd.mismatch.name import LONELY_BLOCKS, Judged
-from ahrsd.mismatch.regression import (
-    CALIBRATION,
-    Base,
-    Candidate,
-    candidate_gram,
-    scale_of,
-    scaled,
-)
+from ahrsd.mismatch.regression import CALIBRATION, Base, Candidate, candidate_gram
 from ahrsd.mismatch.reweighted import stepped
 from ahrsd.mismatch.search import (
     COUNTERPART_NATS,
@@ -37,6 +30,7 @@ from ahrsd.mismatch.search import (
     in_its_place,
     term_group,
 )
+from ahrsd.mismatch.settings import scale_of, scaled
 from ahrsd.mismatch.unknown import AXES, innovation_rms
 from ahrsd.mismatch.validate import Gain, alternating, heading_error_deg, heldout
 from ahrsd.mismatch.values import NullModel, Term

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.exam import IMITATORS, pruned
-from ahrsd.mismatch.regression import Base, evidence_of
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.search import State, formed_basis_of, refitted, without_term
 from ahrsd.mismatch.selection import forward
+from ahrsd.mismatch.settings import evidence_of
 
 
 def without_imitators(state: State) -> State:

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.mismatch.regression import WORTH_NATS, Base, Candidate, evidence_of
+from ahrsd.mismatch.regression import Base, Candidate
+from ahrsd.mismatch.settings import WORTH_NATS, evidence_of
 
 #: names whose cause may change within tenths of a second
 QUICK_CAUSES = ("motor_current_field",)
@@ -41,4 +42,4 @@ def in_time(basis: Base, candidate: Candidate) -> Candidate:
 
 
 def _cost(candidate: Candidate) -> float:
-    return float(np.log(candidate.tried * TRIED))
+    return candidate.paid + float(np.log(TRIED))

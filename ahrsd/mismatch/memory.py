@@ -21,7 +21,8 @@ import numpy as np
 
 from ahrsd.mismatch.effects import series, shapes
 from ahrsd.mismatch.gram import solve
-from ahrsd.mismatch.regression import Base, Candidate, evidence_of, group_gram, scaled
+from ahrsd.mismatch.regression import Base, Candidate, group_gram
+from ahrsd.mismatch.settings import evidence_of, scaled
 from ahrsd.mismatch.values import Columns
 
 #: nats that the choice of an axis costs

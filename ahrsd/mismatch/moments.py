@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from ahrsd.mismatch.regression import WORTH_NATS, Base, Candidate, evidence_of
+from ahrsd.mismatch.regression import Base, Candidate
+from ahrsd.mismatch.settings import WORTH_NATS, evidence_of
 
 
 def as_found(
@@ -46,8 +45,9 @@ def _is_step(candidate: Candidate) -> bool:
 
 def _better(basis: Base, candidate: Candidate, other: Candidate) -> Candidate:
     """The candidate in its own setting or the other's, as the evidence has it, both paid for."""
-    tried = max(candidate.tried, other.tried)
-    evidence = evidence_of(basis, other) - float(np.log(tried))
+    dearer = max(candidate, other, key=lambda one: one.paid)
+    evidence = evidence_of(basis, other) - dearer.paid
     if evidence <= candidate.evidence:
         return candidate
-    return replace(candidate, setting=other.setting, tried=tried, evidence=evidence)
+    chosen = replace(candidate, setting=other.setting, evidence=evidence)
+    return replace(chosen, tried=dearer.tried, alike=dearer.alike)

@@ -10,7 +10,8 @@ import numpy as np
 
 from ahrsd.mismatch.effects.base import Setting
 from ahrsd.mismatch.gram import solve
-from ahrsd.mismatch.regression import ANGLES, Base, Candidate, scale_of, scaled
+from ahrsd.mismatch.regression import Base, Candidate
+from ahrsd.mismatch.settings import ANGLES, scale_of, scaled
 from ahrsd.samples import Array
 
 #: steps for the derivatives by both, and how far an onset may move at once, of the recording

@@ -16,7 +16,7 @@ from ahrsd.mismatch.effects.base import BOUND_DEVIATIONS
 from ahrsd.mismatch.evidence import log_bayes, posterior
 from ahrsd.mismatch.gram import Gram
 from ahrsd.mismatch.limits import Limits
-from ahrsd.mismatch.regression import Base, Candidate, evidence_of, without_known
+from ahrsd.mismatch.regression import Base, Candidate, without_known
 from ahrsd.mismatch.score import (
     Score,
     chi2_p,
@@ -25,6 +25,7 @@ from ahrsd.mismatch.score import (
     shift_statistics,
     total_score,
 )
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.mismatch.validate import Gain, heldout
 from ahrsd.samples import Array
 
@@ -97,7 +98,7 @@ def judge(
         candidate.scale,
         candidate.effect.least_information,
     )
-    evidence = log_bayes(what, basis.colour) - float(np.log(candidate.tried))
+    evidence = log_bayes(what, basis.colour) - candidate.paid
     tests = tried * candidate.tried
     family = min(1.0, tests * chi2_p(what, basis.colour))
     robust = min(1.0, tests * robust_p(what, basis.colour))
@@ -154,7 +155,7 @@ def _without_outliers(candidate: Candidate, columns: Array, left: Array, basis: 
     G = flat.T @ flat
     least = candidate.effect.least_information
     what = total_score(G, flat.T @ readings, np.diag(G), candidate.scale, least)
-    return log_bayes(what, basis.colour) - float(np.log(candidate.tried))
+    return log_bayes(what, basis.colour) - candidate.paid
 
 
 def _periodic(candidate: Candidate) -> bool:

@@ -15,9 +15,10 @@ import numpy as np
 from ahrsd.mismatch.discrepancy import UNIT_GAUSS, fitted
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.locate import Frame
-from ahrsd.mismatch.regression import Base, Candidate, scale_of
+from ahrsd.mismatch.regression import Base, Candidate
 from ahrsd.mismatch.rivals import compared
 from ahrsd.mismatch.search import State, term_group, without_term
+from ahrsd.mismatch.settings import scale_of
 from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
@@ -54,7 +55,7 @@ def price(candidate: Candidate, nats: float) -> float:
     term explains.  At least what the choice among the settings has cost.
     """
     sought = ("onset_s" in candidate.setting) + (scale_of(candidate) is not None)
-    return max(float(np.log(candidate.tried)), 0.5 * sought * float(np.log1p(2 * max(nats, 0.0))))
+    return max(candidate.paid, 0.5 * sought * float(np.log1p(2 * max(nats, 0.0))))
 
 
 def smooth_course(context: Context, frame: Frame) -> Columns:

@@ -11,9 +11,9 @@ noise still held all that was named later, and itself.
 from __future__ import annotations
 
 from ahrsd.mismatch import unknown
-from ahrsd.mismatch.regression import evidence_of
 from ahrsd.mismatch.rivals import MORE_SHARE
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, without_term
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.mismatch.stand_ins import dropped
 
 #: part of a name's evidence when it was found that its own form, which is never exact, may leave

@@ -4,8 +4,9 @@ Iron that has two states, or a source that switches unseen, is for ten seconds w
 that is passed by.  Such a name has the evidence of that one moment; where what no name explains is
 as likely as a whole, the moment is a part of it.
 
-So are bumps, wherever they are, where what is left beside them is a quick source: a current is on
-now and then.  Where the source alone is likelier than the bumps and what they leave of it, it is.
+So are bumps, steps and drifts, wherever they are, where what is left beside them is a quick source:
+a current is on now and then, and more so at first.  Where the source alone is likelier than they
+and what they leave of it, it is.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from __future__ import annotations
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.along_field import framed
 from ahrsd.mismatch.name import LONELY_BLOCKS, Judged
+from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.rivals import MORE_NATS
 from ahrsd.mismatch.search import State, Survey, formed_basis_of
-from ahrsd.mismatch.stand_ins import BUMP, dropped
+from ahrsd.mismatch.stand_ins import TIME_SHAPED, dropped
 
 #: by which such a name must be likelier than what is left
 LIKELIER = 2.0
+#: names that are a course in time
+COURSES = frozenset(name for names in TIME_SHAPED.values() for name in names)
 
 
 def without_passing(
@@ -33,7 +37,7 @@ def without_passing(
     nats = max(burst_nats, left.strongest.evidence if course else 0.0)
     passing = [k for k, judged in enumerate(state.named) if _passing(judged, nats)]
     if not passing:
-        return _without_bumps(state, surveys, left)
+        return _without_parts(state, surveys, left)
     if burst_nats >= nats:
         return dropped(state, surveys, passing, left)
     slim, others, rest = dropped(state, surveys, passing, left)
@@ -47,18 +51,23 @@ def _passing(judged: Judged, nats: float) -> bool:
     return outside and brief and judged.evidence < LIKELIER * nats
 
 
-def _without_bumps(
+def _without_parts(
     state: State, surveys: list[Survey], left: unknown.Remainder
 ) -> tuple[State, list[Survey], unknown.Remainder]:
-    """The state without bumps that are parts of a quick source; else as it was."""
-    bumps = [k for k, name in enumerate(state.names) if name == BUMP]
-    if not bumps or not left.one_source:
+    """The state without names in time that are parts of a quick source; else as it was."""
+    parts = [k for k, judged in enumerate(state.named) if _in_time(judged.candidate)]
+    if not parts or not left.one_source:
         return state, surveys, left
-    slim, others, rest = dropped(state, surveys, bumps, left)
+    slim, others, rest = dropped(state, surveys, parts, left)
     rest = framed(formed_basis_of(slim), rest, state.problem.limits)
-    parts = sum(state.named[k].evidence for k in bumps) + _nats(left)
-    likelier = rest.one_source and _nats(rest) > parts + MORE_NATS
+    together = sum(state.named[k].evidence for k in parts) + _nats(left)
+    likelier = rest.one_source and _nats(rest) > together + MORE_NATS
     return (slim, others, rest) if likelier else (state, surveys, left)
+
+
+def _in_time(name: Candidate) -> bool:
+    """Whether a name is a course in time that nothing logged bears out."""
+    return name.name in COURSES and "covariate" not in name.setting
 
 
 def _nats(left: unknown.Remainder) -> float:

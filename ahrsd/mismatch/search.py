@@ -23,18 +23,8 @@ from ahrsd.mismatch.moved import SCALE_AGAIN, both, moved_together
 from ahrsd.mismatch.name import Judged, judge, ranked
 from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
 from ahrsd.mismatch.problem import Problem
-from ahrsd.mismatch.regression import (
-    Base,
-    Candidate,
-    base,
-    best_settings,
-    candidate_gram,
-    closest_scale,
-    columns_of,
-    evidence_of,
-    quieter,
-    scale_of,
-)
+from ahrsd.mismatch.regression import Base, Candidate, base, candidate_gram, columns_of, quieter
+from ahrsd.mismatch.settings import best_settings, closest_scale, evidence_of, scale_of
 from ahrsd.samples import Array
 
 #: candidates that are held against the gate in one round, strongest first
@@ -217,17 +207,17 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
     if key is None and not any(name in at.setting for name in ("onset_s", *FORMS)):
         return None
     if "place_m" in at.setting:
-        return replace(closest_scale(left, at, SCALE_AGAIN), tried=1)
+        return replace(closest_scale(left, at, SCALE_AGAIN), tried=1, alike=1.0)
     if keys := both(at):
         setting = moved_together(basis, at, keys, state.fit.terms[number].value)
         found = replace(at, setting=setting)
-        return replace(found, tried=1, evidence=evidence_of(left, found))
+        return replace(found, tried=1, alike=1.0, evidence=evidence_of(left, found))
     taken = [(j.candidate.name, j.candidate.setting) for j in state.named if j.candidate is not at]
     return next(iter(best_settings(left, {at.name: at.effect}, taken)), None)
 
 
 def _unpaid(candidate: Candidate) -> float:
-    return candidate.evidence + float(np.log(candidate.tried))
+    return candidate.evidence + candidate.paid
 
 
 def _scaled_again(state: State) -> State:

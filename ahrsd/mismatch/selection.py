@@ -9,10 +9,11 @@ import numpy as np
 
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.delays import DELAYS
+from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.name import ROBUST, Judged, judge
 from ahrsd.mismatch.nested import simplest
 from ahrsd.mismatch.null import at_model
-from ahrsd.mismatch.regression import Candidate, candidate_gram, closest_onset, columns_of, quieter
+from ahrsd.mismatch.regression import Candidate, candidate_gram, columns_of, quieter
 from ahrsd.mismatch.score import Score
 from ahrsd.mismatch.search import (
     FRAME_LEAD,
@@ -28,6 +29,7 @@ from ahrsd.mismatch.search import (
     survey,
     term_group,
 )
+from ahrsd.mismatch.settings import closest_onset
 from ahrsd.mismatch.unknown import course, detected, remainder
 from ahrsd.mismatch.validate import Gain
 from ahrsd.samples import Array
@@ -43,6 +45,8 @@ ONE_CAUSE = (
 )
 #: part of the first one's evidence from which a second column is a second cause
 SECOND_MEASURE = 0.05
+#: walks that a cause is held against, rad/s per root second, up to the most that is noise
+WALKS = tuple(noise_fit.WALK_CAP_RAD_S_SQRT_S / 2.0**k for k in (0.0, 1.0, 2.0, 3.0))
 #: how often the times of steps are sought again in the joint fit
 STEP_PASSES = 2
 
@@ -138,22 +142,33 @@ def noise_or_cause(state: State, judged: Judged, seen: Survey) -> State:
 
     A walk is free to follow any cause, and then none is needed.  Nor is one where the few modes of
     a walk explain nearly as much; a step that may be anywhere is what a walk looks like soonest.
-    Where the lead is small the fit must gain by as much more.
+    It must gain by as much as what nobody knows would have to, on a walk of the likeliest size.
     """
     noisy = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), state.named)
     limits = state.problem.limits
-    walk = max((c.evidence for c in seen.candidates if c.name == WANDERING[0]), default=0.0)
-    lead = judged.candidate.evidence - walk
-    clear = 2.0 * limits.lead_nats
-    least = clear if judged.candidate.name == STEPS["gyro"] else 0.0
-    if judged.candidate.name not in CAUSED or lead < least:
+    cause = _cause(judged, seen, limits)
+    if cause is None:
         return noisy
-    named = added(state, judged)
-    largest = replace(noisy.fit.model, gyro_walk_rad_s_sqrt_s=noise_fit.WALK_CAP_RAD_S_SQRT_S)
-    wider = replace(noisy, fit=at_model(state.problem.track, largest, noisy.fit.terms))
-    best = max(likelihood(noisy), likelihood(wider))
-    gained = likelihood(named) - best
-    return named if gained > limits.unknown_nats + max(0.0, clear - lead) else noisy
+    named = added(state, cause)
+    gained = likelihood(named) - max(likelihood(noisy), *(_wandering(noisy, of) for of in WALKS))
+    return named if gained > limits.unknown_nats else noisy
+
+
+def _cause(judged: Judged, seen: Survey, limits: Limits) -> Judged | None:
+    """The name that a walk is held against, if one is: near enough to the few modes of a walk."""
+    if judged.candidate.name == STEPS["gyro"]:
+        walk = max((c.evidence for c in seen.candidates if c.name == WANDERING[0]), default=0.0)
+        return judged if judged.candidate.evidence >= walk + 2.0 * limits.lead_nats else None
+    least = judged.evidence - limits.lead_nats
+    near = (j for j in seen.judged if j is judged or (j.accepted and j.evidence >= least))
+    smooth = (j for j in near if j.candidate.name in CAUSED and j.candidate.name != STEPS["gyro"])
+    return max(smooth, key=lambda j: j.evidence, default=None)
+
+
+def _wandering(state: State, walk: float) -> float:
+    """Log likelihood of the state with its bias wandering by that much, rad/s per root second."""
+    model = replace(state.fit.model, gyro_walk_rad_s_sqrt_s=walk)
+    return likelihood(replace(state, fit=at_model(state.problem.track, model, state.fit.terms)))
 
 
 def _cause_after_all(state: State, seen: Survey) -> State:

@@ -14,7 +14,7 @@ from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.findings import added_value, shares_of, where
 from ahrsd.mismatch.locate import FRAMES, Frame
 from ahrsd.mismatch.one_course import of_one_course
-from ahrsd.mismatch.regression import Base, evidence_of
+from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import of_another_form
 from ahrsd.mismatch.search import (
     CANCELS,
@@ -28,6 +28,7 @@ from ahrsd.mismatch.search import (
     survey,
     term_group,
 )
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.samples import Array
 
 #: names that are a course in time and nothing else, by the frame that they act in

@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
-from ahrsd.mismatch.regression import Candidate, evidence_of
+from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, refitted
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.mismatch.stand_ins import TIME_SHAPED, frame_of
 
 #: names that a course in the world and the headings on it have in common

@@ -24,8 +24,9 @@ from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.null import FittedTerm, fit_null
 from ahrsd.mismatch.often import changes
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import Candidate, evidence_of
+from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.search import State, Survey, formed_basis_of, without_term
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.mismatch.track import Spec
 from ahrsd.mismatch.validate import Gain
 

@@ -11,7 +11,8 @@ from tracks import experiment, track_of
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.null import fit_null
-from ahrsd.mismatch.regression import base, best_settings
+from ahrsd.mismatch.regression import base
+from ahrsd.mismatch.settings import best_settings
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.2])

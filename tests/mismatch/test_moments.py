@@ -13,8 +13,9 @@ from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.moments import as_found, at_one_moment
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import Base, Candidate, evidence_of
+from ahrsd.mismatch.regression import Base, Candidate
 from ahrsd.mismatch.search import State, formed_basis_of, refitted, survey
+from ahrsd.mismatch.settings import evidence_of
 from ahrsd.mismatch.swapping import swapped
 from ahrsd.mismatch.track import Spec
 

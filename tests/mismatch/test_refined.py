@@ -24,9 +24,12 @@ from ahrsd.mismatch.unknown import Remainder
 BEGIN_S, END_S = 120.0, 160.0
 
 
+LIBRARY = {name: EFFECTS[name] for name in ("hard_iron_step", "hard_iron_drift")}
+
+
 def left_of(track: Track, limits: Limits = LIMITS) -> tuple[State, Remainder]:
     """A state without names and what it leaves."""
-    problem, cold = problem_of(track, Spec(), {"hard_iron_step": EFFECTS["hard_iron_step"]}, limits)
+    problem, cold = problem_of(track, Spec(), LIBRARY, limits)
     state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
     left = with_one_source(unknown.remainder(formed_basis_of(state)))
     return state, refined(state.fit, state, left, None, limits)
@@ -117,9 +120,16 @@ def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named)
     found = explained(state, left, strict.alone())
     assert (found is not None) == named
     if found is not None:
-        tried, surveys, rest = found
+        tried, surveys, last, rest = found
         assert tried.names == ("hard_iron_step",)
         assert len(surveys) == 1
+        # what the name explains is gone from the others, so they are rivals for its place
+        drift = [
+            next(c.evidence for c in seen.candidates if c.name == "hard_iron_drift")
+            for seen in (surveys[0], last)
+        ]
+        assert drift[0] > 10.0
+        assert drift[1] < 2.0
         assert not unknown.detected(rest, strict.alone())
 
 

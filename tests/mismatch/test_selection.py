@@ -16,7 +16,7 @@ from ahrsd.mismatch.name import ROBUST
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S, State, added, refitted, survey
-from ahrsd.mismatch.selection import _cause_after_all, _which_change, borne_out, forward
+from ahrsd.mismatch.selection import _cause, _cause_after_all, _which_change, borne_out, forward
 from ahrsd.mismatch.track import Spec, Track
 
 SCALE = 1 + np.array([-1.2e-3, 2.3e-3, -1.6e-3])
@@ -85,6 +85,35 @@ def test_how_a_bias_changes_is_for_the_evidence_to_say(walk, others, said) -> No
     assert _which_change(DRIFT, state, seen, set()).candidate.name == said
     # what the joint fit does not bear out is not asked again
     assert _which_change(DRIFT, state, seen, {"gyro_startup"}) is DRIFT
+
+
+def held(name: str, evidence: float, *refused: str) -> SimpleNamespace:
+    one = judged(name, evidence, *refused)
+    one.candidate.evidence, one.accepted = evidence, not refused
+    return one
+
+
+@pytest.mark.parametrize(
+    ("first", "others", "asked"),
+    [
+        (held("gyro_startup", 50.0), [], "gyro_startup"),
+        (held("gyro_startup", 50.0, ROBUST), [], "gyro_startup"),
+        (held("gyro_bias_drift", 50.0), [], None),
+        # the few modes of a walk are ahead by little: the walk itself decides
+        (held("gyro_bias_drift", 50.0), [held("gyro_startup", 49.0)], "gyro_startup"),
+        (held("gyro_bias_drift", 50.0), [held("gyro_startup", 46.9)], None),
+        (held("gyro_bias_drift", 50.0), [held("gyro_startup", 49.0, "held-out gain")], None),
+        # a step that may be anywhere is what a walk looks like soonest
+        (held("gyro_bias_step", 56.1), [held("gyro_bias_drift", 50.0)], "gyro_bias_step"),
+        (held("gyro_bias_step", 55.9), [held("gyro_bias_drift", 50.0)], None),
+        (held("gyro_bias_drift", 50.0), [held("gyro_bias_step", 49.0)], None),
+    ],
+)
+def test_which_cause_a_walk_is_held_against(first, others, asked) -> None:
+    every = (first, *others)
+    seen = SimpleNamespace(judged=every, candidates=tuple(one.candidate for one in every))
+    cause = _cause(first, seen, LIMITS)
+    assert (cause.candidate.name if cause else None) == asked
 
 
 def test_a_cause_that_the_joint_fit_does_not_bear_out_is_tried_once(monkeypatch) -> None:

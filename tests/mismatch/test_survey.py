@@ -9,8 +9,9 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.regression import Candidate, base, closest_onset, evidence_of
+from ahrsd.mismatch.regression import Candidate, base
 from ahrsd.mismatch.search import State, formed_basis_of, survey
+from ahrsd.mismatch.settings import closest_onset, evidence_of
 from ahrsd.mismatch.track import Spec
 from ahrsd.mismatch.unknown import beside_names, detected, remainder
 

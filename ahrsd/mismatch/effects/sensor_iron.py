@@ -65,6 +65,7 @@ class HardIronDrift(Linear):
     manoeuvre = "a longer recording with all headings throughout"
     size = "0.1 to 5 mG/h; more after a shock"
     source = "retentive error of ship's compasses (dossier M2)"
+    stands_for = ("mag_bias_temperature",)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Straight; fast, then slow; settling, with time constants a factor of two apart."""
