@@ -39,6 +39,9 @@ from ahrsd.samples import Array
 #: shares below this are not worth a line
 SMALLEST_SHARE = 0.005
 _SCALE_STEP = 0.05
+#: seconds to which the onset of what creeps is known: a device that updates every few of them goes
+#: in steps, and one that ran before the recording began creeps from before
+CREEPS_S = 5.0
 #: deviations by which two weightings of one recording differ at most where the model is true
 AGREE = 3.0
 #: seconds that are dealt in turn where an effect shows no longer than some of them
@@ -136,7 +139,10 @@ def whole_term(
     """
     term = state.fit.terms[number]
     told = _told_in(state, basis, number, beside)
-    change, deviation = refined(told, number, _by_scale(state, told, number))
+    shape = _by_shape(state, told, number)
+    change, deviation = refined(told, number, shape)
+    if shape is not None and shape.shape[2] > 1:  # the value goes with the onset that is told
+        change = refined(told, number, shape[:, :, :1])[0]
     if told is not basis:
         deviation = of_both(change, deviation, refined(basis, number)[1])
     value = added_value(state, number) + change
@@ -173,19 +179,27 @@ def with_unseen(candidate: Candidate, deviation: Array) -> Array:
     return np.asarray(np.sqrt(deviation**2 + prior))
 
 
-def _by_scale(state: State, basis: Base, number: int) -> Array | None:
-    """(N, 3) whitened change of the term with its scale's logarithm; None where it has none."""
+def _by_shape(state: State, basis: Base, number: int) -> Array | None:
+    """(N, 3, q) whitened change of the term with what else was fitted of it; None for nothing.
+
+    The logarithm of its scale; and of what creeps from an onset on the onset, in `CREEPS_S`.
+    """
     candidate, value = state.named[number].candidate, state.fit.terms[number].value
     key = scale_of(candidate)
     if key is None:
         return None
     effect, setting = candidate.effect, candidate.setting
-    sides = [
-        effect.columns(basis.context, scaled(setting, key, change))
-        for change in (-_SCALE_STEP, _SCALE_STEP)
+    sides = [scaled(setting, key, change) for change in (-_SCALE_STEP, _SCALE_STEP)]
+    steps = [2 * _SCALE_STEP]
+    if key == "time_constant_s" and "onset_s" in setting:
+        step_s = _SCALE_STEP * setting[key]
+        sides += [{**setting, "onset_s": setting["onset_s"] + s} for s in (-step_s, step_s)]
+        steps.append(2 * step_s / CREEPS_S)
+    seen = [
+        part @ value for part in basis.whitened([effect.columns(basis.context, s) for s in sides])
     ]
-    low, high = (part @ value for part in basis.whitened(sides))
-    return np.asarray((high - low) / (2 * _SCALE_STEP))
+    changes = [(seen[2 * k + 1] - seen[2 * k]) / step for k, step in enumerate(steps)]
+    return np.stack(changes, axis=2)
 
 
 def _told_in(state: State, basis: Base, number: int, beside: Base | None) -> Base:
@@ -197,17 +211,20 @@ def _told_in(state: State, basis: Base, number: int, beside: Base | None) -> Bas
     return basis if stepped(state) else beside
 
 
-def refined(basis: Base, number: int, scale: Array | None = None) -> tuple[Array, Array]:
+def refined(basis: Base, number: int, shape: Array | None = None) -> tuple[Array, Array]:
     """What is left to change in a term's value (p,), and its deviation (p,) in coloured noise.
 
-    scale (N, 3): how the whitened readings move with the term's time constant or radius, which was
-    fitted too.
+    shape (N, 3, q): how the whitened readings move with the term's time constant or radius, which
+    was fitted too, and with its onset, if that is a second, known to about 1 of its units.
     """
     Z = basis.known.reshape(-1, basis.known.shape[2])
-    if scale is not None:
-        Z = np.column_stack([Z, scale.ravel()])
+    if shape is not None:
+        Z = np.column_stack([Z, shape.reshape(len(Z), -1)])
     where = basis.groups[term_group(number)]
-    inverse = solve(Z.T @ Z, np.column_stack([Z.T @ basis.innovation.ravel(), np.eye(len(Z.T))]))
+    G = Z.T @ Z
+    if shape is not None and shape.shape[2] > 1:
+        G[-1, -1] += 1.0
+    inverse = solve(G, np.column_stack([Z.T @ basis.innovation.ravel(), np.eye(len(G))]))
     variance = np.diag(inverse[:, 1:])[where]
     return inverse[where, 0], np.sqrt(np.maximum(variance, 0.0) * basis.colour)
 

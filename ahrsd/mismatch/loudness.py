@@ -29,14 +29,15 @@ def in_even_noise(basis: Base, left: Remainder, limits: Limits) -> Remainder:
     """The remainder, or, where noise of two levels is all that is seen, that of even rows.
 
     basis: the model's, from which the remainder was taken.  A name that was taken out again for its
-    form, and a source of one direction, are there.
+    form is there.
     """
-    if left.stood_in is not None or left.one_source or not unknown.detected(left, limits):
+    if left.stood_in is not None or not unknown.detected(left, limits):
         return left
     level = even(basis)
     if level is basis:
         return left
-    again = with_spells(unknown.remainder(level, with_bins=bool(left.bins)))
+    again = unknown.remainder(level, with_bins=bool(left.bins))
+    again = with_spells(framed(level, again, limits) if left.one_source else again)
     return left if unknown.detected(again, limits) else again
 
 

@@ -36,6 +36,9 @@ MINIMUM_SHIFT_SHARE = 0.05
 LONELY_BLOCKS, LONELY_NATS = 5.0, 20.0
 #: deviations beyond which a reading says no more: three axes of it are 13 nats, a place costs them
 OUTLIER = 3.0
+#: a play of this many deviations of a reading or less follows the noise as well; what it explains
+#: of that is as wide as the filter's errors: a quarter of a deviation in red noise (`ring600j`)
+NARROW, LEAST_WIDTH = 5.0, 0.5
 #: the check that needs many blocks
 ROBUST = "block-robust probability"
 #: what is shorter turns too little to tell a field outside from one on the vehicle
@@ -114,6 +117,7 @@ def judge(
         ("held-out gain", gain.nats_per_sample > limits.cv_gain or lonely),
         ("without outliers", _without_outliers(candidate, own, left, basis) > limits.evidence_nats),
         ("time-shifted copies", beaten >= limits.placebo_beaten or _periodic(candidate)),
+        ("own noise", not _of_own_noise(candidate, what.value, basis)),
         ("physical bounds", believable(candidate, what, what.value, basis.colour)),
     )
     usual = float(np.quantile(shifted, 0.99)) if len(shifted) else 0.0
@@ -156,6 +160,13 @@ def _without_outliers(candidate: Candidate, columns: Array, left: Array, basis: 
     least = candidate.effect.least_information
     what = total_score(G, flat.T @ readings, np.diag(G), candidate.scale, least)
     return log_bayes(what, basis.colour) - candidate.paid
+
+
+def _of_own_noise(candidate: Candidate, value: Array, basis: Base) -> bool:
+    """Whether a play is no wider than the errors of the field that it is made of."""
+    noise = basis.context.model.sigma_mag_gauss
+    narrow = candidate.setting.get("radius_gauss", np.inf) < NARROW * noise
+    return bool(narrow and np.max(np.abs(value), initial=0.0) < LEAST_WIDTH * noise)
 
 
 def _periodic(candidate: Candidate) -> bool:

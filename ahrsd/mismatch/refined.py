@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from ahrsd.mismatch import unknown
-from ahrsd.mismatch.along_field import MOSTLY_SLOW, slowness
+from ahrsd.mismatch.along_field import slowness
 from ahrsd.mismatch.diagnosis import Unexplained
-from ahrsd.mismatch.evidence import CLEAR_PEAK
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
@@ -28,6 +29,12 @@ from ahrsd.mismatch.search import (
 from ahrsd.mismatch.slow_noise import in_its_noise
 from ahrsd.mismatch.spells import with_spells
 from ahrsd.mismatch.unknown import Remainder
+
+#: colour of white noise: 1, and the scatter of its spectrum; a twentieth of its power that forgets
+#: within a second has 1.2
+WHITE = 1.15
+#: correlation with itself a second later that no noise has which forgets within two seconds
+STEADY = float(np.exp(-1 / 2))
 
 
 def refined(
@@ -75,6 +82,6 @@ def left_alone(
 
 def _of_any_course(state: State, left: Remainder) -> Remainder:
     """The remainder with a quick course where that cannot be slow noise of the magnetometer."""
-    white = left.basis.rest is None and left.basis.colour <= CLEAR_PEAK
-    no_noise = white or slowness(formed_basis_of(state)) >= MOSTLY_SLOW
+    white = left.basis.rest is None and left.basis.colour <= WHITE
+    no_noise = white or slowness(formed_basis_of(state)) >= STEADY
     return with_any_course(left) if no_noise else left

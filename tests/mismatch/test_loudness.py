@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.mismatch import unknown
+from ahrsd.mismatch import loudness, unknown
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.loudness import even, in_even_noise
@@ -67,3 +67,19 @@ def test_a_source_that_comes_and_goes_beside_it_is_still_told() -> None:
     told = in_even_noise(basis, left, LIMITS)
     assert unknown.detected(told, LIMITS)
     assert told is left
+
+
+def test_a_quick_source_in_a_louder_half_is_asked_for_once_more(monkeypatch, loud: Base) -> None:
+    """`ring600j`, bc2798ae: noise three times as loud from the middle on was one source."""
+    asked: list[bool] = []
+
+    def framed(basis: Base, left, limits):
+        asked.append(basis.weight is not None)
+        return left
+
+    monkeypatch.setattr(loudness, "framed", framed)
+    left = replace(with_spells(unknown.remainder(loud)), one_source=True)
+    told = in_even_noise(loud, left, LIMITS)
+    assert asked == [True]
+    assert not told.one_source
+    assert not unknown.detected(told, LIMITS)

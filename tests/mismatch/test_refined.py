@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.mismatch import refined as refined_module
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.explained import explained
@@ -16,7 +18,7 @@ from ahrsd.mismatch.name import ROBUST
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.one_source import NATS, with_one_source
 from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.refined import left_alone, refined
+from ahrsd.mismatch.refined import _of_any_course, left_alone, refined
 from ahrsd.mismatch.search import State, formed_basis_of, survey
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.unknown import Remainder
@@ -77,36 +79,55 @@ def test_an_ordinary_walk_of_the_gyro_is_nothing_and_a_large_one_is() -> None:
     assert left_alone(state.fit, state, left)[2] is not None
 
 
-def wobbling(gauss: float, noise: str = "white") -> Track:
-    """Every reading is longer and shorter by so much, in turns of 8.5 s."""
+def wobbling(gauss: float, noise: str, turn_s: float) -> Track:
+    """Every reading is longer and shorter by so much, in turns."""
     track = made(Trial(4, noise=noise)).track
     unit = track.mag_b_gauss / np.linalg.norm(track.mag_b_gauss, axis=1, keepdims=True)
-    turns = np.sign(np.sin(2 * np.pi * track.time_s / 17.0))
+    turns = np.sign(np.sin(np.pi * track.time_s / turn_s))
     return replace(track, mag_b_gauss=track.mag_b_gauss + gauss * turns[:, None] * unit)
 
 
 @pytest.mark.parametrize(
-    ("gauss", "noise", "told"),
+    ("gauss", "noise", "turn_s", "told"),
     [
-        (0.9e-4, "white", False),
-        (1.3e-4, "white", True),
-        # what is red may be the noise's own
-        (0.0, "red", False),
-        # but no noise of a magnetometer is mostly slow
-        (8e-4, "white", True),
-        (8e-4, "red", True),
+        (0.9e-4, "white", 8.5, False),
+        (1.0e-4, "white", 30.0, True),
+        # what is red may be the noise's own, also where that is next to white
+        (0.0, "red", 8.5, False),
+        (1.2e-4, "white", 8.5, False),
+        # and where it is slow; but nothing that forgets within two seconds is as slow as this
+        (8e-4, "white", 8.5, False),
+        (8e-4, "red", 8.5, False),
+        (1.2e-3, "white", 8.5, True),
     ],
 )
-def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, told) -> None:
-    state, left = left_of(wobbling(gauss, noise))
+def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, turn_s, told) -> None:
+    state, left = left_of(wobbling(gauss, noise, turn_s))
     assert not unknown.detected(left, LIMITS)
     _, rest, seen = left_alone(state.fit, state, left)
     assert (seen is not None) is told
     if seen is not None:
-        assert seen.one_source
         assert seen.strongest.frame in ("sensor", "world")
         assert seen.strongest.evidence > NATS
         assert not rest.one_source
+
+
+@pytest.mark.parametrize(
+    ("colour", "slow", "asked"),
+    [
+        (1.0, 0.0, True),
+        (1.14, 0.0, True),
+        (1.22, 0.04, False),  # `ring120d`, b38bd190: a twentieth of the noise is red
+        (15.6, 0.44, False),  # `ring600j`, 18a2391a: a quarter is, and forgets within two seconds
+        (15.6, 0.62, True),
+    ],
+)
+def test_where_a_quick_course_can_be_no_noise(monkeypatch, colour, slow, asked) -> None:
+    monkeypatch.setattr(refined_module, "slowness", lambda basis: slow)
+    monkeypatch.setattr(refined_module, "formed_basis_of", lambda state: None)
+    monkeypatch.setattr(refined_module, "with_any_course", lambda left: "asked")
+    left = SimpleNamespace(basis=SimpleNamespace(rest=None, colour=colour))
+    assert (_of_any_course(SimpleNamespace(), left) == "asked") is asked
 
 
 @pytest.mark.parametrize(("times", "named"), [(5.0, True), (50.0, False)])
