@@ -4,7 +4,7 @@ An error of the gyro turns the field and does not change its size: along the fie
 leaves its noise.  A field that differs from place to place changes both alike.  Across the field a
 free course of the gyro's rate follows it as well as any other, on a path that nobody logged often
 better; so what is left along the field decides, once the calibration that a large error of the gyro
-bends is put right by its course.  No noise of a magnetometer's is mostly slower than a second.
+bends is put right by its course.  An error of the gyro leaves nothing there that lasts for seconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from ahrsd.mismatch.unknown import FINE, Remainder
 
 APART_S = 1.0
 #: correlation along the field, that far apart, of what is no noise of the magnetometer:
-#: five trials in rooms have 0.45 to 0.74, red noise 0.29 at most, errors of the gyro 0.03
+#: five trials in rooms have 0.45 to 0.74, errors of the gyro 0.03; red noise mostly 0.3 at most,
+#: but a null of `ring600j` has 0.44 (18a2391a), so where only noise is the rival more is asked
+#: (`refined.STEADY`)
 MOSTLY_SLOW = 0.4
 
 
