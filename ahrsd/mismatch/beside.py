@@ -39,7 +39,7 @@ from ahrsd.mismatch.search import (
 )
 from ahrsd.mismatch.settings import best_settings, closest_onset, evidence_of
 from ahrsd.mismatch.spectrum import Spectrum, against, spectrum_of
-from ahrsd.mismatch.stand_ins import TIME_SHAPED
+from ahrsd.mismatch.stand_ins import IN_TIME
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -57,7 +57,7 @@ STEP_NATS = {"hard_iron_step": 75.0, "field_step": 100.0, "gyro_bias_step": 25.0
 #: sensor does that is not quite linear: beside a rest such names say no more than the rest does
 OF_THE_REST = (
     *IMITATORS,
-    *(name for names in TIME_SHAPED.values() for name in names if name not in SAID),
+    *(name for name in sorted(IN_TIME) if name not in SAID),
     "field_gradient",
     "onboard_calibration_active",
     "flexible_mount",

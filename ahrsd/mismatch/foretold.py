@@ -26,7 +26,7 @@ from ahrsd.mismatch.often import logged_often
 from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.reweighted import reweighted
 from ahrsd.mismatch.search import WANDERING, State, Survey
-from ahrsd.mismatch.stand_ins import TIME_SHAPED, dropped, frame_of
+from ahrsd.mismatch.stand_ins import IN_TIME, dropped, frame_of
 from ahrsd.mismatch.validate import Gain
 
 #: part of its evidence that a name must gain on what was held out, if it gains no more than its
@@ -104,5 +104,4 @@ def part_of(gain: Gain, placebo_gain: float, evidence: float, count: int) -> flo
 
 def in_time_alone(candidate: Candidate) -> bool:
     """Whether a candidate begins at a moment of its own, or is a course in time."""
-    courses = {*WANDERING, *(name for names in TIME_SHAPED.values() for name in names)}
-    return "onset_s" in candidate.setting or candidate.name in courses
+    return "onset_s" in candidate.setting or candidate.name in {*WANDERING, *IN_TIME}

@@ -17,12 +17,10 @@ from ahrsd.mismatch.name import LONELY_BLOCKS, Judged
 from ahrsd.mismatch.regression import Candidate
 from ahrsd.mismatch.rivals import MORE_NATS
 from ahrsd.mismatch.search import State, Survey, formed_basis_of
-from ahrsd.mismatch.stand_ins import TIME_SHAPED, dropped
+from ahrsd.mismatch.stand_ins import IN_TIME, dropped
 
 #: by which such a name must be likelier than what is left
 LIKELIER = 2.0
-#: names that are a course in time
-COURSES = frozenset(name for names in TIME_SHAPED.values() for name in names)
 
 
 def without_passing(
@@ -67,7 +65,7 @@ def _without_parts(
 
 def _in_time(name: Candidate) -> bool:
     """Whether a name is a course in time that nothing logged bears out."""
-    return name.name in COURSES and "covariate" not in name.setting
+    return name.name in IN_TIME and "covariate" not in name.setting
 
 
 def _nats(left: unknown.Remainder) -> float:

@@ -1,8 +1,7 @@
 """The recording as a regression: whitened columns of calibration, terms, candidates and frames.
 
-Every effect is tried in every setting it offers with totals only (a few small matrices each); the
-best setting goes on into the Gram with a matrix per block, from which all the tests are computed.
-An onset is then sought more closely, to a fraction of a second.
+A candidate, an effect in its best setting (`settings`), goes into the Gram with a matrix per block,
+from which all the tests are computed.
 """
 
 from __future__ import annotations

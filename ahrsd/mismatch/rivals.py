@@ -24,7 +24,7 @@ them: there it must be more likely by itself, and a coefficient may jump.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import combinations_with_replacement, product
 
@@ -68,7 +68,7 @@ _SMALL = -5.0  # logarithm of a deviation to begin with: next to nothing
 
 
 def of_another_form(
-    state: State, basis: Base, courses: Sequence[str], *, beside: bool = False
+    state: State, basis: Base, courses: Collection[str], *, beside: bool = False
 ) -> list[int]:
     """Numbers of the terms whose names only stand in for something of another form.
 

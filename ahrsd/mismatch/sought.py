@@ -14,7 +14,7 @@ from ahrsd.mismatch.nested import eddies_alone
 from ahrsd.mismatch.often import logged_often
 from ahrsd.mismatch.search import State, Survey, survey
 from ahrsd.mismatch.selection import forward
-from ahrsd.mismatch.stand_ins import TIME_SHAPED, without_stand_ins, without_unlikely
+from ahrsd.mismatch.stand_ins import IN_TIME, without_stand_ins, without_unlikely
 from ahrsd.mismatch.swapping import swapped
 from ahrsd.mismatch.twins import told_apart
 from ahrsd.mismatch.unknown import Remainder
@@ -58,6 +58,5 @@ def sought(state: State) -> Sought:
         if "covariate" in j.candidate.setting and not logged_often(state.problem.track, j.candidate)
     )
     # a course in time is held against a free one, which explains what is left with it
-    courses = {name for names in TIME_SHAPED.values() for name in names}
-    stood_in = frozenset(logged) - courses - frozenset(true.names)
+    stood_in = frozenset(logged) - IN_TIME - frozenset(true.names)
     return Sought(true, surveys, first, last, left, more, stood_in, hidden)

@@ -37,6 +37,8 @@ TIME_SHAPED: Mapping[Frame, tuple[str, ...]] = {
     "world": ("field_step", "geomagnetic_drift", "field_anomaly"),
     "gyro": ("gyro_bias_step", "gyro_startup", "gyro_bias_drift"),
 }
+#: all of them
+IN_TIME = frozenset(name for names in TIME_SHAPED.values() for name in names)
 #: share of the probability below which a name is not said
 LEAST_SHARE = 1 / 3
 #: a bump of the outside field
@@ -108,8 +110,7 @@ def wrong_in_form(state: State, beside: bool) -> list[int]:
     back = [k for k in steps if counterpart(state, k) is not None]
     if len(steps) > 1 and end_where_they_began([state.fit.terms[k].value for k in steps]):
         back = steps
-    courses = [name for names in TIME_SHAPED.values() for name in names]
-    return sorted({*back, *of_another_form(state, basis, courses, beside=beside)})
+    return sorted({*back, *of_another_form(state, basis, IN_TIME, beside=beside)})
 
 
 def end_where_they_began(steps: Sequence[Array]) -> bool:
