@@ -35,13 +35,13 @@ from ahrsd.mismatch.facts import Fact, around, lost_at, matters
 from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, whole_term
 from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.free_course import with_free_course
+from ahrsd.mismatch.free_source import without_names_of_a_source
 from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.humming import heard
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.mismatch.likelier_forms import without_likelier_forms
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
-from ahrsd.mismatch.many_names import one_for_many
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
@@ -149,12 +149,13 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     state, surveys, left = named_beside(*given, hidden=done.hidden, steps=steps)
     beside = len(state.named) > len(done.state.named)
     state, surveys, left = without_unforetold(state, surveys, left, known=len(done.state.named))
-    state, surveys, left = one_for_many(*without_trifles(*without_unplaced(state, surveys, left)))
+    state, surveys, left = without_trifles(*without_unplaced(state, surveys, left))
     short = brief or bursts(formed_basis_of(state))
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)
     burst_nats = 0.0 if short is None else short.evidence_nats
     state, surveys, left = without_passing(state, surveys, left, burst_nats)
+    state, surveys, left = without_names_of_a_source(state, surveys, left)
     left = refined(start, state, left, short, problem.limits)
     against_rest = frozenset(state.names) - frozenset(done.state.names)
     fewer = without_likelier_forms(state, surveys, left, against_rest)

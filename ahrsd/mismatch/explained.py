@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
+from ahrsd.mismatch.free_source import free_nats, white
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.name import ROBUST, Judged
 from ahrsd.mismatch.search import WANDERING, State, Survey, added, formed_basis_of, survey
@@ -44,7 +45,8 @@ def explained(
     if not borne_out(state, tried, best, seen):
         return None
     after = unknown.remainder(formed_basis_of(tried))
-    if unknown.detected(after, limits):
+    free = free_nats(left, quick=white(after))
+    if unknown.detected(after, limits) or free > best.evidence + limits.lead_nats:
         return None
     return tried, [seen] * len(tried.named), survey(tried), after
 

@@ -6,7 +6,8 @@ noise that happens to look like the name.  In the end what is left has a frame. 
 course, or another free form, is likelier than a name, which keeps less than half of its evidence
 beside it (one by a logged cause, which a course is free to follow, no more than would be an
 unknown), the name has only a part of the rest.  And a name that is worth less than the rest,
-no larger than what every sensor has of itself, is not said, as beside a real room (`beside`).
+no larger than what every sensor has of itself, is not said, as beside a real room (`beside`); nor
+is one that is worth a small part of the rest, whatever it is.
 
 A step that was found against the spectrum of the rest and is worth more than the rest is not asked:
 1500 nats are no part of 700, though in white noise, which a room is not, a course in time is yet
@@ -25,6 +26,7 @@ from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.locate import UNITS, coarse_cut, frame_columns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.often import OFTEN, logged_often
+from ahrsd.mismatch.own_form import strengths
 from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.rivals import OWN_SHARE, compared, more
 from ahrsd.mismatch.search import (
@@ -52,6 +54,7 @@ def without_likelier_forms(
         wrong = [k for k in wrong_in_form(state, beside=True) if k in asked] if asked else []
         wrong = wrong or _parts_of_the_rest(state, left, asked)
         wrong = wrong or _of_sensors_themselves(state, left, asked)
+        wrong = wrong or _next_to_nothing(state, left, asked)
         if not wrong:
             break
         frame = frame_of(state, wrong[0])
@@ -117,3 +120,13 @@ def _of_sensors_themselves(state: State, left: unknown.Remainder, asked: list[in
         if state.named[k].evidence < least
         and not material(state.named[k].candidate, state.fit.terms[k].value)
     ]
+
+
+def _next_to_nothing(state: State, left: unknown.Remainder, asked: list[int]) -> list[int]:
+    """Of the names asked those that are worth a small part of the rest, in time or by regime.
+
+    A field that goes with the heading was a step of the soft iron of 8 nats, beside 264.
+    """
+    rest = max([left.strongest.evidence, *(evidence for _, evidence, _ in left.bins)])
+    least, nats = state.problem.limits.beyond_share * rest, strengths(state)
+    return [k for k in asked if nats[k] < least]

@@ -43,6 +43,9 @@ SHORTEST_S = 3.0
 FEWEST = 20
 #: odds of 1000 to 1 (Markov's inequality: noise has them once in 1000 recordings at most)
 NATS = float(np.log(1000.0))
+#: odds of 100 to 1, where noise is white and a course of whatever direction is asked for: of 90
+#: nulls without slow noise none has odds of 1, of 30 with a gyro that walks one has 13 to 1
+ANY_NATS = float(np.log(100.0))
 #: times within which a course forgets, in stretches
 TIMES = (0.25, 1.0, 2.5, 6.0)
 #: of a prior course's modes, those kept
@@ -62,17 +65,9 @@ def with_one_source(left: Remainder) -> Remainder:
     if count < FEWEST:
         return left
     cut = segments(basis.context.track.time_s, count)
-    grams = {frame: course_gram(basis, frame, cut) for frame in FRAMES[:2]}
-    found: dict[Frame, float] = {}
-    seen: dict[Frame, Located] = {}
-    for frame, gram in grams.items():
-        where = gram.groups[group_name(frame)]
-        information, score = gram.total[where, where], gram.total[where, -1]
-        field = field_in(basis, frame, cut)
-        told = directed(information, score, UNITS[frame], basis.colour, field)
-        found[frame] = told.beyond_noise
-        course = locate(gram, frame, cut, basis.colour)
-        seen[frame] = replace(course, evidence=told.beyond_white)
+    told = {frame: _asked(basis, frame, cut) for frame in FRAMES[:2]}
+    seen: dict[Frame, Located] = {frame: course for frame, (_, course) in told.items()}
+    found = {frame: nats for frame, (nats, _) in told.items()}
     left = replace(left, quick=seen)
     clear = [frame for frame, nats in found.items() if nats >= NATS]
     if not clear:
@@ -85,10 +80,33 @@ def with_one_source(left: Remainder) -> Remainder:
     return replace(left, located={**left.located, frame: one}, one_source=True)
 
 
-def with_any_course(left: Remainder) -> Remainder:
-    """The remainder with the frame of a quick course of whatever direction, if there is one."""
-    best = max(left.quick.values(), key=lambda one: one.evidence, default=left.strongest)
-    if best.evidence < max(NATS, left.strongest.evidence) or not left.quick:
+def _asked(basis: Base, frame: Frame, cut: Segments) -> tuple[float, Located]:
+    """Nats by which a frame's quick course has one direction, and the course, in nats over white.
+
+    No slow noise stays along the field in an error of the gyro: there it is asked as in the sensor.
+    """
+    gram = course_gram(basis, frame, cut)
+    where = gram.groups[group_name(frame)]
+    information, score = gram.total[where, where], gram.total[where, -1]
+    field = field_in(basis, "sensor" if frame == "gyro" else frame, cut)
+    told = directed(information, score, UNITS[frame], basis.colour, field)
+    course = locate(gram, frame, cut, basis.colour)
+    return told.beyond_noise, replace(course, evidence=told.beyond_white)
+
+
+def with_gyro_course(left: Remainder) -> Remainder:
+    """The remainder with a quick course of the gyro's error among those of the fields, if any."""
+    if not left.quick:
+        return left
+    cut = left.quick["sensor"].cut
+    return replace(left, quick={**left.quick, "gyro": _asked(left.basis, "gyro", cut)[1]})
+
+
+def with_any_course(left: Remainder, least: float = ANY_NATS) -> Remainder:
+    """The remainder with the frame of a course of whatever direction, if a field has one."""
+    fields = [*left.quick.values(), *(left.located[frame] for frame in FRAMES[:2])]
+    best = max(fields, key=lambda one: one.evidence)
+    if best.evidence < max(least, left.strongest.evidence) or not left.quick:
         return left
     located = {**left.located, best.frame: _sure(best, best.evidence)}
     return replace(left, located=located, one_source=True)

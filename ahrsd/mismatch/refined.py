@@ -17,7 +17,7 @@ from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
 from ahrsd.mismatch.null import NullFit
-from ahrsd.mismatch.one_source import with_any_course, with_one_source
+from ahrsd.mismatch.one_source import ANY_NATS, with_any_course, with_one_source
 from ahrsd.mismatch.own_form import free_price_of, price_of
 from ahrsd.mismatch.search import (
     ORDINARY_WALK_RAD_S_SQRT_S,
@@ -35,6 +35,8 @@ from ahrsd.mismatch.unknown import Remainder
 WHITE = 1.15
 #: correlation with itself a second later that no noise has which forgets within two seconds
 STEADY = float(np.exp(-1 / 2))
+#: what a quick course that is there needs beside a gyro that may wander: odds of 10 to 1
+STILL_NATS = float(np.log(10.0))
 
 
 def refined(
@@ -76,12 +78,12 @@ def left_alone(
     walking = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), ())
     rest = unknown.remainder(formed_basis_of(walking), with_bins=bool(left.bins))
     rest = refined(start, walking, with_one_source(rest), None, limits)
-    still = unknown.detected(_of_any_course(walking, rest), limits)
+    still = unknown.detected(_of_any_course(walking, rest, STILL_NATS), limits)
     return (state, left, seen) if still else (walking, rest, None)
 
 
-def _of_any_course(state: State, left: Remainder) -> Remainder:
+def _of_any_course(state: State, left: Remainder, least: float = ANY_NATS) -> Remainder:
     """The remainder with a quick course where that cannot be slow noise of the magnetometer."""
     white = left.basis.rest is None and left.basis.colour <= WHITE
     no_noise = white or slowness(formed_basis_of(state)) >= STEADY
-    return with_any_course(left) if no_noise else left
+    return with_any_course(left, least) if no_noise else left

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -161,3 +162,14 @@ def test_what_was_logged_and_changes_often_is_no_part_of_a_rest(
     left = replace(left, located={**left.located, "sensor": sensor})
     assert likelier_forms._asked(state, left, frozenset({"switched_device"})) == asked
     assert likelier_forms._asked(state, left, frozenset()) == [0]
+
+
+def test_what_is_a_small_part_of_the_rest_is_not_said(monkeypatch) -> None:
+    rest = SimpleNamespace(
+        strongest=SimpleNamespace(evidence=20.0), bins=(("heading", 264.0, 0.0),)
+    )
+    state = SimpleNamespace(problem=SimpleNamespace(limits=LIMITS))
+    monkeypatch.setattr(likelier_forms, "strengths", lambda _: [7.9, 38.0, 41.0, 8.0])
+    assert likelier_forms._next_to_nothing(state, rest, [0, 1, 2]) == [0, 1]
+    in_time = SimpleNamespace(strongest=SimpleNamespace(evidence=264.0), bins=())
+    assert likelier_forms._next_to_nothing(state, in_time, [1, 2, 3]) == [1, 3]

@@ -1,0 +1,111 @@
+"""Names that no logged column bears out, against one source that is free in time.
+
+A current is on now and then, a speed swells and fades, a path crosses a field that differs from
+place to place: what nobody logged is roughly a bump, a step or iron that takes its time.  On
+parallel legs a position is a function of the headings before it: a field that differs from place to
+place was iron that takes its time, the earth's turn and hysteresis, 99 % sure each.  A course that
+is free in time has to pay for every one of its coefficients; where it is likelier all the same than
+such names and what they leave, it is the answer.  True names of opened rings are the likelier ones,
+most by tens of nats; a speed's bump, by 31 nats to 53, is not (04e11e10 of `ring600k`).
+
+What changes within seconds counts where noise cannot be such a course: where noise is white beside
+the names, or where with and without them it is one source.
+"""
+
+from __future__ import annotations
+
+from ahrsd.mismatch import unknown
+from ahrsd.mismatch.along_field import framed
+from ahrsd.mismatch.delays import DELAYS
+from ahrsd.mismatch.findings import added_value
+from ahrsd.mismatch.foretold import in_time_alone
+from ahrsd.mismatch.one_source import with_any_course, with_gyro_course, with_one_source
+from ahrsd.mismatch.refined import WHITE
+from ahrsd.mismatch.regression import Base, Candidate
+from ahrsd.mismatch.rivals import MORE_NATS
+from ahrsd.mismatch.search import STEPS, State, Survey, formed_basis_of, term_group
+from ahrsd.mismatch.settings import evidence_of
+from ahrsd.mismatch.stand_ins import BUMP, dropped
+
+#: names of a field outside that is elsewhere from a moment on, as it is once a gyro's bias has come
+#: and gone: of a true one a quick course of the gyro's error explains little
+TURNED = (STEPS["world"], BUMP)
+#: names of the motion from which on the source must only be likelier than each of them: pairs of
+#: effects are seen on vehicles
+MANY = 3
+
+
+def without_names_of_a_source(
+    state: State, surveys: list[Survey], left: unknown.Remainder
+) -> tuple[State, list[Survey], unknown.Remainder]:
+    """The state without such names, and the source, where it is likelier; else as it was.
+
+    left: told of quick sources (`along_field.framed`)
+    """
+    asked = [k for k, judged in enumerate(state.named) if _of_no_column(judged.candidate)]
+    if not asked or state.walk:
+        return state, surveys, left
+    nats, bare = _together(state, asked)
+    turned = any(state.named[k].candidate.name in TURNED for k in asked)
+    if not unknown.detected(left, state.problem.limits):
+        # names that leave nothing are the rule, and cost less to be asked without a new fit
+        linear = _told(unknown.remainder(bare, with_bins=False), turned=turned)
+        if not _likelier(state, nats, linear, left):
+            return state, surveys, left
+    slim, others, source = dropped(state, surveys, asked, left)
+    source = framed(formed_basis_of(slim), source, state.problem.limits)
+    source = with_any_course(_told(source, turned=turned)) if white(left) else source
+    there = unknown.detected(source, state.problem.limits)
+    likelier = there and _likelier(state, nats, source, left)
+    return (slim, others, source) if likelier else (state, surveys, left)
+
+
+def _together(state: State, asked: list[int]) -> tuple[float, Base]:
+    """Evidence of these names as one, nats, and the basis without them.
+
+    Of each beside those before it, at least what all had when they were found: two that share what
+    they explain have less beside one another than they have as one.
+    """
+    basis, nats = formed_basis_of(state), 0.0
+    for k in reversed(asked):
+        basis = basis.without(term_group(k), added_value(state, k))
+        candidate = state.named[k].candidate
+        nats += evidence_of(basis, candidate) - candidate.paid
+    found = sum(float(state.named[k].evidence) for k in asked)
+    return max(nats, found), basis
+
+
+def _likelier(
+    state: State, nats: float, source: unknown.Remainder, left: unknown.Remainder
+) -> bool:
+    """Whether the source is likelier than names of so many nats and what they leave."""
+    limits, names = state.problem.limits, state.named
+    free = free_nats(source, quick=white(left) or (left.one_source and source.one_source))
+    if unknown.detected(left, limits):
+        return free > nats + free_nats(left, quick=True) + MORE_NATS
+    own = any(in_time_alone(one.candidate) or not _of_no_column(one.candidate) for one in names)
+    if len(names) >= MANY and not own:
+        return free > max(one.evidence for one in names)
+    return free > nats + limits.lead_nats
+
+
+def _told(left: unknown.Remainder, *, turned: bool) -> unknown.Remainder:
+    """The remainder told of quick courses; of the gyro's, too, where a jump may be one."""
+    seen = left if left.quick else with_one_source(left)
+    return with_gyro_course(seen) if turned else seen
+
+
+def _of_no_column(name: Candidate) -> bool:
+    """Whether nothing that was logged bears a name out; a delay follows the turns."""
+    return "covariate" not in name.setting and name.name not in DELAYS
+
+
+def white(left: unknown.Remainder) -> bool:
+    """Whether what is left is white noise, but for what its own course explains."""
+    return left.basis.rest is None and left.basis.colour <= WHITE
+
+
+def free_nats(left: unknown.Remainder, *, quick: bool) -> float:
+    """Of the likeliest course, quick ones among them or not; 0 where none is likelier than none."""
+    seen = [*left.located.values(), *(left.quick.values() if quick else ())]
+    return max([0.0, *(float(one.evidence) for one in seen)])

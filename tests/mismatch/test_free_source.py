@@ -1,0 +1,170 @@
+"""Names that no column bears out, held against one source that is free in time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.mismatch import free_source
+from ahrsd.mismatch.effects.library import EFFECTS
+from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.free_source import free_nats, without_names_of_a_source
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.refined import WHITE
+from ahrsd.mismatch.rivals import MORE_NATS
+from ahrsd.mismatch.track import Track
+
+SETTINGS = {"switched_device": {"covariate": "lamp_on"}, "hard_iron_step": {"onset_s": 9.0}}
+LEAD = LIMITS.lead_nats
+
+
+def remainder(
+    slow: float, quick: float = -5.0, *, one_source: bool = False, colour: float = 1.0
+) -> SimpleNamespace:
+    """A remainder whose slow and quick courses are so likely; detected by its slow one."""
+    strongest = SimpleNamespace(frame="sensor", evidence=slow, p_value=1e-9 if slow > 0 else 1.0)
+    return SimpleNamespace(
+        strongest=strongest,
+        located={"sensor": strongest},
+        quick={"sensor": SimpleNamespace(frame="sensor", evidence=quick, p_value=1e-9)},
+        one_source=one_source,
+        bins=(),
+        stood_in=None,
+        basis=SimpleNamespace(rest=None, colour=colour),
+    )
+
+
+def state_of(*names: tuple[str, float], walk: float = 0.0) -> SimpleNamespace:
+    judged = [
+        SimpleNamespace(
+            candidate=SimpleNamespace(name=name, setting=SETTINGS.get(name, {}), paid=0.0),
+            evidence=nats,
+        )
+        for name, nats in names
+    ]
+    problem = SimpleNamespace(limits=LIMITS)
+    return SimpleNamespace(named=tuple(judged), problem=problem, walk=walk)
+
+
+QUIET, RED = remainder(-1.0), remainder(-1.0, colour=1.01 * WHITE)
+BUMP, TWO = (("field_anomaly", 31.0),), (("field_anomaly", 31.7), ("field_anomaly", 27.7))
+MANY = (("viscous_magnetisation", 42.6), ("earth_rotation", 30.9), ("hysteresis", 10.8))
+CURRENT, STEP = ("switched_device", 9.0), ("hard_iron_step", 9.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "left", "source", "gone"),
+    [
+        # a bump of 31 nats for a speed that nobody logged
+        (BUMP, QUIET, remainder(20.0, 53.0), [0]),
+        (BUMP, QUIET, remainder(20.0, 31.1 + LEAD), [0]),
+        (BUMP, QUIET, remainder(20.0, 30.9 + LEAD), []),
+        (BUMP, QUIET, remainder(31.1 + LEAD), [0]),
+        # what is quick may be noise that is not white, unless it is one source before and after
+        (BUMP, RED, remainder(20.0, 53.0), []),
+        (BUMP, RED, remainder(20.0, 53.0, one_source=True), []),
+        (BUMP, RED, remainder(40.0), [0]),
+        # 59.4 nats of bumps and 6.6 of the rest, for 119.8 of a current that is on now and then
+        (
+            TWO,
+            remainder(6.6, one_source=True, colour=2.0),
+            remainder(9.0, 119.8, one_source=True),
+            [0, 1],
+        ),
+        (TWO, remainder(6.6, one_source=True, colour=2.0), remainder(9.0, 119.8), []),
+        # beside a rest it must be likelier than all of them and the rest
+        (BUMP, remainder(20.0), remainder(51.1 + MORE_NATS), [0]),
+        (BUMP, remainder(20.0), remainder(50.9 + MORE_NATS), []),
+        (BUMP, remainder(13.0, 20.0), remainder(50.9 + MORE_NATS), []),
+        # than each of three of the motion, but two effects are seen on vehicles
+        (MANY, QUIET, remainder(63.2), [0, 1, 2]),
+        (MANY, QUIET, remainder(42.0), []),
+        (MANY, remainder(30.0), remainder(63.2), []),
+        (MANY[:2], QUIET, remainder(63.2), []),
+        ((*MANY[:2], STEP), QUIET, remainder(63.2), []),
+        ((*MANY[:2], CURRENT), QUIET, remainder(63.2), []),
+        # what is logged, and a delay, are no part of what is not
+        ((CURRENT,), QUIET, remainder(63.2), []),
+        ((("mag_time_lag", 9.0),), QUIET, remainder(63.2), []),
+        ((CURRENT, *BUMP), QUIET, remainder(63.2), [1]),
+        # a source that is not there by itself is none
+        ((("field_anomaly", 1.0),), QUIET, remainder(8.0), []),
+        ((), remainder(30.0), remainder(80.0), []),
+    ],
+)
+def test_a_free_source_against_names(monkeypatch, names, left, source, gone) -> None:
+    taken: list[int] = []
+    slim = SimpleNamespace()
+
+    def dropped(state, surveys, terms, rest):
+        taken.extend(terms)
+        return slim, ["without"], rest
+
+    state = state_of(*names)
+    nats = {id(one.candidate): one.evidence for one in state.named}
+    bare = SimpleNamespace(without=lambda *_: bare)
+    monkeypatch.setattr(free_source, "dropped", dropped)
+    monkeypatch.setattr(free_source, "formed_basis_of", lambda _: bare)
+    monkeypatch.setattr(free_source, "added_value", lambda *_: None)
+    monkeypatch.setattr(free_source, "evidence_of", lambda _, candidate: nats[id(candidate)])
+    monkeypatch.setattr(free_source.unknown, "remainder", lambda *_, **__: source)
+    monkeypatch.setattr(free_source, "with_one_source", lambda one: one)
+    monkeypatch.setattr(free_source, "framed", lambda *_: source)
+    monkeypatch.setattr(free_source, "with_any_course", sure_of_the_quick)
+    after, surveys, rest = without_names_of_a_source(state, ["with"], left)
+    if gone:
+        assert (taken, after, surveys) == (gone, slim, ["without"])
+        assert free_nats(rest, quick=True) == free_nats(source, quick=True)
+    else:
+        assert (after, surveys) == (state, ["with"])
+        assert rest is left
+
+
+def sure_of_the_quick(left: SimpleNamespace) -> SimpleNamespace:
+    quick = left.quick["sensor"]
+    if quick.evidence < left.strongest.evidence:
+        return left
+    return SimpleNamespace(
+        **{**vars(left), "strongest": quick, "located": {"sensor": quick}, "one_source": True}
+    )
+
+
+def test_beside_a_bias_that_wanders_nothing_is_asked() -> None:
+    state = state_of(("field_anomaly", 31.0), walk=1e-5)
+    assert without_names_of_a_source(state, ["with"], QUIET) == (state, ["with"], QUIET)
+
+
+def with_field(course) -> Track:
+    """A field of 1 mG, fixed to the vehicle, whose course (N,) nobody logged."""
+    track = made(Trial(4)).track
+    field = 1e-3 * np.outer(course(track.time_s), [0.48, -0.6, 0.64])
+    return replace(track, mag_b_gauss=track.mag_b_gauss + field)
+
+
+def swelling(time_s):
+    """What swells and fades, as a speed does: three times, never alike."""
+    swells = ((70.0, 14.0, 1.0), (170.0, 25.0, 0.7), (300.0, 9.0, 0.5))
+    return sum(size * np.exp(-0.5 * ((time_s - at) / width) ** 2) for at, width, size in swells)
+
+
+def stepping(time_s):
+    return (time_s > 150.0).astype(float)
+
+
+LIBRARY = {
+    name: EFFECTS[name]
+    for name in ("hard_iron_step", "soft_iron_step", "field_anomaly", "field_step")
+}
+
+
+def test_a_source_that_swells_is_unknown_and_a_step_a_step() -> None:
+    swelled = diagnose(with_field(swelling), library=LIBRARY)
+    assert [one.effect for one in swelled.findings] == []
+    assert swelled.unexplained.detected and swelled.unexplained.where.frame == "sensor"
+    stepped = diagnose(with_field(stepping), library=LIBRARY)
+    assert [one.effect for one in stepped.findings] == ["hard_iron_step"]
+    assert not stepped.unexplained.detected
