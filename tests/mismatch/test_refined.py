@@ -16,7 +16,7 @@ from ahrsd.mismatch.explained import explained
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.name import ROBUST
 from ahrsd.mismatch.null import fit_null
-from ahrsd.mismatch.one_source import NATS, with_one_source
+from ahrsd.mismatch.one_source import ANY_NATS, with_any_course, with_one_source
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.refined import _of_any_course, left_alone, refined
 from ahrsd.mismatch.search import State, formed_basis_of, survey
@@ -108,7 +108,7 @@ def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, tur
     assert (seen is not None) is told
     if seen is not None:
         assert seen.strongest.frame in ("sensor", "world")
-        assert seen.strongest.evidence > NATS
+        assert seen.strongest.evidence > ANY_NATS
         assert not rest.one_source
 
 
@@ -125,9 +125,35 @@ def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, tur
 def test_where_a_quick_course_can_be_no_noise(monkeypatch, colour, slow, asked) -> None:
     monkeypatch.setattr(refined_module, "slowness", lambda basis: slow)
     monkeypatch.setattr(refined_module, "formed_basis_of", lambda state: None)
-    monkeypatch.setattr(refined_module, "with_any_course", lambda left: "asked")
+    monkeypatch.setattr(refined_module, "with_any_course", lambda *_: "asked")
     left = SimpleNamespace(basis=SimpleNamespace(rest=None, colour=colour))
     assert (_of_any_course(SimpleNamespace(), left) == "asked") is asked
+
+
+@pytest.mark.parametrize(
+    ("slow", "quick", "gyro", "frame"),
+    [
+        (-1.1, ANY_NATS - 0.1, -5.0, None),
+        (-1.1, ANY_NATS + 0.1, -5.0, "sensor"),
+        (7.0, 6.4, -5.0, "world"),  # a slow course of a field is one as well
+        (-1.1, 6.4, 8.0, None),  # a gyro's bias that walks is none
+        (-1.1, 8.1, 8.0, "sensor"),
+    ],
+)
+def test_a_field_alone_of_whatever_course(slow, quick, gyro, frame) -> None:
+    _, left = left_of(switched(0.0))
+    nats = {"sensor": -1.1, "world": slow, "gyro": gyro}
+    located = {k: replace(one, evidence=nats[k]) for k, one in left.located.items()}
+    courses = {"sensor": replace(left.quick["sensor"], evidence=quick)}
+    given = replace(left, located=located, quick=courses)
+    told = with_any_course(given)
+    assert told.one_source is (frame is not None)
+    if frame is None:
+        assert told is given
+    else:
+        assert told.strongest.frame == frame
+        assert told.strongest.evidence == max(slow, quick)
+        assert told.strongest.p_value == pytest.approx(np.exp(-max(slow, quick)))
 
 
 @pytest.mark.parametrize(("times", "named"), [(5.0, True), (50.0, False)])
