@@ -25,7 +25,7 @@ from ahrsd.mismatch.regression import Base, Candidate
 from ahrsd.mismatch.rivals import MORE_NATS
 from ahrsd.mismatch.search import STEPS, State, Survey, formed_basis_of, term_group
 from ahrsd.mismatch.settings import evidence_of
-from ahrsd.mismatch.stand_ins import BUMP, dropped
+from ahrsd.mismatch.stand_ins import BUMP, TIME_SHAPED, dropped
 
 #: names of a field outside that is elsewhere from a moment on, as it is once a gyro's bias has come
 #: and gone: of a true one a quick course of the gyro's error explains little
@@ -96,8 +96,12 @@ def _told(left: unknown.Remainder, *, turned: bool) -> unknown.Remainder:
 
 
 def _of_no_column(name: Candidate) -> bool:
-    """Whether nothing that was logged bears a name out; a delay follows the turns."""
-    return "covariate" not in name.setting and name.name not in DELAYS
+    """Whether nothing that was logged bears a name out.
+
+    A delay follows the turns, and a bias that changes is held against its own course (`stand_ins`).
+    """
+    other = name.name in DELAYS or name.name in TIME_SHAPED["gyro"]
+    return "covariate" not in name.setting and not other
 
 
 def white(left: unknown.Remainder) -> bool:

@@ -87,9 +87,10 @@ CURRENT, STEP = ("switched_device", 9.0), ("hard_iron_step", 9.0)
         (MANY[:2], QUIET, remainder(63.2), []),
         ((*MANY[:2], STEP), QUIET, remainder(63.2), []),
         ((*MANY[:2], CURRENT), QUIET, remainder(63.2), []),
-        # what is logged, and a delay, are no part of what is not
+        # what is logged, a delay and a bias that changes are no part of what is not
         ((CURRENT,), QUIET, remainder(63.2), []),
         ((("mag_time_lag", 9.0),), QUIET, remainder(63.2), []),
+        ((("gyro_startup", 9.0),), remainder(20.0), remainder(63.2), []),
         ((CURRENT, *WEAK), QUIET, remainder(63.2), [1]),
         # a jump of the outside field may be what a gyro's bias left behind
         ((("field_step", 40.0 - LEAD - 0.1),), QUIET, remainder(-5.0), [0]),

@@ -16,7 +16,14 @@ from ahrsd.mismatch.name import ROBUST
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.search import ORDINARY_WALK_RAD_S_SQRT_S, State, added, refitted, survey
-from ahrsd.mismatch.selection import _cause, _cause_after_all, _which_change, borne_out, forward
+from ahrsd.mismatch.selection import (
+    _cause,
+    _cause_after_all,
+    _may_wander,
+    _which_change,
+    borne_out,
+    forward,
+)
 from ahrsd.mismatch.track import Spec, Track
 
 SCALE = 1 + np.array([-1.2e-3, 2.3e-3, -1.6e-3])
@@ -187,3 +194,22 @@ def test_vibration_by_two_columns_is_named_once_unless_both_say_much(share, name
     problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
     state, _, _ = forward(State(problem, fit_null(problem.track, problem.spec, cold, walk=False)))
     assert state.names == ("vibration_rectification",) * named
+
+
+@pytest.mark.parametrize(
+    ("name", "nats", "others", "asked"),
+    [
+        ("gyro_startup", 50.0, {}, True),
+        # `ring600l`, 2bc1bb11: a null whose gyro walks
+        ("geomagnetic_drift", 24.6, {"gyro_bias_drift": 22.4, "gyro_bias_step": 21.6}, True),
+        ("geomagnetic_drift", 24.6, {"gyro_bias_drift": 21.5}, False),
+        ("geomagnetic_drift", 24.6, {"hard_iron_drift": 24.0}, False),
+        ("geomagnetic_drift", 24.6, {}, False),
+        ("hard_iron_drift", 24.6, {"gyro_bias_drift": 24.0}, False),
+    ],
+)
+def test_a_field_that_turns_slowly_may_be_a_bias_that_wanders(name, nats, others, asked) -> None:
+    best = held(name, nats)
+    rivals = tuple(held(other, size).candidate for other, size in others.items())
+    seen = SimpleNamespace(candidates=(best.candidate, *rivals))
+    assert _may_wander(best, seen, LIMITS) is asked
