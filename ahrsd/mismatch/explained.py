@@ -11,9 +11,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
-from ahrsd.mismatch.free_source import free_nats, white
+from ahrsd.mismatch.free_source import free_nats
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.name import ROBUST, Judged
+from ahrsd.mismatch.refined import white
 from ahrsd.mismatch.search import WANDERING, State, Survey, added, formed_basis_of, survey
 from ahrsd.mismatch.selection import borne_out, noise_or_cause
 from ahrsd.mismatch.unknown import Remainder

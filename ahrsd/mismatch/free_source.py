@@ -5,8 +5,7 @@ place to place: what nobody logged is roughly a bump, a step or iron that takes 
 parallel legs a position is a function of the headings before it: a field that differs from place to
 place was iron that takes its time, the earth's turn and hysteresis, 99 % sure each.  A course that
 is free in time has to pay for every one of its coefficients; where it is likelier all the same than
-such names and what they leave, it is the answer.  True names of opened rings are the likelier ones,
-most by tens of nats; a speed's bump, by 31 nats to 53, is not (04e11e10 of `ring600k`).
+such names and what they leave, it is the answer (a speed as a bump: 04e11e10 of `ring600k`).
 
 What changes within seconds counts where noise cannot be such a course: where noise is white beside
 the names, or where with and without them it is one source.
@@ -20,7 +19,7 @@ from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.foretold import in_time_alone
 from ahrsd.mismatch.one_source import with_any_course, with_gyro_course, with_one_source
-from ahrsd.mismatch.refined import WHITE
+from ahrsd.mismatch.refined import white
 from ahrsd.mismatch.regression import Base, Candidate
 from ahrsd.mismatch.rivals import MORE_NATS
 from ahrsd.mismatch.search import STEPS, State, Survey, formed_basis_of, term_group
@@ -102,11 +101,6 @@ def _of_no_column(name: Candidate) -> bool:
     """
     other = name.name in DELAYS or name.name in TIME_SHAPED["gyro"]
     return "covariate" not in name.setting and not other
-
-
-def white(left: unknown.Remainder) -> bool:
-    """Whether what is left is white noise, but for what its own course explains."""
-    return left.basis.rest is None and left.basis.colour <= WHITE
 
 
 def free_nats(left: unknown.Remainder, *, quick: bool) -> float:

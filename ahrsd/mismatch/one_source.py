@@ -43,8 +43,8 @@ SHORTEST_S = 3.0
 FEWEST = 20
 #: odds of 1000 to 1 (Markov's inequality: noise has them once in 1000 recordings at most)
 NATS = float(np.log(1000.0))
-#: odds of 100 to 1, where noise is white and a course of whatever direction is asked for: of 90
-#: nulls without slow noise none has odds of 1, of 30 with a gyro that walks one has 13 to 1
+#: odds of 100 to 1 (once in 100 recordings at most), where noise is white and a course of whatever
+#: direction is asked for: the dossier allows one null in a hundred to be called unknown
 ANY_NATS = float(np.log(100.0))
 #: times within which a course forgets, in stretches
 TIMES = (0.25, 1.0, 2.5, 6.0)

@@ -84,6 +84,10 @@ def left_alone(
 
 def _of_any_course(state: State, left: Remainder, least: float = ANY_NATS) -> Remainder:
     """The remainder with a quick course where that cannot be slow noise of the magnetometer."""
-    white = left.basis.rest is None and left.basis.colour <= WHITE
-    no_noise = white or slowness(formed_basis_of(state)) >= STEADY
+    no_noise = white(left) or slowness(formed_basis_of(state)) >= STEADY
     return with_any_course(left, least) if no_noise else left
+
+
+def white(left: Remainder) -> bool:
+    """Whether what is left is white noise, but for what its own course explains."""
+    return left.basis.rest is None and left.basis.colour <= WHITE
