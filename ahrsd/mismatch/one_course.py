@@ -6,9 +6,14 @@ end.  Each of them passes the gate, since a part of the course has its shape, an
 exact.  But one course in one frame explains all of them at once.  Its prior is smooth: cosines in
 time whose variances fall with the fourth power of their number, of any size.  True names are
 likelier than it, by some nats at the least, for a form that is known pays for fewer coefficients.
+
+A single name may be such a course, too, if its form was sought: iron that remembers follows the
+headings of the minutes before, which on parallel legs are a function of the place.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -37,15 +42,39 @@ def of_one_course(state: State, basis: Base) -> tuple[list[int], Frame | None]:
     if len(state.named) < 2:
         return [], None
     noise = max(1.0, basis.colour)
-    courses = basis.whitened([smooth_course(basis.context, frame) for frame in COURSES])
-    for frame, course in zip(COURSES, courses, strict=True):
-        free = course * UNIT_GAUSS
+    for frame, free in _courses(basis):
         worth = [_own(state, basis, k, free, noise) for k in range(len(state.named))]
         parts = [k for k, (name, own) in enumerate(worth) if own < OWN * name]
         paid = sum(price(state.named[k].candidate, worth[k][0]) for k in parts)
         if len(parts) > 1 and _lead(state, basis, parts, free, noise) < paid:
             return parts, frame
     return [], None
+
+
+def as_smooth(
+    state: State, basis: Base, asked: Mapping[int, float]
+) -> tuple[list[int], Frame | None]:
+    """Numbers of the terms, each for itself, that are hardly likelier than one smooth course.
+
+    asked: nats by which each must be, once its own price is paid.  The frame is the last one's.
+    """
+    noise = max(1.0, basis.colour)
+    found, whose = [], None
+    courses = _courses(basis) if asked else []
+    for k, least in asked.items():
+        leads = {frame: _lead(state, basis, [k], free, noise) for frame, free in courses}
+        frame = min(leads, key=lambda one: leads[one])
+        candidate = state.named[k].candidate
+        if leads[frame] < least + price(candidate, float(state.named[k].evidence)):
+            found.append(k)
+            whose = frame
+    return found, whose
+
+
+def _courses(basis: Base) -> list[tuple[Frame, Array]]:
+    """Each frame's smooth course as the innovation sees it, of unit size."""
+    seen = basis.whitened([smooth_course(basis.context, frame) for frame in COURSES])
+    return [(frame, one * UNIT_GAUSS) for frame, one in zip(COURSES, seen, strict=True)]
 
 
 def price(candidate: Candidate, nats: float) -> float:

@@ -121,6 +121,7 @@ def test_a_free_source_against_names(monkeypatch, names, left, source, gone) -> 
     monkeypatch.setattr(free_source, "with_gyro_course", with_gyro_of_40)
     monkeypatch.setattr(free_source, "framed", lambda *_: source)
     monkeypatch.setattr(free_source, "with_any_course", sure_of_the_quick)
+    monkeypatch.setattr(free_source, "as_smooth", lambda *_: ([], None))
     after, surveys, rest = without_names_of_a_source(state, ["with"], left)
     if gone:
         assert (taken, after, surveys) == (gone, slim, ["without"])
@@ -145,9 +146,30 @@ def sure_of_the_quick(left: SimpleNamespace) -> SimpleNamespace:
     )
 
 
-def test_beside_a_bias_that_wanders_nothing_is_asked() -> None:
+def test_beside_a_bias_that_wanders_nothing_is_asked(monkeypatch) -> None:
+    monkeypatch.setattr(free_source, "formed_basis_of", lambda _: None)
+    monkeypatch.setattr(free_source, "as_smooth", lambda *_: ([], None))
     state = state_of(*WEAK, walk=1e-5)
     assert without_names_of_a_source(state, ["with"], QUIET) == (state, ["with"], QUIET)
+
+
+def test_odds_that_a_sought_form_needs_beside_a_smooth_course(monkeypatch) -> None:
+    """1000 to 1 for iron that remembers, 20 to 1 for a step; a trend is asked nothing."""
+    asked: list[dict[int, float]] = []
+
+    def as_smooth(_state, _basis, least):
+        asked.append(least)
+        return [0], "world"
+
+    state = state_of(*WEAK, STEP, ("hard_iron_drift", 9.0), CURRENT, ("mag_scale", 9.0))
+    slim = SimpleNamespace(problem=state.problem, named=(), walk=0.0)
+    monkeypatch.setattr(free_source, "formed_basis_of", lambda _: None)
+    monkeypatch.setattr(free_source, "as_smooth", as_smooth)
+    monkeypatch.setattr(free_source, "dropped", lambda *_: (slim, [], remainder(-1.0)))
+    monkeypatch.setattr(free_source, "replace", lambda one, **more: (one, more))
+    after, surveys, (_, more) = without_names_of_a_source(state, ["with"], QUIET)
+    assert asked == [{0: pytest.approx(np.log(1000.0)), 1: LEAD}]
+    assert (after, surveys, more) == (slim, [], {"stood_in": "world"})
 
 
 def with_field(course) -> Track:
@@ -167,6 +189,11 @@ def stepping(time_s):
     return (time_s > 150.0).astype(float)
 
 
+def warming(time_s):
+    """A sensor that takes its time, as its temperature does."""
+    return 1.0 - np.exp(-time_s / 250.0)
+
+
 LIBRARY = {
     name: EFFECTS[name]
     for name in ("hard_iron_step", "soft_iron_step", "field_anomaly", "field_step")
@@ -180,3 +207,14 @@ def test_a_source_that_swells_is_unknown_and_a_step_a_step() -> None:
     stepped = diagnose(with_field(stepping), library=LIBRARY)
     assert [one.effect for one in stepped.findings] == ["hard_iron_step"]
     assert not stepped.unexplained.detected
+
+
+def test_a_sensor_that_warms_is_no_iron_that_remembers() -> None:
+    """328 nats as that; a smooth course has hardly less, and nobody logged a temperature."""
+    library = {name: EFFECTS[name] for name in ("viscous_magnetisation", "hard_iron_step")}
+    warm = diagnose(with_field(warming), library=library)
+    assert [one.effect for one in warm.findings] == []
+    assert warm.unexplained.detected and warm.unexplained.where.frame == "sensor"
+    iron = diagnose(made(Trial(4, (("viscous_magnetisation", 1.0),))).track, library=library)
+    assert [one.effect for one in iron.findings] == ["viscous_magnetisation"]
+    assert not iron.unexplained.detected

@@ -1,14 +1,16 @@
 """Several names that share one smooth course, and those that only look as if they did."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.mismatch import one_course
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
-from ahrsd.mismatch.one_course import price
+from ahrsd.mismatch.one_course import as_smooth, price
 from ahrsd.mismatch.regression import Candidate
 from ahrsd.simulation import simulate
 
@@ -47,3 +49,22 @@ def test_what_was_sought_is_paid():
     assert price(replace(active, tried=100), 0.0) == np.log(100)
     step = Candidate(EFFECTS["field_step"], {"onset_s": 80.0}, 1, 0.0)
     assert abs(price(step, 1000.0) - np.log(2001.0) / 2) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("world", "sensor", "found"),
+    [(20.0, 8.0, ([0], "sensor")), (-13.5, 0.9, ([0], "world")), (20.0, 13.0, ([], None))],
+)
+def test_a_name_must_be_likelier_than_a_smooth_course_once_paid(
+    monkeypatch, world, sensor, found
+) -> None:
+    """Of 40.5 nats, with a time that was sought: ln(82) / 2 = 2.2 and the odds asked for, 6.9."""
+    leads = {"w": world, "s": sensor}
+    monkeypatch.setattr(one_course, "_courses", lambda _: [("world", "w"), ("sensor", "s")])
+    monkeypatch.setattr(one_course, "_lead", lambda *given: leads[given[3]])
+    setting = {"time_constant_s": 20.0}
+    candidate = Candidate(EFFECTS["viscous_magnetisation"], setting, 1, 0.0)
+    state = SimpleNamespace(named=[SimpleNamespace(candidate=candidate, evidence=40.5)])
+    basis = SimpleNamespace(colour=1.0)
+    assert as_smooth(state, basis, {0: float(np.log(1000.0))}) == found
+    assert as_smooth(state, basis, {}) == ([], None)
