@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ahrsd.mismatch import unknown
-from ahrsd.mismatch.free_source import free_nats
+from ahrsd.mismatch.free_source import free_nats, hardly_likelier
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.name import ROBUST, Judged
 from ahrsd.mismatch.refined import white
@@ -48,6 +48,8 @@ def explained(
     after = unknown.remainder(formed_basis_of(tried))
     free = free_nats(left, quick=white(after))
     if unknown.detected(after, limits) or free > best.evidence + limits.lead_nats:
+        return None
+    if hardly_likelier(tried)[0]:
         return None
     return tried, [seen] * len(tried.named), survey(tried), after
 

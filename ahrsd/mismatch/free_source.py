@@ -24,6 +24,7 @@ from ahrsd.mismatch.along_field import framed
 from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.foretold import in_time_alone
+from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.one_course import as_smooth
 from ahrsd.mismatch.one_source import NATS, with_any_course, with_gyro_course, with_one_source
 from ahrsd.mismatch.refined import white
@@ -74,18 +75,23 @@ def _without_smooth(
     state: State, surveys: list[Survey], left: unknown.Remainder
 ) -> tuple[State, list[Survey], unknown.Remainder]:
     """The state without the names that are hardly likelier than a smooth course in one frame."""
-    asked = {
-        k: state.problem.limits.lead_nats if in_time_alone(one.candidate) else NATS
-        for k, one in enumerate(state.named)
-        if one.candidate.name in SOUGHT
-    }
-    terms, frame = as_smooth(state, formed_basis_of(state), asked)
+    terms, frame = hardly_likelier(state)
     if not terms:
         return state, surveys, left
     state, surveys, left = dropped(state, surveys, terms, left)
     if not unknown.detected(left, state.problem.limits):
         left = replace(left, stood_in=frame)
     return state, surveys, left
+
+
+def hardly_likelier(state: State) -> tuple[list[int], Frame | None]:
+    """Numbers of the terms whose sought form is hardly likelier than a smooth course: its frame."""
+    asked = {
+        k: state.problem.limits.lead_nats if in_time_alone(one.candidate) else NATS
+        for k, one in enumerate(state.named)
+        if one.candidate.name in SOUGHT
+    }
+    return as_smooth(state, formed_basis_of(state), asked)
 
 
 def _together(state: State, asked: list[int]) -> tuple[float, Base]:

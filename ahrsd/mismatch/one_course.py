@@ -78,12 +78,13 @@ def _courses(basis: Base) -> list[tuple[Frame, Array]]:
 
 
 def price(candidate: Candidate, nats: float) -> float:
-    """Nats that a term's onset and scale cost, which were sought among all: Laplace's.
+    """Nats that a term's onset, scale and place cost, which were sought among all: Laplace's.
 
     Half the logarithm of the information on each, in units of its range, is about that of what the
     term explains.  At least what the choice among the settings has cost.
     """
-    sought = ("onset_s" in candidate.setting) + (scale_of(candidate) is not None)
+    setting = candidate.setting
+    sought = ("onset_s" in setting) + (scale_of(candidate) is not None) + 3 * ("place_m" in setting)
     return max(candidate.paid, 0.5 * sought * float(np.log1p(2 * max(nats, 0.0))))
 
 

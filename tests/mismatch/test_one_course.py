@@ -49,6 +49,9 @@ def test_what_was_sought_is_paid():
     assert price(replace(active, tried=100), 0.0) == np.log(100)
     step = Candidate(EFFECTS["field_step"], {"onset_s": 80.0}, 1, 0.0)
     assert abs(price(step, 1000.0) - np.log(2001.0) / 2) < 1e-9
+    place = {"place_m": [1.0, 2.0, 3.0], "distance_m": 2.0, "turn_deg": 30.0}
+    passed = Candidate(EFFECTS["field_anomaly"], place, 1, 0.0)
+    assert abs(price(passed, 1000.0) - 2 * np.log(2001.0)) < 1e-9
 
 
 @pytest.mark.parametrize(
