@@ -180,6 +180,24 @@ def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named)
         assert not unknown.detected(rest, strict.alone())
 
 
+def test_a_name_hardly_likelier_than_a_smooth_course_is_none(monkeypatch) -> None:
+    track = made(Trial(7, effects=(("hard_iron_step", 0.6),))).track
+    strict = replace(
+        LIMITS, robust_family_p=survey(left_of(track)[0]).judged[0].robust_family_p / 5
+    )
+    state, left = left_of(track, strict)
+    asked: list[tuple[str, ...]] = []
+
+    def hardly(tried: State) -> tuple[list[int], str]:
+        asked.append(tried.names)
+        return [0], "sensor"
+
+    assert explained(state, left, strict.alone()) is not None
+    monkeypatch.setattr("ahrsd.mismatch.explained.hardly_likelier", hardly)
+    assert explained(state, left, strict.alone()) is None
+    assert asked == [("hard_iron_step",)]
+
+
 def test_a_name_that_leaves_something_is_none() -> None:
     """A jump and one back: a step explains a part of it, and only the blocks refuse it."""
     track = switched(8e-4)
