@@ -71,6 +71,16 @@ def as_smooth(
     return found, whose
 
 
+def smooth_nats(basis: Base) -> dict[Frame, float]:
+    """Evidence of a smooth course in each frame, nats, in noise of the basis's colour."""
+    noise, nats = max(1.0, basis.colour), {}
+    for frame, free in _courses(basis):
+        G, s = projected(basis, free)
+        group = np.zeros(len(s), dtype=np.intp)
+        nats[frame] = float(fitted(G, s, group, noise, np.zeros(1))[0])
+    return nats
+
+
 def _courses(basis: Base) -> list[tuple[Frame, Array]]:
     """Each frame's smooth course as the innovation sees it, of unit size."""
     seen = basis.whitened([smooth_course(basis.context, frame) for frame in COURSES])

@@ -108,8 +108,12 @@ def with_any_course(left: Remainder, least: float = ANY_NATS) -> Remainder:
     best = max(fields, key=lambda one: one.evidence)
     if best.evidence < max(least, left.strongest.evidence) or not left.quick:
         return left
-    located = {**left.located, best.frame: _sure(best, best.evidence)}
-    return replace(left, located=located, one_source=True)
+    return with_course(left, best, best.evidence)
+
+
+def with_course(left: Remainder, one: Located, nats: float) -> Remainder:
+    """The remainder with a frame's course that is there, so much likelier than noise."""
+    return replace(left, located={**left.located, one.frame: _sure(one, nats)}, one_source=True)
 
 
 def _sure(one: Located, nats: float) -> Located:

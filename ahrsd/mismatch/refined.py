@@ -17,7 +17,8 @@ from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
 from ahrsd.mismatch.null import NullFit
-from ahrsd.mismatch.one_source import ANY_NATS, with_any_course, with_one_source
+from ahrsd.mismatch.one_course import smooth_nats
+from ahrsd.mismatch.one_source import ANY_NATS, NATS, with_any_course, with_course, with_one_source
 from ahrsd.mismatch.own_form import free_price_of, price_of
 from ahrsd.mismatch.search import (
     ORDINARY_WALK_RAD_S_SQRT_S,
@@ -35,7 +36,10 @@ from ahrsd.mismatch.unknown import Remainder
 WHITE = 1.15
 #: correlation with itself a second later that no noise has which forgets within two seconds
 STEADY = float(np.exp(-1 / 2))
-#: what a quick course that is there needs beside a gyro that may wander: odds of 10 to 1
+#: what a smooth course needs where nothing else is: odds of 1000 to 1, and of a million to 1 where
+#: noise has a colour, which is more of it at long periods than at those that tell the colour
+SMOOTH_NATS, OF_COLOUR = NATS, 2.0
+#: what a course that is there needs beside a gyro that may wander: odds of 10 to 1
 STILL_NATS = float(np.log(10.0))
 
 
@@ -78,14 +82,26 @@ def left_alone(
     walking = refitted(replace(state, walk=ORDINARY_WALK_RAD_S_SQRT_S), ())
     rest = unknown.remainder(formed_basis_of(walking), with_bins=bool(left.bins))
     rest = refined(start, walking, with_one_source(rest), None, limits)
-    still = unknown.detected(_of_any_course(walking, rest, STILL_NATS), limits)
+    still = unknown.detected(_of_any_course(walking, rest, STILL_NATS, STILL_NATS), limits)
     return (state, left, seen) if still else (walking, rest, None)
 
 
-def _of_any_course(state: State, left: Remainder, least: float = ANY_NATS) -> Remainder:
-    """The remainder with a quick course where that cannot be slow noise of the magnetometer."""
-    no_noise = white(left) or slowness(formed_basis_of(state)) >= STEADY
-    return with_any_course(left, least) if no_noise else left
+def _of_any_course(
+    state: State, left: Remainder, least: float = ANY_NATS, smooth: float = SMOOTH_NATS
+) -> Remainder:
+    """The remainder with a quick course where that cannot be slow noise, or with a smooth one.
+
+    A smooth one is asked in the model's noise, whose colour counts against it.
+    """
+    basis = formed_basis_of(state)
+    if white(left) or slowness(basis) >= STEADY:
+        told = with_any_course(left, least)
+        if told is not left:
+            return told
+    smooth *= 1.0 if basis.colour <= WHITE else OF_COLOUR
+    nats = smooth_nats(basis)
+    frame = max(nats, key=lambda one: nats[one])
+    return with_course(left, left.located[frame], nats[frame]) if nats[frame] >= smooth else left
 
 
 def white(left: Remainder) -> bool:

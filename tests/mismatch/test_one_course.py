@@ -10,8 +10,13 @@ from mismatch_trials import Trial, made
 from ahrsd.mismatch import one_course
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
-from ahrsd.mismatch.one_course import as_smooth, price
+from ahrsd.mismatch.limits import LIMITS
+from ahrsd.mismatch.null import fit_null
+from ahrsd.mismatch.one_course import as_smooth, price, smooth_nats
+from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.regression import Candidate
+from ahrsd.mismatch.search import State, formed_basis_of
+from ahrsd.mismatch.track import Spec
 from ahrsd.simulation import simulate
 
 PLACES = ("position_north_m", "position_east_m", "position_down_m")
@@ -71,3 +76,20 @@ def test_a_name_must_be_likelier_than_a_smooth_course_once_paid(
     basis = SimpleNamespace(colour=1.0)
     assert as_smooth(state, basis, {0: float(np.log(1000.0))}) == found
     assert as_smooth(state, basis, {}) == ([], None)
+
+
+def test_what_slow_iron_is_worth_and_what_noise_is() -> None:
+    """A field on the sensor of two milligauss that comes and goes within minutes."""
+    track = made(Trial(4)).track
+    course = np.sin(track.time_s / 15.0) * np.exp(-(((track.time_s - 150.0) / 60.0) ** 2))
+    moved = replace(
+        track, mag_b_gauss=track.mag_b_gauss + 2e-3 * np.outer(course, [0.48, -0.6, 0.64])
+    )
+    nats = {}
+    for name, one in (("noise", track), ("iron", moved)):
+        problem, cold = problem_of(one, Spec(), {}, LIMITS)
+        state = State(problem, fit_null(problem.track, problem.spec, cold, walk=False))
+        nats[name] = smooth_nats(formed_basis_of(state))
+    assert max(nats["noise"].values()) < np.log(100.0)
+    assert nats["iron"]["sensor"] > np.log(1e6)
+    assert nats["iron"]["sensor"] > nats["iron"]["world"]

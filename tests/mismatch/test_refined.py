@@ -180,6 +180,30 @@ def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named)
         assert not unknown.detected(rest, strict.alone())
 
 
+@pytest.mark.parametrize(
+    ("nats", "colour", "frame"),
+    [
+        ({"world": 1.0, "sensor": np.log(1000.0) + 0.1}, 1.0, "sensor"),
+        ({"world": np.log(1000.0) - 0.1, "sensor": 1.0}, 1.0, None),
+        # slow noise has more at long periods than its colour tells
+        ({"world": np.log(1e6) - 0.1, "sensor": 1.0}, 3.0, None),
+        ({"world": np.log(1e6) + 0.1, "sensor": 1.0}, 3.0, "world"),
+    ],
+)
+def test_a_smooth_course_alone(monkeypatch, nats, colour, frame) -> None:
+    state, left = left_of(switched(0.0))
+    basis = replace(formed_basis_of(state), colour=colour)
+    monkeypatch.setattr(refined_module, "formed_basis_of", lambda _: basis)
+    monkeypatch.setattr(refined_module, "smooth_nats", lambda _: nats)
+    quiet = replace(left, quick={})
+    told = _of_any_course(state, quiet)
+    if frame is None:
+        assert told is quiet
+    else:
+        assert (told.strongest.frame, told.strongest.evidence) == (frame, nats[frame])
+        assert unknown.detected(told, LIMITS.alone())
+
+
 def test_a_name_hardly_likelier_than_a_smooth_course_is_none(monkeypatch) -> None:
     track = made(Trial(7, effects=(("hard_iron_step", 0.6),))).track
     strict = replace(
