@@ -124,9 +124,10 @@ def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, tur
 )
 def test_where_a_quick_course_can_be_no_noise(monkeypatch, colour, slow, asked) -> None:
     monkeypatch.setattr(refined_module, "slowness", lambda basis: slow)
-    monkeypatch.setattr(refined_module, "formed_basis_of", lambda state: None)
-    monkeypatch.setattr(refined_module, "with_any_course", lambda *_: "asked")
     left = SimpleNamespace(basis=SimpleNamespace(rest=None, colour=colour))
+    monkeypatch.setattr(refined_module, "formed_basis_of", lambda state: left.basis)
+    monkeypatch.setattr(refined_module, "smooth_nats", lambda _: {"sensor": 0.0})
+    monkeypatch.setattr(refined_module, "with_any_course", lambda *_: "asked")
     assert (_of_any_course(SimpleNamespace(), left) == "asked") is asked
 
 
