@@ -12,6 +12,7 @@ import numpy as np
 
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.along_field import slowness
+from ahrsd.mismatch.by_heading import heading_nats
 from ahrsd.mismatch.diagnosis import Unexplained
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.limits import Limits
@@ -91,7 +92,8 @@ def _of_any_course(
 ) -> Remainder:
     """The remainder with a quick course where that cannot be slow noise, or with a smooth one.
 
-    A smooth one is asked in the model's noise, whose colour counts against it.
+    A smooth one, in time or by heading, is asked in the model's noise, whose colour counts against
+    it.
     """
     basis = formed_basis_of(state)
     if white(left) or slowness(basis) >= STEADY:
@@ -100,6 +102,7 @@ def _of_any_course(
             return told
     smooth *= 1.0 if basis.colour <= WHITE else OF_COLOUR
     nats = smooth_nats(basis)
+    nats["sensor"] = max(nats["sensor"], heading_nats(basis))
     frame = max(nats, key=lambda one: nats[one])
     return with_course(left, left.located[frame], nats[frame]) if nats[frame] >= smooth else left
 

@@ -127,6 +127,7 @@ def test_where_a_quick_course_can_be_no_noise(monkeypatch, colour, slow, asked) 
     left = SimpleNamespace(basis=SimpleNamespace(rest=None, colour=colour))
     monkeypatch.setattr(refined_module, "formed_basis_of", lambda state: left.basis)
     monkeypatch.setattr(refined_module, "smooth_nats", lambda _: {"sensor": 0.0})
+    monkeypatch.setattr(refined_module, "heading_nats", lambda _: 0.0)
     monkeypatch.setattr(refined_module, "with_any_course", lambda *_: "asked")
     assert (_of_any_course(SimpleNamespace(), left) == "asked") is asked
 
@@ -195,7 +196,8 @@ def test_a_smooth_course_alone(monkeypatch, nats, colour, frame) -> None:
     state, left = left_of(switched(0.0))
     basis = replace(formed_basis_of(state), colour=colour)
     monkeypatch.setattr(refined_module, "formed_basis_of", lambda _: basis)
-    monkeypatch.setattr(refined_module, "smooth_nats", lambda _: nats)
+    monkeypatch.setattr(refined_module, "smooth_nats", lambda _: dict(nats))
+    monkeypatch.setattr(refined_module, "heading_nats", lambda _: -1.0)
     quiet = replace(left, quick={})
     told = _of_any_course(state, quiet)
     if frame is None:
