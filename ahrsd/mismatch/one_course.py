@@ -52,21 +52,24 @@ def of_one_course(state: State, basis: Base) -> tuple[list[int], Frame | None]:
 
 
 def as_smooth(
-    state: State, basis: Base, asked: Mapping[int, float]
+    state: State, basis: Base, asked: Mapping[tuple[int, ...], float]
 ) -> tuple[list[int], Frame | None]:
-    """Numbers of the terms, each for itself, that are hardly likelier than one smooth course.
+    """Numbers of the terms that are hardly likelier than one smooth course.
 
-    asked: nats by which each must be, once its own price is paid.  The frame is the last one's.
+    asked: terms that are asked as one, and nats by which they must be, once their own price is
+    paid.  The frame is the last ones'.
     """
     noise = max(1.0, basis.colour)
-    found, whose = [], None
+    found: list[int] = []
+    whose: Frame | None = None
     courses = _courses(basis) if asked else []
-    for k, least in asked.items():
-        leads = {frame: _lead(state, basis, [k], free, noise) for frame, free in courses}
+    for terms, least in asked.items():
+        leads = {frame: _lead(state, basis, list(terms), free, noise) for frame, free in courses}
         frame = min(leads, key=lambda one: leads[one])
-        candidate = state.named[k].candidate
-        if leads[frame] < least + price(candidate, float(state.named[k].evidence)):
-            found.append(k)
+        named = [state.named[k] for k in terms]
+        paid = sum(price(one.candidate, float(one.evidence)) for one in named)
+        if leads[frame] < least + paid:
+            found.extend(terms)
             whose = frame
     return found, whose
 

@@ -154,21 +154,21 @@ def test_beside_a_bias_that_wanders_nothing_is_asked(monkeypatch) -> None:
 
 
 def test_odds_that_a_sought_form_needs_beside_a_smooth_course(monkeypatch) -> None:
-    """1000 to 1 for iron that remembers, 20 to 1 for a step; a trend is asked nothing."""
-    asked: list[dict[int, float]] = []
+    """1000 to 1 for iron that remembers, 20 to 1 for steps as one; a trend is asked nothing."""
+    asked: list[dict[tuple[int, ...], float]] = []
 
     def as_smooth(_state, _basis, least):
         asked.append(least)
         return [0], "world"
 
-    state = state_of(*WEAK, STEP, ("hard_iron_drift", 9.0), CURRENT, ("mag_scale", 9.0))
+    state = state_of(*WEAK, STEP, ("hard_iron_drift", 9.0), CURRENT, ("mag_scale", 9.0), STEP)
     slim = SimpleNamespace(problem=state.problem, named=(), walk=0.0)
     monkeypatch.setattr(free_source, "formed_basis_of", lambda _: None)
     monkeypatch.setattr(free_source, "as_smooth", as_smooth)
     monkeypatch.setattr(free_source, "dropped", lambda *_: (slim, [], remainder(-1.0)))
     monkeypatch.setattr(free_source, "replace", lambda one, **more: (one, more))
     after, surveys, (_, more) = without_names_of_a_source(state, ["with"], QUIET)
-    assert asked == [{0: pytest.approx(np.log(1000.0)), 1: LEAD}]
+    assert asked == [{(0,): pytest.approx(np.log(1000.0)), (1, 5): LEAD}]
     assert (after, surveys, more) == (slim, [], {"stood_in": "world"})
 
 

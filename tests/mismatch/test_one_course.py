@@ -74,7 +74,7 @@ def test_a_name_must_be_likelier_than_a_smooth_course_once_paid(
     candidate = Candidate(EFFECTS["viscous_magnetisation"], setting, 1, 0.0)
     state = SimpleNamespace(named=[SimpleNamespace(candidate=candidate, evidence=40.5)])
     basis = SimpleNamespace(colour=1.0)
-    assert as_smooth(state, basis, {0: float(np.log(1000.0))}) == found
+    assert as_smooth(state, basis, {(0,): float(np.log(1000.0))}) == found
     assert as_smooth(state, basis, {}) == ([], None)
 
 
