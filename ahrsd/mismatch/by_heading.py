@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.mismatch.discrepancy import UNIT_GAUSS, fitted
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS
+from ahrsd.mismatch.random_effect import effect_nats
 from ahrsd.mismatch.regression import Base
-from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.values import Columns, Context
 
 #: waves in a turn, at most; the variance of each falls with the square of its number
@@ -21,9 +21,8 @@ HARMONICS = 6
 
 def heading_columns(context: Context) -> Columns:
     """A field in the sensor's axes, 3 columns a wave, wave-major, each of its prior deviation."""
-    heading_rad = np.arctan2(context.R_nb[:, 1, 0], context.R_nb[:, 0, 0])
     order = np.arange(1, HARMONICS + 1)
-    phase = heading_rad[:, None] * order
+    phase = context.heading_rad[:, None] * order
     waves = np.concatenate([np.cos(phase) / order, np.sin(phase) / order], axis=1)
     axes = np.eye(3)
     return Columns(mag=np.einsum("nj,ki->nkji", waves, axes).reshape(len(phase), 3, -1))
@@ -31,7 +30,5 @@ def heading_columns(context: Context) -> Columns:
 
 def heading_nats(basis: Base) -> float:
     """Evidence of such a field, nats, in noise of the basis's colour."""
-    seen = basis.whitened([heading_columns(basis.context)])[0] * UNIT_GAUSS
-    G, s = projected(basis, seen)
-    group = np.zeros(len(s), dtype=np.intp)
-    return float(fitted(G, s, group, max(1.0, basis.colour), np.zeros(1))[0])
+    seen = basis.whitened([heading_columns(basis.context)])[0]
+    return effect_nats(basis, seen * UNIT_GAUSS)

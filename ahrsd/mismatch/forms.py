@@ -12,14 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate, fitted
+from ahrsd.mismatch.discrepancy import UNIT_GAUSS, UNIT_RAD_S, by_rate
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import Frame
-from ahrsd.mismatch.regression import Base
+from ahrsd.mismatch.random_effect import effect_nats
 from ahrsd.mismatch.rivals import by_matrix
-from ahrsd.mismatch.together import projected
 from ahrsd.mismatch.unknown import Remainder, detected
-from ahrsd.samples import Array
 
 
 def with_forms(left: Remainder, price: float, limits: Limits) -> Remainder:
@@ -32,8 +30,8 @@ def with_forms(left: Remainder, price: float, limits: Limits) -> Remainder:
     basis = left.basis
     rate, matrix = basis.whitened([by_rate(basis.context), by_matrix(basis.context)])
     found: dict[Frame, float] = {
-        "gyro": _evidence(basis, rate * UNIT_RAD_S),
-        "sensor": _evidence(basis, matrix * UNIT_GAUSS),
+        "gyro": effect_nats(basis, rate * UNIT_RAD_S),
+        "sensor": effect_nats(basis, matrix * UNIT_GAUSS),
     }
     frame = max(found, key=lambda one: found[one])
     evidence = found[frame] - float(np.log(len(found)))
@@ -41,10 +39,3 @@ def with_forms(left: Remainder, price: float, limits: Limits) -> Remainder:
         return left
     located = {**left.located, frame: replace(left.located[frame], evidence=evidence)}
     return replace(left, located=located, stood_in=frame)
-
-
-def _evidence(basis: Base, columns: Array) -> float:
-    """Nats of the columns (N, 3, p) as one random effect."""
-    G, s = projected(basis, columns)
-    group = np.zeros(len(s), dtype=np.intp)
-    return fitted(G, s, group, max(1.0, basis.colour), np.zeros(1))[0]

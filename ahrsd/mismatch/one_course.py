@@ -20,6 +20,7 @@ import numpy as np
 from ahrsd.mismatch.discrepancy import UNIT_GAUSS, fitted
 from ahrsd.mismatch.findings import added_value
 from ahrsd.mismatch.locate import Frame
+from ahrsd.mismatch.random_effect import effect_nats
 from ahrsd.mismatch.regression import Base, Candidate
 from ahrsd.mismatch.rivals import compared
 from ahrsd.mismatch.search import State, term_group, without_term
@@ -76,12 +77,7 @@ def as_smooth(
 
 def smooth_nats(basis: Base) -> dict[Frame, float]:
     """Evidence of a smooth course in each frame, nats, in noise of the basis's colour."""
-    noise, nats = max(1.0, basis.colour), {}
-    for frame, free in _courses(basis):
-        G, s = projected(basis, free)
-        group = np.zeros(len(s), dtype=np.intp)
-        nats[frame] = float(fitted(G, s, group, noise, np.zeros(1))[0])
-    return nats
+    return {frame: effect_nats(basis, free) for frame, free in _courses(basis)}
 
 
 def _courses(basis: Base) -> list[tuple[Frame, Array]]:
@@ -131,9 +127,7 @@ def _lead(state: State, basis: Base, terms: list[int], course: Array, noise: flo
     group = np.repeat(np.arange(len(terms)), [part.shape[2] for part in columns])
     G, s = projected(left, np.concatenate(columns, axis=2))
     names, _ = fitted(G, s, group, noise, np.zeros(len(terms)))
-    G, s = projected(left, course)
-    one, _ = fitted(G, s, np.zeros(len(s), dtype=np.intp), noise, np.zeros(1))
-    return names - one
+    return names - effect_nats(left, course)
 
 
 def _columns(state: State, basis: Base, number: int) -> Array:

@@ -256,13 +256,12 @@ class Scene:
 def scene_of(context: Context) -> Scene:
     """The scene of a recording."""
     track = context.track
-    heading = np.arctan2(context.R_nb[:, 1, 0], context.R_nb[:, 0, 0])
     return Scene(
         unit_b=context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True),
         R_nb=context.R_nb,
         segment=segments_of(track),
         time=_courses([track.time_s]),
-        heading=_courses([f(n * heading) for n in (1, 2) for f in (np.cos, np.sin)]),
+        heading=_courses([f(n * context.heading_rad) for n in (1, 2) for f in (np.cos, np.sin)]),
         columns=_courses(
             [
                 course

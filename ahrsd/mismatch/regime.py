@@ -48,8 +48,7 @@ def regimes(context: Context) -> tuple[Regime, ...]:
     """Attitude (where the world is levelled), rate and logged columns that move."""
     R = context.R_nb
     quantities = {"rate_rad_s": np.linalg.norm(context.rate_b_rad_s, axis=1)}
-    heading = np.degrees(np.arctan2(R[:, 1, 0], R[:, 0, 0])) % 360.0
-    quantities["heading_deg"] = heading
+    quantities["heading_deg"] = np.degrees(context.heading_rad) % 360.0
     if context.world_levelled:
         quantities["pitch_deg"] = np.degrees(-np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0)))
         quantities["roll_deg"] = np.degrees(np.arctan2(R[:, 2, 1], R[:, 2, 2]))

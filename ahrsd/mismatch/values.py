@@ -109,6 +109,11 @@ class Context:
     world_levelled: bool
     force_b_m_s2: Array | None = None
 
+    @property
+    def heading_rad(self) -> Array:
+        """(N,) direction of the body's x axis in R_nb's level plane, from its x to its y."""
+        return np.asarray(np.arctan2(self.R_nb[:, 1, 0], self.R_nb[:, 0, 0]))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
