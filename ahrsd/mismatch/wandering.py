@@ -4,6 +4,11 @@ Four modes of a random walk have 95 % of its power; of a large one the rest is s
 noise and nothing in the library explains it.  So where the free course of the gyro's error is more
 likely a random walk than values that have nothing to do with each other, and a bias that may walk
 as much in the filter leaves nothing, it is that: a bias that wanders.
+
+What it leaves hides what is beside it: iron that remembers was no more than the rest, and what then
+was left showed in the sensor (e215aba9 of `ring600n`, a name of 324 nats).  So where the walk was
+among the first names, both are asked together, whatever frame is left, and must be likelier than
+the course that is.
 """
 
 from __future__ import annotations
@@ -53,10 +58,8 @@ def wandering(found: Sought) -> Sought:
     A bias that wanders hides what is small beside it: everything is sought once more beside it.
     """
     state, left, limits = found.state, found.left, found.state.problem.limits
-    gyro = left.located["gyro"]
-    others = [one.evidence for frame, one in left.located.items() if frame != "gyro"]
-    clear = gyro.evidence > max(others) + FRAME_LEAD
-    if not clear or not unknown.detected(left, limits) or _named(state):
+    clear = _of_the_gyro(left) and not _named(state)
+    if not _asked(found):
         return found
     size = max(_size(left, limits), _size(_without_the_walk(found.before), limits))
     if size < ORDINARY_WALK_RAD_S_SQRT_S and state.walk:
@@ -68,10 +71,42 @@ def wandering(found: Sought) -> Sought:
         if went_and_came(found.before, wider):
             return found
         beside = sought(wider)
-        if not unknown.detected(beside.left, limits) and not _named(beside.state):
+        if unknown.detected(beside.left, limits) or _named(beside.state):
+            continue
+        if clear or _likelier(beside.state, found):
             named = _with_its_name(beside)
             return found if named is None else replace(named, first=found.first)
     return found
+
+
+def _asked(found: Sought) -> bool:
+    """Whether a wider walk may be what was found, or what was left.
+
+    Beside few modes of a walk that was named, other names may follow what they leave of it.
+    """
+    state = found.state
+    if NAME in state.names:
+        return len(state.named) > 1
+    if _named(state) or not unknown.detected(found.left, state.problem.limits):
+        return False
+    return _of_the_gyro(found.left) or NAME in found.before.names
+
+
+def _of_the_gyro(left: unknown.Remainder) -> bool:
+    """Whether what is left is surely an error of the gyro."""
+    others = [one.evidence for frame, one in left.located.items() if frame != "gyro"]
+    return left.located["gyro"].evidence > max(others) + FRAME_LEAD
+
+
+def _likelier(beside: State, found: Sought) -> bool:
+    """Whether a walk and names beside it are likelier than those found and the course they leave.
+
+    In the noise that the course's own evidence is in, and as surely as a name must be ahead.
+    """
+    gained, left = likelihood(beside) - likelihood(found.state), found.left
+    limits = beside.problem.limits
+    bound = left.strongest.evidence if unknown.detected(left, limits) else 0.0
+    return bool(beside.named) and gained / left.basis.colour > bound + limits.lead_nats
 
 
 def _with_its_name(found: Sought) -> Sought | None:

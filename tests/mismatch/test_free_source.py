@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -111,7 +111,7 @@ def test_a_free_source_against_names(monkeypatch, names, left, source, gone) -> 
 
     state = state_of(*names)
     nats = {id(one.candidate): one.evidence for one in state.named}
-    bare = SimpleNamespace(without=lambda *_: bare)
+    bare = SimpleNamespace(without=lambda *_: bare, colour=1.0)
     monkeypatch.setattr(free_source, "dropped", dropped)
     monkeypatch.setattr(free_source, "formed_basis_of", lambda _: bare)
     monkeypatch.setattr(free_source, "added_value", lambda *_: None)
@@ -122,6 +122,7 @@ def test_a_free_source_against_names(monkeypatch, names, left, source, gone) -> 
     monkeypatch.setattr(free_source, "framed", lambda *_: source)
     monkeypatch.setattr(free_source, "with_any_course", sure_of_the_quick)
     monkeypatch.setattr(free_source, "as_smooth", lambda *_: ([], None))
+    monkeypatch.setattr(free_source, "replace", lambda one, **_: one)
     after, surveys, rest = without_names_of_a_source(state, ["with"], left)
     if gone:
         assert (taken, after, surveys) == (gone, slim, ["without"])
@@ -170,6 +171,37 @@ def test_odds_that_a_sought_form_needs_beside_a_smooth_course(monkeypatch) -> No
     after, surveys, (_, more) = without_names_of_a_source(state, ["with"], QUIET)
     assert asked == [{(0,): pytest.approx(np.log(1000.0)), (1, 5): LEAD}]
     assert (after, surveys, more) == (slim, [], {"stood_in": "world"})
+
+
+@dataclass(frozen=True)
+class Noisy:
+    """A basis of which only the power of its noise, over white, is asked."""
+
+    colour: float
+
+    def without(self, *_) -> Noisy:
+        return self
+
+
+@pytest.mark.parametrize(("colour", "gone"), [(1.0, False), (1.05, True)])
+def test_names_and_source_are_held_against_one_another_in_the_same_noise(
+    monkeypatch, colour, gone
+) -> None:
+    """A drift of 6429 nats in white noise has 6300 in the noise that its own fit leaves."""
+    state = state_of(("geomagnetic_drift", 6300.0))
+    source, kept = remainder(6390.0, colour=colour), (state, ["with"], QUIET)
+    slim = SimpleNamespace()
+    monkeypatch.setattr(free_source, "formed_basis_of", lambda _: Noisy(1.05))
+    monkeypatch.setattr(free_source, "evidence_of", lambda basis, _: 6429.0 / basis.colour)
+    monkeypatch.setattr(free_source, "added_value", lambda *_: None)
+    monkeypatch.setattr(free_source, "as_smooth", lambda *_: ([], None))
+    monkeypatch.setattr(free_source, "with_one_source", lambda one: one)
+    monkeypatch.setattr(free_source.unknown, "remainder", lambda *_, **__: source)
+    monkeypatch.setattr(free_source, "dropped", lambda *_: (slim, [], source))
+    monkeypatch.setattr(free_source, "framed", lambda *_: source)
+    monkeypatch.setattr(free_source, "with_any_course", lambda one: one)
+    after = without_names_of_a_source(state, ["with"], QUIET)
+    assert after == ((slim, [], source) if gone else kept)
 
 
 def with_field(course) -> Track:

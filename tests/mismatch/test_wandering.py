@@ -114,6 +114,50 @@ def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
     assert all(one.confidence > 0.5 for one in found.findings)
 
 
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_what_a_large_walk_hides_is_named_beside_it(seed):
+    """Iron that a walk of 1e-4 hides: once nothing but a course, or a height and the earth's turn.
+
+    What is left without the walk shows in the sensor, not in the gyro.
+    """
+    trial = Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")
+    iron = made(replace(trial, effects=(("soft_iron_step", 1.0),))).track
+    steps = np.random.default_rng(seed).normal(size=(len(iron), 3)) * np.sqrt(0.04)
+    walked = replace(iron, gyro_b_rad_s=iron.gyro_b_rad_s + 1e-4 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert {one.effect for one in found.findings} == {"gyro_bias_drift", "soft_iron_step"}
+    assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize(
+    ("gained", "named", "there", "likelier"),
+    [
+        # 5040 nats in noise of 20 times white, 246 there, for a course of 175 (e215aba9)
+        (5040.0, True, True, True),
+        (20.0 * (175.0 + LIMITS.lead_nats) - 1.0, True, True, False),
+        (20.0 * (175.0 + LIMITS.lead_nats) + 1.0, True, True, True),
+        # where nothing is left there is no course to be likelier than
+        (20.0 * LIMITS.lead_nats + 1.0, True, False, True),
+        (20.0 * LIMITS.lead_nats - 1.0, True, False, False),
+        # a walk with nothing beside it is asked where the gyro has what is left
+        (5040.0, False, True, False),
+    ],
+)
+def test_a_walk_and_what_it_hides_are_likelier_than_a_course(
+    monkeypatch, gained, named, there, likelier
+):
+    of = {"beside": gained, "found": 0.0}
+    monkeypatch.setattr(walks, "likelihood", lambda state: of[state.which])
+    monkeypatch.setattr(walks.unknown, "detected", lambda *_: there)
+    problem = SimpleNamespace(limits=LIMITS)
+    beside = SimpleNamespace(which="beside", problem=problem, named=("iron",) if named else ())
+    left = SimpleNamespace(
+        strongest=SimpleNamespace(evidence=175.0), basis=SimpleNamespace(colour=20.0)
+    )
+    found = SimpleNamespace(state=SimpleNamespace(which="found"), left=left)
+    assert walks._likelier(beside, found) is likelier
+
+
 def fitted(log_likelihood: float, *steps: tuple[float, float, float]):
     """What the comparison asks of a state with these steps of the gyro's bias."""
     used = np.ones(100, dtype=bool)
