@@ -128,7 +128,8 @@ def _likelier(
     """Whether the source is likelier than the names that are asked and what they leave.
 
     In the same noise: of 6400 nats two hundredths more of it cost 130 (956e7e02 of `ring600n`, a
-    slow drift of the outside field that was unknown).
+    slow drift of the outside field that was unknown).  A source needs no lead before names that
+    leave nothing: none that was true in three opened rings is less than nine nats ahead of one.
     """
     nats = _together(state, asked, source.basis.colour)
     limits, names = state.problem.limits, state.named
@@ -138,7 +139,7 @@ def _likelier(
     own = any(in_time_alone(one.candidate) or not _of_no_column(one.candidate) for one in names)
     if len(names) >= MANY and not own:
         return free > max(one.evidence for one in names)
-    return free > nats + limits.lead_nats
+    return free > nats
 
 
 def _told(left: unknown.Remainder, *, turned: bool) -> unknown.Remainder:

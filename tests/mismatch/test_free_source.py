@@ -61,9 +61,9 @@ CURRENT, STEP = ("switched_device", 9.0), ("hard_iron_step", 9.0)
     [
         # a name of 31 nats for a speed that nobody logged
         (WEAK, QUIET, remainder(20.0, 53.0), [0]),
-        (WEAK, QUIET, remainder(20.0, 31.1 + LEAD), [0]),
-        (WEAK, QUIET, remainder(20.0, 30.9 + LEAD), []),
-        (WEAK, QUIET, remainder(31.1 + LEAD), [0]),
+        (WEAK, QUIET, remainder(20.0, 31.1), [0]),
+        (WEAK, QUIET, remainder(20.0, 30.9), []),
+        (WEAK, QUIET, remainder(31.1), [0]),
         # what is quick may be noise that is not white, unless it is one source before and after
         (WEAK, RED, remainder(20.0, 53.0), []),
         (WEAK, RED, remainder(20.0, 53.0, one_source=True), []),
@@ -93,8 +93,8 @@ CURRENT, STEP = ("switched_device", 9.0), ("hard_iron_step", 9.0)
         ((("gyro_startup", 9.0),), remainder(20.0), remainder(63.2), []),
         ((CURRENT, *WEAK), QUIET, remainder(63.2), [1]),
         # a jump of the outside field may be what a gyro's bias left behind
-        ((("field_step", 40.0 - LEAD - 0.1),), QUIET, remainder(-5.0), [0]),
-        ((("field_step", 40.0 - LEAD + 0.1),), QUIET, remainder(-5.0), []),
+        ((("field_step", 40.0 - 0.1),), QUIET, remainder(-5.0), [0]),
+        ((("field_step", 40.0 + 0.1),), QUIET, remainder(-5.0), []),
         ((("hard_iron_step", 31.0),), QUIET, remainder(-5.0), []),
         # a source that is not there by itself is none
         ((("eddy_current", 1.0),), QUIET, remainder(8.0), []),
