@@ -103,7 +103,9 @@ def quantisation(track: Track) -> list[Fact]:
     noise = noise_of(track)[0]
     steps = np.array([step_of(track.mag_b_gauss[:, axis]) for axis in range(3)])
     coarse = steps > _COARSE * noise
-    if noise == 0.0 or not coarse.any():
+    if noise == 0.0:  # most seconds show no change at all: coarse, or stuck
+        coarse &= [_one_by_one(track.mag_b_gauss[:, axis], steps[axis]) for axis in range(3)]
+    if not coarse.any():
         return []
     step = float(steps.max())
     axes = tuple(name for name, yes in zip(_AXES, coarse, strict=True) if yes)
@@ -111,6 +113,13 @@ def quantisation(track: Track) -> list[Fact]:
     where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), axes, "sensor")
     parameters = (Value("step", step, 1e-6, "gauss"),)
     return [Fact("mag_quantisation", words, where, 0.99, parameters)]
+
+
+def _one_by_one(values: Array, step: float) -> bool:
+    """Whether readings that change mostly change by one step; those that were stuck jump."""
+    change = np.abs(np.diff(values))
+    change = change[np.isfinite(change) & (change > 0)]
+    return bool(len(change) and np.median(change) < _TOP_STEPS * step)
 
 
 def step_of(values: Array) -> float:
