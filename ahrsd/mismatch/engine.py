@@ -18,6 +18,7 @@ from ahrsd.mismatch.bursts import bursts
 from ahrsd.mismatch.cut_out import beside_brief
 from ahrsd.mismatch.dead import dead
 from ahrsd.mismatch.delays import DELAYS
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.diagnosis import (
     Baseline,
     Check,
@@ -45,7 +46,7 @@ from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.mismatch.missing import lost_turns
 from ahrsd.mismatch.name import Judged
 from ahrsd.mismatch.noise import level_facts
-from ahrsd.mismatch.null import NullFit, fit_null, unusable
+from ahrsd.mismatch.null import fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.own_form import without_trifles
 from ahrsd.mismatch.passing import without_passing

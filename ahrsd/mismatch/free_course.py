@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from ahrsd.mismatch.descent import FittedTerm
 from ahrsd.mismatch.locate import (
     Frame,
     frame_columns,
@@ -19,7 +20,7 @@ from ahrsd.mismatch.locate import (
     segments,
     single_source,
 )
-from ahrsd.mismatch.null import FittedTerm, fit_null
+from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.search import State
 from ahrsd.mismatch.unknown import Remainder
 from ahrsd.mismatch.values import Columns, Context

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.gram import Gram, block_edges, gram
 from ahrsd.mismatch.innovation import nuisance_columns, run_filter, sensitivities
-from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.regression import CALIBRATION
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.validate import FOLDS, PRIOR, Gain, heldout, one_by_one

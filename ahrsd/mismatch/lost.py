@@ -17,9 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch.delay import delayed_gyro
+from ahrsd.mismatch.descent import FittedTerm
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.missing import LONG, UNSEEN, missing_turns
-from ahrsd.mismatch.null import FittedTerm, at_model
+from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.search import STEPS, State, refitted
 from ahrsd.mismatch.turns import LONGER_NATS

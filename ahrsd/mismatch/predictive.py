@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.mismatch import forward
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.diagnosis import Check
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.effects.base import Effect
@@ -25,7 +26,6 @@ from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.gains import Gains
 from ahrsd.mismatch.innovation import Filtered, nuisance_columns, run_filter, sensitivities
 from ahrsd.mismatch.noise import before, colour_of, tails_of
-from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.probabilities import student_quantile
 from ahrsd.mismatch.rounded import before_rounding, bent, calibration_covariance
 from ahrsd.mismatch.track import Track

@@ -13,11 +13,11 @@ import numpy as np
 from ahrsd.mismatch import unknown
 from ahrsd.mismatch.along_field import slowness
 from ahrsd.mismatch.by_heading import heading_nats
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.diagnosis import Unexplained
 from ahrsd.mismatch.forms import with_forms
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.loudness import beside_bursts, in_even_noise
-from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.one_course import smooth_nats
 from ahrsd.mismatch.one_source import ANY_NATS, NATS, with_any_course, with_course, with_one_source
 from ahrsd.mismatch.own_form import free_price_of, price_of

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.mismatch.delays import DELAYS
-from ahrsd.mismatch.null import FittedTerm, at_model, moved
+from ahrsd.mismatch.descent import FittedTerm, moved
+from ahrsd.mismatch.null import at_model
 from ahrsd.mismatch.prior import PRIOR
 from ahrsd.mismatch.regression import CALIBRATION
 from ahrsd.mismatch.search import STEPS, State, formed_basis_of, term_group

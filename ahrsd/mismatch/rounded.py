@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.effects.base import Readings
 from ahrsd.mismatch.evidence import colour
 from ahrsd.mismatch.innovation import TRACELESS, nuisance_columns, sensitivities
-from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.values import Noise
 from ahrsd.samples import Array
 

@@ -15,13 +15,14 @@ import numpy as np
 
 from ahrsd.mismatch import noise_fit
 from ahrsd.mismatch.delays import DELAYS, beyond_the_lag, plain
+from ahrsd.mismatch.descent import FittedTerm, NullFit
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.memory import with_memory
 from ahrsd.mismatch.moments import as_found, at_one_moment
 from ahrsd.mismatch.moved import SCALE_AGAIN, both, moved_together
 from ahrsd.mismatch.name import Judged, judge, ranked
-from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
+from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.regression import Base, Candidate, base, candidate_gram, columns_of, quieter
 from ahrsd.mismatch.settings import best_settings, closest_scale, evidence_of, scale_of

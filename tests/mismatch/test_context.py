@@ -12,8 +12,8 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
 from ahrsd.mismatch.context import bandwidth_hz, build_context, smoothed_rate
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.innovation import run_filter
-from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Context
 from ahrsd.samples import Array

@@ -194,9 +194,26 @@ def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_h
     residual = np.random.default_rng(2).normal(size=(4000, 3))
     residual[:, 1] += 0.5 * np.cos(2 * np.pi * frequency_hz * time_s)
     dt_s = np.r_[np.nan, np.diff(time_s)]
-    at = [line["frequency_hz"] for line in lines(residual, time_s, dt_s)]
+    at = [line["frequency_hz"] for line in lines(residual, np.zeros((4000, 3)), dt_s)]
     assert len(at) == 2
     assert any(abs(one - frequency_hz) < 2e-3 for one in at) == found
+
+
+@pytest.mark.parametrize(
+    ("turns_hz", "line_hz", "found"),
+    [(0.5, 0.5, False), (0.5, 0.53, False), (0.5, 1.3, True), (0.02, 0.5, True), (7.3, 7.3, True)],
+)
+def test_a_line_at_the_rate_at_which_the_vehicle_turns_to_and_fro_is_none(turns_hz, line_hz, found):
+    rng = np.random.default_rng(3)
+    time_s = np.arange(4000) / 40.0
+    gyro = 0.01 * rng.normal(size=(4000, 3))
+    gyro[:, 0] += np.sin(2 * np.pi * turns_hz * time_s)
+    gyro[:, 2] += np.cos(2 * np.pi * turns_hz * time_s)
+    residual = rng.normal(size=(4000, 3))
+    residual[:, 1] += 0.5 * np.cos(2 * np.pi * line_hz * time_s)
+    dt_s = np.r_[np.nan, np.diff(time_s)]
+    at = [line["frequency_hz"] for line in lines(residual, gyro, dt_s)]
+    assert any(abs(one - line_hz) < 5e-3 for one in at) == found
 
 
 def test_a_gain_with_temperature_is_of_the_field_within_the_iron_of_the_reading_or_of_the_field():

@@ -10,6 +10,7 @@ from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
 from ahrsd.mismatch import foretold, unknown
+from ahrsd.mismatch.descent import FittedTerm
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.foretold import (
@@ -21,7 +22,7 @@ from ahrsd.mismatch.foretold import (
 )
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.name import Judged
-from ahrsd.mismatch.null import FittedTerm, fit_null
+from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.often import changes
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.regression import Candidate

@@ -10,11 +10,12 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch import findings
+from ahrsd.mismatch.descent import FittedTerm
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
 from ahrsd.mismatch.heldout import _alone, gain_of
 from ahrsd.mismatch.innovation import run_filter
-from ahrsd.mismatch.null import FittedTerm, fit_null
+from ahrsd.mismatch.null import fit_null
 
 SAMPLES = 5000
 

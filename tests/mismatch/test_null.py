@@ -11,8 +11,9 @@ from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd import so3
 from ahrsd.mismatch.coarse import noise_of, thinned
+from ahrsd.mismatch.descent import FittedTerm, NullFit
 from ahrsd.mismatch.noise_fit import WALK_CAP_RAD_S_SQRT_S
-from ahrsd.mismatch.null import FittedTerm, NullFit, fit_null
+from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.prior import rate_at_rest
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import Columns, Context, NullModel

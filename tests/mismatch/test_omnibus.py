@@ -9,8 +9,8 @@ from scipy import stats
 from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch.context import build_context
+from ahrsd.mismatch.descent import NullFit
 from ahrsd.mismatch.innovation import Filtered, run_filter
-from ahrsd.mismatch.null import NullFit
 from ahrsd.mismatch.omnibus import Test, omnibus, variance_test
 from ahrsd.mismatch.values import Context
 from ahrsd.samples import Array

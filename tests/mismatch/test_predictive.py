@@ -9,8 +9,9 @@ import pytest
 from effect_motion import moving
 
 from ahrsd.mismatch import forward, predictive
+from ahrsd.mismatch.descent import FittedTerm
 from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.null import FittedTerm, fit_null
+from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.values import Term
 
 

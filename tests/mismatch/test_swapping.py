@@ -42,3 +42,15 @@ def test_the_wrong_name_gives_way_and_the_right_one_does_not(true: str, other: s
     right, seen, last = named(true, true)
     assert _replaced(right, 0, judged(seen, other), seen) is right
     assert swapped(right, last)[0] is right
+
+
+@pytest.mark.parametrize(("short", "asked"), [(0.05, True), (0.2, False)])
+def test_what_is_nearly_as_likely_by_its_columns_is_asked_by_the_joint_fit(
+    monkeypatch: pytest.MonkeyPatch, short: float, asked: bool
+) -> None:
+    state, _, last = named(DRIFT, OUTSIDE)
+    mine = _without(state, 0, last.basis)[1]
+    monkeypatch.setattr(
+        "ahrsd.mismatch.swapping.in_its_place", lambda candidate, last: (1.0 - short) * mine
+    )
+    assert swapped(state, last)[0].names == ((DRIFT,) if asked else (OUTSIDE,))

@@ -29,6 +29,10 @@ _LINES = 2
 #: parts of the sample rate at which the device's own filters and updates leave lines
 _IN_STEP = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 2 / 5)
 _LOWEST_HZ = 0.3  # below, a line is a slow course and other effects fit it as well
+#: a band's share of the turning's power at which the vehicle turns to and fro.  Hands that draw
+#: eights, walkers and shakers have .2 to .4 at their rate and its double, simulated vehicles less
+#: than .1 above half a Hz; what is faster is vibration, which may come with a source's own field
+_BAND_HZ, _OF_THE_TURNS, _TURNS_HZ = 0.2, 0.1, 3.0
 _REPEATED = 0.2  # share of repeated readings from which the magnetometer is slower than the output
 
 
@@ -56,7 +60,7 @@ class AcInterference(Linear):
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The two strongest lines."""
-        return lines(left_over(context), context.track.time_s, context.track.dt_s)
+        return lines(left_over(context), context.track.gyro_b_rad_s, context.track.dt_s)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The alias of 60 Hz at this rate, or a line in the middle of the band."""
@@ -284,10 +288,11 @@ def aliased(frequency_hz: float, rate_hz: float) -> float:
     return abs(frequency_hz - round(frequency_hz / rate_hz) * rate_hz)
 
 
-def lines(residual: Array, time_s: Array, dt_s: Array) -> tuple[Setting, ...]:
+def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, ...]:
     """The strongest lines of (N, 3) in the longest gap-free run, and which mains they may be.
 
-    None that keeps step with the samples: no source outside the device does.
+    None that keeps step with the samples: no source outside the device does.  None where the
+    vehicle turns to and fro: whatever the model lacks returns at that rate.
     """
     run = max(series.runs(dt_s), key=lambda r: int(r.stop - r.start))
     values, step_s = residual[run] - residual[run].mean(axis=0), series.median_step(dt_s[run])
@@ -295,9 +300,12 @@ def lines(residual: Array, time_s: Array, dt_s: Array) -> tuple[Setting, ...]:
         return ()
     window = np.hanning(len(values))[:, None]
     power = np.sum(np.abs(np.fft.rfft(values * window, 4 * len(values), axis=0)) ** 2, axis=1)
-    frequency = np.fft.rfftfreq(4 * len(values), step_s)
+    frequency = np.asarray(np.fft.rfftfreq(4 * len(values), step_s), dtype=np.float64)
     power = np.where((frequency > _LOWEST_HZ) & (frequency < 0.49 / step_s), power, 0.0)
     power = power / _background(power)
+    turns = np.nan_to_num(gyro_b_rad_s[run])
+    turned = np.fft.rfft((turns - turns.mean(axis=0)) * window, 4 * len(values), axis=0)
+    power[_to_and_fro(frequency, np.sum(np.abs(turned) ** 2, axis=1))] = 0.0
     width = 2.0 / (len(values) * step_s)
     found: list[Setting] = []
     for _ in range(_LINES + len(_IN_STEP)):
@@ -308,6 +316,16 @@ def lines(residual: Array, time_s: Array, dt_s: Array) -> tuple[Setting, ...]:
             found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
         power = np.where(np.abs(frequency - best) < 2 * width, 0.0, power)
     return tuple(found[:_LINES])
+
+
+def _to_and_fro(frequency_hz: Array, power: Array) -> NDArray[np.bool]:
+    """Where a turn comes back: a tenth of the turning's power in a fifth of a Hz, and no noise."""
+    total = np.r_[0.0, np.cumsum(power)]
+    low = np.searchsorted(frequency_hz, frequency_hz - _BAND_HZ / 2)
+    high = np.searchsorted(frequency_hz, frequency_hz + _BAND_HZ / 2)
+    share = (total[high] - total[low]) / max(float(total[-1]), 1e-300)
+    noise = _BAND_HZ / float(frequency_hz[-1])
+    return np.asarray((share > max(_OF_THE_TURNS, 3 * noise)) & (frequency_hz < _TURNS_HZ))
 
 
 def _background(power: Array) -> Array:
