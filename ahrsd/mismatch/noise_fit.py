@@ -19,6 +19,8 @@ CAP = 1.5
 WALK_CAP_RAD_S_SQRT_S = 1.2e-5
 #: how far (log) the gyro's noise is believed to be from its differenced one before the data speak
 _TRUST = 0.25
+#: the same below that where the differences are mostly of the motion
+_SHAKEN_TRUST, _SHAKEN_STARTS = 1.5, (0.0, 1.4, 2.8, 4.2, 5.6)
 _WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
 _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
 #: where readings are too far apart to be compared with each other
@@ -61,7 +63,8 @@ def estimated(
 ) -> NullModel:
     """The model of a filter run with its noise estimated anew; what the spec says stays."""
     clean = cleaned(filtered.track, terms_mag, terms_gyro)
-    model = _white(pieces(clean), filtered.model, spec, max(noise_of(filtered.track)[1], 1e-9))
+    differenced = spec.shaken_gyro_rad_s or max(noise_of(filtered.track)[1], 1e-9)
+    model = _white(pieces(clean), filtered.model, spec, differenced)
     return _walking(clean, model) if walk else replace(model, gyro_walk_rad_s_sqrt_s=0.0)
 
 
@@ -76,7 +79,8 @@ def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
     mag = max(model.sigma_mag_gauss * factor, _FLOOR_MAG_GAUSS)
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
-        gyro = float(np.clip(gyro * factor, _FLOOR_GYRO_RAD_S, _cap(noise_of(filtered.track)[1])))
+        differenced = spec.shaken_gyro_rad_s or noise_of(filtered.track)[1]
+        gyro = float(np.clip(gyro * factor, _FLOOR_GYRO_RAD_S, _cap(differenced)))
     return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
 
 
@@ -127,23 +131,25 @@ def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> Nu
     """Both levels, sigma_gyro drawn to the gyro's differenced noise and within its cap."""
     base = replace(model, gyro_walk_rad_s_sqrt_s=0.0)
     given_mag, given_gyro = spec.sigma_mag_gauss, spec.sigma_gyro_rad_s
+    below = _SHAKEN_TRUST if spec.shaken_gyro_rad_s else _TRUST
     if given_mag and given_gyro:
         return replace(base, sigma_mag_gauss=given_mag, sigma_gyro_rad_s=given_gyro)
     if given_gyro:
         return _mag_alone(track, replace(base, sigma_gyro_rad_s=given_gyro))
     if given_mag:
-        return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced)
-    free = _by_ratio(track, base, differenced)
+        return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
+    free = _by_ratio(track, base, differenced, below)
     if free.sigma_gyro_rad_s <= _cap(differenced):
         return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
     return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
 
 
-def _prior(sigma_gyro: float, differenced: float) -> float:
-    return -0.5 * float(np.square(np.log(sigma_gyro / differenced) / _TRUST))
+def _prior(sigma_gyro: float, differenced: float, below: float) -> float:
+    trust = below if sigma_gyro < differenced else _TRUST
+    return -0.5 * float(np.square(np.log(sigma_gyro / differenced) / trust))
 
 
-def _by_ratio(track: Track, model: NullModel, differenced: float) -> NullModel:
+def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
     def scaled(level: float) -> tuple[NullModel, float]:
         tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * float(np.exp(level)))
         done = run_filter(track, tried, sensitive=False)
@@ -157,9 +163,11 @@ def _by_ratio(track: Track, model: NullModel, differenced: float) -> NullModel:
         )
         # with the scale at its best the squares sum to their number
         value = float(np.sum(done.log_likelihood)) + 0.5 * count * (scale - 1 - np.log(scale))
-        return fitted, value + _prior(fitted.sigma_gyro_rad_s, differenced)
+        return fitted, value + _prior(fitted.sigma_gyro_rad_s, differenced, below)
 
     start = np.log(model.sigma_gyro_rad_s / model.sigma_mag_gauss)
+    if below > _TRUST:  # far below there may be another maximum
+        start = max((start - down for down in _SHAKEN_STARTS), key=lambda level: scaled(level)[1])
     return scaled(_highest(lambda level: scaled(level)[1], start))[0]
 
 
@@ -171,10 +179,10 @@ def _mag_alone(track: Track, model: NullModel) -> NullModel:
     return replace(model, sigma_mag_gauss=max(float(np.exp(best)), _FLOOR_MAG_GAUSS))
 
 
-def _gyro_alone(track: Track, model: NullModel, differenced: float) -> NullModel:
+def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
     def of_gyro(level: float) -> float:
         tried = replace(model, sigma_gyro_rad_s=float(np.exp(level)))
-        return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced)
+        return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced, below)
 
     best = float(np.exp(_highest(of_gyro, np.log(differenced))))
     return replace(

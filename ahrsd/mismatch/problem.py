@@ -12,6 +12,7 @@ from ahrsd.mismatch.delay import delayed_gyro
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.null import cold_start
+from ahrsd.mismatch.shaken import quieter
 from ahrsd.mismatch.thin import thinned, working_factor
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel
@@ -79,11 +80,12 @@ def problem_of(
         sigma_mag_gauss=cold.sigma_mag_gauss / float(np.sqrt(averaged)),
         sigma_gyro_rad_s=cold.sigma_gyro_rad_s / float(np.sqrt(m)),
     )
-    known = spec
-    if m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
+    known = noise_of_thinned(spec, averaged, m)
+    if (found := quieter(track, work, known, start)) is not None:
+        known, start = found
+    elif m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
         # the gyro's differences at the working rate would be its motion
-        known = replace(spec, sigma_gyro_rad_s=cold.sigma_gyro_rad_s)
-    known = noise_of_thinned(known, averaged, m)
+        known = replace(known, sigma_gyro_rad_s=start.sigma_gyro_rad_s)
     made = Problem(work, known, library, limits, track, m, cold, averaged=averaged, notes=notes)
     return made, start
 
@@ -98,6 +100,7 @@ def noise_of_thinned(spec: Spec, mag: float, gyro: float) -> Spec:
         spec,
         sigma_mag_gauss=of_mean(spec.sigma_mag_gauss, mag),
         sigma_gyro_rad_s=of_mean(spec.sigma_gyro_rad_s, gyro),
+        shaken_gyro_rad_s=of_mean(spec.shaken_gyro_rad_s, gyro),
     )
 
 

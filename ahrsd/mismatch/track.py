@@ -63,9 +63,14 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """What the user knows of the sensor; None is estimated.  Deviations are per sample."""
+    """What the user knows of the sensor; None is estimated.  Deviations are per sample.
+
+    shaken_gyro_rad_s: found, not told: what the gyro's differences are, where most of that is the
+                       motion's; its noise may be far less
+    """
 
     sigma_mag_gauss: float | None = None
     sigma_gyro_rad_s: float | None = None
     rate_hz: float | None = None
     field_gauss: float | None = None
+    shaken_gyro_rad_s: float | None = None
