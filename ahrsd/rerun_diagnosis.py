@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ahrsd.mismatch.diagnosis import Diagnosis, Drawn
+from ahrsd.mismatch.diagnosis import Contribution, Diagnosis, Drawn
 from ahrsd.mismatch.spoken import headline, lines, place
 from ahrsd.rerun_blueprint import X, Y, Z
 from ahrsd.samples import Array
@@ -23,7 +23,9 @@ def write_rrd(path: Path, found: Diagnosis) -> None:
     path.unlink(missing_ok=True)
     stream = rr.RecordingStream("ahrsd diagnosis", recording_id=found.recording or "diagnosis")
     drawn = found.drawn
-    effects = [] if drawn is None else [_entity(name) for name in drawn.contributions]
+    effects = (
+        [] if drawn is None else [_entity(k, one) for k, one in enumerate(drawn.contributions)]
+    )
     frames = [] if drawn is None else [one.frame for one in drawn.courses if len(one.course)]
     stream.set_sinks(rr.FileSink(str(path), write_footer=True))
     stream.send_blueprint(_blueprint(effects, [str(frame) for frame in frames]))
@@ -35,15 +37,15 @@ def write_rrd(path: Path, found: Diagnosis) -> None:
     stream.disconnect()
 
 
-def _entity(name: str) -> str:
-    return f"effect/{name.replace(' ', '_')}"
+def _entity(number: int, one: Contribution) -> str:
+    return f"effect/{one.effect}_{number}"
 
 
 def _series(stream: rr.RecordingStream, drawn: Drawn) -> None:
     _send(stream, _BEFORE, drawn.time_s, drawn.before)
     _send(stream, _AFTER, drawn.time_s, drawn.after)
-    for name, added in drawn.contributions.items():
-        _send(stream, _entity(name), drawn.time_s, added * 1e3)
+    for number, added in enumerate(drawn.contributions):
+        _send(stream, _entity(number, added), added.time_s, added.added * 1e3)
     for one in drawn.courses:
         if len(one.course):
             edges = np.asarray(one.cut.edges_s)

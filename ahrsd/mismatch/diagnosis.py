@@ -82,6 +82,7 @@ class Finding:
     """One named effect.
 
     heldout, cost_if_left_out: None, and no key in the answer, for what was counted and not fitted
+    term: its number among the terms of the repaired model, likewise
     """
 
     effect: str
@@ -96,6 +97,7 @@ class Finding:
     equation: str = ""
     setting: dict[str, Any] = field(default_factory=dict)
     evidence_nats: float = 0.0
+    term: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,19 +159,60 @@ class Limit:
     unit: str
 
 
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """What whole models gain over the calibration alone where nothing was fitted.
+
+    Nats per recorded sample.  named: all names together, each fifth of the recording from the other
+    four;  free: what the names leave, drawn freely, beside them, from every second stretch;
+    placebo: the largest gain of a name that was moved in time
+    """
+
+    named: float
+    free: float
+    placebo: float
+
+
+@dataclass(frozen=True, slots=True)
+class RegimeMap:
+    """How much is left under which conditions: one quantity in bins with equally many samples.
+
+    edges: (bins + 1,);  before, after: (bins,) nats that a field of the bin's own gains beside the
+    calibration, and beside the repaired model; noise alone has 1.5
+    """
+
+    quantity: str
+    edges: tuple[float, ...]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contribution:
+    """What a term adds to the readings: time_s (N,), added (N, 3) in `unit`, gauss or rad/s."""
+
+    effect: str
+    time_s: Array
+    added: Array
+    unit: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
     """What the report draws; rows as in the (thinned) track.
 
     time_s (N,); before, after (N, 3): whitened innovations of the null and the repaired model;
-    contributions (N, 3) gauss by effect; courses: the agnostic frames' after the named terms;
-    evidence: nats of every candidate in the first round, best setting.
+    before_gauss, after_gauss (N, 3): the same as they are, reading less what was expected;
+    contributions: of the repaired model's terms, in their order;  courses: the agnostic frames'
+    after the named terms;  evidence: nats of every candidate in the first round, best setting.
     """
 
     time_s: Array
     before: Array
     after: Array
-    contributions: dict[str, Array]
+    before_gauss: Array
+    after_gauss: Array
+    contributions: tuple[Contribution, ...]
     courses: tuple[Located, ...]
     evidence: dict[str, float]
 
@@ -195,9 +238,11 @@ class Diagnosis:
     terms: tuple[Term, ...] = ()
     drawn: Drawn | None = None
     omnibus: dict[str, Whiteness] = field(default_factory=dict)
+    validation: Validation | None = None
+    regime_map: tuple[RegimeMap, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """The contract's object, plus omnibus tests, sensitivity, notes and the repaired model."""
+        """The contract's object, and what is beside it: tests, maps, notes, the repaired model."""
         out: dict[str, Any] = {
             "schema": SCHEMA,
             "recording": self.recording,
@@ -208,6 +253,8 @@ class Diagnosis:
             "unexplained": _plain(self.unexplained),
             "posterior_predictive": {k: _plain(v) for k, v in self.posterior_predictive.items()},
             "omnibus": {k: _plain(v) for k, v in self.omnibus.items()},
+            "validation": _plain(self.validation),
+            "regime_map": [_plain(one) for one in self.regime_map],
             "sensitivity": [_plain(limit) for limit in self.sensitivity],
             "notes": list(self.notes),
         }
@@ -219,7 +266,7 @@ class Diagnosis:
 def _told(finding: Finding) -> dict[str, Any]:
     """A finding without the keys of what was not measured."""
     out: dict[str, Any] = _plain(finding)
-    unmeasured = [key for key in ("heldout", "cost_if_left_out") if out[key] is None]
+    unmeasured = [key for key in ("heldout", "cost_if_left_out", "term") if out[key] is None]
     return {key: value for key, value in out.items() if key not in unmeasured}
 
 

@@ -23,17 +23,17 @@ from ahrsd.mismatch.diagnosis import (
     Baseline,
     Check,
     Diagnosis,
-    Drawn,
     Finding,
     Unexplained,
     Whiteness,
 )
+from ahrsd.mismatch.drawing import drawn, regime_map, validation
 from ahrsd.mismatch.effects.base import Effect
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.exam import rest_of
 from ahrsd.mismatch.explained import explained
 from ahrsd.mismatch.facts import Fact, around, lost_at, matters
-from ahrsd.mismatch.findings import contribution, finding, of_fact, rounding, whole_term
+from ahrsd.mismatch.findings import finding, of_fact, rounding, whole_term
 from ahrsd.mismatch.foretold import without_unforetold
 from ahrsd.mismatch.free_course import with_free_course
 from ahrsd.mismatch.free_source import without_names_of_a_source
@@ -54,7 +54,6 @@ from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
 from ahrsd.mismatch.refined import left_alone, refined
-from ahrsd.mismatch.regression import Base
 from ahrsd.mismatch.resting import resting
 from ahrsd.mismatch.search import (
     HARDLY_TURNED,
@@ -207,10 +206,11 @@ def _told(
     found = tuple(_doubted(one, 1 - limits.doubt) for one in found)
     if not (found or left.detected) and done.alone is not None:
         done = replace(done, left=with_free_course(state, done.alone))
-        left = unknown.described(done.left, problem.block_s, limits.alone())
+        left = unknown.described(done.left, problem, limits.alone())
     something = bool(found) or left.detected
     steps = rounding(facts)
     lesser = (fact.words for fact in facts if not matters(fact))
+    free = 0.0 if left.heldout is None else left.heldout.nll_gain_per_sample
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),
@@ -226,8 +226,10 @@ def _told(
             fast.state.fit, _loud(noise), (*_in_track(terms, fast.state), *steps), library
         ),
         terms=(*terms, *steps),
-        drawn=_drawn(done, basis),
+        drawn=drawn(done.start, state, fast, done.first, done.left.courses),
         omnibus=_whiteness(done),
+        validation=validation(state, named, free),
+        regime_map=regime_map(State(state.problem, done.start), state),
     )
 
 
@@ -293,7 +295,7 @@ def _left(done: _Searched, problem: Problem, facts: Sequence[Fact], fast: Quick)
     if done.short is not None:
         return done.short
     if beyond_lost(done.left, facts, problem):
-        return unknown.described(done.left, problem.block_s, problem.limits)
+        return unknown.described(done.left, problem, problem.limits)
     # a turn put together from what is left, and the error of coarse steps, ring by themselves
     itself = any(fact.turned is not None or fact.effect == "mag_quantisation" for fact in facts)
     return Unexplained(False) if itself else heard(done.state, fast)
@@ -377,19 +379,3 @@ def _p_value(named: Sequence[Judged], found: tuple[Finding, ...], left: unknown.
     frames = [min(1.0, 3.0 * one.p_value) for one in left.located.values()]
     bins = [min(1.0, len(left.bins) * p) for _, _, p in left.bins]
     return float(min([1.0, *(judged.family_p for judged in named), *counted, *frames, *bins]))
-
-
-def _drawn(done: _Searched, basis: Base) -> Drawn:
-    state = done.state
-    contributions = {
-        f"{judged.candidate.name} {k}": contribution(judged, term.value, basis)
-        for k, (judged, term) in enumerate(zip(state.named, state.fit.terms, strict=True))
-    }
-    return Drawn(
-        basis.context.track.time_s,
-        done.start.filtered.whitened,
-        state.fit.filtered.whitened,
-        contributions,
-        done.left.courses,
-        {candidate.name: candidate.evidence for candidate in done.first.candidates},
-    )

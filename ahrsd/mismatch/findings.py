@@ -86,6 +86,7 @@ def finding(
         equation=effect.equation,
         setting=term.setting,
         evidence_nats=judged.evidence,
+        term=number,
     )
 
 

@@ -11,6 +11,7 @@ in which it stays.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,13 +23,15 @@ from ahrsd.mismatch.gram import Gram, block_edges, gram
 from ahrsd.mismatch.innovation import nuisance_columns, run_filter, sensitivities
 from ahrsd.mismatch.regression import CALIBRATION
 from ahrsd.mismatch.track import Track
-from ahrsd.mismatch.validate import FOLDS, PRIOR, Gain, heldout, one_by_one
+from ahrsd.mismatch.validate import FOLDS, PRIOR, Folds, Gain, heldout, one_by_one
 from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
 
 #: twice the nats that may be lost per parameter because the other fifths do not know it exactly;
 #: where all five know as much of it they are 1.25
 _LOST = 5.0
+#: group of all terms that are asked together
+_ALL = "terms"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,32 @@ def gain_of(
         before = heldout(left, known, name, scale, one_by_one).before
         scatter = still.scatter - after.scatter
     return Gain(before / level, gain.after / level, scatter)
+
+
+def gain_of_all(fit: NullFit, values: Sequence[Array], scales: Sequence[Array]) -> Gain:
+    """The held-out gain of all terms of a fit together, in fifths; arguments as in `gain_of`.
+
+    A gyro bias that may walk is noise here: in both filters it may.
+    """
+    seen = _seen(fit, fit.model.gyro_walk_rad_s_sqrt_s)
+    gain = gain_together(seen.fifths, values, scales, one_by_one)
+    level = fit.filtered.normalised_innovation
+    return Gain(gain.before / level, gain.after / level)
+
+
+def gain_together(
+    blocks: Gram, values: Sequence[Array], scales: Sequence[Array], dealt: Callable[[int], Folds]
+) -> Gain:
+    """The held-out gain of all terms of some blocks together; values, scales: of each term."""
+    names = [_name(number) for number in range(len(values))]
+    for name, value in zip(names, values, strict=True):
+        blocks = _put_back(blocks, name, value)
+    known = [group for group in blocks.groups if group not in names]
+    ordered = blocks.select([*known, *names])
+    groups = {group: ordered.groups[group] for group in known}
+    first = ordered.groups[names[0]].start
+    whole = replace(ordered, groups={**groups, _ALL: slice(first, len(ordered.information))})
+    return heldout(whole, known, _ALL, np.concatenate(scales), dealt)
 
 
 def _name(number: int) -> str:

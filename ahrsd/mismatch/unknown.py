@@ -21,6 +21,7 @@ from ahrsd.mismatch.evidence import log_bayes
 from ahrsd.mismatch.gram import Gram, gram
 from ahrsd.mismatch.limits import Limits
 from ahrsd.mismatch.locate import FRAMES, Frame, Located
+from ahrsd.mismatch.problem import Problem
 from ahrsd.mismatch.regime import Regime
 from ahrsd.mismatch.regression import Base, known_out, quieter
 from ahrsd.mismatch.score import chi2_p, score
@@ -177,7 +178,7 @@ def detected(left: Remainder, limits: Limits) -> bool:
     return by_time or by_bin or left.stood_in is not None or left.one_source
 
 
-def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
+def described(left: Remainder, problem: Problem, limits: Limits) -> Unexplained:
     """The address of what is left."""
     best, basis = left.strongest, left.basis
     seen = course(left)
@@ -205,7 +206,7 @@ def described(left: Remainder, block_s: float, limits: Limits) -> Unexplained:
             None,
             (x, y, z),
         ),
-        heldout=None if by_bin else _heldout(left, block_s),
+        heldout=None if by_bin else _heldout(left, problem),
         size=float(np.ptp(free.source)),
         unit="rad/s" if best.frame == "gyro" else "gauss",
         single_source_share=free.single_share,
@@ -227,11 +228,12 @@ def _bin_words(one: Regime, basis: Base) -> str:
     return one.words(size > 0.5 * size.max())
 
 
-def _heldout(left: Remainder, block_s: float) -> Heldout:
+def _heldout(left: Remainder, problem: Problem) -> Heldout:
     """What the frame's course says of every second block, known from the others alone.
 
-    Placebo: the same course held against the innovations of another time.
+    Per recorded sample.  Placebo: the same course held against the innovations of another time.
     """
+    block_s, thin = problem.block_s, problem.thin
     best, basis = left.strongest, left.basis
     columns = basis.whitened([locate.frame_columns(basis.context, best.frame, best.cut)])[0]
     gain = _course_gain(best, basis, columns, block_s)
@@ -240,7 +242,7 @@ def _heldout(left: Remainder, block_s: float) -> Heldout:
     usual = max(_course_gain(best, one, columns, block_s).nats_per_sample for one in moved)
     rms = innovation_rms(basis)
     after = rms * float(np.sqrt(max(gain.after, 0.0) / max(gain.before, 1e-12)))
-    return Heldout(rms, after, gain.nats_per_sample, usual)
+    return Heldout(rms, after, gain.nats_per_sample / thin, usual / thin)
 
 
 def _course_gain(best: Located, basis: Base, columns: Array, block_s: float) -> Gain:

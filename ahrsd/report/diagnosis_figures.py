@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ahrsd.mismatch.diagnosis import Diagnosis, Drawn
+from ahrsd.mismatch.diagnosis import Contribution, Diagnosis, Drawn, RegimeMap, Validation
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN
 from ahrsd.samples import Array
 
 _BINS = 300  # of time
+_REGIMES = 10  # quantities in the map
 _AXES = "xyz"
 
 
@@ -30,14 +32,14 @@ def _binned(time_s: Array, values: Array) -> tuple[Array, Array]:
     return 0.5 * (edges[1:] + edges[:-1])[kept], total[kept] / count[kept]
 
 
-def _both(drawn: Drawn) -> tuple[tuple[Array, str, str], ...]:
-    if np.array_equal(drawn.before, drawn.after):  # nothing was named: one would hide the other
-        return ((drawn.before, BEFORE, "nothing named"),)
-    return (drawn.before, BEFORE, "before"), (drawn.after, AFTER, "after")
+def _both(before: Array, after: Array) -> tuple[tuple[Array, str, str], ...]:
+    if np.array_equal(before, after):  # nothing was named: one would hide the other
+        return ((before, BEFORE, "nothing named"),)
+    return (before, BEFORE, "before"), (after, AFTER, "after")
 
 
 def residual(found: Diagnosis, drawn: Drawn) -> Figure:
-    """Whitened innovations over time, each axis, before and after, located spans shaded."""
+    """Readings less what was expected over time, before and after, located spans shaded."""
     figure = _figure(4.6, 3)
     spans = [span for finding in found.findings for span in finding.where.intervals_s]
     if found.unexplained.where is not None:
@@ -47,9 +49,10 @@ def residual(found: Diagnosis, drawn: Drawn) -> Figure:
         for begin, end in spans:
             if end - begin < 0.95 * whole:
                 axes.axvspan(begin, end, color=GREY, alpha=0.15, lw=0)
-        for values, color, name in _both(drawn):
-            axes.plot(*_binned(drawn.time_s, values[:, k]), color=color, lw=1.0, label=name)
-        axes.set_ylabel(f"{_AXES[k]}, sigma")
+        for values, color, name in _both(drawn.before_gauss, drawn.after_gauss):
+            series = _binned(drawn.time_s, values[:, k] * 1e3)
+            axes.plot(*series, color=color, lw=1.0, label=name)
+        axes.set_ylabel(f"{_AXES[k]}, mG")
     figure.axes[0].legend(ncols=2, loc="upper right")
     figure.axes[-1].set_xlabel("time, s")
     return figure
@@ -68,21 +71,65 @@ def evidence(found: Diagnosis, drawn: Drawn) -> Figure:
     axes.invert_yaxis()
     axes.set_xscale("log")
     axes.axvline(3.0, color=BEFORE, lw=1.0)
-    axes.set_xlabel("evidence over none, nats (line: what a name needs)")
+    axes.set_xlabel("evidence, nats")
     return figure
 
 
-def contribution(name: str, drawn: Drawn) -> Figure:
+def contribution(one: Contribution) -> Figure:
     """What a named effect adds to the readings over time."""
     figure = _figure(2.0)
     axes = figure.axes[0]
-    added = drawn.contributions[name]
     for k in range(3):
-        series = _binned(drawn.time_s, added[:, k] * 1e3)
+        series = _binned(one.time_s, one.added[:, k] * 1e3)
         axes.plot(*series, color=SERIES[k], lw=1.0, label=_AXES[k])
     axes.set_xlabel("time, s")
-    axes.set_ylabel("mG (mrad/s in the gyro)")
+    axes.set_ylabel({"gauss": "mG", "rad/s": "mrad/s"}[one.unit])
     axes.legend(ncols=3, loc="upper right")
+    return figure
+
+
+def validation(found: Validation) -> Figure:
+    """Gain of whole models over the calibration alone on parts that were not fitted."""
+    bars = {
+        "calibration alone": (0.0, GREY),
+        "moved in time": (found.placebo, BEFORE),
+        "named": (found.named, AFTER),
+        "named, rest drawn freely": (found.named + found.free, SERIES[1]),
+    }
+    figure = _figure(1.7)
+    axes = figure.axes[0]
+    values = [value for value, _ in bars.values()]
+    drawn = axes.barh(range(len(bars)), values, color=[color for _, color in bars.values()])
+    axes.bar_label(drawn, [f" {value:+.4f}" for value in values], fontsize=8)
+    axes.set_yticks(range(len(bars)), list(bars), fontsize=8)
+    axes.margins(x=0.2)
+    axes.axvline(0.0, color=GREY, lw=0.8)
+    axes.invert_yaxis()
+    axes.set_xlabel("gain, nats per sample")
+    return figure
+
+
+def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
+    """What is left by condition: a row a quantity, low values left, before and after."""
+    shown = maps[:_REGIMES]
+    highest = max(max(one.before + one.after) for one in shown)
+    colours = LogNorm(1.0, max(highest, 10.0), clip=True)
+    figure = _figure(1.0 + 0.5 * len(shown), 2)
+    for axes, side in zip(figure.axes, ("before", "after"), strict=True):
+        for row, one in enumerate(shown):
+            nats = np.array([getattr(one, side)])
+            edges = np.linspace(0.0, 1.0, nats.shape[1] + 1)
+            drawn = axes.pcolormesh(
+                edges, [row - 0.45, row + 0.45], nats, cmap="YlOrRd", norm=colours, edgecolor="w"
+            )
+        labels = [f"{one.quantity}\n{one.edges[0]:.3g} to {one.edges[-1]:.3g}" for one in shown]
+        axes.set_yticks(range(len(shown)), labels, fontsize=7)
+        axes.set_xticks([])
+        axes.invert_yaxis()
+        axes.set_title(side)
+        axes.grid(visible=False)
+        figure.colorbar(drawn, ax=axes, label="nats")
+    figure.axes[1].set_xlabel("low to high, as many samples in every bin")
     return figure
 
 
@@ -109,7 +156,7 @@ def spectrum(drawn: Drawn) -> Figure:
     """Power of the whitened innovations by frequency, all axes: 1 where nothing is left."""
     figure = _figure(2.4)
     axes = figure.axes[0]
-    for values, color, name in _both(drawn):
+    for values, color, name in _both(drawn.before, drawn.after):
         frequency, power = _power(drawn.time_s, values)
         axes.plot(frequency, power, color=color, lw=1.0, label=name)
     axes.axhline(1.0, color=GREY, lw=0.8)

@@ -63,15 +63,17 @@ def _finding(found: Diagnosis, number_: int, one: Finding) -> str:
     if one.separate_from:
         rows.append(("to be sure", escape(one.separate_from)))
     parts = [table(("", ""), [[escape(name), text] for name, text in rows])]
-    if found.drawn is not None:
+    if found.drawn is not None and one.term is not None:
         from ahrsd.report import diagnosis_figures as figures
 
-        drawn = found.drawn
-        names = [name for name in drawn.contributions if name.split(" ")[0] == one.effect]
-        parts += [
-            picture(partial(figures.contribution, name, drawn), f"{one.effect} over time")
-            for name in names
-        ]
+        added = found.drawn.contributions[one.term]
+        parts.append(
+            picture(
+                partial(figures.contribution, added),
+                f"{one.effect} over time",
+                "What it adds to the readings.",
+            )
+        )
     return section(f"{number_}. {headline(one)}", *parts)
 
 
@@ -139,8 +141,8 @@ def _pictures(found: Diagnosis) -> str:
         picture(
             partial(figures.residual, found, drawn),
             "innovations over time, before and after",
-            "What the model did not expect, before (orange) and after (blue) the effects above; "
-            "the places that were found are shaded.",
+            "Readings less what the model expected of them a moment before, before (orange) and "
+            "after (blue) the effects above; the places that were found are shaded.",
         ),
         picture(
             partial(figures.spectrum, drawn),
@@ -153,7 +155,26 @@ def _pictures(found: Diagnosis) -> str:
             picture(
                 partial(figures.evidence, found, drawn),
                 "evidence of every effect",
-                "How much every effect alone would explain; named ones in blue.",
+                "How much every effect alone would explain; named ones in blue. The line is what a "
+                "name needs.",
+            )
+        )
+    if found.regime_map:
+        shots.append(
+            picture(
+                partial(figures.regime_map, found.regime_map),
+                "what is left by condition",
+                "Under which conditions readings and model differ, before and after: a row a "
+                "quantity, low values left, high ones right. Dark is much; noise alone has 1 to 3.",
+            )
+        )
+    if found.validation is not None and found.findings:
+        shots.append(
+            picture(
+                partial(figures.validation, found.validation),
+                "gain on parts that were not fitted",
+                "What the models gain over the calibration alone on parts of the recording that "
+                "they were not fitted to. Moved in time: the same effects where they cannot be.",
             )
         )
     if drawn.courses:
@@ -173,13 +194,12 @@ def _checks(found: Diagnosis) -> str:
         return ""
 
     def mark(inside: bool) -> str:
-        return '<span class="good">inside</span>' if inside else '<span class="bad">outside</span>'
+        return '<span class="good">in</span>' if inside else '<span class="bad">out</span>'
 
     rows = [
         [
-            escape(name),
-            number(check.value),
-            f"{number(check.band[0])} ... {number(check.band[1])}",
+            escape(name.replace("_", " ")),
+            f"{number(check.value)} ({number(check.band[0])} to {number(check.band[1])})",
             mark(check.inside_before),
             mark(check.inside_after),
         ]
@@ -187,9 +207,9 @@ def _checks(found: Diagnosis) -> str:
     ]
     text = (
         "<p>The recording's own statistics against simulations along its motion: by the "
-        "calibration alone (before), and with the effects above (after).</p>"
+        "calibration alone (before), and with the effects above (after), whose range is shown.</p>"
     )
-    head = ("statistic", "recording", "simulated, repaired", "before", "after")
+    head = ("statistic", "recording (simulated)", "before", "after")
     return section("Does the repaired simulation look like the recording?", text, table(head, rows))
 
 

@@ -48,7 +48,7 @@ th { font-weight: 600; color: var(--soft); }
 pre { background: var(--card); padding: .6rem; font-size: .78rem; white-space: pre-wrap;
   overflow-wrap: anywhere; }
 ul { padding-left: 1.2rem; }
-@media (max-width: 500px) { table { font-size: .8rem; } th, td { padding-right: .4rem; }
+@media (max-width: 500px) { table { font-size: .76rem; } th, td { padding-right: .3rem; }
   .n { white-space: normal; padding-right: .5rem; } }
 """
 

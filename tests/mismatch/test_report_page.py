@@ -9,15 +9,18 @@ from browser import BROWSER, look_at
 from ahrsd.mismatch.diagnosis import (
     Baseline,
     Check,
+    Contribution,
     Cost,
     Diagnosis,
     Drawn,
     Finding,
     Heldout,
     Limit,
+    RegimeMap,
     Share,
     Suspect,
     Unexplained,
+    Validation,
     Value,
     Where,
 )
@@ -43,6 +46,7 @@ def diagnosis(**changes):
         separate_from="pulse the motor at rest on one heading",
         words="the field of a motor current",
         equation="m += k I(t)",
+        term=0,
     )
     left = Unexplained(
         detected=True,
@@ -57,7 +61,13 @@ def diagnosis(**changes):
         time_s=time_s,
         before=rng.standard_normal((4000, 3)),
         after=rng.standard_normal((4000, 3)),
-        contributions={"motor_current_field 0": rng.standard_normal((4000, 3)) * 1e-3},
+        before_gauss=rng.standard_normal((4000, 3)) * 2e-3,
+        after_gauss=rng.standard_normal((4000, 3)) * 1e-3,
+        contributions=(
+            Contribution(
+                "motor_current_field", time_s, rng.standard_normal((4000, 3)) * 1e-3, "gauss"
+            ),
+        ),
         courses=(),
         evidence={"motor_current_field": 2102.0, "hysteresis": 5.0, "mag_time_lag": -2.0},
     )
@@ -68,10 +78,20 @@ def diagnosis(**changes):
         "p_value": 1e-9,
         "findings": (finding,),
         "unexplained": left,
-        "posterior_predictive": {"nis": Check(1.09, (0.97, 1.03), False, True)},
+        "posterior_predictive": {
+            "normalised_innovation": Check(1.0934, (0.97123, 1.0311), False, True),
+            "autocorrelation": Check(255.2, (106.44, 384.1), False, True),
+        },
         "notes": ("column a & b was left out",),
         "model": NullModel(np.eye(3), np.array([0.1, 0.0, -0.2]), np.zeros(3), 1e-3, 5e-4),
         "drawn": drawn,
+        "validation": Validation(0.052, 0.01, 0.0006),
+        "regime_map": (
+            RegimeMap(
+                "heading_deg", (0.0, 120.0, 240.0, 360.0), (2.0, 900.0, 1.0), (1.0, 2.0, 1.5)
+            ),
+            RegimeMap("motor_current_a", (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),
+        ),
     }
     return Diagnosis(**(fields | changes))
 
@@ -104,7 +124,8 @@ def test_one_line_where_before_and_after_are_the_same():
         return [line.get_label() for line in axes.get_lines()]
 
     assert labels(drawn) == ["before", "after"]
-    assert labels(replace(drawn, after=drawn.before)) == ["nothing named"]
+    alike = replace(drawn, after_gauss=drawn.before_gauss)
+    assert labels(alike) == ["nothing named"]
 
 
 def test_nothing_found_says_what_would_have_been_seen():
@@ -131,10 +152,11 @@ def test_the_page_in_a_browser(tmp_path, width_px):
     write_diagnosis_report(page, diagnosis(), "ahrsd diagnose dive")
     seen = look_at(page, width_px, tmp_path)
     assert seen["errors"] == []
-    assert len(seen["pictures"]) == 4
+    assert len(seen["pictures"]) == 6
     assert all(complete and width > 0 for _, width, complete in seen["pictures"])
     assert seen["window"] == width_px
     assert seen["width"] <= width_px
+    assert seen["cut"] == []  # no table that has to be pushed aside to be read
     assert "Unknown, here" in seen["headings"]
     assert "<b>throttle" not in page.read_text()
 

@@ -23,6 +23,8 @@ window.addEventListener("load", () => {
     pictures: [...document.images].map(i => [i.alt, i.naturalWidth, i.complete]),
     width: document.documentElement.scrollWidth,
     window: window.innerWidth,
+    cut: [...document.querySelectorAll(".scroll")].filter(d => d.scrollWidth > d.clientWidth)
+      .map(d => d.textContent.slice(0, 60)),
     headings: [...document.querySelectorAll("h1, h2")].map(h => h.textContent),
   });
   document.body.append(out);
