@@ -1,4 +1,4 @@
-"""A diagnosis with columns that were logged badly: with holes, noise, or by a clock of their own.
+"""A diagnosis with columns that were logged badly: with holes, seldom, noise, or a wrong clock.
 
 What a column can still say is asked first; it counts only if an effect is named by it.  Else the
 answer is the one that the recording gives without it.
@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from ahrsd.mismatch import roles
 from ahrsd.mismatch.clocks import Late, clock_of, suspects
+from ahrsd.mismatch.delays import DELAYS
 from ahrsd.mismatch.diagnosis import Diagnosis
 from ahrsd.mismatch.effects.library import EFFECTS
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.held_columns import drawn_between, held_columns
 from ahrsd.mismatch.hygiene import hygiene, put_right
 from ahrsd.mismatch.limits import LIMITS
 from ahrsd.mismatch.logger_noise import cleaned
@@ -28,6 +30,8 @@ from ahrsd.mismatch.track import Spec, Track
 LEFT = 0.5
 #: columns whose clock is sought, the likeliest first
 MOST_ASKED = 2
+#: a column that explains most at a smaller lag is asked last
+ON_TIME_S = 1.0
 
 
 def diagnose_logged(track: Track, spec: Spec | None = None, *, recording: str = "") -> Diagnosis:
@@ -43,12 +47,40 @@ def diagnose_logged(track: Track, spec: Spec | None = None, *, recording: str = 
         missing = np.zeros(len(track), dtype=bool)
         for one in holed.values():
             missing |= one.missing
-        found = _as_logged(_blind(filled, missing), spec, recording)
+        found = _straight(_blind(filled, missing), spec, recording)
         used = [name for name in holed if name in causes(found)]
         if used:
             notes = tuple(holed[name].words for name in used)
             return replace(found, notes=(*notes, *found.notes))
-    return _as_logged(track, spec, recording)
+    return _straight(track, spec, recording)
+
+
+def _straight(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+    """The diagnosis, with columns that were held between their values drawn straight if better.
+
+    Better is what gains more, all names together, on what was not fitted.
+    """
+    found = _as_logged(track, spec, recording)
+    seldom = held_columns(roles.prepared(track)[0])
+    by = set(causes(found))
+    if not seldom or not (found.unexplained.detected or by & {one.name for one in seldom}):
+        return found
+    again = _as_logged(drawn_between(track, seldom), spec, recording)
+    used = [one for one in seldom if one.name in causes(again)]
+    if used and _gain(again) > _gain(found):
+        words = ", ".join(f"{one.name} ({one.often})" for one in used)
+        said = f"logged more seldom than the sensor and drawn straight between its values: {words}"
+        return replace(again, notes=(said, *again.notes))
+    near = by | {one.channel for one in found.unexplained.follows}
+    late = ", ".join(f"{one.name} ({one.often})" for one in seldom if one.name in near)
+    if not late or not found.unexplained.detected:
+        return found
+    said = f"logged more seldom than the sensor: {late}; what is quicker cannot be told by it"
+    return replace(found, notes=(said, *found.notes))
+
+
+def _gain(found: Diagnosis) -> float:
+    return 0.0 if found.validation is None else found.validation.named
 
 
 def _as_logged(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
@@ -109,9 +141,20 @@ def _clock(found: Diagnosis, track: Track, spec: Spec) -> Late | None:
     if not asked:
         return None
     problem, cold = problem_of(put_right(track, hygiene(track)), spec, EFFECTS, LIMITS)
+    problem = problem.lagging(_lag_s(found))
     basis = formed_basis_of(State(problem, fit_null(problem.track, problem.spec, cold)))
+    asked.sort(key=lambda one: abs(one[0]) < ON_TIME_S)  # what is on time has no clock to be told
     clocks = (clock_of(basis, name, lag_s) for lag_s, name in asked[:MOST_ASKED])
     return next((clock for clock in clocks if clock is not None), None)
+
+
+def _lag_s(found: Diagnosis) -> float:
+    """The magnetometer's delay that is named; what it would leave hides the column."""
+    return sum(
+        DELAYS[one.effect] * one.parameters[0].value
+        for one in found.findings
+        if one.effect in DELAYS and one.parameters[0].unit == "s"
+    )
 
 
 def causes(found: Diagnosis) -> tuple[str, ...]:
