@@ -17,6 +17,8 @@ _PILED = 6.0  # times as many at the limit as at each number just inside it
 _MARGIN, _NEAR = 5.0, 0.02  # noise levels, and share of the limit, at which it begins to act
 _BESIDE = 2  # rows before and after such readings: noise that is added behind the limit hides a few
 _TOP_STEPS = 1.5  # of coarse numbers, as many at the top as one step below are no limit
+_HEAP = 7.0  # noise levels that hold a heap of readings at a limit that noise is added to
+_SIDES, _ALIKE = 3, 0.01  # sides of axes that end at a shared limit, and how alike they are
 _FINE = 0.5  # share of the readings that differ from all others, where numbers are fine
 _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
 
@@ -34,6 +36,8 @@ def clipping(track: Track) -> list[Fact]:
             _flat_tops(column, fresh, max(noise, _TOP_STEPS * step_of(column)))
             for column in values.T
         ]
+        if not any(rows.any() for rows, _ in found):
+            found = _one_limit(values, noise)
         if not any(rows.any() for rows, _ in found):
             continue
         limit = max(level for rows, level in found if rows.any())
@@ -96,6 +100,45 @@ def _flat_tops(
             rows |= at
             size = max(size, top)
     return rows, size
+
+
+def _one_limit(values: Array, noise: float) -> list[tuple[NDArray[np.bool], float]]:
+    """Rows at a limit that axes share, and its size, where noise was added behind the limit.
+
+    No two readings are equal then, but every axis ends at one size, in both senses, with a heap of
+    readings as wide as their noise and next to none just inside.  A vehicle that always turns at
+    one rate does so about one axis; what two axes and three sides have in common is the sensor's.
+    """
+    none = [(np.zeros(len(values), dtype=bool), 0.0) for _ in _AXES]
+    heaps = [
+        (axis, sign, level)
+        for axis in range(3)
+        for sign in (1.0, -1.0)
+        if (level := _heap(sign * values[:, axis], noise)) > 0.0
+    ]
+    if len(heaps) < _SIDES:
+        return none
+    usual = float(np.median([level for _, _, level in heaps]))
+    shared = [heap for heap in heaps if abs(heap[2] - usual) < _ALIKE * usual]
+    if len(shared) < _SIDES or len({axis for axis, _, _ in shared}) < 2:
+        return none
+    # by its bias an axis reaches the limit at a little more on one side than on the other
+    lowest = min(level for _, _, level in shared)
+    reach = lowest - _HEAP / 2 * noise
+    return [(np.abs(values[:, axis]) > reach, lowest) for axis in range(3)]
+
+
+def _heap(values: Array, noise: float) -> float:
+    """Where the largest of (N,) values pile up within their noise; 0 where they do not."""
+    known = values[np.isfinite(values)]
+    top, width = float(np.max(known, initial=0.0)), _HEAP * noise
+    inside = known > top - width
+    heaped = int(np.count_nonzero(inside))
+    below = int(np.count_nonzero(known > top - 2 * width)) - heaped
+    if top < 4 * width or heaped < _PILED * max(below, 1):
+        return 0.0
+    longest = max((b - a for a, b in spans_of(values > top - width)), default=0)
+    return float(np.median(known[inside])) if longest >= _FEWEST else 0.0
 
 
 def quantisation(track: Track) -> list[Fact]:

@@ -40,6 +40,7 @@ from ahrsd.mismatch.free_source import without_names_of_a_source
 from ahrsd.mismatch.gyro_noise import loud_gyro
 from ahrsd.mismatch.humming import heard
 from ahrsd.mismatch.hygiene import hygiene, put_right, would_have_shown
+from ahrsd.mismatch.levels import without_levels
 from ahrsd.mismatch.likelier_forms import without_likelier_forms
 from ahrsd.mismatch.limits import LIMITS, Limits
 from ahrsd.mismatch.lost import believed, beyond_lost, differ, lost_beside
@@ -154,6 +155,7 @@ def _searched(problem: Problem, model: NullModel) -> _Searched:
     if short is None or unknown.detected(left, problem.limits):
         left = framed(formed_basis_of(state), left, problem.limits)
     burst_nats = 0.0 if short is None else short.evidence_nats
+    state, surveys, left = without_levels(state, surveys, left)
     state, surveys, left = without_passing(state, surveys, left, burst_nats)
     state, surveys, left = without_names_of_a_source(state, surveys, left)
     left = refined(start, state, left, short, problem.limits)

@@ -44,6 +44,8 @@ _SCALE_STEP = 0.05
 CREEPS_S = 5.0
 #: deviations by which two weightings of one recording differ at most where the model is true
 AGREE = 3.0
+#: odds of a gyro whose axes share one error of scale, to a clock of that error
+COMMON_SCALE = 0.5
 #: seconds that are dealt in turn where an effect shows no longer than some of them
 SECOND_S = 1.0
 
@@ -313,9 +315,21 @@ def shares_of(state: State, number: int, seen: Survey, last: Survey) -> dict[str
     evidence = {c.name: in_its_place(c, last) for c in seen.candidates if c.name != mine}
     own = [c.evidence for c in seen.candidates if c.name == mine]
     evidence = {mine: lead + max([judged.evidence, *own]), **evidence}
-    found = posterior({name: SHARPER * nats for name, nats in evidence.items()}, {})
+    found = posterior(_with_common({k: SHARPER * nats for k, nats in evidence.items()}), {})
     rest = {k: v for k, v in sorted(found.items(), key=lambda item: -item[1]) if k != mine}
     return {mine: found[mine], **rest}
+
+
+def _with_common(nats: Mapping[str, float]) -> dict[str, float]:
+    """The same, a gyro's scale as likely as three numbers or as one that all axes share.
+
+    As one it is a clock's error to the last digit; only the host's time tells.
+    """
+    out = dict(nats)
+    if "clock_rate" in out:
+        common = out["clock_rate"] + float(np.log(COMMON_SCALE))
+        out["gyro_scale"] = max(out.get("gyro_scale", -np.inf), common)
+    return out
 
 
 def with_all_else(judged: Judged, seen: Survey) -> Judged:

@@ -34,7 +34,7 @@ def lines(found: Diagnosis) -> list[str]:
         out += ["", "not in the library:", *_unexplained_lines(found.unexplained)]
     if not found.mismatch and found.sensitivity:
         out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
-    failed = [k for k, check in found.posterior_predictive.items() if not check.inside_after]
+    failed = failed_checks(found)
     if found.posterior_predictive:
         count = len(found.posterior_predictive)
         state = f"fails {', '.join(failed)}" if failed else "passes all of them"
@@ -54,9 +54,17 @@ def _whiteness(found: Diagnosis) -> str:
     return f"fail {', '.join(before) or 'nothing'} before; {left}"
 
 
+def failed_checks(found: Diagnosis) -> list[str]:
+    """Statistics in which the recording is not like simulations of the repaired model."""
+    return [k for k, check in found.posterior_predictive.items() if not check.inside_after]
+
+
 def verdict(found: Diagnosis) -> str:
     """One sentence."""
     names = len(found.findings)
+    failed = failed_checks(found)
+    if not found.mismatch and failed:
+        return f"nothing was found, and yet they differ in: {', '.join(failed)} (see the checks)"
     if not found.mismatch:
         return "recording and model agree"
     parts = []

@@ -186,7 +186,8 @@ def test_an_object_beside_the_way_is_found_to_a_hand_s_breadth():
 
 
 @pytest.mark.parametrize(
-    ("frequency_hz", "found"), [(40 / 3, False), (40 / 6, False), (10.0, True), (7.3, True)]
+    ("frequency_hz", "found"),
+    [(40 / 3, False), (40 / 6, False), (10.0, True), (7.3, True), (19.8, True), (20.0, False)],
 )
 def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_hz, found):
     """10 Hz is what 50 Hz looks like at 40 Hz."""

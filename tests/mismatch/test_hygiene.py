@@ -423,3 +423,24 @@ def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
     found = [fact for fact in as_recorded(degrees) if fact.effect == "unit_error"]
     assert [fact.setting for fact in found] == [{"sensor": "gyro", "unit": "deg/s"}]
     assert as_recorded(loud) == []
+
+
+def test_a_limit_with_noise_behind_it(track: Track) -> None:
+    """No two readings are equal: two axes that end at one size tell it, one axis does not."""
+    rng = np.random.default_rng(5)
+    rate = track.gyro_b_rad_s
+    top = 0.6 * float(np.min(np.abs(rate).max(axis=0)))
+    noise = 3e-4 * rng.standard_normal(rate.shape)
+    bias = np.array([1e-3, -5e-4, 2e-4])
+    clipped = np.clip(rate, -top, top) + bias + noise
+    fact = _only(clipping(replace(track, gyro_b_rad_s=clipped)))
+    assert fact.effect == "gyro_saturation"
+    assert _value(fact) == pytest.approx(top, abs=2e-3)
+    assert fact.turned is not None
+    at_limit = np.any(np.abs(rate) > top, axis=1)
+    assert np.isnan(fact.turned[at_limit]).mean() > 0.99
+    assert np.isfinite(fact.turned[np.all(np.abs(rate) < 0.8 * top, axis=1)]).all()
+    # a vehicle that always turns at one rate, to either side
+    turning = rate + bias + noise
+    turning[:, 2] = np.clip(rate[:, 2], -top, top) + noise[:, 2]
+    assert clipping(replace(track, gyro_b_rad_s=turning)) == []

@@ -128,6 +128,18 @@ def test_one_line_where_before_and_after_are_the_same():
     assert labels(alike) == ["nothing named"]
 
 
+def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees():
+    checks = {
+        "line": Check(9.0, (1.0, 3.0), False, False),
+        "tail": Check(1.0, (0.0, 3.0), True, True),
+    }
+    none = Unexplained(False)
+    silent = diagnosis(mismatch=False, findings=(), unexplained=none, posterior_predictive=checks)
+    assert lines(silent)[0] == (
+        "dive <7>.csv: nothing was found, and yet they differ in: line (see the checks)"
+    )
+
+
 def test_nothing_found_says_what_would_have_been_seen():
     limits = (
         Limit("mag_time_lag", "lag", 1.5e-3, "s"),

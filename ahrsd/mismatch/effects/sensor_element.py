@@ -301,12 +301,13 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     window = np.hanning(len(values))[:, None]
     power = np.sum(np.abs(np.fft.rfft(values * window, 4 * len(values), axis=0)) ** 2, axis=1)
     frequency = np.asarray(np.fft.rfftfreq(4 * len(values), step_s), dtype=np.float64)
-    power = np.where((frequency > _LOWEST_HZ) & (frequency < 0.49 / step_s), power, 0.0)
+    width = 2.0 / (len(values) * step_s)
+    inside = (frequency > _LOWEST_HZ) & (frequency < 0.5 / step_s - width)
+    power = np.where(inside, power, 0.0)
     power = power / _background(power)
     turns = np.nan_to_num(gyro_b_rad_s[run])
     turned = np.fft.rfft((turns - turns.mean(axis=0)) * window, 4 * len(values), axis=0)
     power[_to_and_fro(frequency, np.sum(np.abs(turned) ** 2, axis=1))] = 0.0
-    width = 2.0 / (len(values) * step_s)
     found: list[Setting] = []
     for _ in range(_LINES + len(_IN_STEP)):
         at = int(np.argmax(power))
