@@ -32,6 +32,8 @@ ROWS_BESIDE = 3
 #: settings that are a size, sought between the values of their grid, and what that choice costs
 SCALES = ("time_constant_s", "radius_gauss", "length_s", "length_m")
 ANGLES = ("turn_deg",)
+#: how a logged cause is read: by how much it is late, and by how much its north is turned
+READ_ONCE = ("late_s", "turn_deg")
 SCALE_CHOICES = 3
 WORTH_NATS = 4.0
 #: best places of an object from which it is sought more closely
@@ -48,7 +50,8 @@ def best_settings(
     offered: dict[str, tuple[Setting, ...]] = {}
     for name, effect in library.items():
         options = _settings(effect, basis.context) if effect.kind == "mean" else ()
-        offered[name] = tuple(option for option in options if (name, option) not in taken)
+        given = [_cause(setting) for other, setting in taken if other == name]
+        offered[name] = tuple(option for option in options if _cause(option) not in given)
     _summed(basis, [(library[name], o) for name, options in offered.items() for o in options])
     for name, options in offered.items():
         effect = library[name]
@@ -63,6 +66,11 @@ def best_settings(
         paid = best.evidence + float(np.log(ways))
         found.append(replace(best, alike=best.alike * ways, evidence=paid))
     return sorted(found, key=lambda candidate: -candidate.evidence)
+
+
+def _cause(setting: Setting) -> Setting:
+    """A setting without how its cause is read: no cause is late by two times at once."""
+    return {key: value for key, value in setting.items() if key not in READ_ONCE}
 
 
 @lru_cache(maxsize=64)  # surveys without one name or another are of the same context

@@ -79,3 +79,21 @@ def test_a_temperature_that_nobody_logged_is_one_more_way_to_a_drift(basis: Base
     assert drift(unlogged, both) - drift(basis, both) == pytest.approx(np.log(2.0), abs=1e-6)
     # a library without that effect knows of no such way
     assert drift(unlogged, alone) == pytest.approx(drift(basis, alone), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "again"),
+    [
+        ("motor_current_field", "late_s", False),
+        ("field_gradient", "turn_deg", False),
+        ("hard_iron_step", "onset_s", True),
+    ],
+)
+def test_a_cause_is_read_in_one_way(basis: Base, name: str, key: str, again: bool) -> None:
+    """A current is not late by two times at once, and one north is not turned by two angles."""
+    effect = EFFECTS[name]
+    one, *others = effect.settings(basis.context)
+    taken = [(name, {**one, key: 0.123})]
+    assert others or name == "motor_current_field"
+    found = [candidate.name for candidate in best_settings(basis, {name: effect}, taken)]
+    assert found == ([name] if again else [])
