@@ -13,6 +13,7 @@ from ahrsd.mismatch.clipping import step_of
 from ahrsd.mismatch.coarse import noise_of
 from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.facts import Fact, spans_of
+from ahrsd.mismatch.prior import sphere_centre
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
@@ -55,14 +56,17 @@ def _expected_change(track: Track) -> Array:
     return np.asarray(step * size)
 
 
-def _turned(track: Track, first: int, last: int) -> float:
-    """Gauss by which the whole turn over these rows moves the reading that they repeat."""
+def _turned(track: Track, centre: Array, first: int, last: int) -> float:
+    """Gauss by which the whole turn over these rows moves the reading that they repeat.
+
+    centre (3,): of the readings' sphere, which does not turn
+    """
     rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
     turn = rate[first:last].T @ np.nan_to_num(track.dt_s[first:last], nan=0.0)
     said = track.mag_b_gauss[first]
     if not said.any():  # 0 0 0 is no field that could have been turned
         return float(np.linalg.norm(turn)) * track.usual_gauss
-    return float(np.linalg.norm(np.cross(turn, said)))
+    return float(np.linalg.norm(np.cross(turn, said - centre)))
 
 
 def _resolution(track: Track) -> float:
@@ -83,7 +87,9 @@ def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[n
     usual = float(np.median(np.diff(np.flatnonzero(~again), append=len(again))))
     least = max(_STUCK_ROWS, _LONGER * usual)
     long = [(first, last) for first, last in spans_of(again) if last - first >= least]
-    turned = [_turned(track, *span) >= _MOVED * _resolution(track) for span in long]
+    mag = track.mag_b_gauss
+    centre = sphere_centre(mag[np.isfinite(mag).all(axis=1) & mag.any(axis=1)])
+    turned = [_turned(track, centre, *span) >= _MOVED * _resolution(track) for span in long]
     fine = any(turned) and _step(track) == 0.0
     for (first, last), moved in zip(long, turned, strict=True):
         if moved or fine:

@@ -17,6 +17,7 @@ from ahrsd.mismatch.frames import ranked, windows
 from ahrsd.mismatch.hygiene import as_recorded, hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
 from ahrsd.mismatch.missing import missing_turns, whole_nats
+from ahrsd.mismatch.repeats import _turned
 from ahrsd.mismatch.stamps import regular
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
@@ -444,3 +445,18 @@ def test_a_limit_with_noise_behind_it(track: Track) -> None:
     turning = rate + bias + noise
     turning[:, 2] = np.clip(rate[:, 2], -top, top) + noise[:, 2]
     assert clipping(replace(track, gyro_b_rad_s=turning)) == []
+
+
+def test_a_turn_about_the_field_moves_no_reading_however_large_the_hard_iron(track: Track) -> None:
+    """In steps of 8 mG a sensor then repeats itself honestly."""
+    centre, field = np.array([0.0, 0.4, 0.0]), np.array([0.1, 0.0, 0.2])
+    rate = np.zeros((len(track), 3))
+    rate[100:200] = field / np.linalg.norm(field)  # 1 rad/s
+    still = replace(
+        track,
+        mag_b_gauss=np.tile(centre + field, (len(track), 1)),
+        gyro_b_rad_s=rate,
+    )
+    seconds = 100 * track.step_s
+    assert _turned(still, centre, 100, 200) == pytest.approx(0.0, abs=1e-12)
+    assert _turned(still, np.zeros(3), 100, 200) == pytest.approx(0.4 * seconds)
