@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.mismatch.evidence import SIZES, weighed
+from ahrsd.mismatch.evidence import SIZES
 from ahrsd.mismatch.gram import RANK_SHARE
 from ahrsd.samples import Array
 
@@ -33,11 +33,10 @@ class Choices:
     def log_bayes(self, colour: float, sizes: Sequence[float] = SIZES) -> Array:
         """(S,) log Bayes factors against the effect's absence, nats."""
         l, s = self.information / colour, self.score / colour  # noqa: E741
-        k, weights = weighed(sizes)
-        k2 = np.square(k)[:, None, None]
+        k2 = np.square(np.asarray(sizes, float))[:, None, None]
         price = np.where(self.seen, np.log1p(k2 * l), 0.0)
         terms = 0.5 * np.sum(s**2 / (l + 1.0 / k2) - price, axis=2)
-        return np.asarray(np.logaddexp.reduce(terms + weights[:, None], axis=0))
+        return np.asarray(np.logaddexp.reduce(terms, axis=0) - np.log(len(sizes)))
 
     def below_zero(self, deviations: float) -> NDArray[np.bool]:
         """(S,) whether a parameter is so many of its own deviations below zero."""

@@ -23,17 +23,6 @@ from ahrsd.mismatch.score import Score
 from ahrsd.samples import Array
 
 SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
-#: and one that is far beyond what is usual, with its odds to each of them: a cheap sensor in a bad
-#: place is as real, and a name that is true must not pay for it what another form need not
-LARGE, LARGE_ODDS = 10.0, 0.1
-
-
-def weighed(sizes: Sequence[float]) -> tuple[Array, Array]:
-    """The sizes, the usual ones with the large one, and the logarithms of their weights."""
-    odds = [1.0] * len(sizes)
-    if sizes is SIZES:
-        sizes, odds = (*SIZES, LARGE), [*odds, LARGE_ODDS]
-    return np.asarray(sizes, float), np.log(np.asarray(odds) / sum(odds))
 
 
 def log_bayes(what: Score, colour: float = 1.0, sizes: Sequence[float] = SIZES) -> float:
@@ -41,10 +30,9 @@ def log_bayes(what: Score, colour: float = 1.0, sizes: Sequence[float] = SIZES) 
     if what.rank == 0:
         return 0.0
     l, s = what.information / colour, what.score / colour  # noqa: E741
-    k, weights = weighed(sizes)
-    k2 = np.square(k)[:, None]
+    k2 = np.square(np.asarray(sizes, float))[:, None]
     terms = 0.5 * np.sum(s**2 / (l + 1.0 / k2), axis=1) - 0.5 * np.sum(np.log1p(k2 * l), axis=1)
-    return float(np.logaddexp.reduce(terms + weights))
+    return float(np.logaddexp.reduce(terms) - np.log(len(sizes)))
 
 
 def log_bayes_walk(G: Array, s: Array, axes: int, deviations: Array, colour: float = 1.0) -> float:
