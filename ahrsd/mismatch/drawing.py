@@ -9,7 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ahrsd.mismatch.descent import NullFit
-from ahrsd.mismatch.diagnosis import Contribution, Drawn, Finding, RegimeMap, Validation
+from ahrsd.mismatch.diagnosis import (
+    Contribution,
+    Drawn,
+    Finding,
+    RegimeMap,
+    Unexplained,
+    Validation,
+)
 from ahrsd.mismatch.findings import added_value, contribution
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.heldout import gain_of, gain_of_all, gain_together
@@ -79,8 +86,8 @@ def _nats(basis: Base, one: Regime, colour: float) -> tuple[float, ...]:
     return tuple(out)
 
 
-def validation(state: State, findings: Sequence[Finding], free: float) -> Validation:
-    """All names together on what was not fitted.  free: nats per sample of what they leave.
+def validation(state: State, findings: Sequence[Finding], left: Unexplained) -> Validation:
+    """All names together on what was not fitted, and beside them what they leave.
 
     What only the recorded rate shows is not in the fifths, and counts by itself.
     """
@@ -91,6 +98,7 @@ def validation(state: State, findings: Sequence[Finding], free: float) -> Valida
         if one.heldout is not None and (one.term or 0) >= len(state.named)
     )
     placebo = max([0.0, *(one.placebo_gain for one in heldout)])
+    free = 0.0 if left.heldout is None else left.heldout.nll_gain_per_sample
     return Validation(_together(state) / state.problem.thin + quickly, free, placebo)
 
 

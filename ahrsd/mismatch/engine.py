@@ -212,7 +212,6 @@ def _told(
     something = bool(found) or left.detected
     steps = rounding(facts)
     lesser = (fact.words for fact in facts if not matters(fact))
-    free = 0.0 if left.heldout is None else left.heldout.nll_gain_per_sample
     return Diagnosis(
         recording=recording,
         baseline=_baseline(done.start),
@@ -230,7 +229,7 @@ def _told(
         terms=(*terms, *steps),
         drawn=drawn(done.start, state, fast, done.first, done.left.courses),
         omnibus=_whiteness(done),
-        validation=validation(state, named, free),
+        validation=validation(state, named, left),
         regime_map=regime_map(State(state.problem, done.start), state),
     )
 

@@ -11,6 +11,35 @@ from ahrsd.mismatch.spoken import headline, place, sensitivity, value_text, verd
 from ahrsd.report.page import CSS, number, picture, section, table
 
 _MG = 1e3
+#: what each picture is called, and what is said below it
+_OVER_TIME = (
+    "innovations over time, before and after",
+    "Readings less what the model expected of them a moment before, before (orange) and after "
+    "(blue) the effects above; the places that were found are shaded.",
+)
+_BY_FREQUENCY = (
+    "spectrum of the innovations",
+    "The same by frequency: 1 everywhere where nothing is left.",
+)
+_BY_NAME = (
+    "evidence of every effect",
+    "How much every effect alone would explain; named ones in blue. The line is what a name needs.",
+)
+_BY_CONDITION = (
+    "what is left by condition",
+    "Under which conditions readings and model differ, before and after: a row a quantity, low "
+    "values left, high ones right. Dark is much; noise alone has 1 to 3.",
+)
+_NOT_FITTED = (
+    "gain on parts that were not fitted",
+    "What the models gain over the calibration alone on parts of the recording that they were not "
+    "fitted to. Moved in time: the same effects where they cannot be.",
+)
+_BY_FRAME = (
+    "what is left, by frame",
+    "What is left after the named effects, drawn freely in three frames; grey: two standard "
+    "deviations.",
+)
 
 
 def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
@@ -138,55 +167,18 @@ def _pictures(found: Diagnosis) -> str:
     from ahrsd.report import diagnosis_figures as figures
 
     shots = [
-        picture(
-            partial(figures.residual, found, drawn),
-            "innovations over time, before and after",
-            "Readings less what the model expected of them a moment before, before (orange) and "
-            "after (blue) the effects above; the places that were found are shaded.",
-        ),
-        picture(
-            partial(figures.spectrum, drawn),
-            "spectrum of the innovations",
-            "The same by frequency: 1 everywhere where nothing is left.",
-        ),
+        (partial(figures.residual, found, drawn), *_OVER_TIME),
+        (partial(figures.spectrum, drawn), *_BY_FREQUENCY),
     ]
     if drawn.evidence:
-        shots.append(
-            picture(
-                partial(figures.evidence, found, drawn),
-                "evidence of every effect",
-                "How much every effect alone would explain; named ones in blue. The line is what a "
-                "name needs.",
-            )
-        )
+        shots.append((partial(figures.evidence, found, drawn), *_BY_NAME))
     if found.regime_map:
-        shots.append(
-            picture(
-                partial(figures.regime_map, found.regime_map),
-                "what is left by condition",
-                "Under which conditions readings and model differ, before and after: a row a "
-                "quantity, low values left, high ones right. Dark is much; noise alone has 1 to 3.",
-            )
-        )
+        shots.append((partial(figures.regime_map, found.regime_map), *_BY_CONDITION))
     if found.validation is not None and found.findings:
-        shots.append(
-            picture(
-                partial(figures.validation, found.validation),
-                "gain on parts that were not fitted",
-                "What the models gain over the calibration alone on parts of the recording that "
-                "they were not fitted to. Moved in time: the same effects where they cannot be.",
-            )
-        )
+        shots.append((partial(figures.validation, found.validation), *_NOT_FITTED))
     if drawn.courses:
-        shots.append(
-            picture(
-                partial(figures.courses, drawn),
-                "what is left, by frame",
-                "What is left after the named effects, drawn freely in three frames; grey: two "
-                "standard deviations.",
-            )
-        )
-    return section("Before and after", *shots)
+        shots.append((partial(figures.courses, drawn), *_BY_FRAME))
+    return section("Before and after", *(picture(*shot) for shot in shots))
 
 
 def _checks(found: Diagnosis) -> str:
