@@ -325,11 +325,10 @@ def _with_common(nats: Mapping[str, float]) -> dict[str, float]:
 
     As one it is a clock's error to the last digit; only the host's time tells.
     """
-    out = dict(nats)
-    if "clock_rate" in out:
-        common = out["clock_rate"] + float(np.log(COMMON_SCALE))
-        out["gyro_scale"] = max(out.get("gyro_scale", -np.inf), common)
-    return out
+    if not {"clock_rate", "gyro_scale"} <= nats.keys():
+        return dict(nats)
+    common = nats["clock_rate"] + float(np.log(COMMON_SCALE))
+    return {**nats, "gyro_scale": max(nats["gyro_scale"], common)}
 
 
 def with_all_else(judged: Judged, seen: Survey) -> Judged:

@@ -44,6 +44,15 @@ def test_a_slow_low_pass_is_one_name_and_leaves_nothing_for_others():
     assert found.findings[0].parameters[0].value == pytest.approx(0.09, abs=1e-3)
 
 
+def test_a_clock_that_is_off_shares_with_a_gyro_whose_axes_are_all_off_alike():
+    found, _ = answer(("clock_rate", 1.0))
+    (one,) = found.findings
+    assert one.effect == "clock_rate"
+    gyro = next(other for other in one.alternatives if other.effect == "gyro_scale")
+    assert gyro.confidence == pytest.approx(one.confidence / 2, rel=0.01)
+    assert one.separate_from is not None and "host time" in one.separate_from
+
+
 def test_two_effects_are_both_named_and_nothing_else():
     found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0))
     assert sorted(x.effect for x in found.findings) == ["gyro_scale", "hard_iron_step"]
