@@ -36,6 +36,19 @@ def logged(track: Track, name: str, values: Array) -> Track:
     return track.with_columns({**track.covariates, name: values})
 
 
+def test_a_wrong_clock_is_found_beside_a_magnetometer_that_is_late(driven) -> None:
+    """What a delay of 100 ms leaves is larger than the current's field: it is taken out first."""
+    track, _ = driven
+    t = track.time_s - track.time_s[0]
+    late = np.column_stack([np.interp(t - 0.1, t, axis) for axis in track.mag_b_gauss.T])
+    column = levels(t - 3.0, 7)
+    found = diagnose_logged(logged(replace(track, mag_b_gauss=late), "motor_current_a", column))
+    assert [one.effect for one in found.findings] == ["mag_time_lag", "motor_current_field"]
+    assert found.findings[0].parameters[0].value == pytest.approx(0.1, abs=2e-3)
+    assert found.notes[0].startswith("column motor_current_a runs 2.9 s late against the sensor")
+    assert not found.unexplained.detected
+
+
 @pytest.mark.parametrize(
     ("clock", "words"),
     [
