@@ -1,4 +1,7 @@
-"""`ahrsd challenge make|run|score`: sealed blind trials of `diagnose`, see docs/challenge.md."""
+"""`ahrsd challenge make|run|score`: sealed blind trials of `diagnose`.
+
+See docs/validation/blind-trials.md.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Limits:
                     more, errors of a gyro whose bias walks, which are held against a walk besides
     doubt:          what noise model and library do not know, by which every confidence is less:
                     about the share of names with all of the evidence that sealed rings found wrong
-                    (docs/challenge.md, "calibration error of the confidence")
+                    (docs/validation/blind-trials.md, "calibration error of the confidence")
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 

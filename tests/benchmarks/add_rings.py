@@ -1,37 +1,50 @@
-"""Scores of several opened rings added up from their reports: shares only, with each ring's own.
+"""Scores of several opened rings added up: shares only, with each ring's own.
 
-python tests/benchmarks/add_rings.py docs/challenge/ring600{d,e,f,g,h,i}
+    python tests/benchmarks/add_rings.py ring600{i,j,k} [--scores docs/validation/trials/scores.csv]
+
+The table of scores has a row per round, tool and score, as `ahrsd challenge score` printed it.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-HEADING = "## Scores of ahrsd"
+SCORES = Path(__file__).parents[2] / "docs" / "validation" / "trials" / "scores.csv"
 
 
-def shares(report: str) -> dict[str, tuple[int, int, str]]:
-    """Of every score that is a share: how many, of how many, what is wanted."""
-    found: dict[str, tuple[int, int, str]] = {}
-    table = report.split(HEADING, 1)[1].split("\n## ", 1)[0]
-    for line in table.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if len(cells) == 6 and cells[1].endswith("%"):
-            score, value, _, cases, wanted, _ = cells
-            found[score] = (round(float(value[:-1]) * int(cases) / 100), int(cases), wanted)
-    return found
+def shares(
+    rows: Iterable[Mapping[str, str]], ring: str, tool: str = "ahrsd"
+) -> dict[str, tuple[int, int, str]]:
+    """Of every score of a ring that is a share: how many, of how many, what is wanted."""
+    return {
+        row["score"]: (
+            round(float(row["value"][:-1]) * int(row["cases"]) / 100),
+            int(row["cases"]),
+            row["wanted"],
+        )
+        for row in rows
+        if row["round"] == ring and row["tool"] == tool and row["value"].endswith("%")
+    }
 
 
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("ring", nargs="+", type=Path, help="folder of a ring's report.md")
-    rings = parser.parse_args().ring
+    parser.add_argument("ring", nargs="+", help="name of a round in the table")
+    parser.add_argument("--scores", type=Path, default=SCORES)
+    asked = parser.parse_args()
+    with asked.scores.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    unknown = set(asked.ring) - {row["round"] for row in rows}
+    if unknown:
+        parser.error(f"{asked.scores} has no round {', '.join(sorted(unknown))}")
     added: dict[str, list[tuple[int, int, str]]] = defaultdict(list)
-    for ring in rings:
-        for score, told in shares((ring / "report.md").read_text()).items():
+    for ring in asked.ring:
+        for score, told in shares(rows, ring).items():
             added[score].append(told)
     print("| score | cases | share | wanted | of each |\n|---|---|---|---|---|")
     for score, told in added.items():

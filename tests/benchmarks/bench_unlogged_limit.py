@@ -1,10 +1,10 @@
 """How well a cause that nobody logged can be seen at all: by one who knows all but its course.
 
-    python tests/benchmarks/bench_unlogged_limit.py docs/challenge/ring600g/key.json ... [--below 2]
+    python tests/benchmarks/bench_unlogged_limit.py KEY.json ... [--below 2]
 
-For every case of an opened ring whose cause was withheld: the generator draws the same kind of
-cause `DRAWS` times more, with other courses, directions and places, along the very motion of the
-case.  Their covariance, at the case's strength, is all that anyone can know of a course that was
+For every case of a ring, by its key (`ahrsd challenge make --seed` makes it), whose cause was
+withheld: the generator draws the same kind of cause `DRAWS` times more, with other courses,
+directions and places, along the very motion of the case.  Their covariance, at the case's strength, is all that anyone can know of a course that was
 not logged.  The observer knows it, besides the noise, the attitude and the field; calibration,
 gyro bias and the outside field are projected out, as of all that `blindworld.ideal` sees.  Of a
 gyro's bias the noise is also a walk of an ordinary gyro (5e-6 rad/s per root second).
