@@ -4,10 +4,11 @@
 
 For every case of a ring, by its key (`ahrsd challenge make --seed` makes it), whose cause was
 withheld: the generator draws the same kind of cause `DRAWS` times more, with other courses,
-directions and places, along the very motion of the case.  Their covariance, at the case's strength, is all that anyone can know of a course that was
-not logged.  The observer knows it, besides the noise, the attitude and the field; calibration,
-gyro bias and the outside field are projected out, as of all that `blindworld.ideal` sees.  Of a
-gyro's bias the noise is also a walk of an ordinary gyro (5e-6 rad/s per root second).
+directions and places, along the very motion of the case. Their covariance, at the case's
+strength, is all that anyone can know of a course that was not logged. The observer knows it,
+besides the noise, the attitude and the field; calibration, gyro bias and the outside field are
+projected out, as of all that `blindworld.ideal` sees. Of a gyro's bias the noise is also a walk
+of an ordinary gyro (5e-6 rad/s per root second).
 
 Of tests that know no more of a signal than its covariance the best is the likelihood ratio
 
