@@ -7,8 +7,6 @@ The same answer as NP from three unknowns. s_k is the same for all readings here
 
 from __future__ import annotations
 
-import numpy as np
-
 from ahrsd.methods.data import Data, Fit, Settings
 from ahrsd.methods.sphere import distances, linear_centre, minimise
 from ahrsd.samples import Array
@@ -18,12 +16,6 @@ def rows(b: Array, field: Array, norms: Array) -> tuple[Array, Array]:
     """r (N,) and dr/db (N, 3)."""
     rho, n = distances(field, b)
     return rho - norms, -n
-
-
-def preserved(b: Array, field: Array, norms: Array) -> Array:
-    """B_k (N, 3): the nearest readings that have the field's magnitude about b."""
-    _, n = distances(field, b)
-    return np.asarray(b + norms[:, None] * n)
 
 
 def estimate(data: Data, settings: Settings) -> Fit:
