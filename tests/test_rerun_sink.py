@@ -419,7 +419,7 @@ def test_a_closed_sink_leaves_a_complete_file(tmp_path):
         push_all(sink, simulated_events(20.0))
         sink.close(15.0)
         assert sink.counters == SinkCounters()
-    assert verified(path, tmp_path)
+    assert verified(path)
     gyro = columns(path)["/gyro_b_rad_s"]
     assert sorted(gyro.column("sample").drop_null().to_pylist()) == list(range(2000))
     sink.push(Noted(0.0, 0.0, "info", "too late"), 0.0)  # ignored, not an error
@@ -560,7 +560,7 @@ def test_parts_change_at_their_size_and_the_oldest_go(tmp_path):
     left = sorted(tmp_path.glob("*.rrd"))
     assert path not in left
     assert part_name(path, 4) in left
-    assert [verified(part, tmp_path) for part in left] == [True] * len(left)
+    assert [verified(part) for part in left] == [True] * len(left)
 
 
 def test_a_port_in_use_is_counted_and_the_file_still_written(tmp_path):
