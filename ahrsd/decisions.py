@@ -1,7 +1,10 @@
 """The decision log: what was concluded when, as plain values, and its hash.
 
-Two runs over the same inputs must yield the same log; the hash says whether they did. Numbers are
-rounded to 9 significant digits before hashing, below what differs between processors.
+Two runs over the same inputs must yield the same log; the hash says whether they did, also on
+another processor. An entry keeps 9 significant digits for people. The hash is over the entry with
+every number but its time rounded further, to `_HASHED_DIGITS` significant digits and to
+`_HASHED_STEP`: the last digits of a solver belong to the processor's arithmetic (up to 3e-9 of a
+number was seen to differ between kernels of one library), and no decision depends on them.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ from ahrsd.calibration import Estimate
 from ahrsd.events import GateResult
 
 _DIGITS = 9
+_HASHED_DIGITS = 4
+_HASHED_STEP = 6  # decimal places: 1 uG, 1 urad/s, and far below any gate's limit
 
 
 @dataclass(slots=True)
@@ -49,7 +54,7 @@ class DecisionLog:
         }
         entry.update({name: _plain(value) for name, value in facts.items()})
         line = json.dumps(entry, sort_keys=True).encode()
-        self._hash.update(line)
+        self._hash.update(hashed_form(entry))
         self.count += 1
         self._lines.append(line)
         if self.keep is not None and len(self._lines) > self.keep:
@@ -79,12 +84,31 @@ class DecisionLog:
         return self._hash.hexdigest()
 
 
+def hashed_form(entry: dict[str, object]) -> bytes:
+    """The bytes of an entry that are hashed: what decides, without what a processor adds to it."""
+    rest = {name: value for name, value in entry.items() if name != "at_s"}
+    coarse = {"at_s": entry["at_s"], **{name: _coarse(value) for name, value in rest.items()}}
+    return json.dumps(coarse, sort_keys=True).encode()
+
+
+def _coarse(value: object) -> object:
+    if isinstance(value, float):
+        return round(_rounded(value, _HASHED_DIGITS), _HASHED_STEP) + 0.0  # -0.0 becomes 0.0
+    if isinstance(value, list):
+        return [_coarse(v) for v in value]
+    if isinstance(value, dict):
+        return {name: _coarse(v) for name, v in value.items()}
+    return value
+
+
+def _rounded(value: float, digits: int) -> float:
+    return float(f"{value:.{digits - 1}e}")
+
+
 def _plain(value: object) -> object:
     """Rounded, finite or null: what JSON and another machine can both say."""
     if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return float(f"{value:.{_DIGITS - 1}e}")
+        return _rounded(value, _DIGITS) if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
     if isinstance(value, dict):

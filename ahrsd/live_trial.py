@@ -5,8 +5,10 @@ corrections see the same motion and the same disturbances, so only their quality
 both show the sensor's noise and neither is worse. That says nothing of the gyroscope, nor of a
 matrix that is turned: `carried_field` does, with the new registers and with each alternative to
 them (either one put back, or both). The heading's jump is the difference of the two
-tilt-compensated headings of the same samples, averaged over the first seconds in which the vehicle
-is level: only for that was it predicted, and on the side it may be twice as much.
+tilt-compensated headings of the same samples, averaged over the first seconds of samples in which
+the vehicle is level: only for that was it predicted, and on the side it may be twice as much.
+Seconds are those that samples cover, taken in pieces of a quarter of one: over a gap, or over the
+many seconds that a busy host reads at once, the vehicle turns, and a mean over a turn is no field.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from ahrsd.writeback.trial import TrialMetrics
 
 _WINDOW_S = 60.0
 _JUMP_S = 3.0
+_PIECE_S = 0.25  # one heading each; a vehicle turns by little in it
 _LEVEL = np.cos(np.radians(15.0))
 _SPACING_S = 0.1  # samples closer than this add nothing to a spread
 
@@ -44,7 +47,7 @@ class LiveTrial:
         )
         self._rows: deque[tuple[float, Array]] = deque()
         self._jumps: list[float] = []
-        self._jump_ends_s: float | None = None
+        self._jump_covered_s = 0.0  # by the samples of the jumps
         self._start_s: float | None = None
         self._last_s = 0.0
         self._turned_rad = 0.0
@@ -64,14 +67,23 @@ class LiveTrial:
         while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
             self._rows.popleft()
         self._last_s = now_s
-        if self._jump_ends_s is None and down[2] >= _LEVEL:  # false where it is nan
-            self._jump_ends_s = float(block.time_s[0]) + _JUMP_S
-        if down[2] >= _LEVEL and now_s <= (self._jump_ends_s or now_s):
-            mean, force = block.raw_b_gauss.mean(axis=0)[None], -down[None]
-            new = tilt_compensated_heading(self._new.apply(mean), force)
-            old = tilt_compensated_heading(self._old.apply(mean), force)
-            self._jumps.append(float((new - old)[0]))
+        for piece in _pieces(block.time_s):
+            if self._jump_covered_s < _JUMP_S:
+                self._see_jump(
+                    block.raw_b_gauss[piece], block.accel_b_m_s2[piece], block.dt_s[piece]
+                )
         return self._metrics()
+
+    def _see_jump(self, raw: Array, accel: Array, dt_s: Array) -> None:
+        """How far the heading of these samples is from what it was with the old registers."""
+        down = _down(accel)
+        if not down[2] >= _LEVEL:  # nor where it is nan
+            return
+        mean, force = raw.mean(axis=0)[None], -down[None]
+        new = tilt_compensated_heading(self._new.apply(mean), force)
+        old = tilt_compensated_heading(self._old.apply(mean), force)
+        self._jumps.append(float((new - old)[0]))
+        self._jump_covered_s += float(np.nansum(np.minimum(dt_s, _PIECE_S)))
 
     def _metrics(self) -> TrialMetrics:
         field = np.array([m for _, m in self._rows])
@@ -94,6 +106,15 @@ class LiveTrial:
             new_swing=float(swing[0]),
             old_swing=float(swing[1:].min()),
         )
+
+
+def _pieces(time_s: Array) -> list[slice]:
+    """Samples that follow each other within `_PIECE_S` of the first of their piece."""
+    starts = [0]
+    for k, t in enumerate(time_s.tolist()):
+        if not 0.0 <= t - time_s[starts[-1]] < _PIECE_S:
+            starts.append(k)
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(time_s)], strict=True)]
 
 
 def _down(accel: Array) -> Array:

@@ -121,8 +121,12 @@ class Outputs:
             self._tell(self._server, self._server.open(sink, now_s))
 
     def finish(self) -> None:
-        """Write out everything; the process ends after this without closing a stream."""
-        self._file.flush(FINISH_FLUSH_S)
+        """Write out everything, and the footer of the file, which its end brings.
+
+        The live stream is not closed: that waits for viewers without limit.
+        """
+        if self._file.flush(FINISH_FLUSH_S):
+            self._file.close()
 
     def _open_part(self, path: Path, now_s: float) -> None:
         self._part = path if self._fresh else free_part(path)
@@ -130,7 +134,7 @@ class Outputs:
             self._file.pause(self._disk_text(), now_s)
             return
         keep_quota(path, self._settings.limits.quota_bytes)
-        opened = self._file.open(rr.FileSink(self._part, write_footer=False), now_s)
+        opened = self._file.open(rr.FileSink(self._part), now_s)
         self._fresh = self._fresh and not opened
         self._tell(self._file, opened)
 

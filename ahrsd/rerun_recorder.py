@@ -345,7 +345,7 @@ def record(events: Iterable[Event], path: Path) -> None:
     """
     stream = new_stream(uuid.uuid4().hex)
     try:
-        stream.set_sinks(rr.FileSink(path, write_footer=False), default_blueprint=names.blueprint())
+        stream.set_sinks(rr.FileSink(path), default_blueprint=names.blueprint())
     except RuntimeError as error:
         raise OSError(f"{path}: {error}") from error
     recorder = Recorder(stream)

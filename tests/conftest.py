@@ -26,7 +26,36 @@ REAL = {"subprocess", "socket", "pty", "serial", "threading", "EmulatorProcess",
 REAL_FIXTURES = {"live", "emulated", "small_disk"}
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def _needs_recordings(item: pytest.Item) -> bool:
+    marked = item.get_closest_marker("recordings") is not None
+    return marked or "recordings" in getattr(item, "fixturenames", ())
+
+
+def _one_skip_a_file(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Where the real recordings are absent: one skip for all tests of a file that need them.
+
+    A clone has no recordings; a skip for each of a hundred parameters would hide any other skip.
+    """
+    by_file: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        if _needs_recordings(item):
+            by_file.setdefault(item.path, []).append(item)
+    for first, *others in by_file.values():
+        why = f"the real recordings (../shared/recordings) are not here: {1 + len(others)} of this"
+        first.add_marker(pytest.mark.skip(reason=f"{why} file need them"))
+    return [other for _, *others in by_file.values() for other in others]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Tests without their recordings are told file by file; real ports get a second try."""
+    if not RECORDINGS.is_dir() and (left_out := _one_skip_a_file(items)):
+        config.hook.pytest_deselected(items=left_out)
+        out = set(left_out)
+        items[:] = [item for item in items if item not in out]
+    _second_try(items)
+
+
+def _second_try(items: list[pytest.Item]) -> None:
     """A second try, printed as RERUN, where a test runs on real ports, sockets and processes.
 
     Their names and numbers belong to the machine: another worker may get the one that was let go.

@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 
-from ahrsd.decisions import DecisionLog
+from ahrsd.decisions import DecisionLog, hashed_form
 from ahrsd.events import GateResult
 
 
@@ -34,19 +34,33 @@ def test_the_hash_is_that_of_the_entries_and_can_be_checked_by_others():
     log.add(2.0, "CANDIDATE", [gate(1.5)], reason="all gates open")
     expected = hashlib.sha256()
     for entry in log.entries:
-        expected.update(json.dumps(entry, sort_keys=True).encode())
+        expected.update(hashed_form(entry))
     assert log.sha256 == expected.hexdigest()
     assert log.count == 2
 
 
-def test_what_differs_below_the_ninth_digit_is_the_same_and_above_is_not():
-    hashes = []
-    for value in (0.123456789, 0.1234567890004, 0.123456799):
-        log = DecisionLog()
-        log.add(1.0, "OBSERVING", [gate(value)])
-        hashes.append(log.sha256)
-    assert hashes[0] == hashes[1]
-    assert hashes[0] != hashes[2]
+def hash_of(value: float) -> str:
+    log = DecisionLog()
+    log.add(1.0, "OBSERVING", [gate(value)])
+    return log.sha256
+
+
+def test_what_only_the_arithmetic_of_a_processor_changes_is_not_in_the_hash():
+    assert hash_of(0.123456789) == hash_of(0.123456789 * (1 + 3e-9))
+    assert hash_of(0.123456789) != hash_of(0.123556789)
+    assert hash_of(2.2e-14) == hash_of(0.0) == hash_of(-1e-15)  # what is left of a difference
+    assert hash_of(0.000321) != hash_of(0.000322)
+    assert hash_of(20.7) != hash_of(20.8)
+
+
+def test_the_hash_is_that_of_these_bytes():
+    log = DecisionLog()
+    log.add(120.123456, "CANDIDATE", [gate(2.1000049)], hard_iron_gauss=[0.10220049, -1e-9])
+    assert log.entries[0]["hard_iron_gauss"] == [0.10220049, -1e-9]
+    assert hashed_form(log.entries[0]) == (
+        b'{"at_s": 120.123456, "gates": [{"gate": "observability.score", "limit": 1.0, "ok": true, '
+        b'"value": 2.1}], "hard_iron_gauss": [0.1022, 0.0], "state": "CANDIDATE"}'
+    )
 
 
 def test_what_json_cannot_say_becomes_null():

@@ -52,7 +52,7 @@ def test_iron_that_stays_is_not_divided(bench, kind):
         assert answer(bench, run)[0].restarted_s is None
 
 
-@pytest.mark.skipif(not BROAD.exists(), reason="the real recordings are not here")
+@pytest.mark.recordings
 @pytest.mark.parametrize(
     "name",
     ["32_disturbed_attached_magnet_1cm", "34_disturbed_attached_magnet_3cm",
@@ -65,7 +65,7 @@ def test_a_magnet_that_was_taken_off_again(name):
     assert np.linalg.norm(found.hard_iron_gauss) < 0.02
 
 
-@pytest.mark.skipif(not BROAD.exists(), reason="the real recordings are not here")
+@pytest.mark.recordings
 def test_a_magnet_that_was_taken_off_again_in_one_go():
     """All epochs of the recording at once: that it is settled shows only at the very end."""
     estimator = Estimator(at_once=WHOLE)

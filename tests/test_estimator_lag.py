@@ -78,7 +78,7 @@ def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
     assert right.converged and right.gyro_misscaled == 0.0
 
 
-@pytest.mark.skipif(not WALK.exists(), reason="the real recordings are not here")
+@pytest.mark.recordings
 def test_a_rate_that_lost_messages_made_wrong_is_no_answer():
     assert calibrate(WALK, Config(), rate_hz=40.0).estimate.gyro_misscaled == 0.0
     found = calibrate(WALK, Config(), rate_hz=30.0).estimate
@@ -109,7 +109,7 @@ def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
     np.testing.assert_allclose(rates(data)[:, 0], [1.0, 1.0, 3.0, 3.0])
 
 
-@pytest.mark.skipif(not BROAD.exists(), reason="the real recordings are not here")
+@pytest.mark.recordings
 @pytest.mark.parametrize("name", ["02_undisturbed_slow_rotation_B", "21_undisturbed_fast_combined"])
 def test_the_lag_of_a_real_instrument(name):
     found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate

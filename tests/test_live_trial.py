@@ -95,6 +95,51 @@ def test_the_jump_is_of_the_first_seconds_only():
     assert later == pytest.approx(early)
 
 
+def gapped(yaws_deg: list[float], seconds: float, gap_s: float) -> SampleBlock:
+    """Samples at rest at these headings for some seconds each, with a gap before every one."""
+    parts = []
+    for k, yaw in enumerate(yaws_deg):
+        part = circle(seconds, 0.0, start_s=100.0 + k * (seconds + gap_s))
+        R_nb = so3.exp(np.array([[0.0, 0.0, np.radians(yaw)]]))[0]
+        raw = np.tile(FIELD_N @ R_nb + RIGHT.offset, (len(part), 1))
+        parts.append(replace(part, raw_b_gauss=raw))
+    names = ("time_s", "dt_s", "host_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2")
+    return SampleBlock(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+def jump_deg(yaw_deg: float) -> float:
+    """Of one heading: with the right registers and with the factory's."""
+    x, y = 0.24 * np.cos(np.radians(yaw_deg)), -0.24 * np.sin(np.radians(yaw_deg))
+    old_deg = np.degrees(np.arctan2(-(y - 0.03), x + 0.05))
+    return float((yaw_deg - old_deg + 180.0) % 360.0 - 180.0)
+
+
+@pytest.mark.parametrize("rows", [5, 40, 10_000])
+def test_a_gap_and_a_late_reader_are_no_jump_of_the_heading(rows):
+    """However the samples are cut into blocks: over a turn the mean field is none of the vehicle's.
+
+    Four headings a quarter turn apart: their mean field has the hard iron alone left, of which the
+    old registers make a heading that is anything.
+    """
+    yaws = [0.0, 90.0, 180.0, 270.0]
+    block = gapped(yaws, 0.5, 8.0)
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    for piece in pieces(block, rows):
+        metrics = trial.take(piece)
+    expected = float(np.mean([jump_deg(yaw) for yaw in yaws]))
+    assert metrics.heading_jump_deg == pytest.approx(expected, abs=0.05)
+    assert max(abs(jump_deg(yaw)) for yaw in yaws) < 15.0
+
+
+def test_a_gap_behind_the_write_does_not_use_up_the_seconds_of_the_jump():
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    trial.take(circle(0.5, 0.0))  # at rest to the north
+    far = gapped([180.0], 10.0, 0.0)  # and half a minute later to the south
+    metrics = run(trial, far)
+    expected = (0.5 * jump_deg(0.0) + 2.5 * jump_deg(180.0)) / 3.0
+    assert metrics.heading_jump_deg == pytest.approx(expected, abs=0.2)
+
+
 def test_on_its_side_a_vehicle_shows_no_jump_until_it_is_level():
     """There the hard iron of z turns the heading too, and only for level was the jump predicted."""
     level = circle(5.0, 0.0)

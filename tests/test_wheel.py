@@ -53,6 +53,14 @@ def test_the_command_is_there(wheel):
     assert "ahrsd = ahrsd.__main__:main" in entry
 
 
+def test_the_licence_is_in_it_and_named(wheel):
+    metadata = wheel.read("ahrsd-0.1.0.dist-info/METADATA").decode()
+    assert "\nLicense-Expression: MIT\n" in metadata
+    licence = wheel.read("ahrsd-0.1.0.dist-info/licenses/LICENSE").decode()
+    assert licence == (PROJECT / "LICENSE").read_text()
+    assert "the ahrsd developers" in licence
+
+
 def test_the_unit_starts_the_command_and_knows_its_exit_codes():
     unit = (PROJECT / "systemd" / "ahrsd.service").read_text()
     assert "ExecStart=/opt/ahrsd/bin/ahrsd -v run --wait --config /etc/ahrsd.toml" in unit

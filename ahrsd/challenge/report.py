@@ -46,6 +46,9 @@ def _facts(head: dict[str, Any]) -> str:
     return (
         f"Key sealed as {head['sha256_of_salt_and_key']}, opened {head['opened_utc']}, when the "
         "answers of all tools below were closed. Intervals are 95 % (Wilson)."
+        + "".join(
+            f" {tool} is not scored: {why}." for tool, why in head.get("not_scored", {}).items()
+        )
     )
 
 

@@ -5,12 +5,14 @@
     ruptures   change points (PELT) of the one-step residuals
 
 `python -m ahrsd.challenge.rivals TOOL CASE --spec FILE --json FILE`; each answers in the form of
-`ahrsd diagnose --json`, with a name for every effect that keeps a coefficient.
+`ahrsd diagnose --json`, with a name for every effect that keeps a coefficient. `TOOL --check` does
+nothing but load the rival's package.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
 import warnings
@@ -117,6 +119,24 @@ _TOOLS: dict[str, Callable[[Regression], Json]] = {
 }
 
 
+_MODULES = {"stlsq": "pysindy", "lasso-bic": "sklearn", "ruptures": "ruptures"}
+
+
+def _missing(tool: str, error: ImportError) -> AhrsdError:
+    name = error.name or _MODULES[tool]
+    return AhrsdError(f"{tool} needs {name}; install the group: pip install 'ahrsd[rivals]'")
+
+
+def check(tool: str) -> None:
+    """Load the rival's package.  AhrsdError where it is not installed."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            importlib.import_module(_MODULES[tool])
+    except ImportError as error:
+        raise _missing(tool, error) from error
+
+
 def answer(tool: str, case: Path) -> Json:
     """A rival's answer.  AhrsdError where the recording or the rival's package will not do."""
     table = read_table(case, check_units=False)
@@ -131,20 +151,24 @@ def answer(tool: str, case: Path) -> Json:
             warnings.simplefilter("ignore")
             return _TOOLS[tool](regression(table, estimate))
     except ImportError as error:
-        raise AhrsdError(
-            f"{tool} needs {error.name}; install the group: pip install 'ahrsd[rivals]'"
-        ) from error
+        raise _missing(tool, error) from error
 
 
 def main(arguments: list[str] | None = None) -> None:
     """The program."""
     parser = argparse.ArgumentParser(prog="ahrsd.challenge.rivals", description=__doc__)
     parser.add_argument("tool", choices=sorted(_TOOLS))
-    parser.add_argument("case", type=Path)
+    parser.add_argument("case", type=Path, nargs="?")
+    parser.add_argument("--check", action="store_true", help="only: is its package installed?")
     parser.add_argument("--spec", type=Path, help="not used: the rivals know of no noise")
-    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--json", type=Path)
     asked = parser.parse_args(arguments)
+    if not asked.check and None in (asked.case, asked.json):
+        parser.error("a case and --json are needed")
     try:
+        if asked.check:
+            check(asked.tool)
+            return
         said = answer(asked.tool, asked.case)
         asked.json.write_text(json.dumps(said, allow_nan=False), encoding="utf-8")
     except (AhrsdError, OSError) as error:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -15,12 +17,22 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from ahrsd.challenge.sealing import Json, Round, close_answers, refuse_opened, write_object
+from ahrsd.challenge.sealing import (
+    Json,
+    Round,
+    close_answers,
+    read_object,
+    refuse_opened,
+    write_object,
+)
 from ahrsd.errors import AhrsdError
 
 OURS = "ahrsd"
 RIVALS = ("stlsq", "lasso-bic", "ruptures")
 _TIMEOUT_S = 600.0
+_NOT_FOUND = 127  # the exit code that every shell gives to a program that it cannot start
+#: last words of a tool that lacks a package: of our rivals, and of any program in Python
+_LACKS = re.compile(r"\S+ needs [\w.]+; install |(ModuleNotFoundError|ImportError):")
 
 
 def command_of(tool: str) -> list[str]:
@@ -42,6 +54,38 @@ def command_of(tool: str) -> list[str]:
     return parts
 
 
+def could_not_run(record: Json) -> str | None:
+    """Why the tool did not run at all on a case; None where it did, whatever came of it."""
+    if isinstance(record.get("answer"), dict):
+        return None
+    why = str(record.get("failure") or "")
+    absent = record.get("exit") == _NOT_FOUND or _LACKS.match(why)
+    return (why or f"exit {_NOT_FOUND}") if absent else None
+
+
+def refuse_unable(tool: str) -> None:
+    """AhrsdError, with what to install, for a tool that cannot run here."""
+    command = command_of(tool)
+    if tool in RIVALS:
+        checked = subprocess.run(
+            [sys.executable, "-m", "ahrsd.challenge.rivals", tool, "--check"],
+            check=False,
+            capture_output=True,
+            text=True,
+        )
+        if checked.returncode:
+            words = checked.stderr.strip().splitlines() or [f"exit {checked.returncode}"]
+            raise AhrsdError(f"--tool {tool} cannot run here: {words[-1]}")
+    elif shutil.which(command[0]) is None:
+        raise AhrsdError(
+            f"--tool: there is no program {command[0]} here; install it or give its whole path"
+        )
+
+
+def _is_answered(path: Path) -> bool:
+    return path.exists() and could_not_run(read_object(path)) is None
+
+
 def run(
     trial: Round,
     tool: str,
@@ -53,13 +97,15 @@ def run(
     """Answer every case that has no answer yet, then close the answers; their hash.
 
     name: the folder of the answers, the tool's name if None. A stopped run goes on where it was.
+    AhrsdError for a tool that cannot run, before the first case or as soon as it shows.
     """
     refuse_opened(trial)
     command = command_of(tool)
+    refuse_unable(tool)
     called = name or (tool if tool in (OURS, *RIVALS) else Path(command[0]).name)
     folder = trial.answers(called)
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [case for case in trial.cases if not (folder / f"{case}.json").exists()]
+    missing = [case for case in trial.cases if not _is_answered(folder / f"{case}.json")]
     finished = len(trial.cases) - len(missing)
     if done is not None:
         done(finished, len(trial.cases))
@@ -67,7 +113,10 @@ def run(
         waiting = {pool.submit(_answer, trial, case, command): case for case in missing}
         try:
             for future in as_completed(waiting):
-                write_object(folder / f"{waiting[future]}.json", future.result())
+                record = future.result()
+                if why := could_not_run(record):
+                    raise AhrsdError(f"{called} cannot run here: {why}; no answers were closed")
+                write_object(folder / f"{waiting[future]}.json", record)
                 finished += 1
                 if done is not None:
                     done(finished, len(trial.cases))
@@ -119,7 +168,7 @@ def _timed(command: list[str], errors: Path) -> _Ended:
                 env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
             )
     except OSError as error:
-        return _Ended(127, str(error), 0.0, 0.0)
+        return _Ended(_NOT_FOUND, str(error), 0.0, 0.0)
     limit = threading.Timer(_TIMEOUT_S, process.kill)
     limit.start()
     _, status, used = os.wait4(process.pid, 0)

@@ -9,7 +9,7 @@ from typing import Any
 from ahrsd.challenge.answers import Answer, read_answer
 from ahrsd.challenge.judge import ORDER, Verdict, judge
 from ahrsd.challenge.report import html, markdown
-from ahrsd.challenge.running import OURS
+from ahrsd.challenge.running import OURS, could_not_run
 from ahrsd.challenge.scores import Score, error_rate, scores
 from ahrsd.challenge.sealing import Json, Round, open_key, read_object, write_object
 from ahrsd.errors import AhrsdError
@@ -25,14 +25,31 @@ class Result:
     mistakes: Score
 
 
+def unable(trial: Round) -> dict[str, str]:
+    """Tools that could not run, and why: theirs are no answers, so they are not scored."""
+    found: dict[str, str] = {}
+    for tool in trial.tools():
+        folder = trial.answers(tool)
+        whys = [could_not_run(read_object(folder / f"{case}.json")) for case in trial.cases]
+        if lacking := [why for why in whys if why]:
+            found[tool] = f"it could not run on {len(lacking)} of {len(whys)} cases: {lacking[0]}"
+    return found
+
+
 def score(trial: Round, key_path: Path, output: Path) -> list[Result]:
     """Open the key, judge all tools, write score.json, report.md and report.html into `output`.
 
-    AhrsdError where seals are broken or nobody has answered.
+    A tool that could not run is not judged. AhrsdError where seals are broken or nobody answered.
     """
-    tools = sorted(trial.tools(), key=lambda tool: (tool != OURS, tool))
+    left_out = unable(trial)
+    tools = sorted(set(trial.tools()) - set(left_out), key=lambda tool: (tool != OURS, tool))
     if not tools:
-        raise AhrsdError(f"{trial.folder}: no finished answers; `ahrsd challenge run` first")
+        raise AhrsdError(
+            "\n".join(
+                [f"{tool}: not scored: {why}" for tool, why in left_out.items()]
+                + [f"{trial.folder}: no finished answers; `ahrsd challenge run` first"]
+            )
+        )
     key = open_key(trial, key_path, tools)
     results = [_result(tool, key["cases"], _answers(trial, tool)) for tool in tools]
     output.mkdir(parents=True, exist_ok=True)
@@ -44,6 +61,7 @@ def score(trial: Round, key_path: Path, output: Path) -> list[Result]:
         "sha256_of_salt_and_key": trial.sha256,
         "opened_utc": opened.get("opened_utc"),
         "answers_sha256": opened.get("answers"),
+        "not_scored": left_out,
     }
     write_object(output / "score.json", head | {"tools": [_json(result) for result in results]})
     for name, text in (

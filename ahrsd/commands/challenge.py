@@ -73,7 +73,10 @@ def make_command(
 @click.option("--name", help="Name of the answers' folder; the tool's if left out.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
 def run_command(folder: Path, tool: str, name: str | None, jobs: int) -> None:
-    """Let a tool answer every case in FOLDER, then close its answers; goes on where it stopped."""
+    """Let a tool answer every case in FOLDER, then close its answers; goes on where it stopped.
+
+    A tool that cannot run, for want of a package or a program, is refused before the first case.
+    """
     from ahrsd.challenge.running import run
     from ahrsd.challenge.sealing import open_round
 
@@ -92,14 +95,18 @@ def score_command(folder: Path, key_path: Path, output: Path | None) -> None:
 
     Writes score.json, report.md and report.html; exit 1 where the first tool missed a wanted score.
     """
-    from ahrsd.challenge.scoring import score
+    from ahrsd.challenge.scoring import score, unable
     from ahrsd.challenge.sealing import open_round
 
-    results = score(open_round(folder), key_path, output or folder)
+    trial = open_round(folder)
+    results = score(trial, key_path, output or folder)
+    for tool, why in unable(trial).items():
+        click.echo(f"{tool}: not scored: {why}", err=True)
     for result in results:
         rate = result.mistakes
         if rate.value is not None:
-            click.echo(f"{result.tool}: {rate.value:.1%} mistakes in {rate.cases} cases")
+            cases = "1 case" if rate.cases == 1 else f"{rate.cases} cases"
+            click.echo(f"{result.tool}: {rate.value:.1%} mistakes in {cases}")
     for row in results[0].scores:
         value = "" if row.value is None else f"{row.value:.3f}"
         met = {None: "", True: "met", False: "NOT MET"}[row.met]

@@ -1,6 +1,7 @@
 """Make, run and score with a tool that knows nothing, and what happens to whoever cheats."""
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -153,6 +154,87 @@ def test_the_same_key_under_another_salt_has_another_hash(sealed):
     assert sealing.key_sha256(key) != sealing.key_sha256(key | {"salt": "00" * 32})
 
 
+@pytest.fixture
+def without_pysindy(tmp_path, monkeypatch):
+    """Processes that are started find no pysindy, as on a machine where it is not installed."""
+    shadow = tmp_path / "shadow"
+    shadow.mkdir()
+    (shadow / "pysindy.py").write_text(
+        "raise ModuleNotFoundError(\"No module named 'pysindy'\", name='pysindy')\n"
+    )
+    before = os.environ.get("PYTHONPATH")
+    here = str(Path(__file__).parents[2])  # of the source tree that is tested
+    paths = [str(shadow), here, *([before] if before else [])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+
+
+def test_a_rival_without_its_package_is_refused_before_the_first_case(sealed, without_pysindy):
+    trial, _, _ = sealed
+    ran = CliRunner().invoke(command, ["run", str(trial.folder), "--tool", "stlsq"])
+    assert isinstance(ran.exception, AhrsdError)
+    assert ran.exception.exit_code == 2
+    assert str(ran.exception) == (
+        "--tool stlsq cannot run here: stlsq needs pysindy; "
+        "install the group: pip install 'ahrsd[rivals]'"
+    )
+    assert not (trial.folder / "answers").exists()
+
+
+def test_a_program_that_is_not_there_is_refused_before_the_first_case(sealed):
+    trial, _, _ = sealed
+    with pytest.raises(AhrsdError, match=r"no program mytool-of-nobody here; install it"):
+        run(trial, "mytool-of-nobody {case} {json}")
+    assert not (trial.folder / "answers").exists()
+
+
+def test_a_tool_that_lacks_a_package_is_stopped_and_its_answers_are_not_closed(sealed, tmp_path):
+    trial, _, _ = sealed
+    lacking = tmp_path / "lacking.py"
+    lacking.write_text("import a_package_of_nobody")
+    with pytest.raises(AhrsdError, match=r"mine cannot run here: ModuleNotFoundError: No module"):
+        run(trial, f"{sys.executable} {lacking} {{case}} {{json}}", name="mine")
+    assert trial.tools() == []
+    assert list(trial.answers("mine").iterdir()) == []
+
+
+def test_answers_of_a_tool_that_could_not_run_are_never_scored(sealed, tmp_path):
+    """As earlier versions left them: closed, every case with what the rival lacks."""
+    trial, key_path, tool = sealed
+    run(trial, tool, name="fake")
+    folder = trial.answers("stlsq")
+    folder.mkdir()
+    lacks = "stlsq needs pysindy; install the group: pip install 'ahrsd[rivals]'"
+    for name in trial.cases:
+        sealing.write_object(
+            folder / f"{name}.json", {"case": name, "exit": 2, "failure": lacks, "answer": None}
+        )
+    sealing.close_answers(trial, "stlsq")
+    asked = ["score", str(trial.folder), "--key", str(key_path), "-o", str(tmp_path / "out")]
+    scored = CliRunner().invoke(command, asked)
+    assert scored.exit_code == 1, scored.output  # fake missed a wanted score
+    assert f"stlsq: not scored: it could not run on 3 of 3 cases: {lacks}\n" in scored.stderr
+    assert "stlsq" not in scored.stdout
+    written = json.loads((tmp_path / "out" / "score.json").read_text())
+    assert [one["tool"] for one in written["tools"]] == ["fake"]
+    assert written["not_scored"] == {"stlsq": f"it could not run on 3 of 3 cases: {lacks}"}
+    assert "stlsq is not scored" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_nobody_who_could_run_is_no_round_to_score(sealed, tmp_path):
+    trial, key_path, _ = sealed
+    folder = trial.answers("stlsq")
+    folder.mkdir(parents=True)
+    for name in trial.cases:
+        record = {"case": name, "exit": 127, "failure": "No such file", "answer": None}
+        sealing.write_object(folder / f"{name}.json", record)
+    sealing.close_answers(trial, "stlsq")
+    with pytest.raises(AhrsdError, match="stlsq: not scored"):
+        score(trial, key_path, tmp_path)
+    assert trial.opened is None  # the key was not read: the tool may be run again
+    run(trial, f"{sys.executable} {tmp_path / 'fake.py'} {{case}} {{spec}} {{json}}", name="stlsq")
+    assert score(trial, key_path, tmp_path)[0].tool == "stlsq"
+
+
 @pytest.mark.parametrize("tool", ["gradient-boosting", "mytool {case}"])
 def test_an_unknown_tool_is_one_line(tool):
     with pytest.raises(AhrsdError, match=r"no tool .*ahrsd, stlsq, lasso-bic, ruptures"):
@@ -200,7 +282,7 @@ def test_the_command_makes_runs_and_scores(tmp_path):
     assert ran.exit_code == 0, ran.output
     scored = CliRunner().invoke(command, ["score", str(folder), "--key", str(key_path)])
     assert scored.exit_code == 0, scored.output
-    assert "q: 0.0% mistakes in 1 cases" in scored.output
+    assert "q: 0.0% mistakes in 1 case\n" in scored.output
     assert Path(folder / "report.html").is_file()
 
 

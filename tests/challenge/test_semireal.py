@@ -141,9 +141,7 @@ _CIRCLES = next(base for base in bases.BASES if "circles_2022" in base.file)
 
 
 @pytest.fixture
-def variant():
-    if not RECORDINGS.is_dir():
-        pytest.skip("no real recordings beside the project")
+def variant(recordings):
     return bases.Variant(_CIRCLES, 1, 77)
 
 

@@ -73,6 +73,7 @@ def test_an_error_of_the_gyro_stays_one() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.recordings
 def test_a_magnet_that_stands_in_the_room_is_an_unknown_of_the_world() -> None:
     found = diagnose(recorded("broad/28_disturbed_stationary_magnet_A"))
     assert [one.effect for one in found.findings] == ["mag_time_lag"]

@@ -54,6 +54,7 @@ def test_a_field_in_no_unit(track: Track) -> None:
      "broad/36_disturbed_attached_magnet_5cm", "arducopter/log171_MAG2_10hz",
      "vn100/drive_2022_rahul", "vn100/walk_square_2024_sazgar"],
 )  # fmt: skip
+@pytest.mark.recordings
 def test_nothing_is_said_of_sensors_that_work(name: str) -> None:
     real = recorded(name)
     assert dead(real) is None

@@ -268,6 +268,7 @@ def test_rotations_are_carried_along():
     "name",
     ["01_undisturbed_slow_rotation_A", "02_undisturbed_slow_rotation_B"],
 )
+@pytest.mark.recordings
 def test_real_motion_is_silent_and_an_injected_step_is_told(name):
     path = RECORDINGS / "broad" / f"{name}.csv.gz"
     if not path.exists():

@@ -20,9 +20,7 @@ RECORDINGS = Path(__file__).parents[2] / ".." / "shared" / "recordings"
 #: of an independent regression against the external compass, mG/A
 CURRENT = np.array([-2.95, -5.18, 3.20]) * 1e-3
 
-pytestmark = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason="the real recordings are not here (../shared/recordings)"
-)
+pytestmark = pytest.mark.recordings
 
 
 def track_of(name: str) -> Track:

@@ -52,6 +52,7 @@ def test_smooth_motion_is_not_shaken(scenario: str, rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["broad/01_undisturbed_slow_rotation_A", "vn100/drive_2022_rahul"])
+@pytest.mark.recordings
 def test_real_motion_is_shaken(name: str) -> None:
     assert shaken(recorded(name))
 

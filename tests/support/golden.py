@@ -4,10 +4,10 @@
     python tests/support/golden.py --streams   every stream anew, too
 
 A stream is made once, in virtual time; `STREAMS` says how. `fixtures/replays/golden.toml` has, for
-each, counts, the gates that are red at the end, the estimate, and the hash of all decisions. Hashes
-are of one arithmetic: libraries and processors differ in the last digit, and a decision that was
-near a limit may fall to the other side. `arithmetic()` names the one on which they were made; on
-another the hash is not compared, everything else is (tests/test_golden.py).
+each, counts, the gates that are red at the end, the estimate, and the hash of all decisions, which
+are the same on every processor (`ahrsd.decisions`). The bytes of a stream are of one arithmetic:
+libraries and processors differ in the last digit of a sine. `arithmetic()` names the one on which
+they were made; on another they are not compared byte by byte (tests/test_golden.py).
 """
 
 from __future__ import annotations

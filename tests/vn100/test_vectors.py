@@ -1,7 +1,7 @@
 """Every wire example, three ways: whole, byte by byte, cut at random; with noise around it.
 
-The examples are those of fixtures/vn100/manual_examples.toml, and the reference's own file where it
-is there. Both have the device's bytes, so a mistake shared by encoder and decoder is caught.
+The examples are those of fixtures/vn100: manual_examples.toml, and wire_examples.json, which names its
+sources. Both have the device's bytes, so a mistake shared by encoder and decoder is caught.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from drivers.vn100.deframer import Cause, Deframer, Packet, Sentence
 
 PROJECT = Path(__file__).parent.parent.parent
 OWN = PROJECT / "fixtures" / "vn100" / "manual_examples.toml"
-REFERENCE = PROJECT.parent / "shared" / "reference" / "vn100-vectors.json"
+WIRE = PROJECT / "fixtures" / "vn100" / "wire_examples.json"
 
 Case = dict[str, Any]
 
@@ -41,13 +41,8 @@ def load() -> list[Any]:
         cases = [
             pytest.param(case, id=f"own-{case['name']}") for case in tomllib.load(file)["case"]
         ]
-    if REFERENCE.exists():
-        for case in json.loads(REFERENCE.read_text()):
-            cases.append(pytest.param(case, id=case["name"]))
-    else:
-        why = "the reference's examples (../shared/reference/vn100-vectors.json) are not here"
-        cases.append(pytest.param({}, id="reference", marks=pytest.mark.skip(reason=why)))
-    return cases
+    wire = json.loads(WIRE.read_text())
+    return cases + [pytest.param(case, id=case["name"]) for case in wire]
 
 
 every_case = pytest.mark.parametrize("case", load())
