@@ -22,6 +22,8 @@ _MOST_MISSING = 0.98
 _MOST_HOLES = 0.5  # of the rows: with more holes than values a column says too little
 _LONG_ON_ROWS = 4  # a 0/1 column that stays on longer is a switch, else a train of pulses
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
+# an attitude measured by others: the motion, and the cause of nothing that is read
+_REFERENCE = re.compile(r"^ref_q[wxyz]$")
 # what the sensor itself makes of the same readings: it moves with every error and causes none
 _OWN_OUTPUT = re.compile(
     r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|uncomp|delta_|lin_?acc|(mag|gyro|accel)_(?!temp)"
@@ -160,12 +162,13 @@ def prepared(track: Track) -> tuple[Track, tuple[str, ...]]:
     """The track with usable covariates only, short holes filled, and a sentence per refusal.
 
     Columns without a role are kept where they are complete: they serve to look for courses; not
-    so the sensor's own outputs, which are made of the readings that are being explained.
+    so the sensor's own outputs, which are made of the readings that are being explained, and a
+    reference attitude: that it is there must not change what is said of the sensor.
     """
     kept: dict[str, Array] = {}
     notes: list[str] = []
     for name, values in track.covariates.items():
-        if _OWN_OUTPUT.match(name.lower()):
+        if _OWN_OUTPUT.match(name.lower()) or _REFERENCE.match(name.lower()):
             continue
         filled, note = _filled(name, values, track.time_s)
         note = note or fault(name, filled)

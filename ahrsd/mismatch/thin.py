@@ -22,7 +22,6 @@ from ahrsd.samples import Array
 #: rows per second that a search works with, and what is enough where a group of samples hardly
 #: turns, root mean square
 WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
-_ATTITUDE = "ref_q"
 
 
 def thin_factor(track: Track, wanted_hz: float) -> int:
@@ -96,8 +95,7 @@ def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str
     if track.lost_turns is not None:
         out["unseen"] = np.concatenate([[0.0], track.lost_turns[rows][shifted].sum(axis=1)])
     for name, values in track.covariates.items():
-        turns = name.startswith(_ATTITUDE)
-        out[name] = _about_middle(values[rows], m) if turns else values[rows].reshape(-1, m).mean(1)
+        out[name] = values[rows].reshape(-1, m).mean(1)
     return out
 
 
