@@ -225,11 +225,12 @@ def borne_out(
 ) -> Unexplained:
     """What is left, if anything besides its own likelihood says that it is there.
 
-    Drawn freely it gains where nothing was fitted, or simulations of the model do not look like the
-    recording.  Else nothing is left: a model that predicts as well and whose simulations look the
+    Drawn freely it gains where nothing was fitted, more than the same course at another time does,
+    or simulations of the model do not look like the recording.  Else nothing is left: a model that predicts as well and whose simulations look the
     same is not wrong in a way that anybody could use.
     """
-    gains = left.heldout is not None and left.heldout.nll_gain_per_sample > 0.0
+    held = left.heldout
+    gains = held is not None and held.nll_gain_per_sample > max(0.0, held.placebo_gain)
     fails = not all(one.inside_after for one in checks.values())
     uneven = any(one.p_after < UNEVEN_P for one in whiteness.values())
     return left if gains or fails or uneven else Unexplained(False)
