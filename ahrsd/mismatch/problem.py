@@ -69,9 +69,7 @@ class Problem:
 
     def beside(self, riding: Array, model: NullModel) -> Problem:
         """The same, what rides with the sensor beyond the model's hard iron told of."""
-        cold = replace(
-            self.cold, hard_iron_gauss=model.hard_iron_gauss, soft_iron=model.soft_iron
-        )
+        cold = replace(self.cold, hard_iron_gauss=model.hard_iron_gauss, soft_iron=model.soft_iron)
         return replace(self, riding=riding, cold=cold).lagging(self.lag_s)
 
 

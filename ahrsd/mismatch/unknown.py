@@ -226,8 +226,9 @@ def borne_out(
     """What is left, if anything besides its own likelihood says that it is there.
 
     Drawn freely it gains where nothing was fitted, more than the same course at another time does,
-    or simulations of the model do not look like the recording.  Else nothing is left: a model that predicts as well and whose simulations look the
-    same is not wrong in a way that anybody could use.
+    or simulations of the model do not look like the recording.  Else nothing is left: a model that
+    predicts as well and whose simulations look the same is not wrong in a way that anybody could
+    use.
     """
     held = left.heldout
     gains = held is not None and held.nll_gain_per_sample > max(0.0, held.placebo_gain)
