@@ -21,6 +21,7 @@ from ahrsd.mismatch.effects.shapes import on_axes
 from ahrsd.mismatch.gram import solve
 from ahrsd.mismatch.locate import Located
 from ahrsd.mismatch.regression import Base, quieter, without_known
+from ahrsd.mismatch.shown import shown
 from ahrsd.mismatch.track import Track
 from ahrsd.mismatch.values import Columns
 from ahrsd.samples import Array
@@ -57,7 +58,7 @@ class Late:
     def words(self) -> str:
         """Which column, by how much."""
         way = "late" if self.lag_s > 0 else "early"
-        text = f"column {self.column} runs {abs(self.lag_s):.3g} s {way} against the sensor"
+        text = f"column {shown(self.column)} runs {abs(self.lag_s):.3g} s {way} against the sensor"
         if self.drift:
             text += f" halfway, and its clock drifts by {100 * abs(self.drift):.2g} %"
         return text

@@ -4,8 +4,9 @@ Attitude: the gyro's integral U (body to a carried frame, `Filtered.orientation`
 fixed in the world stands still in the carried frame but for that drift: the field and, on average,
 the specific force.  Smoothed there over DRIFT_S both ways, they give the carried frame's attitude:
 down from the accelerometer, magnetic north from the field.  Without an accelerometer only the
-drift that turns the field is taken out.  A reference attitude (`ref_qw` ... `ref_qz`) is used as
-it is, turned so that down is +z.
+drift that turns the field is taken out.  A reference attitude (`ref_qw` ... `ref_qz`) is not asked:
+the filter turns its field by the gyro, and by another attitude a field that stays in the world
+would turn against the filter's own by all of the gyro's noise, which is in the innovations too.
 
 Rates in regressors: the raw rate shares its noise with the innovation (errors in variables), so
 everything here is made of rates smoothed without phase.  The bandwidth is the recording's own: up
@@ -27,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from ahrsd import so3
 from ahrsd.mismatch.innovation import Bearings, Filtered
 from ahrsd.mismatch.recursive import both_ways, gaussian
 from ahrsd.mismatch.specific_force import without_noise
@@ -40,7 +40,6 @@ SINK = 4.0
 #: chance with which noise alone may stand above the floor at one frequency
 BY_CHANCE = 1e-5
 _SLOWEST_HZ = 0.5  # the smoothing is never longer than about a second
-_REFERENCE = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
 
 
 class Fit(Protocol):
@@ -193,9 +192,6 @@ def attitude(track: Track, done: Filtered | Bearings) -> tuple[Array, bool]:
     accel = track.accel_b_m_s2
     if accel is not None and not np.isfinite(accel).all():
         accel = None
-    reference = _reference(track, accel)
-    if reference is not None:
-        return reference, True
     U = done.orientation
     runs = track.runs or (slice(0, len(track)),)
     width = DRIFT_S / track.step_s
@@ -205,28 +201,6 @@ def attitude(track: Track, done: Filtered | Bearings) -> tuple[Array, bool]:
     down = _unit(_carried(U, -accel, runs, width))
     east = _unit(np.cross(down, field))
     return np.stack([np.cross(east, down), east, down], axis=1) @ U, True
-
-
-def _reference(track: Track, accel: Array | None) -> Array | None:
-    if not all(name in track.covariates for name in _REFERENCE):
-        return None
-    q = np.column_stack([track.covariates[name] for name in _REFERENCE])
-    if not np.isfinite(q).all() or np.any(np.linalg.norm(q, axis=1) < 0.5):
-        return None
-    R_wb = _rotations(q)
-    if accel is None:
-        return None
-    up = np.einsum("nij,nj->ni", R_wb, accel).mean(axis=0)
-    if up[2] > 0.8 * np.linalg.norm(up):  # the world's z is up: half a turn about x
-        return np.asarray(np.diag([1.0, -1.0, -1.0]) @ R_wb)
-    return R_wb if up[2] < -0.8 * np.linalg.norm(up) else None
-
-
-def _rotations(q: Array) -> Array:
-    """(N, 3, 3) of quaternions (N, 4), scalar first, of any length."""
-    w, v = q[:, :1, None], q[:, 1:]
-    K = so3.skew(v)
-    return np.asarray(np.eye(3) + 2.0 * (w * K + K @ K) / np.sum(q**2, axis=1)[:, None, None])
 
 
 def _carried(U: Array, vectors: Array, runs: Sequence[slice], width: float) -> Array:

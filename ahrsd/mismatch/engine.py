@@ -209,6 +209,8 @@ def _told(
     if not (found or left.detected) and done.alone is not None:
         done = replace(done, left=with_free_course(state, done.alone))
         left = unknown.described(done.left, problem, limits.alone())
+    checked, white = _checked(done, fast, terms, library, (*facts, *noise)), _whiteness(done)
+    left = unknown.borne_out(left, checked, white)
     something = bool(found) or left.detected
     steps = rounding(facts)
     lesser = (fact.words for fact in facts if not matters(fact))
@@ -216,10 +218,10 @@ def _told(
         recording=recording,
         baseline=_baseline(done.start),
         mismatch=something,
-        p_value=min(_p_value(seen, found, done.left), float(np.exp(-left.evidence_nats))),
+        p_value=_p_value(seen, found, done.left, left),
         findings=found,
         unexplained=left,
-        posterior_predictive=_checked(done, fast, terms, library, (*facts, *noise)),
+        posterior_predictive=checked,
         sensitivity=() if something else would_show(problem, basis, done.first, fast),
         notes=(*notes, *lesser, *(() if something else would_have_shown(problem.recorded))),
         model=model_at_rate(state.fit.model, problem),
@@ -228,7 +230,7 @@ def _told(
         ),
         terms=(*terms, *steps),
         drawn=drawn(done.start, state, fast, done.first, done.left.courses),
-        omnibus=_whiteness(done),
+        omnibus=white,
         validation=validation(state, named, left),
         regime_map=regime_map(State(state.problem, done.start), state),
     )
@@ -374,9 +376,17 @@ def _baseline(start: NullFit) -> Baseline:
     )
 
 
-def _p_value(named: Sequence[Judged], found: tuple[Finding, ...], left: unknown.Remainder) -> float:
-    """The smallest family-wise probability of what is found, or of what was looked at in vain."""
+def _p_value(
+    named: Sequence[Judged],
+    found: tuple[Finding, ...],
+    seen: unknown.Remainder,
+    left: Unexplained,
+) -> float:
+    """The smallest family-wise probability of what is told, or of what was looked at in vain."""
     counted = [0.0] if len(found) > len(named) else []
-    frames = [min(1.0, 3.0 * one.p_value) for one in left.located.values()]
-    bins = [min(1.0, len(left.bins) * p) for _, _, p in left.bins]
-    return float(min([1.0, *(judged.family_p for judged in named), *counted, *frames, *bins]))
+    told = [judged.family_p for judged in named]
+    frames = [min(1.0, 3.0 * one.p_value) for one in seen.located.values()]
+    bins = [min(1.0, len(seen.bins) * p) for _, _, p in seen.bins]
+    if not left.detected:  # what nothing else bears out is no evidence of a mismatch either
+        return float(min([1.0, *told, *counted]))
+    return float(min([1.0, *told, *counted, *frames, *bins, np.exp(-left.evidence_nats)]))

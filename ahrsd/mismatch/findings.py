@@ -31,6 +31,7 @@ from ahrsd.mismatch.search import (
     term_group,
 )
 from ahrsd.mismatch.settings import scale_of, scaled
+from ahrsd.mismatch.shown import shown
 from ahrsd.mismatch.unknown import AXES, innovation_rms
 from ahrsd.mismatch.validate import Gain, alternating, heading_error_deg, heldout
 from ahrsd.mismatch.values import NullModel, Term
@@ -378,5 +379,6 @@ def _regime(judged: Judged, basis: Base, added: Array) -> str | None:
     strong = values[size >= np.median(size)]
     low, high = float(np.min(strong)), float(np.max(strong))
     if low > float(np.median(values)) * 0.9:
-        return f"{name} > {low:.3g}"
-    return f"{name} < {high:.3g}" if high < float(np.median(values)) else f"follows {name}"
+        return f"{shown(str(name))} > {low:.3g}"
+    below = high < float(np.median(values))
+    return f"{shown(str(name))} < {high:.3g}" if below else f"follows {shown(str(name))}"

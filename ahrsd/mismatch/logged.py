@@ -24,6 +24,7 @@ from ahrsd.mismatch.logger_noise import cleaned
 from ahrsd.mismatch.null import fit_null
 from ahrsd.mismatch.problem import problem_of
 from ahrsd.mismatch.search import State, formed_basis_of
+from ahrsd.mismatch.shown import shown
 from ahrsd.mismatch.track import Spec, Track
 
 #: of the unknown that may be left when a column is at its true time, or without its noise
@@ -68,11 +69,11 @@ def _straight(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
     again = _as_logged(drawn_between(track, seldom), spec, recording)
     used = [one for one in seldom if one.name in causes(again)]
     if used and _gain(again) > _gain(found):
-        words = ", ".join(f"{one.name} ({one.often})" for one in used)
+        words = ", ".join(f"{shown(one.name)} ({one.often})" for one in used)
         said = f"logged more seldom than the sensor and drawn straight between its values: {words}"
         return replace(again, notes=(said, *again.notes))
     near = by | {one.channel for one in found.unexplained.follows}
-    late = ", ".join(f"{one.name} ({one.often})" for one in seldom if one.name in near)
+    late = ", ".join(f"{shown(one.name)} ({one.often})" for one in seldom if one.name in near)
     if not late or not found.unexplained.detected:
         return found
     said = f"logged more seldom than the sensor: {late}; what is quicker cannot be told by it"
@@ -98,7 +99,8 @@ def _as_logged(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
     if not (_names(again) == _names(found) and _less(again, found)):
         return found
     own = [name for name in by if clean.covariates[name] is not usable.covariates[name]]
-    said = f"column {', '.join(own)} has noise of its own: what follows it is judged without it"
+    names = ", ".join(map(shown, own))
+    said = f"column {names} has noise of its own: what follows it is judged without it"
     return replace(again, notes=(said, *again.notes))
 
 

@@ -16,6 +16,7 @@ from ahrsd.mismatch.shaken import quieter
 from ahrsd.mismatch.thin import thinned, working_factor
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.mismatch.values import NullModel
+from ahrsd.samples import Array
 
 BLOCKS = 80
 BLOCK_S = (2.0, 10.0)
@@ -32,6 +33,7 @@ class Problem:
 
     recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
     lag_s:    lag of the magnetometer that is already taken out of the track
+    riding:   (recorded rows, 3) gauss of named terms that ride with the sensor, None for none
     averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
               is read more seldom than the gyro
     notes:    what a person should know of how the rates were read
@@ -47,6 +49,7 @@ class Problem:
     lag_s: float = 0.0
     averaged: float = 1.0
     notes: tuple[str, ...] = ()
+    riding: Array | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -60,8 +63,14 @@ class Problem:
 
     def lagging(self, lag_s: float) -> Problem:
         """The same with a lag of the magnetometer taken out."""
-        track = thinned(delayed_gyro(self.recorded, lag_s), self.thin, self.cold)
+        delayed = delayed_gyro(self.recorded, lag_s)
+        track = thinned(delayed, self.thin, self.cold, self.riding)
         return replace(self, track=track, lag_s=lag_s)
+
+    def beside(self, riding: Array, model: NullModel) -> Problem:
+        """The same, what rides with the sensor beyond the model's hard iron told of."""
+        cold = replace(self.cold, hard_iron_gauss=model.hard_iron_gauss, soft_iron=model.soft_iron)
+        return replace(self, riding=riding, cold=cold).lagging(self.lag_s)
 
 
 def problem_of(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.mismatch.shown import shown
 from ahrsd.mismatch.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -41,7 +42,7 @@ class Regime:
         parts = [
             f"{self.edges[a]:.3g} to {self.edges[b]:.3g}" for a, b in zip(starts, ends, strict=True)
         ]
-        return f"{self.quantity} {', '.join(parts)}" if parts else ""
+        return f"{shown(self.quantity)} {', '.join(parts)}" if parts else ""
 
 
 def regimes(context: Context) -> tuple[Regime, ...]:

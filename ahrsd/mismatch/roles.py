@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.mismatch.shown import shown
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
@@ -22,6 +23,8 @@ _MOST_MISSING = 0.98
 _MOST_HOLES = 0.5  # of the rows: with more holes than values a column says too little
 _LONG_ON_ROWS = 4  # a 0/1 column that stays on longer is a switch, else a train of pulses
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
+# an attitude measured by others: the motion, and the cause of nothing that is read
+_REFERENCE = re.compile(r"^ref_q[wxyz]$")
 # what the sensor itself makes of the same readings: it moves with every error and causes none
 _OWN_OUTPUT = re.compile(
     r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|uncomp|delta_|lin_?acc|(mag|gyro|accel)_(?!temp)"
@@ -142,17 +145,17 @@ def fault(name: str, values: Array) -> str:
     row = ROLES[role]
     missing = np.count_nonzero(~np.isfinite(values))
     if missing:
-        return f"column {name} was left out: {missing} of {len(values)} values are missing"
+        return f"column {shown(name)} was left out: {missing} of {len(values)} values are missing"
     low, high = float(np.min(values)), float(np.max(values))
     if low < row.limits[0] or high > row.limits[1]:
         return (
-            f"column {name} was left out: {low:g} to {high:g} is no {row.words}; it looks like "
-            f"{row.beyond}"
+            f"column {shown(name)} was left out: {low:g} to {high:g} is no {row.words}; it looks "
+            f"like {row.beyond}"
         )
     if role == "angle" and name.endswith("_rad") and high - low > 50.0:
-        return f"column {name} was left out: {low:g} to {high:g} rad looks like degrees"
+        return f"column {shown(name)} was left out: {low:g} to {high:g} rad looks like degrees"
     if not row.constant and high - low <= 1e-9 * max(abs(low), abs(high), 1e-9):
-        return f"column {name} was left out: it is {low:g} throughout, so nothing follows it"
+        return f"column {shown(name)} was left out: it is {low:g} throughout, so nothing follows it"
     return ""
 
 
@@ -160,12 +163,13 @@ def prepared(track: Track) -> tuple[Track, tuple[str, ...]]:
     """The track with usable covariates only, short holes filled, and a sentence per refusal.
 
     Columns without a role are kept where they are complete: they serve to look for courses; not
-    so the sensor's own outputs, which are made of the readings that are being explained.
+    so the sensor's own outputs, which are made of the readings that are being explained, and a
+    reference attitude: that it is there must not change what is said of the sensor.
     """
     kept: dict[str, Array] = {}
     notes: list[str] = []
     for name, values in track.covariates.items():
-        if _OWN_OUTPUT.match(name.lower()):
+        if _OWN_OUTPUT.match(name.lower()) or _REFERENCE.match(name.lower()):
             continue
         filled, note = _filled(name, values, track.time_s)
         note = note or fault(name, filled)
@@ -174,7 +178,9 @@ def prepared(track: Track) -> tuple[Track, tuple[str, ...]]:
         elif np.isfinite(filled).all():
             kept[name] = filled
         else:
-            notes.append(f"column {name} was left out: its values are no numbers to compute with")
+            notes.append(
+                f"column {shown(name)} was left out: its values are no numbers to compute with"
+            )
     return replace(track, covariates=kept), tuple(notes)
 
 
@@ -205,8 +211,9 @@ def holed(track: Track) -> dict[str, Holed]:
             continue
         first = int(np.argmax(missing))
         words = (
-            f"column {name} has no values in {np.count_nonzero(missing) * track.step_s:.1f} s, "
-            f"first at {time_s[first]:.1f} s: readings without it were not used"
+            f"column {shown(name)} has no values in "
+            f"{np.count_nonzero(missing) * track.step_s:.1f} s, first at "
+            f"{time_s[first]:.1f} s: readings without it were not used"
         )
         out[name] = Holed(filled, missing, words)
     return out
@@ -219,14 +226,14 @@ def _filled(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
         return values, ""
     share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
     if share > _MOST_MISSING:
-        return values, f"column {name} was left out: {share:.0%} of its values are missing"
+        return values, f"column {shown(name)} was left out: {share:.0%} of its values are missing"
     known_s = np.concatenate([time_s[:1], time_s[good], time_s[-1:]])
     widest = int(np.argmax(np.diff(known_s)))
     hole_s = float(known_s[widest + 1] - known_s[widest])
     usual_s = float(np.median(np.diff(time_s)))
     if hole_s > _SHORT_GAP_S + usual_s and not _same_hole(time_s, known_s[widest], hole_s):
         return values, (
-            f"column {name} was left out: no values from {known_s[widest]:.1f} to "
+            f"column {shown(name)} was left out: no values from {known_s[widest]:.1f} to "
             f"{known_s[widest + 1]:.1f} s; holes of more than {_SHORT_GAP_S:g} s are not guessed"
         )
     nearest = _longest_on(values[good]) and np.isin(values[good], (0.0, 1.0)).all()

@@ -14,8 +14,10 @@ from functools import partial
 import numpy as np
 
 from ahrsd.mismatch import noise_fit
+from ahrsd.mismatch.context import Given, build_context
 from ahrsd.mismatch.delays import DELAYS, beyond_the_lag, plain
 from ahrsd.mismatch.descent import FittedTerm, NullFit
+from ahrsd.mismatch.innovation import bearings
 from ahrsd.mismatch.late import in_time
 from ahrsd.mismatch.locate import Frame
 from ahrsd.mismatch.memory import with_memory
@@ -168,13 +170,32 @@ def added(state: State, judged: Judged) -> State:
     """The state with one more term, everything fitted together."""
     name = judged.candidate.name
     if name not in DELAYS:
-        return shaped_again(_scaled_again(refitted(state, (*state.named, judged))), newest=False)
+        more = _scaled_again(refitted(state, (*state.named, judged)))
+        return shaped_again(_riding_apart(more), newest=False)
     step_s = float(np.nanmedian(state.problem.track.dt_s)) / 2
     lag_s = DELAYS[name] * float(judged.what.value[0])
     lag_s *= step_s if name == "gyro_integration" else 1.0
     effect = state.problem.library[plain(lag_s)]
     lag = replace(judged, candidate=replace(judged.candidate, effect=effect, setting={}))
     return shaped_again(_lag_taken_out(state, lag, lag_s), newest=False)
+
+
+def _riding_apart(state: State) -> State:
+    """The state with its newest term's field averaged, not turned, in the working rows.
+
+    What rides with the sensor was not known when the readings of a row were turned to its middle.
+    """
+    problem, judged = state.problem, state.named[-1]
+    if problem.thin == 1 or not judged.candidate.effect.rides:
+        return state
+    model = state.fit.model
+    context = build_context(problem.recorded, Given(bearings(problem.recorded, model)))
+    riding = np.zeros((len(problem.recorded), 3))
+    for term in state.fit.terms:
+        columns = term.columns(context).mag
+        if problem.library[term.identifier].rides and columns is not None:
+            riding += columns @ term.value
+    return refitted(replace(state, problem=problem.beside(riding, model)), state.named)
 
 
 def shaped_again(state: State, *, newest: bool) -> State:

@@ -130,6 +130,8 @@ class _Course:
             on = turned
         changes = np.count_nonzero(np.diff(on))
         away = np.asarray(on > 0.5)
+        if changes == 0:  # what is never off is the calibration's, and no switching source
+            return -np.inf, np.zeros(self.count, dtype=np.bool)
         if away.mean() > 0.5:
             away = ~away
         return self.nats(each_axis(on)) - float(changes * self.change), away
@@ -190,12 +192,14 @@ def best_wave(G: Array, s: Array, ridge: Array) -> Array:
 
 
 def best_box(G: Array, s: Array, ridge: Array) -> tuple[int, int]:
-    """The stretches [first, last) in which one vector explains most."""
+    """The stretches [first, last) in which one vector explains most; never all of them."""
     count = len(s) // 3
     blocks = np.zeros((count + 1, count + 1, 3, 3))
     blocks[1:, 1:] = G.reshape(count, 3, count, 3).swapaxes(1, 2).cumsum(0).cumsum(1)
     sums = np.vstack([np.zeros(3), s.reshape(count, 3).cumsum(axis=0)])
     a, b = np.triu_indices(count + 1, 1)
+    part = b - a < count
+    a, b = a[part], b[part]
     inner = blocks[b, b] - blocks[a, b] - blocks[b, a] + blocks[a, a] + ridge
     outer = sums[b] - sums[a]
     gained = np.sum(outer * np.linalg.solve(inner, outer[:, :, None])[:, :, 0], axis=1)

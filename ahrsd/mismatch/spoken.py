@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from ahrsd.mismatch.diagnosis import Diagnosis, Finding, Limit, Unexplained, Value, Where
+from ahrsd.mismatch.shown import shown
 
 _FRAMES = {
     "sensor": "turns with the vehicle",
@@ -137,7 +138,8 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
             f"   one source of fixed direction explains {left.single_source_share:.0%} of it"
         )
     out += [
-        f"   moves with {one.channel} (correlation {one.correlation:+.2f}, p = {one.p_value:.1g})"
+        f"   moves with {shown(one.channel)} (correlation {one.correlation:+.2f}, "
+        f"p = {one.p_value:.1g})"
         for one in left.follows
     ]
     if left.heldout is not None:

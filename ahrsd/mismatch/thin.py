@@ -12,6 +12,8 @@ sample, with half a sample at either end.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ahrsd import so3
@@ -22,7 +24,6 @@ from ahrsd.samples import Array
 #: rows per second that a search works with, and what is enough where a group of samples hardly
 #: turns, root mean square
 WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
-_ATTITUDE = "ref_q"
 
 
 def thin_factor(track: Track, wanted_hz: float) -> int:
@@ -40,15 +41,19 @@ def working_factor(track: Track) -> int:
     return next((m for m in range(most, least, -1) if m * turn_rad < GROUP_TURN_RAD), least)
 
 
-def thinned(track: Track, m: int, model: NullModel) -> Track:
+def thinned(track: Track, m: int, model: NullModel, riding: Array | None = None) -> Track:
     """The track with every m samples made one; runs shorter than 2 m samples are left out.
 
+    riding: (N, 3) gauss that ride with the sensor, beyond the hard iron: they are averaged, not
+            turned.  0.3 gauss of a motor turned by a hundredth of a radian are three noise levels.
     ValueError where m is not positive.
     """
     if m < 1:
         raise ValueError(f"thinning by {m}: one sample of so many cannot be")
     if m == 1:
         return track
+    if riding is not None:
+        return _beside(track, m, model, riding)
     runs = [run for run in track.runs if run.stop - run.start >= 2 * m]
     parts = [_thinned_run(track, run, m, model) for run in runs]
     lengths = [len(part["time_s"]) for part in parts]
@@ -68,6 +73,18 @@ def thinned(track: Track, m: int, model: NullModel) -> Track:
         unseen,
         track.step_share / m,
     )
+
+
+def _beside(track: Track, m: int, model: NullModel, riding: Array) -> Track:
+    """The same with what rides taken out before the turning and put back as its means."""
+    names = [f"riding {axis}" for axis in "xyz"]
+    known = {**track.covariates, **dict(zip(names, riding.T, strict=True))}
+    made = thinned(
+        replace(track, mag_b_gauss=track.mag_b_gauss - riding, covariates=known), m, model
+    )
+    means = np.column_stack([made.covariates[name] for name in names])
+    left = {name: values for name, values in made.covariates.items() if name not in names}
+    return replace(made, mag_b_gauss=made.mag_b_gauss + means, covariates=left)
 
 
 def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str, Array]:
@@ -96,8 +113,7 @@ def _thinned_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str
     if track.lost_turns is not None:
         out["unseen"] = np.concatenate([[0.0], track.lost_turns[rows][shifted].sum(axis=1)])
     for name, values in track.covariates.items():
-        turns = name.startswith(_ATTITUDE)
-        out[name] = _about_middle(values[rows], m) if turns else values[rows].reshape(-1, m).mean(1)
+        out[name] = values[rows].reshape(-1, m).mean(1)
     return out
 
 

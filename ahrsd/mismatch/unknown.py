@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.mismatch import intervals, locate, regime
 from ahrsd.mismatch.course_gram import course_gram
-from ahrsd.mismatch.diagnosis import Heldout, Suspect, Unexplained, Where
+from ahrsd.mismatch.diagnosis import Check, Heldout, Suspect, Unexplained, Where, Whiteness
 from ahrsd.mismatch.directions import by_direction
 from ahrsd.mismatch.evidence import log_bayes
 from ahrsd.mismatch.gram import Gram, gram
@@ -33,6 +33,8 @@ FINE = 80
 #: shifts of the placebo
 SHIFTS = 3
 AXES = ("x", "y", "z")
+#: probability of an omnibus test below which innovations are not those of the model
+UNEVEN_P = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,6 +218,23 @@ def described(left: Remainder, problem: Problem, limits: Limits) -> Unexplained:
         if by_bin
         else tuple(zip(free.cut.middle_s.tolist(), free.source.tolist(), strict=True)),
     )
+
+
+def borne_out(
+    left: Unexplained, checks: Mapping[str, Check], whiteness: Mapping[str, Whiteness]
+) -> Unexplained:
+    """What is left, if anything besides its own likelihood says that it is there.
+
+    Drawn freely it gains where nothing was fitted, more than the same course at another time does,
+    or simulations of the model do not look like the recording.  Else nothing is left: a model that
+    predicts as well and whose simulations look the same is not wrong in a way that anybody could
+    use.
+    """
+    held = left.heldout
+    gains = held is not None and held.nll_gain_per_sample > max(0.0, held.placebo_gain)
+    fails = not all(one.inside_after for one in checks.values())
+    uneven = any(one.p_after < UNEVEN_P for one in whiteness.values())
+    return left if gains or fails or uneven else Unexplained(False)
 
 
 def _bin_words(one: Regime, basis: Base) -> str:

@@ -94,7 +94,7 @@ class Context:
                   next to no noise with a single innovation
     field_dot_b:  (N, 3) gauss/s, smooth_b x rate_b_rad_s
     R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
-                  is an accelerometer or a reference attitude (`world_levelled`), else fixed but
+                  is an accelerometer (`world_levelled`), else fixed but
                   of unknown orientation
     force_b_m_s2: (N, 3) specific force without the accelerometer's noise, None without one
     """

@@ -8,6 +8,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from ahrsd.mismatch.diagnosis import Contribution, Diagnosis, Drawn, RegimeMap, Validation
+from ahrsd.mismatch.shown import shown
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN
 from ahrsd.samples import Array
 
@@ -111,19 +112,21 @@ def validation(found: Validation) -> Figure:
 
 def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
     """What is left by condition: a row a quantity, low values left, before and after."""
-    shown = maps[:_REGIMES]
-    highest = max(max(one.before + one.after) for one in shown)
+    rows = maps[:_REGIMES]
+    highest = max(max(one.before + one.after) for one in rows)
     colours = LogNorm(1.0, max(highest, 10.0), clip=True)
-    figure = _figure(1.0 + 0.5 * len(shown), 2)
+    figure = _figure(1.0 + 0.5 * len(rows), 2)
     for axes, side in zip(figure.axes, ("before", "after"), strict=True):
-        for row, one in enumerate(shown):
+        for row, one in enumerate(rows):
             nats = np.array([getattr(one, side)])
             edges = np.linspace(0.0, 1.0, nats.shape[1] + 1)
             drawn = axes.pcolormesh(
                 edges, [row - 0.45, row + 0.45], nats, cmap="YlOrRd", norm=colours, edgecolor="w"
             )
-        labels = [f"{one.quantity}\n{one.edges[0]:.3g} to {one.edges[-1]:.3g}" for one in shown]
-        axes.set_yticks(range(len(shown)), labels, fontsize=7)
+        labels = [
+            f"{_plain(one.quantity)}\n{one.edges[0]:.3g} to {one.edges[-1]:.3g}" for one in rows
+        ]
+        axes.set_yticks(range(len(rows)), labels, fontsize=7)
         axes.set_xticks([])
         axes.invert_yaxis()
         axes.set_title(side)
@@ -131,6 +134,11 @@ def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
         figure.colorbar(drawn, ax=axes, label="nats")
     figure.axes[1].set_xlabel("low to high, as many samples in every bin")
     return figure
+
+
+def _plain(name: str) -> str:
+    """A column's name in a picture: a dollar sign begins no formula."""
+    return shown(name).replace("$", r"\$")
 
 
 def courses(drawn: Drawn) -> Figure:

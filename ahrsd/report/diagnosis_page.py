@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from ahrsd.mismatch.diagnosis import Diagnosis, Finding
+from ahrsd.mismatch.shown import shown
 from ahrsd.mismatch.spoken import headline, place, sensitivity, value_text, verdict
 from ahrsd.report.page import CSS, number, picture, section, table
 
@@ -118,7 +119,7 @@ def _unexplained(found: Diagnosis) -> str:
     rows += [
         (
             "moves with",
-            escape(f"{s.channel}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}"),
+            escape(f"{shown(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}"),
         )
         for s in left.follows
     ]

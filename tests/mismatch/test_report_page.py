@@ -1,6 +1,7 @@
 """The report of a diagnosis in a real browser, and its words."""
 
 from dataclasses import replace
+from html import escape
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from ahrsd.mismatch.diagnosis import (
     Value,
     Where,
 )
+from ahrsd.mismatch.shown import MOST, shown
 from ahrsd.mismatch.spoken import lines
 from ahrsd.mismatch.values import NullModel
 from ahrsd.report import diagnosis_figures
@@ -176,3 +178,38 @@ def test_the_page_in_a_browser(tmp_path, width_px):
 def test_the_rerun_recording_is_written(tmp_path):
     write_rrd(tmp_path / "d.rrd", diagnosis())
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
+
+
+NAMES = ("$x_{", "a$b$c", "two\nlines\x1b[31m", "\\frac{$", "n" * 1_000_000)
+
+
+@pytest.mark.parametrize("name", NAMES, ids=lambda name: name[:6].encode().hex())
+def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
+    """No formula of matplotlib's, no control character."""
+    maps = (RegimeMap(name, (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),)
+    figure = diagnosis_figures.regime_map(maps)
+    figure.draw_without_rendering()
+    label = figure.axes[0].get_yticklabels()[0].get_text()
+    assert label.replace(r"\$", "$") == f"{shown(name)}\n0 to 27"
+    left = replace(diagnosis().unexplained, follows=(Suspect(name, 0.9, 0.01),))
+    told = lines(diagnosis(unexplained=left))
+    assert "\x1b" not in "\n".join(told)
+    assert max(map(len, told)) < 300
+
+
+def test_a_long_name_makes_no_large_page(tmp_path):
+    left = replace(diagnosis().unexplained, follows=(Suspect(NAMES[-1], 0.9, 0.01),))
+    page = tmp_path / "report.html"
+    write_diagnosis_report(page, diagnosis(unexplained=left, drawn=None), "ahrsd diagnose x")
+    text = page.read_text(encoding="utf-8")
+    assert len(text) < 20_000
+    assert escape(shown(NAMES[-1])) in text
+
+
+def test_a_long_name_keeps_its_beginning_and_its_end():
+    assert shown("motor_current_a") == "motor_current_a"
+    assert shown("a\tb") == "a\\tb"
+    long = shown("begin" + "x" * 100 + "_a")
+    assert len(long) == MOST
+    assert long.startswith("begin")
+    assert long.endswith("..." + "x" * 8 + "_a")

@@ -118,8 +118,15 @@ def test_a_hole_of_the_samples_themselves_is_none_of_the_column():
 
 
 def test_columns_without_a_role_are_kept():
-    found, notes = roles.prepared(track(hdop=RAMP, ref_qw=RAMP))
-    assert list(found.covariates) == ["hdop", "ref_qw"]
+    found, notes = roles.prepared(track(hdop=RAMP))
+    assert list(found.covariates) == ["hdop"]
+    assert notes == ()
+
+
+def test_a_reference_attitude_is_no_cause() -> None:
+    """What it adds to a recording must not change what is said of the sensor."""
+    found, notes = roles.prepared(track(ref_qw=RAMP, ref_qz=RAMP, hdop=RAMP))
+    assert list(found.covariates) == ["hdop"]
     assert notes == ()
 
 

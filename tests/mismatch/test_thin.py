@@ -28,7 +28,7 @@ def turning(count: int = 450, dt: float = 0.02) -> tuple[Track, np.ndarray]:
     mag = np.einsum("nji,j->ni", R_nb, [0.2, 0.1, 0.4]) @ A + [0.05, -0.02, 0.1]
     step = np.full(count, dt)
     step[0] = np.nan
-    logged = {"a": t.copy(), "ref_qw": t.copy()}
+    logged = {"a": t.copy()}
     track = Track(t, step, mag, rate, np.outer(t, [0.0, 1.0, -2.0]), logged, (slice(0, count),))
     return track, R_nb
 
@@ -45,7 +45,6 @@ def test_turns_and_readings_are_those_of_the_middle_samples(m):
     np.testing.assert_allclose(thin.time_s, track.time_s[middle], atol=1e-12)
     centre = track.time_s[middle] - (0.0 if m % 2 else track.time_s[1] / 2)
     np.testing.assert_allclose(thin.covariates["a"], centre, atol=1e-12)
-    np.testing.assert_allclose(thin.covariates["ref_qw"], track.time_s[middle], atol=1e-12)
     np.testing.assert_allclose(thin.accel_b_m_s2[:, 1], track.time_s[middle], atol=1e-12)
     np.testing.assert_allclose(thin.mag_b_gauss, track.mag_b_gauss[middle], atol=1e-12)
     turn = so3.exp(thin.gyro_b_rad_s[1:] * thin.dt_s[1:, None])

@@ -74,6 +74,7 @@ class Effect(ABC):
     kind:        "variance" and "discrete" effects have no columns and no settings
     after_noise: it acts on the finished reading, noise included
     frame:       in which it is told, where that is not the family's name
+    rides:       its field stays on the sensor whatever that does, in gauss by what was logged
     unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
                  them is the noise of its own columns, and what is known is the prior
     form_share:  part of its evidence that its columns may leave, where they are not exact
@@ -98,6 +99,7 @@ class Effect(ABC):
     kind: Kind = "mean"
     after_noise: bool = False
     frame: str | None = None
+    rides: bool = False
     unseen: tuple[tuple[float, ...], ...] = ()
     form_share: float = 0.0
     stands_for: tuple[str, ...] = ()

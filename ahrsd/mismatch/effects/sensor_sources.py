@@ -22,6 +22,7 @@ class MotorCurrentField(Linear):
     identifier = "motor_current_field"
     code = "M4"
     family = "sensor"
+    rides = True
     words = "the magnetic field of a motor, thruster or battery current"
     equation = "m += k I(t)"
     parameters = shapes.vector("field_per_ampere", "gauss/A", 1.0 * _MG, 50.0 * _MG)
@@ -53,6 +54,7 @@ class CurrentDerivativeField(Linear):
     identifier = "current_derivative_field"
     code = "M5"
     family = "sensor"
+    rides = True
     words = "a field that follows the change of a current: loops and eddies in the frame"
     equation = "m += k dI/dt"
     parameters = shapes.vector("field_per_ampere_per_second", "gauss s/A", 0.1 * _MG, 10.0 * _MG)
@@ -84,9 +86,10 @@ class SpeedField(Linear):
     identifier = "speed_field"
     code = "M6"
     family = "sensor"
+    rides = True
     words = "a field that follows speed or shaft speed"
     equation = "m += k f(v), f = v / 1 m/s, (v / 1 m/s)^2 or rpm / 1000"
-    parameters = shapes.vector("field_per_unit_speed", "gauss", 0.5 * _MG, 20.0 * _MG)
+    parameters = shapes.vector("field_per_unit_speed", "gauss", 0.5 * _MG, 200.0 * _MG)
     typical = shapes.along(1.0 * _MG)
     needs = ("speed|rpm",)
     signature = "a constant offset at constant speed, on every heading"
@@ -95,7 +98,7 @@ class SpeedField(Linear):
         ("eddy_current", "drive straight at two speeds"),
     )
     manoeuvre = "the same straight leg at three speeds"
-    size = "20 to 250 nT on underwater vehicles"
+    size = "20 to 250 nT on underwater vehicles; 50 mG per m/s over a rover's drive motors"
     source = "Remote Sensing 15:4164 (dossier M6)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
@@ -157,6 +160,7 @@ class MagBiasTemperature(Linear):
     identifier = "mag_bias_temperature"
     code = "M10"
     family = "sensor"
+    rides = True
     words = "an offset of the magnetometer that follows temperature"
     equation = "m += k (T - T0)"
     parameters = shapes.vector("offset_per_degree", "gauss/K", 0.1 * _MG, 5.0 * _MG)
@@ -221,6 +225,7 @@ class SwitchedDevice(Linear):
     identifier = "switched_device"
     code = "M24"
     family = "sensor"
+    rides = True
     words = "a device that is switched on and off: lamp, gripper, pump"
     equation = "m += k u(t), u = 0 or 1"
     parameters = shapes.vector("field", "gauss", 3.0 * _MG, 200.0 * _MG)
