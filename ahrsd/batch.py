@@ -26,6 +26,8 @@ from ahrsd.mismatch.facts import matters
 from ahrsd.mismatch.hygiene import hygiene
 from ahrsd.mismatch.model_file import RepairedModel
 from ahrsd.mismatch.roles import prepared
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import TABLE_ROWS
 from ahrsd.replay import Replayed, replay
 from ahrsd.result import calibration_json, why_not_converged
 from ahrsd.summary import said_of
@@ -109,15 +111,23 @@ def calibrate(
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
     model: RepairedModel | None = None,
+    columns: ColumnMap = NO_MAP,
 ) -> BatchResult:
     """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`.
 
     model: what its terms add to the readings is taken out first; AhrsdError where a term needs a
-    column that the recording has not.
+    column that the recording has not. columns: names and units of a table.
     """
     seen: list[Event] = []
     done = replay(
-        path, config, rate_hz=rate_hz, listeners=[seen.append], progress=progress, held_out=False
+        path,
+        config,
+        rate_hz=rate_hz,
+        listeners=[seen.append],
+        progress=progress,
+        held_out=False,
+        columns=columns,
+        most_samples=TABLE_ROWS,
     )
     left: tuple[str, ...] = ()
     if model is not None:
@@ -136,7 +146,9 @@ def calibrate(
         *(fact.words for fact in facts if not fact.stops and matters(fact)),
         *([] if calibrator.step is None else [calibrator.step.words]),
     )
-    return BatchResult(path.name, done.core, estimate, tuple(seen), warnings, turned, wrong)
+    return BatchResult(
+        done.recording.name, done.core, estimate, tuple(seen), warnings, turned, wrong
+    )
 
 
 def _without_terms(

@@ -24,6 +24,9 @@ from ahrsd.mismatch.effects.shapes import GRAVITY_M_S2
 from ahrsd.mismatch.logged import diagnose_logged
 from ahrsd.mismatch.model_file import RepairedModel, from_text
 from ahrsd.mismatch.track import Spec, Track
+from ahrsd.printable import printable
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import TABLE_ROWS
 from ahrsd.recording.opening import Kind, open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
@@ -48,16 +51,18 @@ def load_track(
     progress: Callable[[int], None] | None = None,
     *,
     spec: Spec | None = None,
+    columns: ColumnMap = NO_MAP,
 ) -> tuple[Track, list[str]]:
     """The recording as one track, and what a person should know of how it was read.
 
-    rate_hz: for a byte stream without a time of its own, before that of the spec
+    rate_hz: for a byte stream without a time of its own, before that of the spec; columns: names
+    and units of a table
     Raises RecordingError where there is nothing to diagnose.
     """
-    recording = open_recording(path, rate_hz, check_units=False)
+    recording = open_recording(path, rate_hz, check_units=False, columns=columns)
     said_hz = None if spec is None else spec.rate_hz
     if recording.kind is Kind.TABLE:
-        table = recording.table or read_table(path, check_units=False)
+        table = recording.table or read_table(path, check_units=False, columns=columns)
         blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
     else:
         blocks, notes = _streamed(path, rate_hz or said_hz, progress)
@@ -121,7 +126,14 @@ def _streamed(
     from ahrsd.replay import replay
 
     seen: list[Event] = []
-    done = replay(path, Config(), rate_hz=rate_hz, listeners=[seen.append], progress=progress)
+    done = replay(
+        path,
+        Config(),
+        rate_hz=rate_hz,
+        listeners=[seen.append],
+        progress=progress,
+        most_samples=TABLE_ROWS,
+    )
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     return blocks, [*done.warnings, *done.core.stream.warnings]
 
@@ -210,10 +222,14 @@ def diagnose_recording(
     spec: Path | None = None,
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
+    columns: ColumnMap = NO_MAP,
 ) -> Diagnosis:
-    """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError."""
+    """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError.
+
+    columns: names and units of REAL, where it is a table of another program
+    """
     known, unused = (Spec(), []) if spec is None else load_spec(spec)
-    track, notes = load_track(real, rate_hz, progress, spec=known)
+    track, notes = load_track(real, rate_hz, progress, spec=known, columns=columns)
     notes = [*unused, *notes]
     if simulation is None:
         found = _answered(real, track, known)
@@ -231,6 +247,6 @@ def diagnose_recording(
 
 def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
     try:
-        return diagnose_logged(track, spec, recording=path.name)
+        return diagnose_logged(track, spec, recording=printable(path.name, 200))
     except ValueError as error:
         raise RecordingError(path, str(error), "record again, with the vehicle turning") from None

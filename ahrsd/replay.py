@@ -18,7 +18,9 @@ from ahrsd.core import Core
 from ahrsd.core_settings import BESIDE_KEY, CoreSettings
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
-from ahrsd.recording.bytestream import read_chunks
+from ahrsd.recording.bytestream import read_stream
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
 from ahrsd.recording.opening import Kind, Recording, open_recording
 from ahrsd.settings import core_settings, terms_text
 from ahrsd.shell import Listener, Shell, Viewer
@@ -28,6 +30,7 @@ from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.deframer import Cause
 
+_CUT = "cut it in parts"
 _PASSIVE = WriteBackPolicy(mode=Mode.PASSIVE)
 
 
@@ -56,16 +59,19 @@ def replay(
     progress: Callable[[int], None] | None = None,
     held_out: bool = True,
     settings: CoreSettings | None = None,
+    columns: ColumnMap = NO_MAP,
+    most_samples: float = math.inf,
 ) -> Replayed:
     """Feed a recording to a core; speed 0 is as fast as it goes, 1 real time.
 
     settings: of the core, else those of `config`; a capture of the daemon brings its own
-    configuration, and its own `held_out`. Raises RecordingError where nothing in the recording can
+    configuration, and its own `held_out`. columns: names and units of a table. most_samples: for
+    who keeps them all. Raises RecordingError where nothing in the recording can
     be calibrated.
     """
     if rate_hz is not None and not math.isfinite(rate_hz):
         raise RecordingError(path, f"a rate of {rate_hz} Hz is none", "give --rate in Hz")
-    recording = open_recording(path, rate_hz)
+    recording = open_recording(path, rate_hz, columns=columns)
     core = Core(settings or _settings(recording, config, rate_hz, held_out))
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
     done = Replayed(core, recording, list(recording.notes))
@@ -76,6 +82,10 @@ def replay(
         shell.feed(item)
         if progress is not None and isinstance(item, Received):
             progress(len(item.data))
+        refuse_beyond(path, core.stream.facts.samples, most_samples, "samples", _CUT)
+        counters = core.conversation.session.deframer.counters
+        if counters.valid == 0 and counters.fed_bytes > GARBAGE_BYTES:
+            break
     _refuse_empty(core, path)
     done.warnings += [note for note in recording.notes if note not in done.warnings]
     if recording.kind is Kind.BYTES and _cut_off(core):
@@ -94,7 +104,7 @@ def _settings(
         return replace(core_settings(own), beside=BESIDE_KEY in recording.header)
     if recording.kind is not Kind.BYTES:
         return core_settings(config, policy=_PASSIVE, held_out=held_out)
-    found = None if rate_hz is not None else rate_of(read_chunks(recording.path))
+    found = None if rate_hz is not None else rate_of(read_stream(recording.path))
     rate = rate_hz if found is None else found[0]
     settings = core_settings(config, stream_rate_hz=rate, policy=_PASSIVE, held_out=held_out)
     return settings if found is None else replace(settings, stream_rate_source=found[1])

@@ -193,9 +193,13 @@ def test_the_time_in_another_unit(tmp_path, seed, factor):
 def test_time_going_backwards(tmp_path, seed, row, back):
     rows = tumbling(seed, 400)
     rows[row:, 0] -= rows[row, 0] - rows[row - 1, 0] + back
-    said = tried(tmp_path, rows)
-    assert isinstance(said, str)
-    assert f"row {row + 2}, column time_s: time " in said
+    result = tried(tmp_path, rows)
+    if isinstance(result, str):  # so near the end that nothing tells a clock that was set
+        assert row > 396
+        assert f"row {row + 2}, column time_s: time goes back" in result
+        return
+    said = " ".join(result.said())
+    assert f"at row {row + 2} (" in said or "have the time of the row before" in said
 
 
 @FEW

@@ -85,7 +85,8 @@ def test_files_without_a_message(run, capsys, tmp_path, name, data, words):
 def test_a_gzip_file_that_is_cut_off(run, capsys, tmp_path):
     path = tmp_path / "cut.vnbin.gz"
     path.write_bytes(STREAM.read_bytes()[:40_000])
-    refused(run, capsys, path, "truncated or damaged after", "gzip -dc cut.vnbin.gz > cut.vnbin")
+    assert run("replay", path) == 0
+    assert "warning: the gzip file is truncated after" in capsys.readouterr().out
 
 
 def test_a_capture_that_holds_nothing(run, capsys, tmp_path):

@@ -9,12 +9,14 @@ import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
+from ahrsd.commands.recording_options import columns_option
 from ahrsd.config import Config, load_config
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 
 if TYPE_CHECKING:
     from ahrsd.batch import BatchResult
     from ahrsd.methods.comparison import Row
+    from ahrsd.recording.column_names import ColumnMap
 
 _ALL = "all"
 _METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow to import
@@ -28,6 +30,7 @@ _METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow
 @click.option("--method", type=click.Choice(_METHODS), default=_METHODS[0], show_default=True)
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@columns_option
 @click.option(
     "--model",
     "model_path",
@@ -43,6 +46,7 @@ def command(
     method: str,
     path: Path | None,
     rate_hz: float | None,
+    columns: ColumnMap,
     model_path: Path | None,
     json_path: str | None,
     report_path: Path | None,
@@ -65,7 +69,9 @@ def command(
     config = load_config(path) if path else Config()
     model = None if model_path is None else load_model(model_path)
     with byte_progress(recording) as progress:
-        result = calibrate(recording, config, rate_hz=rate_hz, progress=progress, model=model)
+        result = calibrate(
+            recording, config, rate_hz=rate_hz, progress=progress, model=model, columns=columns
+        )
     if method in _METHODS[:2] and (words := saturated(result)):
         raise RecordingError(
             recording, words, "record again, away from magnets and strong currents"
@@ -77,7 +83,7 @@ def command(
     if json_path is not None:
         write_json(json_path, result.json(method))
     if json_path != "-":
-        click.echo(f"{recording.name}: {result.samples} samples, method {method}")
+        click.echo(f"{result.name}: {result.samples} samples, method {method}")
         for line in estimate_lines(result.estimate):
             click.echo(line)
         for text in result.said():

@@ -9,11 +9,13 @@ import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
+from ahrsd.commands.recording_options import columns_option
 from ahrsd.errors import AhrsdError
 from ahrsd.heap import keep_heap
 
 if TYPE_CHECKING:
     from ahrsd.mismatch.diagnosis import Diagnosis
+    from ahrsd.recording.column_names import ColumnMap
 
 _PATH = click.Path(path_type=Path)
 
@@ -23,6 +25,7 @@ _PATH = click.Path(path_type=Path)
 @click.option("--simulation", type=_PATH, help="A simulation of this motion, as a recording.")
 @click.option("--spec", type=_PATH, help="Known noise, rate and field of the sensor, JSON.")
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@columns_option
 @click.option("--json", "json_path", help="The answer as JSON into this file, - for stdout.")
 @click.option("--report", "folder", type=_PATH, help="A page with pictures, and more, in here.")
 def command(
@@ -30,6 +33,7 @@ def command(
     simulation: Path | None,
     spec: Path | None,
     rate_hz: float | None,
+    columns: ColumnMap,
     json_path: str | None,
     folder: Path | None,
 ) -> None:
@@ -51,7 +55,12 @@ def command(
     keep_heap()
     with byte_progress(real) as progress:
         found = diagnose_recording(
-            real, simulation=simulation, spec=spec, rate_hz=rate_hz, progress=progress
+            real,
+            simulation=simulation,
+            spec=spec,
+            rate_hz=rate_hz,
+            progress=progress,
+            columns=columns,
         )
     if json_path is not None:
         write_json(json_path, found.to_json())

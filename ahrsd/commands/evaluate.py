@@ -10,10 +10,13 @@ import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
+from ahrsd.commands.recording_options import columns_option
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.printable import printable
 
 if TYPE_CHECKING:
     from ahrsd.evaluation import Evaluation, Fixes, Reference, Track
+    from ahrsd.recording.column_names import ColumnMap
 
 _TILTS = ("auto", "gravity", "accelerometer", "device")
 _MODELS = ("wmm", "igrf")
@@ -39,6 +42,7 @@ _MODELS = ("wmm", "igrf")
 @click.option("--min-speed", "least_speed_m_s", type=click.FloatRange(0.1), default=4.0,
               show_default=True, help="Course counts above this speed. [m/s]")  # fmt: skip
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@columns_option
 @click.option("--json", "json_path", help="All figures into this file, - for stdout.")
 @click.option("--figure", "figure_path", type=click.Path(path_type=Path), help="Picture, PNG.")
 @click.option("--report", "folder", type=click.Path(path_type=Path),
@@ -96,6 +100,7 @@ def evaluate(
     tilt: str = "auto",
     least_speed_m_s: float = 4.0,
     rate_hz: float | None = None,
+    columns: ColumnMap | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[list[Evaluation], dict[str, str]]:
     """The evaluations that the command prints, and by method why one is none.  Raises AhrsdError.
@@ -111,7 +116,7 @@ def evaluate(
 
     calibrations, without = sources.read_calibrations(calibration_path, method)
     world = sources.place_and_date(position, date, model)  # type: ignore[arg-type]
-    track, said = sources.read_track(recording, Config(), rate_hz, progress)
+    track, said = sources.read_track(recording, Config(), rate_hz, progress, columns)
     beside, fixes, place = _beside(reference_path or sources.gps_beside(recording), track)
     if place is not None and world is None and date is not None:
         world = sources.place_and_date(place, date, model)  # type: ignore[arg-type]
@@ -120,7 +125,7 @@ def evaluate(
     references, more = _references(track, fixes, heading_column, least_speed_m_s)
     found = [
         judge(
-            recording.name,
+            printable(recording.name, 200),
             track,
             replace(calibration, remarks=(*said, *more, *calibration.remarks)),
             references,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import datetime
-import gzip
 import io
 import json
 from collections.abc import Callable
@@ -25,6 +24,9 @@ from ahrsd.evaluation import (
 )
 from ahrsd.evaluation.references import Fixes, fixes_from_degrees
 from ahrsd.events import SamplesSeen
+from ahrsd.recording.bytestream import read_chunks
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import TABLE_BYTES, TABLE_ROWS, refuse_beyond
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.replay import replay
@@ -39,6 +41,7 @@ from ahrsd.worldfield import (
 )
 
 _GPS_SUFFIX = ".gps.csv.gz"
+_CHUNK_BYTES = 1 << 18
 _GPS_TIME = ("t_s", "time_s")
 _GPS_PLACE = ("lat_deg", "lon_deg")
 
@@ -48,9 +51,10 @@ def read_track(
     config: Config,
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
+    columns: ColumnMap | None = None,
 ) -> tuple[Track, list[str]]:
     """A recording's samples, and what a person should know.  RecordingError as `replay`."""
-    recording = open_recording(path, rate_hz)
+    recording = open_recording(path, rate_hz, columns=columns or NO_MAP)
     if recording.table is not None:
         pieces = [(block, Affine.identity()) for block in recording.table.blocks()]
         return tracked(pieces), list(recording.notes)
@@ -60,6 +64,7 @@ def read_track(
         config,
         rate_hz=rate_hz,
         progress=progress,
+        most_samples=TABLE_ROWS,
         listeners=[lambda event: seen.append(event) if isinstance(event, SamplesSeen) else None],
     )
     said = [*done.warnings, *done.core.stream.warnings]
@@ -218,9 +223,11 @@ def _number(text: str | None) -> float:
 
 
 def _text(path: Path) -> str:
+    data = bytearray()
+    for chunk in read_chunks(path, _CHUNK_BYTES):
+        data += chunk
+        refuse_beyond(path, len(data), TABLE_BYTES, "bytes of text and more", "cut it in parts")
     try:
-        data = path.read_bytes()
-        return (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8")
-    except (OSError, EOFError, UnicodeDecodeError) as error:
-        words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise EvaluationError(f"{path}: cannot be read: {words}; check the path") from error
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise EvaluationError(f"{path}: cannot be read: {error}; save it as UTF-8") from error

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
+from ahrsd.commands.recording_options import columns_option
 from ahrsd.config import Config, load_config
+
+if TYPE_CHECKING:
+    from ahrsd.recording.column_names import ColumnMap
 
 
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@columns_option
 @click.option("--speed", type=click.FloatRange(0.0), default=0.0,
               help="0: as fast as it goes (default); 1: real time.")  # fmt: skip
 @click.option("--json", "json_path", help="Summary as JSON into this file, - for stdout.")
@@ -23,6 +29,7 @@ def command(
     recording: Path,
     path: Path | None,
     rate_hz: float | None,
+    columns: ColumnMap,
     speed: float,
     json_path: str | None,
     rerun_path: Path | None,
@@ -43,13 +50,19 @@ def command(
     try:
         with byte_progress(recording) as progress:
             done = replay(
-                recording, config, rate_hz=rate_hz, speed=speed, viewer=viewer, progress=progress
+                recording,
+                config,
+                rate_hz=rate_hz,
+                speed=speed,
+                viewer=viewer,
+                progress=progress,
+                columns=columns,
             )
     finally:
         if viewer is not None:
             viewer.close(10.0)
     if json_path is not None:
-        write_json(json_path, summary_json(done.core, recording.name, done.warnings))
+        write_json(json_path, summary_json(done.core, done.recording.name, done.warnings))
     if json_path != "-":
-        for line in summary_lines(done.core, recording.name, done.warnings):
+        for line in summary_lines(done.core, done.recording.name, done.warnings):
             click.echo(line)

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from ahrsd.commands.json_output import write_json
+from ahrsd.commands.recording_options import columns_option
 from ahrsd.errors import EXIT_DONE, AhrsdError
 
 if TYPE_CHECKING:
+    from ahrsd.recording.column_names import ColumnMap
     from ahrsd.samples import Array
     from ahrsd.simulation import Experiment
     from ahrsd.simulation.disturbance import Disturbances
@@ -49,6 +51,7 @@ _MOST_SAMPLES = 1e7
 )
 @click.option("--model", type=click.Path(path_type=Path), help="A repaired model, with --along.")
 @click.option("--along", "along_path", type=click.Path(path_type=Path), help="Its motion's source.")
+@columns_option
 def command(**options: object) -> None:
     """Simulate SCENARIO: wam, mam or lam (wide, medium, low angular movement) of the MAGYC thesis,
     or recorded: a field on the motion of a recorded gyro stream (--gyro), without soft iron.
@@ -64,7 +67,7 @@ def command(**options: object) -> None:
     if wanted.model is not None and wanted.along_path is not None:
         if wanted.scenario is not None or wanted.effects:
             raise AhrsdError("--model and --along take neither a scenario nor --effect")
-        _simulate_along(wanted.output, wanted.model, wanted.along_path, wanted.seed)
+        _simulate_along(wanted, wanted.model, wanted.along_path)
     else:
         _simulate_scenario(wanted)
     raise SystemExit(EXIT_DONE)
@@ -91,6 +94,7 @@ class _Options:
     effects: tuple[str, ...]
     model: Path | None
     along_path: Path | None
+    columns: ColumnMap
 
 
 def _simulate_scenario(wanted: _Options) -> None:
@@ -129,9 +133,7 @@ def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
             gap_at_s=wanted.gap_at_s,
         )
         if wanted.gyro_path is not None:
-            made = _recorded(
-                wanted.gyro_path, wanted.seconds, wanted.seed, wanted.mag_mg, disturbances
-            )
+            made = _recorded(wanted.gyro_path, wanted, disturbances)
             return made, {"gyro": wanted.gyro_path.name, "seed": wanted.seed}
         settings = Settings(
             scenario=wanted.scenario,
@@ -149,9 +151,7 @@ def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
         raise AhrsdError(str(error)) from None
 
 
-def _recorded(
-    path: Path, seconds: float, seed: int, mag_mg: float, wanted: Disturbances
-) -> Experiment:
+def _recorded(path: Path, wanted: _Options, disturbances: Disturbances) -> Experiment:
     """[L]'s experiment on the longest stretch without a gap; the recorded rates are the truth."""
     import numpy as np
 
@@ -160,27 +160,30 @@ def _recorded(
     from ahrsd.simulation.recorded import simulate_recorded
     from ahrsd.simulation.scenarios import generator
 
-    table = read_table(path)
+    table = read_table(path, columns=wanted.columns)
     ends = np.array([*table.starts, len(table.rows)])
     longest = int(np.argmax(np.diff(ends)))
     rows = slice(ends[longest], ends[longest + 1])
     time_s, gyro = table.rows.time_s[rows], table.rows.gyro_b_rad_s[rows]
-    kept = time_s <= time_s[0] + seconds
-    made = simulate_recorded(time_s[kept], gyro[kept], seed=seed, noise_mag_gauss=mag_mg * _MG)
-    return disturbed(made, wanted, generator(seed, 3))
+    kept = time_s <= time_s[0] + wanted.seconds
+    made = simulate_recorded(
+        time_s[kept], gyro[kept], seed=wanted.seed, noise_mag_gauss=wanted.mag_mg * _MG
+    )
+    return disturbed(made, disturbances, generator(wanted.seed, 3))
 
 
-def _simulate_along(output: Path, model_path: Path, recording: Path, seed: int) -> None:
+def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None:
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
     from ahrsd.commands.simulate_effects import along
     from ahrsd.diagnosing import load_model
     from ahrsd.mismatch.injection import terms_json
     from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table
 
+    output, seed = wanted.output, wanted.seed
     if not is_table(output):
         raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
     model = load_model(model_path)
-    columns, notes = along(model, recording, seed)
+    columns, notes = along(model, recording, seed, wanted.columns)
     for note in notes:
         click.echo(f"{recording}: {note}", err=True)
     _write_columns(output, columns)

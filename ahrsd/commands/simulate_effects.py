@@ -11,6 +11,7 @@ from ahrsd.mismatch import forward, roles
 from ahrsd.mismatch.effects import profiles, request
 from ahrsd.mismatch.injection import injected, readings_of, terms_json
 from ahrsd.mismatch.model_file import RepairedModel
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
 
@@ -31,12 +32,14 @@ def with_effects(
     return injected(experiment, readings, terms), terms_json(terms)
 
 
-def along(model: RepairedModel, recording: Path, seed: int) -> tuple[dict[str, Array], list[str]]:
+def along(
+    model: RepairedModel, recording: Path, seed: int, columns: ColumnMap = NO_MAP
+) -> tuple[dict[str, Array], list[str]]:
     """A table's columns: what the repaired model reads along the motion of a recording.
 
     RecordingError as `diagnose`; AhrsdError where a term needs a column that there is not.
     """
-    read, notes = load_track(recording)
+    read, notes = load_track(recording, columns=columns)
     track, refused = roles.prepared(read)
     try:
         context = forward.context_along(track, model.calibration, model.terms)
@@ -45,10 +48,10 @@ def along(model: RepairedModel, recording: Path, seed: int) -> tuple[dict[str, A
     except ValueError as error:
         raise AhrsdError(f"{recording}: {error}") from None
     done = forward.track_of(made, track)
-    columns = {"time_s": done.time_s}
+    written = {"time_s": done.time_s}
     sensors = [("mag", "gauss", done.mag_b_gauss), ("gyro", "rad_s", done.gyro_b_rad_s)]
     if done.accel_b_m_s2 is not None:
         sensors.append(("accel", "m_s2", done.accel_b_m_s2))
     for name, unit, values in sensors:
-        columns |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
-    return columns | done.covariates, [*notes, *refused]
+        written |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
+    return written | done.covariates, [*notes, *refused]

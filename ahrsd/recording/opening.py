@@ -13,10 +13,14 @@ from pathlib import Path
 
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples, Stop
-from ahrsd.recording.bytestream import read_chunks, read_received
+from ahrsd.printable import printable
+from ahrsd.recording.bytestream import read_chunks, read_received, utf16_of
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.foreign import recognised
 from ahrsd.recording.table import Table, read_table
 
 _END = "end of recording"
+_HEAD_BYTES = 4096
 
 
 class Kind(Enum):
@@ -53,7 +57,7 @@ class Recording:
     @property
     def name(self) -> str:
         """The file's name, for reports."""
-        return self.path.name
+        return printable(self.path.name, 200)
 
     def inputs(self) -> Iterator[Input]:
         """Everything that the core takes, in order, ending in `Stop`; RecordingError as found."""
@@ -61,7 +65,7 @@ class Recording:
             return _table_inputs(self.table)
         if self.kind is Kind.CAPTURE:
             return self._capture_inputs()
-        return _byte_inputs(self.path)
+        return _byte_inputs(self)
 
     def _capture_inputs(self) -> Iterator[Input]:
         from ahrsd.recording.capture import CaptureReader, Sent
@@ -84,8 +88,14 @@ class Recording:
             yield Stop(last.host_ns, _END)
 
 
-def _byte_inputs(path: Path) -> Iterator[Input]:
-    yield from read_received(path)
+def _byte_inputs(recording: Recording) -> Iterator[Input]:
+    told: list[str] = []
+    for item in read_received(recording.path, told):
+        if told:  # as soon as it is known, and once however often the inputs are read
+            recording.notes += [note for note in told if note not in recording.notes]
+            told.clear()
+        yield item
+    recording.notes += [note for note in told if note not in recording.notes]
     yield Stop(0, _END)
 
 
@@ -98,41 +108,54 @@ def _table_inputs(table: Table) -> Iterator[Input]:
 
 
 def open_recording(
-    path: Path, rate_hz: float | None = None, *, check_units: bool = True
+    path: Path,
+    rate_hz: float | None = None,
+    *,
+    check_units: bool = True,
+    columns: ColumnMap = NO_MAP,
 ) -> Recording:
     """Open a capture, a byte stream or a table.
 
-    rate_hz is for byte streams without a device clock and is not used otherwise; check_units as
-    in `read_table`.
+    rate_hz is for byte streams without a device clock and is not used otherwise; check_units and
+    columns as in `read_table`, for tables only.
     Raises RecordingError, one line, where the file is none of the three.
     """
     if rate_hz is not None and not rate_hz > 0.0:
         raise RecordingError(path, f"the rate {rate_hz:g} Hz is not positive", "give --rate in Hz")
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
+        there = "is no regular file" if path.exists() else "does not exist"
+        what = "is a folder" if path.is_dir() else there
         raise RecordingError(path, what, "give the path of a recording")
     suffix = path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
-    kind = _SUFFIXES.get(suffix.lower()) or _by_content(path)
+    start = next(read_chunks(path, _HEAD_BYTES))  # empty or no gzip: say so now
+    if (found := recognised(start)) is not None:
+        raise RecordingError(path, found.what, found.remedy)
+    kind = _SUFFIXES.get(suffix.lower()) or _by_content(path, start)
+    unused = (
+        ["--columns is not used: it is for tables"] if columns and kind is not Kind.TABLE else []
+    )
     if kind is Kind.BYTES:
-        next(read_chunks(path))  # empty or no gzip: say so now, not in the middle of a replay
-        return Recording(path, kind, rate_hz)
-    unused = [] if rate_hz is None else [f"--rate is not used: a {kind.value} has its own time"]
+        return Recording(path, kind, rate_hz, notes=unused)
+    if rate_hz is not None:
+        unused.append(f"--rate is not used: a {kind.value} has its own time")
     if kind is Kind.CAPTURE:
         from ahrsd.recording.capture import CaptureReader  # a table needs no reader of captures
 
         header = CaptureReader(path).header
         return Recording(path, kind, header=header, notes=unused)
-    table = read_table(path, check_units=check_units)
+    table = read_table(path, check_units=check_units, columns=columns)
     return Recording(path, kind, notes=[*unused, *table.notes], table=table)
 
 
-def _by_content(path: Path) -> Kind:
-    start = next(read_chunks(path))
+def _by_content(path: Path, start: bytes) -> Kind:
     from ahrsd.recording import blocks
+
+    if (encoding := utf16_of(start)) is not None:
+        start = start.decode(encoding, "ignore").encode("utf-8")
 
     if blocks.is_mcap(start):
         return Kind.CAPTURE
-    if b"time_s" in start.split(b"\n", 1)[0]:
+    if b"time_s" in start.split(b"\n", 1)[0] or b"TimeStartup," in start.split(b"\n", 1)[0]:
         return Kind.TABLE
     if b"$VN" in start or b"\xfa" in start:
         return Kind.BYTES
