@@ -256,7 +256,11 @@ def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     def enough(chunk: bytes) -> bool:
         nonlocal answers
         replies = [decode(frame) for frame in deframer.feed(chunk)]
-        answers += sum(isinstance(reply, Reply) and reply.register == 1 for reply in replies)
+        # a line that echoes sends the question back, which has no values
+        answers += sum(
+            isinstance(reply, Reply) and reply.register == 1 and bool(reply.tokens)
+            for reply in replies
+        )
         return answers > 0
 
     received = _collect(port, listen_s, enough)

@@ -259,7 +259,7 @@ def _change(
         if not yes:
             raise click.UsageError("nothing was written; add --yes to do it")
         if not identity.profile.writable:
-            raise AhrsdError(f"firmware {identity.firmware} is not known; nothing is written to it")
+            raise AhrsdError(f"nothing is written to it: {identity.profile.observed_for}")
         permitted.update(changes)
         record = apply(device, journal, identity, changes, **why)
         click.echo(f"written and verified in RAM, journal {journal.path} record {record.seq}")
