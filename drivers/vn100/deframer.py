@@ -20,9 +20,10 @@ the stream only, so how the stream is cut into chunks changes nothing.
 **Damage** is counted by cause and never raised; the bytes are kept until `take_skipped`. A message
 is *rejected* when its start was recognised and then its checksum, CRC or content refused it; each
 such start counts once. A header with fields that no VN-100 has is recognised only behind a whole
-packet with it: most of them are bytes of something else. Two lines that became one because the bytes between were lost are one. Where
-a new ``$`` breaks a line off, that is one for the first, and the second is judged by itself. A
-start that silence cut (`Cause.CUT`) was refused by nobody: it is damage, but not rejected.
+packet with it: most of them are bytes of something else. Two lines that became one because the
+bytes between were lost are one. Where a new ``$`` breaks a line off, that is one for the first, and
+the second is judged by itself. A start that silence cut (`Cause.CUT`) was refused by nobody: it is
+damage, but not rejected.
 
     fed bytes = bytes of valid messages + skipped bytes + pending        always
 """
