@@ -181,11 +181,16 @@ def _turns_up(a: tuple[float, float], b: tuple[float, float], c: tuple[float, fl
 class StepClock:
     """Times for a stream that carries none: one step per message, lost messages included."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, start_s: float = 0.0) -> None:
         if not (np.isfinite(rate_hz) and rate_hz > 0.0):
             raise ValueError(f"a rate must be positive, in Hz; got {rate_hz!r}")
         self.step_s = 1.0 / rate_hz
-        self._count = 0
+        self._count, self._start_s = 0, start_s
+
+    @property
+    def now_s(self) -> float:
+        """Time of the message that would come next, were none lost."""
+        return self._start_s + self._count * self.step_s
 
     def times(self, lost_before: Array) -> Array:
         """(N,) times of N messages; lost_before (N,) counts the ones lost before each.
@@ -195,7 +200,7 @@ class StepClock:
         counts = self._count + np.cumsum(1 + np.asarray(lost_before, dtype=np.int64))
         if len(counts):
             self._count = int(counts[-1])
-        return np.asarray((counts - 1) * self.step_s, dtype=np.float64)
+        return np.asarray(self._start_s + (counts - 1) * self.step_s, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,11 +90,11 @@ def read_surely(profile: Profile, twice: Iterable[int]) -> Procedure[dict[int, V
     RegisterValueError.
     """
     values = yield from read_configuration(profile)
-    for number in twice:
+    for number in (n for n in twice if n in values):
         again = yield from read(number)
         if not same(number, values[number], again):
             raise Unsteady(f"register {number} reads {values[number]}, then {again}")
-        format_command(number, again)
+        format_command(number, again, held=True)
     return values
 
 

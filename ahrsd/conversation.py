@@ -41,6 +41,10 @@ from drivers.vn100.procedures import SESSION_SETTINGS, Identity, identify, quiet
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
 
+ECHOES = (
+    "the line sends back what is sent (an adapter or terminal that echoes): echoes are told from "
+    "answers and left out"
+)
 ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
 RESTORE_AGAIN_S = 0.1
 _FOREIGN = 20  # messages without one of the session's own output: it is gone
@@ -99,7 +103,7 @@ class Conversation:
     def deadline_s(self) -> float | None:
         """When `tick` wants to be called if nothing arrives before."""
         due = [self.session.deadline_s, self.limit.due_s]
-        if self.idle and self._may_ask:
+        if self.idle and self._may_ask and self._writable:
             due.append(self.silence.due_s)
         return min((d for d in due if d is not None), default=None)
 
@@ -206,7 +210,8 @@ class Conversation:
 
     def set_up_again(self, now_s: float) -> list[Event]:
         """The user's own outputs are back for a save, or kept: set the session's up (again)."""
-        if not (self.change_stream and (self.idle or self.phase is Phase.KEEPING)):
+        may = self.change_stream and self._writable
+        if not (may and (self.idle or self.phase is Phase.KEEPING)):
             return []
         if not self.outputs.kept:  # the disk was full until now: the journal first
             self.phase = Phase.KEEPING
@@ -244,16 +249,21 @@ class Conversation:
         return permitted(command, self.mode, self.change_stream, self._asking)
 
     @property
+    def _writable(self) -> bool:
+        """False for a device that is only observed: another model, or a firmware not known."""
+        return self.identity is None or self.identity.profile.writable
+
+    @property
     def _must_restore(self) -> bool:
         """The device that was read, and no other, may hold settings of this session."""
         left = self.change_stream and bool(self.outputs.left)
-        return (self._touched or left) and bool(self.outputs.users)
+        return (self._touched or left) and bool(self.outputs.users) and self._writable
 
     def _on_time(self, now_s: float) -> list[Event]:
         """What is due without a word from the device: the end of a stop, a silence to be ended."""
         if self.limit.over(now_s):
             return [] if self.phase is Phase.DONE else self._give_up(now_s)
-        if not (self.idle and self._may_ask):
+        if not (self.idle and self._may_ask and self._writable):
             return []
         if self.silence.pays(now_s):
             if not self._unkept:
@@ -279,7 +289,7 @@ class Conversation:
         """What takes too long ends here; a last VNASY,1 goes out, its reply is not waited for."""
         linked, self.phase = self.phase is not Phase.CLOSED, Phase.CLOSED
         events = self._abandon(now_s)
-        if linked and self._may_ask:
+        if linked and self._may_ask and self._writable:
             self._resume_blindly()
         self._done(OutOfTime(self._failure) if self._must_restore else None)
         return events
@@ -384,10 +394,14 @@ class Conversation:
             self.phase = Phase.READING
             twice = SESSION_SETTINGS if self.change_stream else ()
             return self._start(closing.read_surely(result.profile, twice), Purpose.READ, now_s)
-        if phase is Phase.READING and isinstance(result, dict):
+        if phase is Phase.READING and isinstance(result, dict) and self.identity is not None:
             self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]
+            self.identity = self.identity.observed_without(result)
+            if not self._writable:
+                why = self.identity.profile.observed_for
+                self._warn(f"observed only, nothing is written to it: {why}")
             self._said.append(ConfigurationRead(result))
-            if self.change_stream:
+            if self.change_stream and self._writable:
                 self.phase = Phase.KEEPING
                 return []
         if isinstance(result, CalibrationStream):

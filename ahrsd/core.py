@@ -16,7 +16,7 @@ import numpy as np
 from ahrsd import events, inputs
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.calibrator import Calibrator
-from ahrsd.conversation import Conversation
+from ahrsd.conversation import ECHOES, Conversation
 from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
 from ahrsd.errands import Errands
@@ -41,12 +41,12 @@ from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.states import State
-from drivers.vn100.decode import Measurement, Undecodable
+from drivers.vn100.decode import Measurement, Undecodable, Unused
 from drivers.vn100.registers import Values
-from drivers.vn100.session import DeviceFault, Stray
+from drivers.vn100.session import DeviceFault, LineEchoes, Stray
 from drivers.vn100.session import Event as SessionEvent
 
-_WATCHDOG_RESET, _HARD_FAULT, _RATE = 0x0A, 0x01, 7  # two VNERR codes, a register
+_WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01  # VNERR codes
 
 
 class Core:
@@ -185,6 +185,10 @@ class Core:
             elif isinstance(event, Undecodable):
                 self.undecodable += 1
                 self.stream.undecodable()
+            elif isinstance(event, Unused):
+                self.stream.unused(event.name)
+            elif isinstance(event, LineEchoes):
+                self._note("warning", ECHOES)
             elif isinstance(event, DeviceFault):
                 self._fault(event.code)
             elif isinstance(event, Stray):
@@ -227,9 +231,7 @@ class Core:
         compensation = Compensation.from_registers(values)
         self.epochs.begin(self._host_s, compensation)
         self.stream.warnings.update(dict.fromkeys(compensation.warnings))
-        rate = values.get(_RATE, ())
-        if rate and isinstance(rate[0], int | float) and rate[0] > 0:
-            self.stream.register_rate_hz = float(rate[0])
+        self.stream.registers = values
         # on trial, a candidate is still compared with what the user had before it
         trial = self.writeback.history.open
         users = values if trial is None else {**values, **trial.old}

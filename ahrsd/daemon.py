@@ -117,6 +117,7 @@ class Daemon:
         self._next_watch_s = self._retry_s = 0.0
         self._messages_before = 0
         self._wait_s = _REOPEN_S[0]
+        self._waiting = False  # whether it was said what is waited for since the link was lost
 
     # -- from outside ------------------------------------------------------------------------------
 
@@ -302,7 +303,7 @@ class Daemon:
             self._inbox.wake()
         if self._messages > self._messages_before:  # it was a device: it may be back at once
             self._wait_s = _REOPEN_S[0]
-        self._retry_s = time.monotonic() + self._wait_s
+        self._retry_s, self._waiting = time.monotonic() + self._wait_s, False
         self._feed(inputs.LinkLost(host_ns, reason))
 
     def _reopen(self) -> None:
@@ -314,7 +315,11 @@ class Daemon:
         try:
             self._open()
         except PortError as error:
-            self.shell.say(logging.WARNING, f"waiting for the device: {error}", self.clock.now_ns())
+            text = f"waiting for the device: {error}"
+            if not self._waiting:  # after each loss at once, however short ago the last one was
+                self.shell.folded.unfold(logging.WARNING, text)
+            self._waiting = True
+            self.shell.say(logging.WARNING, text, self.clock.now_ns())
 
     # -- the end -----------------------------------------------------------------------------------
 

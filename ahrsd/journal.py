@@ -192,7 +192,9 @@ def wrg_lines(record: Record, which: str = "old") -> list[str]:
 def typed_lines(registers: Mapping[int, Values]) -> list[str]:
     """`$VNWRG,...*CS` for each register that can be written, in the order of their numbers."""
     return [
-        encode(f"VNWRG,{format_command(number, as_stored(number, values))}").decode().strip()
+        encode(f"VNWRG,{format_command(number, as_stored(number, values), held=True)}")
+        .decode()
+        .strip()
         for number, values in sorted(registers.items())
         if REGISTERS[number].writable
     ]

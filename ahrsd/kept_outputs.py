@@ -55,7 +55,7 @@ class KeptOutputs:
         kept = self._kept or {}
         present = {n: registers[n] for n in SESSION_SETTINGS if n in registers}
         self.users = {
-            n: kept[n] if n in kept and left_by_session(n, kept[n], value) else value
+            n: kept[n] if n in kept and left_by_session(n, kept, value) else value
             for n, value in present.items()
         }
         self.left = tuple(n for n, value in present.items() if self.users[n] != value)

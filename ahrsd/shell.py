@@ -58,6 +58,11 @@ class FoldedLog:
         if len(self._open) > _FOLD_TEXTS:
             self._end(*self._open.popitem(last=False))
 
+    def unfold(self, level: int, text: str) -> None:
+        """The text is news again: the next time it is written."""
+        if (counted := self._open.pop((level, text), None)) is not None:
+            self._end((level, text), counted)
+
     def settle(self, now_s: float) -> None:
         """Write the counts whose minute is over."""
         while self._open and now_s - next(iter(self._open.values()))[0] >= _FOLD_S:

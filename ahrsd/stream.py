@@ -4,10 +4,11 @@ Rows of one layout are collected until a quarter of a second is together, at lea
 so that the blocks do not depend on how the bytes were cut), then turned into arrays at once.
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
-the rate. Damaged messages, and steps over which the device turned further than its rate can explain
-(`stream_rate.TurnWatch`), count as lost messages then, so that nothing is bridged. The rate of such
-a stream is what the caller says, else register 7, else what the arrival times say, else the
-factory's 40 Hz.
+the rate. Damaged messages, steps over which the device turned further than its rate can explain
+(`stream_rate.TurnWatch`), and a pause in the arrivals count as lost messages then, so that nothing
+is bridged. The rate of such a stream is what the caller says, else what the register of this very
+output says (`output_rates`), else what the arrival times say, else the factory's 40 Hz. Where
+messages come at another rate than a register says, time after time, the arrivals are right.
 
 How the bytes were cut into chunks changes nothing: everything here goes by the messages and by the
 damage in front of each, never by what else came with them.
@@ -23,6 +24,7 @@ import numpy as np
 
 from ahrsd.clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
 from ahrsd.evidence.values import HealthFacts
+from ahrsd.output_rates import RateWatch, offered_rate, rate_by_registers, rate_of_arrivals
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream_facts import Gaps, StreamFacts
 from ahrsd.stream_rate import TurnWatch, attitude_columns
@@ -31,14 +33,19 @@ from ahrsd.unmapping import (
     Extractor,
     MissingQuantityError,
     RegisterEpochs,
+    RegisterValues,
     sample_blocks,
 )
+from drivers.vn100.binary import BinaryLayout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
 
 FACTORY_RATE_HZ = 40.0
 _BLOCK_S, _LEAST_ROWS, _MOST_ROWS = 0.25, 4, 256
-_ARRIVALS = 100  # messages whose arrival times give the rate of a stream without device time
+_PAUSE_S, _PAUSE_STEPS = 0.5, 4.0  # arrivals apart by both: something was not sent or not heard
+_LONGEST_PAUSE_S = (
+    60.0  # a longer one may be the host's clock that was set: its length says nothing
+)
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _GARBAGE_BYTES = 60  # of no text; less may have come between two whole messages
 _MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
@@ -72,7 +79,9 @@ class Stream:
         self.by_layout: Counter[str] = Counter()
         self.warnings: dict[str, None] = {}
         self.refused: dict[str, MissingQuantityError] = {}
-        self.register_rate_hz: float | None = None
+        self.not_used: dict[str, None] = {}
+        self._not_used_said = ""
+        self.registers: RegisterValues = {}
         self._said_rate_hz, self._said_source = rate_hz, rate_source
         self._extractor: Extractor | None = None
         self._timeline = StreamTimeline()
@@ -82,11 +91,13 @@ class Stream:
         self._lost: list[int] = []
         self._lost_next = self._others = 0
         self._want = 1
+        self._arrived_s = 0.0
         self._forgiven = False
         self._replaced = self._left_out = False
         self._attitude: list[int] | None = None
         self._turns = TurnWatch()
         self._turns_said = self._rate_warned = ""
+        self._watch = RateWatch()
         self._given_s: float | None = None
         self._given_steps, self._given_step_s = 0, 0.0
 
@@ -122,6 +133,16 @@ class Stream:
             tail = noise and self._lost_next > 0  # of a message that was counted
             self.lost(size // _MESSAGE_BYTES if tail else max(1, round(size / _MESSAGE_BYTES)))
 
+    def unused(self, name: str) -> None:
+        """A whole message of another model, or one with nothing that a VN-100 measures: no loss."""
+        self._count(name)
+        if name not in self.not_used and len(self.not_used) < _MOST_NAMES:
+            self.not_used[name] = None
+            told = ", ".join(self.not_used)
+            self.warnings.pop(self._not_used_said, None)
+            self._not_used_said = f"in the stream, but no message of a VN-100 and not used: {told}"
+            self.warnings[self._not_used_said] = None
+
     def undecodable(self) -> None:
         """A message with a right checksum whose content is none."""
         self.facts.damaged += 1
@@ -139,6 +160,8 @@ class Stream:
     def _cut(self) -> None:
         self._timeline.forget()
         self._turns.forget()
+        self._watch.forget()
+        self._arrived_s = 0.0
         if self._steps is not None:  # counted time stood still meanwhile and the host's did not
             self.clock = DeviceClock()
         self._lost_next = max(self._lost_next, 1)
@@ -159,6 +182,8 @@ class Stream:
             extractor = self._accept(measurement)
             if extractor is None:
                 return []
+        if not extractor.has_time:
+            self._look_at_arrival(host_s)
         self._rows.append(measurement.values)
         self._arrivals.append(host_s)
         self._lost.append(self._lost_next)
@@ -167,6 +192,45 @@ class Stream:
             return []
         self._want = self._wanted(extractor)
         return self.flush() if len(self._rows) >= self._want else []
+
+    def _look_at_arrival(self, host_s: float) -> None:
+        """What an arrival says of a stream without time: a pause, and whether the rate is right."""
+        before_s, self._arrived_s = self._arrived_s, host_s
+        if before_s <= 0.0:
+            return
+        step_s, pause_s = self._step_s(), host_s - before_s
+        if pause_s > max(_PAUSE_S, _PAUSE_STEPS * step_s):
+            self._watch.forget()
+            if self._steps is None:
+                self._clear()  # these arrivals and those to come are not on one line
+            else:
+                known = pause_s <= _LONGEST_PAUSE_S
+                self.lost(max(round(pause_s / step_s) - 1, 1) if known else 1)
+        elif self._steps is not None and self._said_rate_hz is None:
+            comes_hz = self._watch.look(host_s, self._lost_next, self.facts.rate_hz)
+            if comes_hz is not None:
+                self._correct_rate(comes_hz)
+
+    def _step_s(self) -> float:
+        """Seconds between messages as far as is known; infinite where nothing is."""
+        if self._steps is not None:
+            return self._steps.step_s
+        if len(self._arrivals) < _LEAST_ROWS:
+            return np.inf
+        return (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
+
+    def _correct_rate(self, comes_hz: float) -> None:
+        """The arrivals contradict the rate: what was collected by it is forgotten."""
+        assert self._extractor is not None
+        assert self._steps is not None
+        layout, believed = self._extractor.layout, self.facts.rate_source
+        rate_hz = offered_rate(layout, comes_hz)
+        since_s, was_hz = self._steps.now_s, self.facts.rate_hz
+        self._clear()
+        self._decide(rate_hz, f"arrival times; {believed} said {was_hz:.4g} Hz")
+        self._steps = StepClock(rate_hz, since_s)
+        self._cut()
+        self._replaced = self.facts.samples > 0
 
     def _count(self, name: str) -> None:
         """One message; a name too many is one of the `OTHERS`."""
@@ -200,6 +264,9 @@ class Stream:
         self._attitude = None if new.has_time else attitude_columns(layout)
         self.facts.layout = layout.name
         self.warnings.update(dict.fromkeys(new.warnings))
+        if isinstance(layout, BinaryLayout) and layout.left_out:
+            fields = ", ".join(dict.fromkeys(layout.left_out))
+            self.warnings[f"{layout.name}: skipped, as no VN-100 measures it: {fields}"] = None
         self._cut()
         return new
 
@@ -228,24 +295,26 @@ class Stream:
         if extractor.has_time:
             period = self._timeline.period_s
             return 16 if not np.isfinite(period) else _rows(1.0 / period)
-        if self._steps is None and self._rate(len(self._rows)) is None:
+        if self._steps is None and self._rate() is None:
             return len(self._rows) + 1
         rate = self.facts.rate_hz
         return _rows(rate) if np.isfinite(rate) else 1
 
-    def _rate(self, count: int) -> float | None:
+    def _rate(self) -> float | None:
         """Rate of a stream without device time, None while it must still be watched."""
         said = self._said_rate_hz
         if said is not None:
             return self._decide(said, self._said_source)
-        if self.register_rate_hz is not None:
-            return self._decide(self.register_rate_hz, "register 7")
+        assert self._extractor is not None
+        layout = self._extractor.layout
+        if (found := rate_by_registers(layout, self.registers)) is not None:
+            return self._decide(*found)
         if not self._arrivals or self._arrivals[-1] == 0.0:
             return self._decide(FACTORY_RATE_HZ, "assumed: the factory's rate")
-        span = self._arrivals[-1] - self._arrivals[0]
-        if self.epochs.now.compensation is None or count < _ARRIVALS or span <= 0:
-            return None  # register 7 may yet be read, or the arrivals say too little
-        return self._decide((count - 1) / span, "arrival times")
+        if self.epochs.now.compensation is None:
+            return None  # the registers may yet be read
+        arrived_hz = rate_of_arrivals(layout, self._arrivals, self._lost)
+        return None if arrived_hz is None else self._decide(arrived_hz, "arrival times")
 
     def _decide(self, rate_hz: float, source: str) -> float:
         self.facts.rate_hz, self.facts.rate_source = rate_hz, source
@@ -263,7 +332,7 @@ class Stream:
         extractor = self._extractor
         if extractor is None or not self._rows:
             return []
-        if not extractor.has_time and self._steps is None and self._rate(len(self._rows)) is None:
+        if not extractor.has_time and self._steps is None and self._rate() is None:
             self._clear()  # nobody can say yet when they were
             return []
         table = np.array(self._rows, dtype=np.float64)
@@ -389,9 +458,11 @@ class Stream:
         """Raise NoSamplesError, naming what came, where messages came and none is of use."""
         if self.facts.samples or not self.by_layout:
             return
-        reasons = "; ".join(str(error) for error in self.refused.values())
+        reasons = [str(error) for error in self.refused.values()]
+        if self.not_used:
+            reasons.append(f"{', '.join(self.not_used)}: nothing of it is used")
         if reasons:
-            raise NoSamplesError(reasons)
+            raise NoSamplesError("; ".join(reasons))
 
 
 def _rows(rate_hz: float) -> int:

@@ -10,7 +10,8 @@ Errors::
     PortError                    report it
     +-- PortAbsent               wait for the device, or the path is wrong
     +-- PortBusy                 somebody has it: `holders` says who
-    +-- PortUnusable             no permission, no terminal, a rate it cannot do
+    +-- PortForbidden            no permission: the text names the group to join
+    +-- PortUnusable             no terminal, a rate it cannot do
     +-- LinkLost                 it was open and is gone: close, open again
 """
 
@@ -19,8 +20,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
 import os
+import pwd
 import select
+import stat
 import struct
 import termios
 import time
@@ -61,6 +65,10 @@ class PortBusy(PortError):
         who = ", ".join(map(str, others)) or "a process that cannot be seen from here"
         super().__init__(f"{path} is in use by {who}: stop it first")
         self.holders = others
+
+
+class PortForbidden(PortError):
+    """The user may not open it."""
 
 
 class PortUnusable(PortError):
@@ -256,7 +264,11 @@ def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     def enough(chunk: bytes) -> bool:
         nonlocal answers
         replies = [decode(frame) for frame in deframer.feed(chunk)]
-        answers += sum(isinstance(reply, Reply) and reply.register == 1 for reply in replies)
+        # a line that echoes sends the question back, which has no values
+        answers += sum(
+            isinstance(reply, Reply) and reply.register == 1 and bool(reply.tokens)
+            for reply in replies
+        )
         return answers > 0
 
     received = _collect(port, listen_s, enough)
@@ -313,5 +325,29 @@ def _why(path: str, error: Exception) -> PortError:
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
     if number in (errno.EACCES, errno.EPERM):
-        return PortUnusable(f"{path}: no permission (is the user in the group of the device?)")
+        return PortForbidden(f"{path}: no permission; {_who_may(path)}")
     return PortUnusable(f"{path} cannot be opened as a serial port: {error}")
+
+
+def _who_may(path: str) -> str:
+    """What a person can do who may not open the port."""
+    try:
+        status = Path(path).stat()
+        group = grp.getgrgid(status.st_gid)
+    except (OSError, KeyError):
+        return "is the user in the group of the device?"
+    both = stat.S_IRGRP | stat.S_IWGRP
+    if not status.st_gid or status.st_mode & both != both:
+        return "no group may open it: give it to one by a udev rule"
+    if status.st_gid in os.getgroups():
+        return f"although this process is in its group {group.gr_name}: is it in a container?"
+    if _user() in group.gr_mem:
+        return f"you are in its group {group.gr_name} since you logged in: log in again"
+    return f"join its group: sudo usermod -aG {group.gr_name} {_user()}, then log in again"
+
+
+def _user() -> str:
+    try:
+        return pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return "$USER"

@@ -81,7 +81,14 @@ KEPT = ("OUTPUTS_KEPT", {"serial": 5, "old": {str(n): list(v) for n, v in USERS.
     ],
 )
 def test_what_a_session_leaves_is_told_from_what_a_person_wrote(register, users, present, left):
-    assert left_by_session(register, users, present) is left
+    assert left_by_session(register, {register: users}, present) is left
+
+
+def test_an_output_that_moved_to_a_free_register_is_the_sessions():
+    users = {75: (3, 40, 0x29, 0x7FFF, 0x0210, 0x000C), 76: (0, 1, 0)}
+    assert left_by_session(76, users, (2, *users[75][1:]))
+    assert not left_by_session(76, users, (2, 8, *users[75][2:]))
+    assert not left_by_session(76, {76: (0, 1, 0)}, (2, *users[75][1:]))
 
 
 def test_the_users_outputs_are_told_register_by_register():

@@ -123,7 +123,7 @@ class TestWithoutTime:
 
     def test_register_7_comes_before_arrival_times(self):
         stream = Stream(known())
-        stream.register_rate_hz = 20.0
+        stream.registers = {7: (20,)}
         feed(stream, VNYMR, range(20), host=True)
         assert (stream.facts.rate_hz, stream.facts.rate_source) == (20.0, "register 7")
 
@@ -374,7 +374,7 @@ def test_names_of_messages_are_bounded_and_every_message_is_counted():
 def test_a_rate_that_is_found_again_is_warned_of_once():
     stream = Stream(RegisterEpochs())
     for begin, rate in ((0, 40.0), (5000, 50.0), (10000, 20.0)):
-        stream.register_rate_hz = rate
+        stream.registers = {7: (rate,)}
         feed(stream, VNYMR, range(begin, begin + 50))
         assert stream.facts.rate_hz == rate
         stream.forget()

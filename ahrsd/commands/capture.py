@@ -6,24 +6,27 @@ import json
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import click
 
-from ahrsd.commands.device_access import describe, driver_errors, open_port, read_all
+from ahrsd.commands.device_access import PORT, describe, driver_errors, open_port, read_all
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
 from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
 from ahrsd.recording.capture import CaptureStatus, CaptureWriter, Sent
 from drivers import serial_port
 from drivers.serial_port import SerialPort
 from drivers.usb import latency_timer_ms
+from drivers.vn100.deframer import Deframer, Sentence
 from drivers.vn100.device import Device
 
 _WAIT_S = 0.2  # how soon a signal or the end of --seconds is noticed
-_PROGRESS_S = 0.5
+_PROGRESS_S, _LINE_S = 0.5, 5.0  # on a terminal, and where each is a line of its own
+_MOST_KINDS = 64
 
 
 @dataclass(slots=True)
@@ -32,12 +35,37 @@ class _Session:
 
     start_s: float
     received: int = 0
+    deframer: Deframer = field(default_factory=Deframer)
+    kinds: Counter[str] = field(default_factory=Counter)
     reason: str = ""
     unplugged: bool = False
 
+    @property
+    def messages(self) -> int:
+        """Whole messages so far."""
+        return self.deframer.counters.valid
+
+    def hear(self, data: bytes) -> None:
+        """Bytes that arrived: counted, and the messages in them."""
+        self.received += len(data)
+        for frame in self.deframer.feed(data):
+            kind = frame.body[:5] if isinstance(frame, Sentence) else frame.layout.name
+            if kind in self.kinds or len(self.kinds) < _MOST_KINDS:
+                self.kinds[kind] += 1
+
+    def said(self, now_s: float) -> str:
+        """What was heard until now, for a person."""
+        took_s = now_s - self.start_s
+        if not self.messages:
+            heard = "no message of a VN-100" if self.received else "silence"
+        else:
+            most = ", ".join(kind for kind, _ in self.kinds.most_common(2))
+            heard = f"{self.messages:,} messages ({most})"
+        return f"{took_s:7.1f} s {self.received:12,} bytes, {heard}"
+
 
 @click.command()
-@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("port", type=PORT)
 @click.option("-o", "--output", "path", required=True, type=click.Path(path_type=Path),
               help="File to write, *.mcap; it must not exist.")  # fmt: skip
 @click.option("--passive", is_flag=True, help="Send no byte; the registers stay unknown.")
@@ -116,13 +144,13 @@ def _record(serial: SerialPort, writer: CaptureWriter, seconds: float | None) ->
                 session.reason, session.unplugged = str(error), True
                 break
             if data:
-                session.received += len(data)
+                session.hear(data)
                 writer.write(Received(time.monotonic_ns(), data))
             now_s = time.monotonic()
             if end_s is not None and now_s >= end_s:
                 session.reason = f"--seconds {seconds:g}"
             if now_s >= progress_s:
-                progress_s = now_s + _PROGRESS_S
+                progress_s = now_s + (_PROGRESS_S if sys.stderr.isatty() else _LINE_S)
                 _progress(session, writer.status, now_s)
     host_ns = time.monotonic_ns()
     if session.unplugged:
@@ -147,12 +175,11 @@ def _signals(session: _Session) -> Iterator[None]:
 
 
 def _progress(session: _Session, status: CaptureStatus, now_s: float) -> None:
+    trouble = f"  {status.error}" if status.error else ""
     if sys.stderr.isatty():
-        trouble = f"  {status.error}" if status.error else ""
-        took_s = now_s - session.start_s
-        click.echo(
-            f"\r{took_s:7.1f} s {session.received:12,} bytes{trouble}\033[K", err=True, nl=False
-        )
+        click.echo(f"\r{session.said(now_s)}{trouble}\033[K", err=True, nl=False)
+    elif now_s > session.start_s:
+        click.echo(f"{session.said(now_s)}{trouble}", err=True)
 
 
 def _report(path: Path, session: _Session, status: CaptureStatus, json_path: str | None) -> None:
@@ -165,13 +192,17 @@ def _report(path: Path, session: _Session, status: CaptureStatus, json_path: str
         "recording": str(path),
         "duration_s": round(took_s, 3),
         "bytes": session.received,
+        "messages": session.messages,
         "lost_bytes": status.lost_bytes,
         "stopped_by": session.reason,
     }
     if json_path == "-":
         click.echo(json.dumps(summary))
     else:
-        click.echo(f"{path}: {session.received} bytes in {took_s:.1f} s, ended by {session.reason}")
+        click.echo(
+            f"{path}: {session.received} bytes, {session.messages} messages in {took_s:.1f} s, "
+            f"ended by {session.reason}"
+        )
         if json_path:
             Path(json_path).write_text(json.dumps(summary) + "\n", encoding="utf-8")
     if status.lost_bytes:
@@ -181,4 +212,8 @@ def _report(path: Path, session: _Session, status: CaptureStatus, json_path: str
         raise DeviceError(f"{session.reason}; what came before is in {path}", EXIT_BUSY)
     if not session.received:
         raise DeviceError("nothing was received; is the device on, is --baud right?", EXIT_BUSY)
+    if not session.messages:
+        raise DeviceError(
+            f"no message of a VN-100 in {session.received} bytes; is --baud right?", EXIT_BUSY
+        )
     raise SystemExit(EXIT_DONE)

@@ -8,23 +8,28 @@ from pathlib import Path
 
 import click
 
+from ahrsd.conversation import ECHOES
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, DeviceError
+from ahrsd.serial_reader import find_device
 from drivers.serial_port import (
     BaudNotFound,
     LinkLost,
     PortAbsent,
     PortBusy,
     PortError,
+    PortForbidden,
     SerialPort,
-    detect_baud,
 )
 from drivers.vn100.commands import Command
 from drivers.vn100.device import Device, Tap, reads_only
 from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import Identity, identify, read_configuration
 from drivers.vn100.registers import Values
+from drivers.vn100.session import Event, LineEchoes
 
-_EXIT = {PortAbsent: EXIT_BUSY, PortBusy: EXIT_BUSY, BaudNotFound: EXIT_BUSY, LinkLost: EXIT_BUSY}
+_EXIT = dict.fromkeys((PortAbsent, PortBusy, PortForbidden, BaudNotFound, LinkLost), EXIT_BUSY)
+# Whether it may be opened is for the driver to say: it knows the group that one must join.
+PORT = click.Path(path_type=Path, readable=False)
 
 
 @contextmanager
@@ -41,7 +46,7 @@ def driver_errors() -> Iterator[None]:
 def open_port(path: Path, baud: int | None, *, may_query: bool) -> SerialPort:
     """The port at the given rate, or at the one that the device is heard at."""
     if baud is None:
-        found = detect_baud(path, may_query=may_query)
+        found = find_device(path, None, may_query=may_query)
         click.echo(f"{path}: {found.why}", err=True)
         baud = found.baud
     return SerialPort(path, baud)
@@ -55,8 +60,17 @@ def open_device(
     tap: Tap | None = None,
 ) -> Iterator[Device]:
     """A device that may be sent what `allow` lets through; its errors come as DeviceError."""
-    with driver_errors(), Device(open_port(path, baud, may_query=True), allow, tap) as device:
+    with (
+        driver_errors(),
+        Device(open_port(path, baud, may_query=True), allow, tap, _tell) as device,
+    ):
         yield device
+
+
+def _tell(event: Event) -> None:
+    """What a person should know of the line."""
+    if isinstance(event, LineEchoes):
+        click.echo(f"ahrsd: {ECHOES}", err=True)
 
 
 def read_all(device: Device) -> tuple[Identity, dict[int, Values]]:

@@ -71,7 +71,7 @@ def apply(
         "HAND_PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), **why
     )
     try:
-        device.run(quiet(_write_all(changes)))
+        device.run(quiet(_write_all(changes, held="undoes" in why)))
     except (DriverError, PortError) as error:
         restored = _put_back(device, old)
         journal.append("HAND_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
@@ -92,9 +92,9 @@ def save_to_flash(device: Device, journal: Journal, prepared: Record) -> None:
     journal.append("HAND_FLASH_ACKED", txn=prepared.seq)
 
 
-def _write_all(changes: Changes) -> Procedure[None]:
+def _write_all(changes: Changes, held: bool) -> Procedure[None]:
     for number, values in changes.items():
-        yield from write_verified(number, values)
+        yield from write_verified(number, values, held=held)
 
 
 def _put_back(device: Device, old: Changes) -> str:

@@ -10,20 +10,27 @@ from typing import TypeVar
 import click
 
 from ahrsd.commands import register_locks
-from ahrsd.commands.device_access import describe, open_device
+from ahrsd.commands.device_access import PORT, describe, open_device
 from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
+from ahrsd.commands.register_text import described
 from ahrsd.config import default_state_directory
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.journal import Journal, Record, journal_path, register_values, typed_lines, wrg_lines
 from drivers.vn100.device import Device
-from drivers.vn100.procedures import Identity, identify, read_configuration, read_registers
+from drivers.vn100.procedures import (
+    Identity,
+    identify,
+    missing,
+    read_configuration,
+    read_present,
+    read_registers,
+)
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,
     Values,
     format_command,
-    format_reply,
     parse,
 )
 
@@ -67,7 +74,7 @@ command.add_command(register_locks.unlock)
 
 
 @command.command()
-@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("port", type=PORT)
 @click.argument("ids", nargs=-1, type=int, callback=_known)
 @_BAUD
 @click.option("--json", "json_path", help="Values as JSON into this file, - for stdout.")
@@ -75,16 +82,23 @@ def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | No
     """Print registers of the device on PORT: those in IDS, else its whole configuration."""
     with open_device(port, baud) as device:
         identity = device.run(identify())
-        procedure = read_registers(ids) if ids else read_configuration(identity.profile)
+        procedure = read_present(ids) if ids else read_configuration(identity.profile)
         values = device.run(procedure)
+    absent = [n for n in ids if n not in values] if ids else missing(identity.profile, values)
     if json_path != "-":
         click.echo(f"{identity.model}, serial {identity.serial}, firmware {identity.firmware}")
         for number, row in values.items():
-            click.echo(f"{number:3}  {REGISTERS[number].name:36.36}  {_text(number, row)}")
+            click.echo(f"{number:3}  {REGISTERS[number].name}")
+            click.echo(f"     {_text(number, row)}")
     if json_path == "-":
         click.echo(_json(values, identity), nl=False)
     elif json_path:
         Path(json_path).write_text(_json(values, identity), encoding="utf-8")
+    if absent:
+        numbers = ", ".join(map(str, absent))
+        click.echo(f"ahrsd: firmware {identity.firmware} has no register {numbers}", err=True)
+    if ids and absent:
+        raise SystemExit(EXIT_NO)
 
 
 @command.command()
@@ -123,7 +137,7 @@ def diff(
 
 
 @command.command(context_settings={"ignore_unknown_options": True})
-@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("port", type=PORT)
 @click.argument("number", metavar="ID", type=int, callback=_known)
 @click.argument("values", nargs=-1, required=True)
 @_YES
@@ -201,7 +215,7 @@ def export(
 
 
 @command.command()
-@click.argument("port", type=click.Path(path_type=Path))
+@click.argument("port", type=PORT)
 @click.argument("number", metavar="[ID]", type=int, required=False)
 @_YES
 @_SAVE
@@ -259,7 +273,7 @@ def _change(
         if not yes:
             raise click.UsageError("nothing was written; add --yes to do it")
         if not identity.profile.writable:
-            raise AhrsdError(f"firmware {identity.firmware} is not known; nothing is written to it")
+            raise AhrsdError(f"nothing is written to it: {identity.profile.observed_for}")
         permitted.update(changes)
         record = apply(device, journal, identity, changes, **why)
         click.echo(f"written and verified in RAM, journal {journal.path} record {record.seq}")
@@ -301,7 +315,7 @@ def _print_record(record: Record) -> None:
 
 
 def _text(number: int, values: Values) -> str:
-    return format_reply(number, values).partition(",")[2]
+    return described(number, values)
 
 
 def _state(given: Path | None) -> Path:

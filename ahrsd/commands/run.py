@@ -10,10 +10,15 @@ import click
 from ahrsd.config import Config, Mode, load_config
 from ahrsd.config_text import print_config
 
+# Whether it may be opened is for the driver to say: it knows the group that one must join.
+_PORT = click.Path(path_type=Path, readable=False)
+
 
 @click.command()
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
-@click.option("--port", type=click.Path(path_type=Path), help="Serial port of the device.")
+@click.option(
+    "--port", type=click.Path(path_type=Path, readable=False), help="Serial port of the device."
+)
 @click.option("--mode", type=click.Choice(get_args(Mode)), help="How far the daemon may go.")
 @click.option("--wait", is_flag=True, help="Wait for a device that is not there (for a service).")
 @click.option("--print-config", "print_only", is_flag=True, help="Print the configuration, stop.")

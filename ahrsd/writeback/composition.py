@@ -102,7 +102,7 @@ def compose(
 def register_lines(values: Mapping[int, Values]) -> tuple[str, ...]:
     """`$VNWRG,23,...*XX`: what is sent, and what a person may type into a terminal."""
     return tuple(
-        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]))}")
+        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]), held=True)}")
         .decode()
         .strip()
         for number in sorted(values)

@@ -63,7 +63,7 @@ class Safeguards:
                 f"this is the device {identity.serial}, writes are for {self._serial} only"
             )
         if not identity.profile.writable:
-            self._limits.append(f"firmware {identity.firmware!r} is unknown: observe only")
+            self._limits.append(f"observe only: {identity.profile.observed_for}")
         if missing := [n for n in (MAG, GYRO, HSI_CONTROL) if n not in registers]:
             self._limits.append(f"registers {missing} could not be read")
         if not journal_readable:

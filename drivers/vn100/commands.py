@@ -9,7 +9,7 @@ Codes".
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from drivers.vn100.decode import Reply
@@ -92,6 +92,8 @@ class Read:
 
     def answered_by(self, reply: Reply) -> bool:
         """Whether `reply` is one to this: the word, the register, and values that it can have."""
+        if not reply.tokens and self.register != USER_TAG:  # a command's echo, not an answer
+            return False
         values = _values(self.register, "VNRRG", reply)
         return values is not None and (self.port is None or values[1:] == (self.port,))
 
@@ -101,18 +103,22 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Write a register in RAM. RegisterValueError where the device would refuse the values."""
+    """Write a register in RAM. RegisterValueError where the device would refuse the values.
+
+    held: the device itself held these values, so they may go back whatever the manual says of them
+    """
 
     register: int
     values: Values
+    held: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
-        format_command(self.register, self.values)
+        format_command(self.register, self.values, held=self.held)
 
     @property
     def body(self) -> str:
         """What goes between $ and *."""
-        return f"VNWRG,{format_command(self.register, self.values)}"
+        return f"VNWRG,{format_command(self.register, self.values, held=self.held)}"
 
     def answered_by(self, reply: Reply) -> bool:
         """Whether `reply` echoes these values; an echo of others is another program's."""
@@ -165,6 +171,7 @@ class Pause:
 
 Command = Read | Write | Word | Pause
 Speech = Read | Write | Word
+USER_TAG = 0
 RESUME = Word("VNASY", (1,))
 QUIET = Word("VNASY", (0,))
 

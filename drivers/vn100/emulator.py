@@ -228,6 +228,7 @@ class Emulator:
 
     def _follow(self, answer: Answer, now_s: float) -> None:
         if answer.packet:
+            self._reply(answer.body, now_s)
             self._wire.send(answer.packet, now_s)
             return
         if answer.effect is Effect.SAVE:

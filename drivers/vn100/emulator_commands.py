@@ -6,6 +6,7 @@ beyond its reply is returned as an `Effect`; the emulator sees to the times.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -41,7 +42,7 @@ class Effect(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A reply: the body of a sentence, or a packet as it goes on the wire."""
+    """A reply: the body of a sentence, and a packet as it goes on the wire behind it."""
 
     body: str = ""
     packet: bytes = b""
@@ -90,11 +91,14 @@ class Interpreter:
             "VNASY": self._gate,
             "VNKMD": self._disturbance("VNKMD", KNOWN_MAGNETIC),
             "VNKAD": self._disturbance("VNKAD", KNOWN_ACCELERATION),
-            "VNSGB": self._keep_bias,
+            "VNSGB": self._keep_bias_as("VNSGB"),
             "VNBOM": self._poll,
         }
         if memory.generation == 2:
             self._words["VNTAR"] = self._tare
+        else:  # known to the vendor's current library
+            self._words["VNSIH"] = self._initial_heading
+            self._words["VNSFB"] = self._keep_bias_as("VNSFB")
 
     def answer(self, body: str, tick: int) -> Answer:
         """Carry out a command at `tick`. Raises RegisterValueError where it is refused."""
@@ -190,13 +194,31 @@ class Interpreter:
 
         return handler
 
-    def _keep_bias(self, arguments: list[str], _: int) -> Answer:
-        _none(arguments)
-        register = self.memory.bias_register
-        rest = self.memory.get(register)[3:]
-        bias = self.memory.stored(register, (*self.sensor.filter_bias(), *rest))
-        self.memory.ram[register, 0] = bias
-        return Answer("VNSGB")
+    def _keep_bias_as(self, word: str) -> Callable[[list[str], int], Answer]:
+        """The filter's gyro bias into its start-up register (VNSGB, in newer words VNSFB)."""
+
+        def handler(arguments: list[str], _: int) -> Answer:
+            _none(arguments)
+            register = self.memory.bias_register
+            rest = self.memory.get(register)[3:]
+            bias = self.memory.stored(register, (*self.sensor.filter_bias(), *rest))
+            self.memory.ram[register, 0] = bias
+            return Answer(word)
+
+        return handler
+
+    def _initial_heading(self, arguments: list[str], tick: int) -> Answer:
+        """VNSIH: the heading of now, in degrees, until the next start."""
+        if len(arguments) != 1:
+            raise _refused(TOO_MANY if arguments else TOO_FEW, "one heading, in degrees")
+        try:
+            heading_deg = float(arguments[0])
+        except ValueError:
+            heading_deg = math.nan
+        if not abs(heading_deg) <= 360.0:
+            raise _refused(INVALID_PARAMETER, f"{arguments[0]} is no heading in degrees")
+        self.sensor.set_heading(tick, math.radians(heading_deg))
+        return Answer(f"VNSIH,{arguments[0]}")
 
     def _tare(self, arguments: list[str], tick: int) -> Answer:
         """The present attitude becomes the zero attitude until the next start (2.x)."""
@@ -205,8 +227,9 @@ class Interpreter:
         return Answer("VNTAR")
 
     def _poll(self, arguments: list[str], tick: int) -> Answer:
-        output = BINARY_OUTPUTS[_one(arguments, (1, 2, 3)) - 1]
+        number = _one(arguments, (1, 2, 3))
+        output = BINARY_OUTPUTS[number - 1]
         packet = binary_packet(self.memory.get(output), self.sensor, tick, 1)
         if not packet:
             raise _refused(INVALID_PARAMETER, f"register {output} selects nothing")
-        return Answer(packet=packet)
+        return Answer(f"VNBOM,{number}", packet)

@@ -22,7 +22,9 @@ KNOWN_MAGNETIC, KNOWN_ACCELERATION = 0x0800, 0x1000  # VpeStatus, after VNKMD an
 GYRO_FULL, MAG_FULL = 0x0004, 0x0040
 
 # Registers that hold what an asynchronous message carries.
-MEASURED: dict[int, Columns] = {row.register: row.columns for row in MESSAGES.values()}
+MEASURED: dict[int, Columns] = {
+    row.register: row.columns for row in MESSAGES.values() if row.register
+}
 
 
 @dataclass(frozen=True, slots=True)

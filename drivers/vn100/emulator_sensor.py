@@ -80,6 +80,14 @@ class Sensor:
         self._tare = np.array(self.row(("quat_x",), tick, 1))
         self.changed()
 
+    def set_heading(self, tick: int, heading_rad: float) -> None:
+        """The heading at `tick` becomes this one, about the vertical, until the next start."""
+        self._tare = None
+        self.changed()
+        half = (self.row(("yaw_rad",), tick, 1)[0] - heading_rad) / 2
+        self._tare = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+        self.changed()
+
     def row(self, names: Sequence[str], tick: int, step_ticks: int) -> Row:
         """The named quantities at `tick` (of the present block) for an output of that step."""
         offset = min(max(tick - self._block.first_tick, 0), BLOCK_TICKS - 1)

@@ -69,11 +69,12 @@ class DriverError(Exception):
 
 
 class DeviceRefused(DriverError):
-    """The device answered ``$VNERR,code``; `error` is the table's row."""
+    """The device answered ``$VNERR,code``; `error` is the table's row, `to` the command."""
 
-    def __init__(self, code: int) -> None:
+    def __init__(self, code: int, to: object = None) -> None:
         self.code = code
         self.error = device_error(code)
+        where = "" if to is None else f"{to}: "
         super().__init__(
-            f"the device answered error {code:02X} ({self.error.name}): {self.error.advice}"
+            f"{where}the device answered error {code:02X} ({self.error.name}): {self.error.advice}"
         )

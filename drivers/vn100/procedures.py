@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from drivers.vn100.commands import (
@@ -36,8 +36,8 @@ ERROR_WINDOW_S = 1.5  # after VNWNV: the device may still report an error
 INVALID_REGISTER = 0x08
 SESSION_SETTINGS = (*BINARY_OUTPUTS, 7, 6)  # in the order in which `restore` puts them back
 
-# Without one of these nothing can be said about the samples or put back later, so its absence is an
-# error. The others may be missing on some firmware.
+# Without one of these not everything can be said about the samples or put back later, so a device
+# that lacks one is only observed. The others may be missing on some firmware.
 _ESSENTIAL = (5, 6, 7, 23, 26, 30, 44, 47, 75, 76, 77, 84, 85)
 _OPTIONAL = (21, 25, 32, 35, 36, 38, 43, 74, 82, 83)
 CONFIGURATION = tuple(sorted(_ESSENTIAL + _OPTIONAL))
@@ -73,6 +73,16 @@ class Identity:
     firmware: str
     profile: Profile
 
+    def observed_without(self, values: Mapping[int, Values]) -> Identity:
+        """The same, not to be written where an essential register is not among `values`."""
+        absent = [n for n in _ESSENTIAL if self.profile.has(n) and n not in values]
+        if not absent:
+            return self
+        numbers = ", ".join(map(str, absent))
+        many = "s" if len(absent) > 1 else ""
+        why = f"firmware {self.firmware} has no register{many} {numbers}"
+        return replace(self, profile=self.profile.observed(why))
+
 
 def identify() -> Procedure[Identity]:
     """Registers 1 to 4. What an earlier program left half-sent may spoil the first query."""
@@ -85,7 +95,8 @@ def identify() -> Procedure[Identity]:
         hardware = int((yield from read(2))[0])
     serial = yield from read(3)
     firmware = str((yield from read(4))[0])
-    return Identity(str(first[0]), hardware, int(serial[0]), firmware, profile_of(firmware))
+    model = str(first[0])
+    return Identity(model, hardware, int(serial[0]), firmware, profile_of(firmware, model))
 
 
 def read(register: int, port: int | None = None) -> Procedure[Values]:
@@ -105,8 +116,8 @@ def read_registers(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
 def read_configuration(profile: Profile) -> Procedure[dict[int, Values]]:
     """Every configuration register of this firmware: what must be put back and what un-maps data.
 
-    A register that is not essential and that the device does not have (VNERR 08) is left out, so
-    `missing` can name it.
+    A register that the device does not have (VNERR 08) is left out, so `missing` can name it. So is
+    one of another model whose answer does not read like a VN-100's.
     """
     values: dict[int, Values] = {}
     for number in CONFIGURATION:
@@ -115,7 +126,22 @@ def read_configuration(profile: Profile) -> Procedure[dict[int, Values]]:
         try:
             values[number] = yield from read(number)
         except DeviceRefused as error:
-            if error.code != INVALID_REGISTER or number in _ESSENTIAL:
+            if error.code != INVALID_REGISTER:
+                raise
+        except NoReply:
+            if profile.writable or not values:
+                raise
+    return values
+
+
+def read_present(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Several registers, without those that the device does not have (VNERR 08)."""
+    values: dict[int, Values] = {}
+    for number in ids:
+        try:
+            values[number] = yield from read(number)
+        except DeviceRefused as error:
+            if error.code != INVALID_REGISTER:
                 raise
     return values
 
@@ -125,13 +151,14 @@ def missing(profile: Profile, values: Mapping[int, Values]) -> tuple[int, ...]:
     return tuple(n for n in CONFIGURATION if profile.has(n) and n not in values)
 
 
-def write_verified(register: int, values: Values) -> Procedure[Values]:
+def write_verified(register: int, values: Values, *, held: bool = False) -> Procedure[Values]:
     """Write, see the echo, read afresh, compare; up to three times. Returns what was read.
 
+    held: the device itself held the values (`commands.Write`)
     An echo that never came is no failure as long as the fresh read shows the values. Raises
     VerifyFailed; ValueError before anything is sent where the device would refuse the values.
     """
-    command = Write(register, values)
+    command = Write(register, values, held)
     back: Values = ()
     for _ in range(WRITE_TRIES):
         with suppress(NoReply):  # carried out or not: the read says which
@@ -218,7 +245,7 @@ def _put_back(number: int, values: Values) -> Procedure[bool]:
     present = yield from read(number)
     if same(number, values, present):
         return False
-    yield from write_verified(number, values)
+    yield from write_verified(number, values, held=True)
     return True
 
 

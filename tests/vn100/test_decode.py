@@ -20,6 +20,7 @@ from drivers.vn100.decode import (
     Measurement,
     Reply,
     Undecodable,
+    Unused,
     decode,
     decode_batch,
 )
@@ -96,7 +97,7 @@ def test_bad_values_are_undecodable(values: str) -> None:
         ("VNERR,XY", Undecodable("VNERR without an error code", 0)),
         ("VNRRG", Undecodable("VNRRG without a register number", 0)),
         ("VNRRG,-1", Undecodable("VNRRG without a register number", 0)),
-        ("VNGPS,1", Undecodable("VNGPS is not a message of a VN-100", 0)),
+        ("VNGPS,1", Unused("VNGPS", 0)),
     ],
 )
 def test_replies_and_errors(body: str, result: Decoded) -> None:
@@ -111,7 +112,7 @@ words = st.sampled_from(["VNYPR", "VNIMU", "VNRRG", "VNWRG", "VNERR", "VNASY", "
 @given(words, text)
 def test_no_text_raises(word: str, rest: str) -> None:
     result = decode(Sentence(f"{word},{rest}", 3, 0))
-    assert isinstance(result, Measurement | Reply | ErrorReply | Undecodable)
+    assert isinstance(result, Measurement | Reply | ErrorReply | Undecodable | Unused)
     if isinstance(result, Measurement):
         assert all(map(math.isfinite, result.values))
 

@@ -72,7 +72,7 @@ EXCHANGES = [  # vn100-protocol 1.1, 3, 9 and 13.1, as found in public documents
     (b"$VNWRG,26,1,0.1,0,0,1,0,0,0,1*XX", b"$VNERR,07*76"),
     (b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,nan*XX", b"$VNERR,07*76"),
     (b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,1E-3*XX", b"$VNERR,07*76"),
-    (b"$VNWRG,75,1,16,08,0001*XX", b"$VNERR,07*76"),
+    (b"$VNWRG,75,1,16,04,2000*XX", b"$VNERR,07*76"),
     (b"$VNBOM,1*45", b"$VNERR,07*76"),
     (b"$VNRRG,99*XX", b"$VNERR,08*79"),
     (b"$VNRRG,74*XX", b"$VNERR,08*79"),
