@@ -99,7 +99,8 @@ class Desk:
         self._out.append(action)
 
     def record(self, kind: Kind, **facts: object) -> None:
-        """Append to the journal; the history takes it as given."""
+        """Append to the journal, behind what it lacks; the history takes it as given."""
+        self.journal_again()
         transaction = self.history.open
         complete = {
             **({} if transaction is None else {"txn": transaction.id}),

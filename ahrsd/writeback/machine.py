@@ -214,7 +214,7 @@ class WriteBack:
             and self.state in RESTS
             and self._restarts.proven(record, desk.now.stamp, host_s)
         ):
-            self._restarts.seen(record, desk.now.stamp)
+            self._restarts.concluded()
             reason = "the device restarted since the journal's newest record"
         else:
             desk.device_s = uptime_s
@@ -290,6 +290,7 @@ class WriteBack:
     def on_stop(self, host_s: float) -> list[Action]:
         """The daemon ends: what is only in RAM is undone, unless it is proven and to be kept."""
         self._desk.host_s, self._safe.stopping = host_s, True
+        self._desk.journal_again()
         if not (self.policy.keep_on_stop and self.state is State.PROVEN):
             self._flow.roll_back("stop", "the daemon stops")
         return self._answer()

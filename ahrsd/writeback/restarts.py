@@ -29,10 +29,18 @@ class RestartWatch:
         self._started_s = math.inf  # when it started up, at the latest
 
     def seen(self, record: Stamp, now: Stamp, uptime_s: float | None = None) -> None:
-        """A restart was seen; where its time tells (it fell), that must be after the record."""
-        if uptime_s is None or restarted_since(record, now, uptime_s):
+        """A restart was seen; a device that tells its time must show that it was after the record.
+
+        So what the device only reports (VNERR) counts where its stream has no time.
+        """
+        untimed = uptime_s is None and self._first_s is None
+        if untimed or restarted_since(record, now, uptime_s):
             self._seen = self._serial
         self._bound = False
+
+    def concluded(self) -> None:
+        """Its time has proven a restart: the device is read again, and that counts."""
+        self._seen, self._bound = self._serial, False
 
     def lost(self) -> None:
         """The link went away, or nobody is there to ask."""

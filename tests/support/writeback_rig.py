@@ -309,11 +309,10 @@ class Rig:
         if lost == "device":
             self.do(self.wb.on_link_lost(self.now_s))
             self.do(self.wb.on_reset(self.now_s))
-            self.connect()
-            return
         if lost == "all":
             self.boots, self.boot_began_s = self.boots + 1, self.now_s - 5.0
-        self.start()
+        if lost != "device":
+            self.start()
         self.connect()
         asked = self.asked_again
         for _ in range(3 if self.tells_time else 0):  # a second of messages
