@@ -76,7 +76,7 @@ class Core:
         self.first_s = float("nan")
         self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
         self._stopping = ""
-        self._closing = self._uptime_due = self._unread = False
+        self._closing = self._unread = False
         self._serial: int | None = None
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
@@ -125,7 +125,8 @@ class Core:
     # -- inputs ------------------------------------------------------------------------------------
 
     def _wall_clock(self, item: inputs.WallClock) -> None:
-        self._rollcall.wall_offset_s = item.wall_s - self._host_s
+        add, back = self._errands.add, self.writeback
+        add(back.on_clock(item.wall_s, item.boot_id, item.boot_s, self._host_s))
 
     def _link_opened(self, item: inputs.LinkOpened) -> None:
         latency = "" if item.latency_ms is None else f", USB latency {item.latency_ms} ms"
@@ -161,9 +162,8 @@ class Core:
         self._block(item.block)
 
     def _journal_opened(self, item: inputs.JournalOpened) -> None:
-        if item.error:
-            self._note("error", f"journal: {item.error}; nothing can be written")
-        self._rollcall.journal(item)
+        if error := self._rollcall.journal(item):
+            self._note("error", f"journal: {error}; nothing can be written")
         self._device_known()
 
     def _stop(self, item: inputs.Stop) -> None:
@@ -197,7 +197,7 @@ class Core:
             self.stream.damaged(piece)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
-            self._device_reset("its time fell")
+            self._device_reset("its time fell", self.at_s)
 
     def _fault(self, code: int) -> None:
         self.faults += 1
@@ -205,13 +205,13 @@ class Core:
         if code in (_WATCHDOG_RESET, _HARD_FAULT):
             self._device_reset(f"VNERR {code:02X}")
 
-    def _device_reset(self, why: str) -> None:
+    def _device_reset(self, why: str, uptime_s: float | None = None) -> None:
         self._note("warning", f"the device restarted ({why})")
         self._breaks += 1
         if self.conversation.identity is None:
             return
         self.epochs.begin(self._host_s, None)
-        self._errands.add(self.writeback.on_reset(self._host_s))
+        self._errands.add(self.writeback.on_reset(self._host_s, uptime_s))
         self._errands.forget_procedure()
         self.take(self.conversation.identify_again(self._host_s))
 
@@ -221,9 +221,7 @@ class Core:
 
     def _device_known(self) -> None:
         """Identity, registers and journal may all be there now."""
-        told = self._rollcall.told(self.conversation, self.writeback, self._host_s)
-        self._uptime_due = self._uptime_due or bool(told)
-        self._errands.add(told)
+        self._errands.add(self._rollcall.told(self.conversation, self.writeback, self._host_s))
 
     def _in_force(self, values: dict[int, Values]) -> None:
         """These registers act on what follows; the first ones are the estimator's prior."""
@@ -333,8 +331,10 @@ class Core:
     def _block(self, block: SampleBlock) -> None:
         self.at_s = float(block.time_s[-1])
         self.first_s = float(block.time_s[0]) if np.isnan(self.first_s) else self.first_s
-        if self._uptime_due and self.stream.facts.rate_source == "device time":
-            self._uptime_due = False  # the first one since the device was read: did it restart?
+        if (
+            self.stream.facts.rate_source == "device time"
+            and self.stream.restarts == self._restarts
+        ):
             self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
         if self.stream.take_replaced():
             self.calibrator = self.calibrator.anew()

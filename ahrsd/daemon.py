@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
-from ahrsd import inputs
+from ahrsd import host_clock, inputs
 from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import Config
 from ahrsd.operator_box import OperatorBox
@@ -111,7 +111,7 @@ class Daemon:
         self.stopped_s: float | None = None  # when `stop` was called, monotonic
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
         self._next_interlock_ns = self._next_columns_ns = 0
-        self._wall_offset_s = float("nan")
+        self._offsets_s = [float("inf")] * 2  # of wall clock and boottime, as last told
         self._asleep_s = _asleep_s()
         self._watch = Watch(time.monotonic())
         self._next_watch_s = self._retry_s = 0.0
@@ -227,12 +227,14 @@ class Daemon:
         return max(longest_s, _SHORTEST_WAIT_S)
 
     def _tell_wall(self) -> None:
-        """The wall clock, at the start and when it was set: budgets count days by it."""
+        """The host's other clocks, at the start and when one was set or the host was suspended."""
         now_ns = self.clock.now_ns()
-        offset_s = time.time() - now_ns * 1e-9 / self.clock.speed
-        if not abs(offset_s - self._wall_offset_s) < _WALL_STEP_S:
-            self._wall_offset_s = offset_s
-            self._feed(inputs.WallClock(now_ns, time.time()))
+        wall_s, boot_s = time.time(), host_clock.boot_s()
+        offsets_s = [told - now_ns * 1e-9 / self.clock.speed for told in (wall_s, boot_s)]
+        steps_s = [abs(a - b) for a, b in zip(offsets_s, self._offsets_s, strict=True)]
+        if not max(steps_s) < _WALL_STEP_S:
+            self._offsets_s = offsets_s
+            self._feed(inputs.WallClock(now_ns, wall_s, host_clock.boot_id(), boot_s))
 
     def _feed(self, item: inputs.Input) -> None:
         output = self.shell.feed(item)

@@ -29,10 +29,16 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class WallClock:
-    """What the wall clock says: for budgets per day and for labels, never for durations."""
+    """The host's other clocks: the wall clock, and the time since its boot, suspends included.
+
+    The wall clock may forbid (budgets per day) and is a label; boottime gives durations within the
+    boot of this id. Without them (older recordings) nothing is concluded from durations.
+    """
 
     host_ns: int
     wall_s: float
+    boot_id: str = ""
+    boot_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

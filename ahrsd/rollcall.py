@@ -9,6 +9,7 @@ from typing import Any
 from ahrsd.conversation import Conversation
 from ahrsd.inputs import JournalOpened
 from ahrsd.writeback.actions import Action
+from ahrsd.writeback.journal_history import of_another_device
 from ahrsd.writeback.machine import WriteBack
 from drivers.vn100.registers import Values, same
 
@@ -32,7 +33,6 @@ class RecordRead:
 class Rollcall:
     """Waits for registers and journal of the device that was identified last."""
 
-    wall_offset_s: float = 0.0
     _values: dict[int, Values] | None = None
     _journal: Sequence[RecordRead] | None = field(default=None)
     _journal_known: bool = False
@@ -43,10 +43,13 @@ class Rollcall:
         """A device said who it is: its journal is not open yet."""
         self._journal_known = False
 
-    def journal(self, item: JournalOpened) -> None:
-        """Its journal, or why there is none that can be trusted."""
-        self._journal = None if item.error else [RecordRead.of(r) for r in item.records]
+    def journal(self, item: JournalOpened) -> str:
+        """Its journal; returns why it cannot be trusted, "" where it can."""
+        records = [RecordRead.of(r) for r in item.records]
+        error = item.error or of_another_device(records, item.serial)
+        self._journal = None if error else records
         self._journal_known, self._read_from_s = True, item.host_ns * 1e-9
+        return error
 
     def registers(
         self, values: dict[int, Values], believed: Mapping[int, Values], breaks: int
@@ -81,7 +84,6 @@ class Rollcall:
             users,
             self._journal,
             host_s,
-            host_s + self.wall_offset_s,
             session_keys=conversation.session_keys,
             read_from_s=self._read_from_s,
         )

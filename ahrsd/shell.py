@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from ahrsd import events
+from ahrsd import events, host_clock
 from ahrsd.core import Core
 from ahrsd.errors import JournalError
 from ahrsd.inputs import Input, Journalled, JournalOpened
 from ahrsd.journal import Journal
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.worker import Worker
+from ahrsd.writeback.journal_history import of_another_device
 
 log = logging.getLogger("ahrsd")
 
@@ -90,11 +91,15 @@ class JournalKeeper:
         """Open the journal of a device; an error is an answer, not an exception."""
         self.journal = None
         try:
-            self.journal = self.open(serial)
+            journal = self.open(serial)
         except JournalError as error:
             return JournalOpened(self.now_ns(), serial, [], str(error))
+        if other := of_another_device(journal.records(), serial):
+            text = f"{journal.path}: {other}; move the file away or put that device's name on it"
+            return JournalOpened(self.now_ns(), serial, [], text)
+        self.journal = journal
         records: list[dict[str, object]] = [
-            {"kind": r.kind, "facts": dict(r.facts)} for r in self.journal.records()
+            {"kind": r.kind, "facts": dict(r.facts)} for r in journal.records()
         ]
         return JournalOpened(self.now_ns(), serial, records)
 
@@ -103,7 +108,7 @@ class JournalKeeper:
         if self.journal is None:
             return Journalled(self.now_ns(), item.kind, "no journal is open")
         try:
-            self.journal.append(item.kind, **item.facts)
+            self.journal.append(item.kind, **{**host_clock.stamp(), **item.facts})
         except JournalError as error:
             return Journalled(self.now_ns(), item.kind, str(error))
         return Journalled(self.now_ns(), item.kind)

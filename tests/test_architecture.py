@@ -34,6 +34,7 @@ SHELL = (
     "ahrsd.daemon",
     "ahrsd.demo",
     "ahrsd.diagnosing",
+    "ahrsd.host_clock",
     "ahrsd.interlock",
     "ahrsd.journal",
     "ahrsd.logs",

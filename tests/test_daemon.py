@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 
+from ahrsd import host_clock
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.events import GateResult, SamplesSeen, StateChanged
 from ahrsd.inputs import LinkLost, WallClock
@@ -326,14 +327,17 @@ def test_a_host_clock_that_is_set_moves_no_sample(live, monkeypatch):
     monkeypatch.setattr(time, "time", lambda: real() + step[0])
     with live({"output": "binary"}) as daemon:
         daemon.flowing()
-        rollcall = daemon.core._rollcall
+        desk = daemon.core.writeback._desk
         for days in (-1, 7):
-            was_s, step[0] = rollcall.wall_offset_s, 86400.0 * days
-            daemon.until(lambda was_s=was_s: abs(rollcall.wall_offset_s - was_s) > 80_000.0)
+            was_s, step[0] = desk.wall_s, 86400.0 * days
+            daemon.until(lambda was_s=was_s: abs(desk.wall_s - was_s) > 80_000.0)
             daemon.flowing()
         daemon.stop()
         facts = daemon.core.stream.facts
         assert daemon.core.stream.gaps == []
         assert facts.samples == facts.expected
-    told = [i.wall_s for i in CaptureReader(daemon.capture) if isinstance(i, WallClock)]
-    assert np.round(np.diff(told) / 86400.0, 2).tolist() == [-1.0, 8.0]
+    told = [i for i in CaptureReader(daemon.capture) if isinstance(i, WallClock)]
+    assert np.round(np.diff([i.wall_s for i in told]) / 86400.0, 2).tolist() == [-1.0, 8.0]
+    assert {i.boot_id for i in told} == {host_clock.boot_id()}
+    offsets_s = [i.boot_s - i.host_ns * 1e-9 for i in told]
+    assert np.ptp(offsets_s) < 0.5  # nobody can set boottime

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import click
 
+from ahrsd import host_clock
 from ahrsd.commands.device_access import PORT, describe, driver_errors, open_port, read_all
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
 from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
@@ -106,7 +107,7 @@ def command(
 def _opened(port: Path, serial: SerialPort) -> list[Input | Sent]:
     host_ns = time.monotonic_ns()
     return [
-        WallClock(host_ns, time.time()),
+        WallClock(host_ns, time.time(), host_clock.boot_id(), host_clock.boot_s()),
         LinkOpened(host_ns, str(port), serial.baud, latency_timer_ms(port)),
     ]
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from ahrsd import host_clock
 from ahrsd.commands.device_access import describe
 from ahrsd.errors import DeviceError
 from ahrsd.journal import Journal, Record, register_values
@@ -67,17 +68,22 @@ def apply(
     Raises JournalError before anything is sent, DeviceError with the outcome of putting back.
     """
     old = device.run(read_registers(changes))
-    prepared = journal.append(
-        "HAND_PREPARED", device=describe(identity), old=_texts(old), new=_texts(changes), **why
+    prepared = _append(
+        journal,
+        "HAND_PREPARED",
+        device=describe(identity),
+        old=_texts(old),
+        new=_texts(changes),
+        **why,
     )
     try:
         device.run(quiet(_write_all(changes, held="undoes" in why)))
     except (DriverError, PortError) as error:
         restored = _put_back(device, old)
-        journal.append("HAND_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
+        _append(journal, "HAND_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
         outcome = f"NOT put back: {restored}" if restored else "the old values are back"
         raise DeviceError(f"{error}; {outcome}") from error
-    journal.append("HAND_VERIFIED", txn=prepared.seq)
+    _append(journal, "HAND_VERIFIED", txn=prepared.seq)
     return prepared
 
 
@@ -87,9 +93,14 @@ def save_to_flash(device: Device, journal: Journal, prepared: Record) -> None:
     present = device.run(read_registers(expected))
     if changed := to_write(present, expected):
         raise DeviceError(f"register {min(changed)} no longer holds what was written; not saved")
-    journal.append("HAND_FLASH_SENT", txn=prepared.seq)
+    _append(journal, "HAND_FLASH_SENT", txn=prepared.seq)
     device.run(quiet(save_settings()))
-    journal.append("HAND_FLASH_ACKED", txn=prepared.seq)
+    _append(journal, "HAND_FLASH_ACKED", txn=prepared.seq)
+
+
+def _append(journal: Journal, kind: str, **facts: object) -> Record:
+    """A record with the time by every clock."""
+    return journal.append(kind, **{**host_clock.stamp(), **facts})
 
 
 def _write_all(changes: Changes, held: bool) -> Procedure[None]:

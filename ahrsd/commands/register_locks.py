@@ -6,13 +6,13 @@ does, the record goes into the journal, and the next daemon begins with it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
+from ahrsd import host_clock
 from ahrsd.commands.register_sources import journals
 from ahrsd.config import default_state_directory
 from ahrsd.errors import DeviceError, JournalError
@@ -73,7 +73,7 @@ def _say(kind: Kind, reason: str, serial: int | None, state: Path) -> None:
     if kind is Kind.UNLOCKED and history.locked is None and not history.torn:
         click.echo(f"{journal.path}: it is not locked")
         return
-    record = journal.append(kind, reason=reason, by="registers", wall_s=time.time())
+    record = journal.append(kind, reason=reason, by="registers", **host_clock.stamp())
     click.echo(f"{journal.path}: record {record.seq}, {kind}: {reason}")
 
 

@@ -15,8 +15,9 @@ from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash,
 from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
 from ahrsd.commands.register_text import described
 from ahrsd.config import default_state_directory
-from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, JournalError
 from ahrsd.journal import Journal, Record, journal_path, register_values, typed_lines, wrg_lines
+from ahrsd.writeback.journal_history import of_another_device
 from drivers.vn100.device import Device
 from drivers.vn100.procedures import (
     Identity,
@@ -262,6 +263,8 @@ def _change(
     with open_device(port, baud, gate(permitted, save=save and yes)) as device:
         identity = device.run(identify())
         journal = Journal.open(journal_file or journal_path(state, identity.serial))
+        if other := of_another_device(journal.records(), identity.serial):
+            raise JournalError(f"{journal.path}: {other}; nothing was written")
         changes, why = wanted(device, journal)
         if "undoes" not in why:  # what goes back to where it was is not locked out
             register_locks.refuse_locked(journal)

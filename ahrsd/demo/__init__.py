@@ -52,7 +52,14 @@ from drivers.vn100.registers import same
 __all__ = ["FILES", "SPEED", "DemoResult", "demo_config", "figures", "lines", "run_demo", "verdict"]
 
 SPEED = 20.0
-FILES = ("report.html", "run.rrd", "capture.mcap", "calibration.json", "journal.jsonl")
+FILES = (
+    "report.html",
+    "run.rrd",
+    "capture.mcap",
+    "calibration.json",
+    "journal.jsonl",
+    "journal.receipt",
+)
 _BAUD = 115200
 _RATE_HZ = 50
 _MAG, _GYRO = 23, 84

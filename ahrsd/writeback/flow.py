@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from ahrsd.calibration import Estimate
+from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.actions import IdentifyAgain, SetUpStream
 from ahrsd.writeback.composition import (
+    GYRO,
+    MAG,
     Proposal,
     UnwritableError,
     apart_deg,
@@ -94,7 +96,7 @@ class Flow:
 
     def watch(self) -> None:
         """Take the step that waits for nothing but a condition, if it holds now."""
-        now = (self.desk.history, self.desk.host_s, self.desk.wall_s)
+        now = (self.desk.history, self.desk.host_s, self.desk.now)
         if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
             self.signal(Signal.APPROVED, f"approved: {self.approver}")
         elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
@@ -377,6 +379,22 @@ class Flow:
                 "error",
                 f"register {', '.join(map(str, changed))} changed since the journal's last record: "
                 "somebody else wrote or saved it",
+            )
+        factory, history = Affine.identity().to_register(), self.desk.history
+        strange = [
+            number
+            for number in (MAG, GYRO)
+            if (values := self.registers.get(number)) is not None
+            and not held
+            and not same(number, factory, values)
+            and not history.knows(number, values)
+        ]
+        if strange and self.safe.journal_ok:
+            self.desk.note(
+                "warning",
+                f"register {', '.join(map(str, strange))} holds values that are neither the "
+                "factory's nor in the journal: somebody calibrated the device before, or a journal "
+                "was lost in a trial; then switch the device off and on",
             )
 
     def transaction(self) -> Transaction:

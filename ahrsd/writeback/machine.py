@@ -28,6 +28,7 @@ from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
 from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.restarts import RestartWatch
 from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
@@ -41,7 +42,17 @@ from ahrsd.writeback.trial import Finding, TrialMetrics
 from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values
 
-UPTIME_MARGIN_S = 0.5  # what a message may take to get here
+RESTS = frozenset(  # states in which a proven restart since the newest record has it read again
+    {
+        State.CANDIDATE,
+        State.QUALIFIED,
+        State.TRIAL,
+        State.PROVEN,
+        State.COMMITTED,
+        State.FAULT,
+        State.LOCKED,
+    }
+)
 
 _AWAITED = {
     State.PREPARING: Kind.PREPARED,
@@ -59,8 +70,7 @@ class WriteBack:
         self._desk = self._flow.desk
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
-        self._saw_reset = False
-        self._read_from_s = float("inf")  # since when the registers were being read; inf: told
+        self._restarts = RestartWatch()
 
     # -- what others ask ---------------------------------------------------------------------------
 
@@ -92,7 +102,7 @@ class WriteBack:
     @property
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
-        deadlines = [self._flow.deadline_s]
+        deadlines = [self._flow.deadline_s, self._desk.journal_again_s]
         if self._flow.watches_interlock:
             deadlines.append(self._desk.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
@@ -104,7 +114,7 @@ class WriteBack:
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
-        now = (self.history, self._desk.host_s, self._desk.wall_s)
+        now = (self.history, self._desk.host_s, self._desk.now)
         if self.state is State.PROVEN:
             return self._safe.save_holds(*now)
         reasons = self._safe.write_holds(*now)
@@ -119,6 +129,16 @@ class WriteBack:
         self._desk.host_s = host_s
         if self._flow.deadline_s is not None and host_s >= self._flow.deadline_s:
             self._flow.on_timeout()
+        if (again_s := self._desk.journal_again_s) is not None and host_s >= again_s:
+            self._desk.journal_again()
+        return self._answer()
+
+    def on_clock(
+        self, wall_s: float, boot_id: str, boot_s: float | None, host_s: float
+    ) -> list[Action]:
+        """The host's other clocks; the wall clock may have been set."""
+        self._desk.host_s = host_s
+        self._desk.set_clocks(wall_s, boot_id, boot_s)
         return self._answer()
 
     def on_device(
@@ -127,9 +147,7 @@ class WriteBack:
         registers: Mapping[int, Values],
         journal: Sequence[JournalRecord] | None,
         host_s: float,
-        wall_s: float,
         *,
-        uptime_s: float | None = None,
         session_keys: frozenset[int] = frozenset(),
         read_from_s: float = float("inf"),
     ) -> list[Action]:
@@ -139,18 +157,13 @@ class WriteBack:
                       with the values that the user had
         read_from_s:  when the reading of them began; see `on_uptime`
         journal:      this device's records, oldest first; None where they cannot be trusted
-        wall_s:       the wall clock at `host_s`; only for budgets that span restarts
-        uptime_s:     the device's own time since its start-up, where its stream says it
         """
         flow, self._desk.host_s = self._flow, host_s
-        self._desk.bind(identity.serial, journal, wall_s)
+        self._desk.bind(identity.serial, journal)
+        restarted = self._restarts.bind(identity.serial, read_from_s)
         self._safe.bind(identity, registers, journal is not None)
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
         self._desk.in_force(registers)
-        age_s = wall_s - self.history.last_wall_s
-        restarted = self._saw_reset or (uptime_s is not None and 0.0 <= uptime_s < age_s)
-        self._read_from_s = float("inf") if self._saw_reset else read_from_s
-        self._saw_reset = False
         if self.state is not State.RECONCILING:
             flow.enter(State.RECONCILING, "the device was read again")
         unfinished = self.history.open
@@ -161,6 +174,7 @@ class WriteBack:
     def on_no_device(self, registers: Mapping[int, Values] | None, host_s: float) -> list[Action]:
         """There is nobody to ask: mode passive, or a recording. Registers where they are known."""
         self._desk.host_s = host_s
+        self._restarts.lost()
         identity = Affine.identity().to_register()
         self._flow.registers = {MAG: identity, GYRO: identity, **(registers or {})}
         self._safe.no_device("there is no device to write to")
@@ -170,34 +184,43 @@ class WriteBack:
     def on_link_lost(self, host_s: float) -> list[Action]:
         """The port went away."""
         self._desk.host_s = host_s
+        self._restarts.lost()
         self._flow.signal(Signal.LINK_LOST, "the link was lost")
         return self._answer()
 
-    def on_reset(self, host_s: float) -> list[Action]:
-        """The device restarted: its RAM is what its flash holds. `on_device` must follow."""
-        self._desk.host_s, self._saw_reset = host_s, True
+    def on_reset(self, host_s: float, uptime_s: float | None = None) -> list[Action]:
+        """The device restarted: its RAM is what its flash holds. `on_device` must follow.
+
+        uptime_s: its time since then, where that is what tells; then it must agree with the journal
+        """
+        self._desk.host_s = host_s
+        self._restarts.seen(self.history.last_at, self._desk.now.stamp, uptime_s)
         self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
     def on_uptime(self, uptime_s: float, host_s: float) -> list[Action]:
-        """The device's time since its start-up, once its stream tells: a restart nobody saw.
+        """The device's time since its start-up, as its stream tells: a restart that nobody saw.
 
-        One since the registers were read (the output of before had no device time) makes that
-        reading void. And only a restart shows what a save left in flash, so it is asked again then.
+        One since the registers were read makes that reading void. And only a restart shows what a
+        save left in flash, so it is asked again then.
         """
-        self._desk.host_s = host_s
-        if uptime_s < host_s - self._read_from_s - UPTIME_MARGIN_S:
-            self._saw_reset = True
-            self._flow.signal(Signal.DEVICE_RESET, "the device restarted since it was read")
-            self._desk.ask(IdentifyAgain())
-            return self._answer()
-        age_s = self._desk.wall_s - self.history.last_wall_s
-        open_save = self.history.last in (Kind.FLASH_SENT, Kind.FLASH_ACKED)
-        resting = self.state in (State.FAULT, State.COMMITTED)
-        if open_save and resting and 0.0 <= uptime_s < age_s:
-            self._saw_reset = True
-            self._flow.signal(Signal.DEVICE_RESET, "the device restarted since the save")
-            self._desk.ask(IdentifyAgain())
+        desk, record = self._desk, self.history.last_at
+        desk.host_s = host_s
+        reason = self._restarts.heard(uptime_s, host_s)
+        if reason:
+            self._restarts.seen(record, desk.now.stamp, uptime_s)
+        elif (
+            self.history.open is not None
+            and self.state in RESTS
+            and self._restarts.proven(record, desk.now.stamp, host_s)
+        ):
+            self._restarts.concluded()
+            reason = "the device restarted since the journal's newest record"
+        else:
+            desk.device_s = uptime_s
+        if reason:
+            self._flow.signal(Signal.DEVICE_RESET, reason)
+            desk.ask(IdentifyAgain())
         return self._answer()
 
     def on_samples(self, block: SampleBlock) -> list[Action]:
@@ -267,13 +290,15 @@ class WriteBack:
     def on_stop(self, host_s: float) -> list[Action]:
         """The daemon ends: what is only in RAM is undone, unless it is proven and to be kept."""
         self._desk.host_s, self._safe.stopping = host_s, True
+        self._desk.journal_again()
         if not (self.policy.keep_on_stop and self.state is State.PROVEN):
             self._flow.roll_back("stop", "the daemon stops")
         return self._answer()
 
     def on_journal_ok(self, kind: Kind, host_s: float) -> list[Action]:
         """The record is on the disk."""
-        self._desk.host_s, self._safe.journal_ok = host_s, True
+        self._desk.host_s = host_s
+        self._safe.journal_ok = self._desk.journaled(kind)
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNALLED, f"{kind.value} is in the journal")
         return self._answer()
@@ -281,6 +306,7 @@ class WriteBack:
     def on_journal_failed(self, kind: Kind, error: str, host_s: float) -> list[Action]:
         """The record is not on the disk. What waited for it does not happen."""
         self._desk.host_s, self._safe.journal_ok = host_s, False
+        self._desk.not_journaled(kind)
         self._desk.note("error", f"{kind.value} could not be journalled: {error}")
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNAL_FAILED, error)

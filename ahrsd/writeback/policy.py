@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from ahrsd.writeback.clocks import Now, passed_s
 from ahrsd.writeback.composition import Proposal
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.permissions import Mode
@@ -107,35 +108,38 @@ def worth_writing(policy: WriteBackPolicy, history: History, proposal: Proposal)
     )
 
 
-def ram_budget(policy: WriteBackPolicy, history: History, wall_s: float) -> list[str]:
-    """Why RAM must not be written now; empty where it may. A clock set back does not help."""
+def ram_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:
+    """Why RAM must not be written now; empty where it may. Times as `clocks.passed_s` reads them:
+    no clock that was wrong, or was set, makes one longer.
+    """
     reasons: list[str] = []
     if history.locked is not None:
         reasons.append(f"locked: {history.locked}; unlock to go on")
     if history.broken is not None:
         reasons.append(f"the journal's {history.broken} record cannot be understood")
-    writes = history.ram_writes_wall_s
-    if writes and wall_s - writes[-1] < policy.min_interval_s:
+    *writes_s, _ = passed_s((*history.ram_writes_at, history.newest_at), now)
+    if writes_s and writes_s[-1] < policy.min_interval_s:
         reasons.append(
-            f"the last write was {max(wall_s - writes[-1], 0.0):.0f} s ago, wait for "
-            f"{policy.min_interval_s:.0f} s"
+            f"the last write was {writes_s[-1]:.0f} s ago, wait for {policy.min_interval_s:.0f} s"
         )
-    today = sum(wall_s - at < DAY_S for at in writes)
+    today = sum(passed < DAY_S for passed in writes_s)
     if today >= policy.ram_writes_per_day:
         reasons.append(f"{today} RAM writes in a day, limit {policy.ram_writes_per_day}")
-    last = history.last_rollback_wall_s
-    if last is not None and wall_s - last < policy.cooldown_s:
-        reasons.append(
-            f"a rollback was {max(wall_s - last, 0.0) / 3600.0:.1f} h ago, wait for "
-            f"{policy.cooldown_s / 3600.0:.1f} h"
-        )
+    if history.rollback_at is not None:
+        since_s, _ = passed_s((history.rollback_at, history.newest_at), now)
+        if since_s < policy.cooldown_s:
+            reasons.append(
+                f"a rollback was {since_s / 3600.0:.1f} h ago, wait for "
+                f"{policy.cooldown_s / 3600.0:.1f} h"
+            )
     return reasons
 
 
-def flash_budget(policy: WriteBackPolicy, history: History, wall_s: float) -> list[str]:
+def flash_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:
     """Why flash must not be written now; empty where it may."""
     reasons: list[str] = []
-    today = sum(wall_s - at < DAY_S for at in history.flashes_wall_s)
+    *flashes_s, _ = passed_s((*history.flashes_at, history.newest_at), now)
+    today = sum(passed < DAY_S for passed in flashes_s)
     if today >= policy.flash_writes_per_day:
         reasons.append(f"{today} flash writes in a day, limit {policy.flash_writes_per_day}")
     if history.flashes >= policy.flash_writes_lifetime:

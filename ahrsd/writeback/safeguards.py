@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ahrsd.events import GateResult
+from ahrsd.writeback.clocks import Now
 from ahrsd.writeback.composition import GYRO, MAG
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.permissions import Mode, Purpose, permitted
@@ -94,7 +95,7 @@ class Safeguards:
             return ""
         return self.interlock_holds(host_s)
 
-    def write_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
+    def write_holds(self, history: History, host_s: float, now: Now) -> list[str]:
         """Why no write may begin now, but for the approval."""
         reasons = list(self._limits)
         if self.policy.mode < Mode.STAGE:
@@ -108,10 +109,10 @@ class Safeguards:
             reasons.append("no gate has judged yet")
         if self._hsi_applied:
             reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
-        reasons += ram_budget(self.policy, history, wall_s)
+        reasons += ram_budget(self.policy, history, now)
         return reasons + self._always(host_s)
 
-    def save_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
+    def save_holds(self, history: History, host_s: float, now: Now) -> list[str]:
         """Why the flash may not be written now."""
         reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
         if not self.armed:
@@ -122,7 +123,7 @@ class Safeguards:
         reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.flash_gates if not gate.ok]
         if not self.flash_gates:
             reasons.append("no gate has judged for flash yet")
-        reasons += flash_budget(self.policy, history, wall_s)
+        reasons += flash_budget(self.policy, history, now)
         if still := self.stillness.why_not(host_s):
             reasons.append(still)
         return reasons + self._always(host_s)

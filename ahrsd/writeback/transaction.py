@@ -8,11 +8,12 @@ did: that is a conversation of its own, so that the gate knows a rollback from a
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from ahrsd.writeback.composition import register_lines
-from drivers.vn100.commands import NoReply, NotPermitted, Procedure
+from drivers.vn100.commands import QUIET, NoReply, NotPermitted, Procedure
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.firmware import Profile, profile_of
 from drivers.vn100.procedures import (
@@ -23,6 +24,7 @@ from drivers.vn100.procedures import (
     read_configuration,
     read_registers,
     restore,
+    resume,
     save_settings,
     write_verified,
 )
@@ -119,8 +121,12 @@ def stage(transaction: Transaction) -> Procedure[Outcome]:
 
 
 def roll_back(transaction: Transaction) -> Procedure[Outcome]:
-    """The old values again, read back; a register that has them is not written."""
-    return quiet(_roll_back(transaction))
+    """The old values again, read back; a register that has them is not written.
+
+    Every register is tried before a failure is reported, and all of them also where the device does
+    not let its output be paused: that makes replies slower, and is no reason to leave values in it.
+    """
+    return _roll_back(transaction)
 
 
 def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
@@ -152,7 +158,18 @@ def _stage(transaction: Transaction) -> Procedure[Outcome]:
 
 
 def _roll_back(transaction: Transaction) -> Procedure[Outcome]:
-    yield from restore(transaction.old, transaction.old)
+    abandoned = False
+    try:
+        with suppress(NoReply, DeviceRefused):
+            yield QUIET
+        yield from restore(transaction.old, transaction.old)
+    except GeneratorExit:  # dropped without an end: nobody is there to carry out a command
+        abandoned = True
+        raise
+    finally:
+        if not abandoned:
+            with suppress(NoReply, DeviceRefused):  # the registers are what the outcome is about
+                yield from resume()
     return Outcome(True)
 
 

@@ -274,7 +274,7 @@ class Soak:
 
     def _inputs(self) -> Iterator[None]:
         """Round after round, for ever; yields after every chunk."""
-        self._feed(inputs.WallClock(0, 1.7e9))
+        self._feed(inputs.WallClock(0, 1.7e9, "soak", 0.0))
         number, device_s = 0, 10.0
         while True:
             began_s = self._now_s

@@ -16,7 +16,7 @@ from ahrsd.core import Core
 from ahrsd.core_settings import CoreSettings
 from drivers.vn100.emulator import Emulator
 
-WALL_S = 8e8
+WALL_S = 1.8e9
 
 
 class VirtualRun:
@@ -44,7 +44,12 @@ class VirtualRun:
         self._serial = 0
         self._interlock_s = 0.0
         emulator.advance(self.now_s)
-        self.feed(inputs.WallClock(self.now_ns, WALL_S + self.now_s))
+        self.tell_clocks()
+
+    def tell_clocks(self) -> None:
+        """The computer's other clocks; it never restarts."""
+        wall_s = WALL_S + self.now_s
+        self.feed(inputs.WallClock(self.now_ns, wall_s, "virtual boot", self.now_s))
 
     @property
     def now_ns(self) -> int:
@@ -128,7 +133,7 @@ class VirtualRun:
         """The program was killed and is started again: only the journal is remembered."""
         self.core = Core(self.core.settings)
         self._plugged = False
-        self.feed(inputs.WallClock(self.now_ns, WALL_S + self.now_s))
+        self.tell_clocks()
 
     def operate(self, verb: str, argument: str = "") -> None:
         """A person's word."""

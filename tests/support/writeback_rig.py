@@ -149,7 +149,9 @@ class Rig:
         self.journal: list[Record] = []
         self.disk_full = False
         self.safe = True
-        self.now_s, self.wall_s = 1000.0, 5e8
+        self.now_s, self.wall_s = 1000.0, 1.8e9
+        self.boots, self.boot_began_s = 1, 0.0  # of the computer
+        self.tells_time, self.started_s = True, 0.0  # the device: in its stream; its start-up
         self.cut_at: int | None = None
         self.points = 0
         self.events: list[Any] = []
@@ -161,10 +163,13 @@ class Rig:
     def start(self) -> None:
         """A new process: nothing is remembered but the journal."""
         self.wb = WriteBack(self.policy)
+        boot_s = self.now_s - self.boot_began_s
+        wall_s = self.wall_s + self.now_s
+        self.do(self.wb.on_clock(wall_s, f"boot {self.boots}", boot_s, self.now_s))
 
     # -- what the core does ------------------------------------------------------------------------
 
-    def connect(self, uptime_s: float | None = None, **changes: Any) -> None:
+    def connect(self, **changes: Any) -> None:
         registers = {n: printed(n, v) for n, v in self.device.ram.items()}
         identity = Identity("VN-100T-CR", 7, self.device.serial, FIRMWARE, PROFILE)
         arguments: dict[str, Any] = {
@@ -172,8 +177,6 @@ class Rig:
             "registers": registers,
             "journal": list(self.journal),
             "host_s": self.now_s,
-            "wall_s": self.wall_s + self.now_s,
-            "uptime_s": uptime_s,
             **changes,
         }
         self.do(self.wb.on_device(**arguments))
@@ -243,6 +246,12 @@ class Rig:
         self.now_s += seconds
         self.do(self.wb.on_interlock(self.safe, self.now_s))
         self.do(self.wb.tick(self.now_s))
+        self.hear_time()
+
+    def hear_time(self) -> None:
+        """The device's own time, where its stream has it."""
+        if self.tells_time and self.device.asynchronous:
+            self.do(self.wb.on_uptime(self.now_s - self.started_s, self.now_s))
 
     # -- what the world does -----------------------------------------------------------------------
 
@@ -266,6 +275,7 @@ class Rig:
         dt_s = np.full(count, 0.1)
         block = SampleBlock(time_s, dt_s, time_s, np.zeros((count, 3)), gyro, accel)
         self.do(self.wb.on_interlock(self.safe, self.now_s))
+        self.hear_time()
         self.do(self.wb.on_samples(block))
 
     def whole_way(self) -> None:
@@ -295,13 +305,20 @@ class Rig:
         self.now_s += 60.0
         if lost != "program":
             self.device.restart()
+            self.started_s = self.now_s - 5.0
         if lost == "device":
             self.do(self.wb.on_link_lost(self.now_s))
             self.do(self.wb.on_reset(self.now_s))
-            self.connect()
-        else:
+        if lost == "all":
+            self.boots, self.boot_began_s = self.boots + 1, self.now_s - 5.0
+        if lost != "device":
             self.start()
-            self.connect(uptime_s=5.0 if lost == "all" else 10_000.0)
+        self.connect()
+        asked = self.asked_again
+        for _ in range(3 if self.tells_time else 0):  # a second of messages
+            self.pass_time(0.6)
+        if self.asked_again > asked:
+            self.connect()
 
     # -- what a test asks --------------------------------------------------------------------------
 

@@ -89,8 +89,9 @@ class Bench:
                 self.identify()
             elif name == "identify":
                 who, held = event.result
-                wall_s = 5e8 + self.now_s
-                self.do(self.wb.on_device(who, held, self.journal, self.now_s, wall_s))
+                wall_s, boot_s = 1.8e9 + self.now_s, self.now_s
+                self.do(self.wb.on_clock(wall_s, "boot", boot_s, self.now_s))
+                self.do(self.wb.on_device(who, held, self.journal, self.now_s))
                 self.identified = who
             elif isinstance(event, Finished):
                 self.do(self.wb.on_procedure_finished(name, event.result, self.now_s))
