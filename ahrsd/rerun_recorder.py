@@ -28,6 +28,7 @@ from ahrsd.events import (
     SamplesSeen,
     StateChanged,
 )
+from ahrsd.gates import guards_a_write
 from ahrsd.rerun_sink import BATCH_ROWS
 from ahrsd.samples import Array
 
@@ -216,7 +217,8 @@ class Recorder:
 
     def _judged(self, judged: Judged) -> None:
         changed = False
-        for gate, checks in by_gate(judged.gates).items():
+        counted = [check for check in judged.gates if guards_a_write(check.gate)]
+        for gate, checks in by_gate(counted).items():
             ok = all(check.ok for check in checks)
             if self._gates.get(gate) is ok:
                 continue
@@ -249,7 +251,7 @@ class Recorder:
 
 
 def by_gate(checks: Iterable[GateResult]) -> dict[str, list[GateResult]]:
-    """The checks of each gate: `field.spread` and `field.strongest` both belong to `field`."""
+    """The gates of each family: `field.spread` and `field.strongest` both belong to `field`."""
     gates: dict[str, list[GateResult]] = {}
     for check in checks:
         gates.setdefault(check.gate.partition(".")[0], []).append(check)
@@ -257,17 +259,16 @@ def by_gate(checks: Iterable[GateResult]) -> dict[str, list[GateResult]]:
 
 
 def gate_table(checks: Sequence[GateResult]) -> str:
-    """Markdown of a verdict: what to do first, then every check with its value and its limit."""
-    gates = by_gate(checks)
-    failing = {
-        name: bad for name, rows in gates.items() if (bad := [row for row in rows if not row.ok])
-    }
-    held = f"**Held back by {len(failing)} of {len(gates)} gates**"
-    lines = [held if failing else f"**All {len(gates)} gates ok**", ""]
-    for name, bad in failing.items():
+    """Markdown of a verdict: what to do first, then every gate with its value and its limit."""
+    checks = [check for check in checks if guards_a_write(check.gate)]
+    families = by_gate(check for check in checks if not check.ok)
+    shut = sum(map(len, families.values()))
+    held = f"**Held back by {shut} of {len(checks)} gates**"
+    lines = [held if shut else f"**All {len(checks)} gates ok**", ""]
+    for name, bad in families.items():
         more = f" *(and {len(bad) - 1} more)*" if len(bad) > 1 else ""
         lines.append(f"- **{name}**: {bad[0].advice}{more}")
-    lines += ["", "| | check | value | limit |", "|---|---|---|---|"]
+    lines += ["", "| | gate | value | limit |", "|---|---|---|---|"]
     for check in sorted(checks, key=lambda check: check.ok):
         lines.append(
             f"| {'ok' if check.ok else '**NO**'} | {_cell(check.gate)} "

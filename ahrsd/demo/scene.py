@@ -24,7 +24,7 @@ from ahrsd.events import (
     SamplesSeen,
     StateChanged,
 )
-from ahrsd.gates import Level, for_level
+from ahrsd.gates import Level, for_level, guards_a_write
 from ahrsd.headings import tilt_compensated_heading
 from ahrsd.report import EventCollector
 from ahrsd.samples import Array, SampleBlock
@@ -74,7 +74,7 @@ class Scene:
             case Estimated(estimate=estimate):
                 self.estimate = estimate
             case Judged(gates=gates):
-                self.gates = tuple(for_level(gates, Level.RAM))
+                self.gates = tuple(gate for gate in gates if guards_a_write(gate.gate))
                 self._progress()
             case RegisterWritten(register=register, outcome=outcome):
                 self._line("", f"register {register} {outcome}")
@@ -142,9 +142,12 @@ class Scene:
             return
         self.said_s = self.passed_s
         shut = [g.gate for g in self.gates if not g.ok]
+        of_write = [g.gate for g in for_level(self.gates, Level.RAM) if not g.ok]
         text = f"heading known to {self.estimate.heading_sigma_deg:.2f} deg (1 sigma); "
         text += f"{len(self.gates) - len(shut)} of {len(self.gates)} gates open"
-        self._line("", text + (f", next {shut[0]}" if shut else ""))
+        if shut:
+            text += f", next {of_write[0]}" if of_write else f"; the save waits for {shut[0]}"
+        self._line("", text)
 
     def _line(self, state: str, text: str) -> None:
         at_s = 0.0 if math.isnan(self.newest_s) else self.newest_s
