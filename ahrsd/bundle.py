@@ -6,6 +6,7 @@ The network, environment variables and other programs' files are left alone.
 
 from __future__ import annotations
 
+import gzip
 import importlib.metadata
 import io
 import json
@@ -58,12 +59,14 @@ def _pack(file: Path, parts: dict[str, bytes]) -> None:
             for name, body in parts.items():
                 packed.writestr(name, body)
         return
-    opened = tarfile.open(file, "w") if known == "tar" else tarfile.open(file, "w:gz")
-    with opened as archive:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w") as archive:
         for name, body in parts.items():
             entry = tarfile.TarInfo(name)
             entry.size, entry.mtime = len(body), int(time.time())
             archive.addfile(entry, io.BytesIO(body))
+    packed_bytes = stream.getvalue()
+    file.write_bytes(packed_bytes if known == "tar" else gzip.compress(packed_bytes))
 
 
 def versions() -> dict[str, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import uuid
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from ahrsd.events import (
 )
 from ahrsd.gates import guards_a_write
 from ahrsd.rerun_sink import BATCH_ROWS
+from ahrsd.run_time import RunTime
 from ahrsd.samples import Array
 
 Indices = NDArray[np.signedinteger]
@@ -90,6 +91,7 @@ class Recorder:
         self._gates: dict[str, bool] = {}
         self._newest: Affine | None = None  # shown until there is a proposal
         self._state_known = False
+        self._time = RunTime()
         self._table_at_s = self._shape_at_s = -math.inf
         names.log_styles(stream)
 
@@ -98,6 +100,7 @@ class Recorder:
         rows = _Rows.of(seen, self._newest)
         if not len(rows.time_s):
             return
+        rows = replace(rows, time_s=self._time.samples(rows.time_s))
         if self._first_s is None:
             self._first_s = float(rows.time_s[0]), float(rows.host_s[0])
         every = np.arange(len(rows.time_s))
@@ -131,7 +134,8 @@ class Recorder:
 
     def _at(self, at_s: float, host_s: float, sample: int) -> None:
         self._stream.reset_time()  # a clock that is not known yet must not keep an old value
-        for timeline, value in ((names.DEVICE_TIME, at_s), (names.HOST_TIME, host_s)):
+        device_s = self._time.at(at_s)
+        for timeline, value in ((names.DEVICE_TIME, device_s), (names.HOST_TIME, host_s)):
             if math.isfinite(value):
                 self._stream.set_time(timeline, duration=value)
         self._stream.set_time(names.SAMPLE, sequence=sample)

@@ -27,6 +27,7 @@ from ahrsd.events import (
 from ahrsd.gates import Level, for_level, guards_a_write
 from ahrsd.headings import tilt_compensated_heading
 from ahrsd.report import EventCollector
+from ahrsd.run_time import RunTime
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
 
@@ -50,6 +51,7 @@ class Scene:
     power_cycle: Callable[[], None] = lambda: None
     daemon: Daemon | None = None
     collector: EventCollector = field(default_factory=EventCollector)
+    clock: RunTime = field(default_factory=RunTime)
     state: str = State.RECONCILING.value
     gates: tuple[GateResult, ...] = ()
     estimate: Estimate | None = None
@@ -92,6 +94,7 @@ class Scene:
     def _samples(self, block: SampleBlock) -> None:
         now_s = float(block.time_s[-1])
         step_s = now_s - self.newest_s
+        self.clock.samples(block.time_s)
         if step_s > 0.0:  # the device's time begins again when its power was away
             self.passed_s += step_s
         self.newest_s = now_s
@@ -150,7 +153,7 @@ class Scene:
         self._line("", text)
 
     def _line(self, state: str, text: str) -> None:
-        at_s = 0.0 if math.isnan(self.newest_s) else self.newest_s
+        at_s = 0.0 if math.isnan(self.clock.newest_s) else self.clock.newest_s
         self.say(f"{at_s:8.1f} s  {state:15}{text}")
 
     def _end(self, reason: str) -> None:

@@ -270,7 +270,7 @@ def _states(data: ReportData) -> str:
         [f"{s.at_s:.1f} s", f"{escape(s.old)} → <b>{escape(s.new)}</b>", escape(s.reason)]
         for s in data.states
     ]
-    return section("What happened", table(["device time", "state", "why"], rows, numeric=(0,)))
+    return section("What happened", table(["time", "state", "why"], rows, numeric=(0,)))
 
 
 def _registers(data: ReportData) -> str:
@@ -307,7 +307,7 @@ def _made(data: ReportData) -> str:
     if data.seed is not None:
         lines.append(
             f'<p class="soft">Seed {data.seed}: the same seed gives the same hidden truth, motion '
-            "and noise. When the daemon reads them is up to the machine, so the last digits and the "
-            "moment of a step differ from run to run.</p>"
+            "and noise. When the daemon reads them is up to the machine, so the last digits and "
+            "the moment of a step differ from run to run.</p>"
         )
     return section("How this report was made", *lines) if lines else ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import re
 import shlex
 import tarfile
@@ -82,7 +81,7 @@ def test_a_bundle_without_a_daemon_is_in_the_format_of_its_name_and_says_what_it
     assert run("bundle", "-o", target, "--state-directory", state) == 0
     out, error = capsys.readouterr()
     inside = ["versions.json", "config.toml", "journal/journal-1.jsonl"]
-    assert out == f"{target}: {os.path.getsize(target) / 1e6:.1f} MB: {', '.join(inside)}\n"
+    assert out == f"{target}: {target.stat().st_size / 1e6:.1f} MB: {', '.join(inside)}\n"
     assert "no status in the archive: " in error
     assert f"no capture in the archive: {state / 'captures'} has none" in error
     assert "no journal" not in error
