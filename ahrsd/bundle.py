@@ -6,6 +6,7 @@ The network, environment variables and other programs' files are left alone.
 
 from __future__ import annotations
 
+import gzip
 import importlib.metadata
 import io
 import json
@@ -13,10 +14,12 @@ import platform
 import sys
 import tarfile
 import time
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+FORMATS = {".tar.gz": "tar.gz", ".tgz": "tar.gz", ".tar": "tar", ".zip": "zip"}
 _PACKAGES = ("ahrsd", "numpy", "scipy", "gtsam", "rerun-sdk", "pyserial", "mcap")
 _CAPTURE_BYTES = 64 << 20
 _JOURNAL_BYTES = 4 << 20
@@ -25,7 +28,7 @@ _JOURNAL_BYTES = 4 << 20
 def write_bundle(
     file: Path, state: Path, captures: Path, config: str, status: dict[str, Any] | None
 ) -> list[str]:
-    """Write FILE (tar, gzip) and return what is in it. Raises OSError.
+    """Write FILE, in the format of its name, and return what is in it. Raises OSError.
 
     status: what the running daemon says of itself; None where none runs
     """
@@ -41,12 +44,29 @@ def write_bundle(
     if newest := _newest(captures.glob("*.mcap")):
         # the head, because the format is read from there; what was cut off is readable to the cut
         parts[f"captures/{newest.name}"] = _head(newest, _CAPTURE_BYTES)
-    with tarfile.open(file, "w:gz") as archive:
+    _pack(file, {f"ahrsd-bundle/{name}": body for name, body in parts.items()})
+    return list(parts)
+
+
+def format_of(file: Path) -> str | None:
+    """The format that a file's name says; None for a name that says none of `FORMATS`."""
+    return next((known for suffix, known in FORMATS.items() if file.name.endswith(suffix)), None)
+
+
+def _pack(file: Path, parts: dict[str, bytes]) -> None:
+    if (known := format_of(file)) == "zip":
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            for name, body in parts.items():
+                packed.writestr(name, body)
+        return
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w") as archive:
         for name, body in parts.items():
-            entry = tarfile.TarInfo(f"ahrsd-bundle/{name}")
+            entry = tarfile.TarInfo(name)
             entry.size, entry.mtime = len(body), int(time.time())
             archive.addfile(entry, io.BytesIO(body))
-    return list(parts)
+    packed_bytes = stream.getvalue()
+    file.write_bytes(packed_bytes if known == "tar" else gzip.compress(packed_bytes))
 
 
 def versions() -> dict[str, str]:

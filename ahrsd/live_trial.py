@@ -6,7 +6,9 @@ both show the sensor's noise and neither is worse. That says nothing of the gyro
 matrix that is turned: `carried_field` does, with the new registers and with each alternative to
 them (either one put back, or both). The heading's jump is the difference of the two
 tilt-compensated headings of the same samples, averaged over the first seconds of samples in which
-the vehicle is level: only for that was it predicted, and on the side it may be twice as much.
+the vehicle is nearly level. It was predicted for level, on the side it may be twice as much, and
+at 15 deg a hard iron along the vertical adds half as much again: so each sample is turned level on
+its own heading before the two are compared.
 Seconds are those that samples cover, taken in pieces of a quarter of one: over a gap, or over the
 many seconds that a busy host reads at once, the vehicle turns, and a mean over a turn is no field.
 """
@@ -79,10 +81,11 @@ class LiveTrial:
         down = _down(accel)
         if not down[2] >= _LEVEL:  # nor where it is nan
             return
-        mean, force = raw.mean(axis=0)[None], -down[None]
-        new = tilt_compensated_heading(self._new.apply(mean), force)
-        old = tilt_compensated_heading(self._old.apply(mean), force)
-        self._jumps.append(float((new - old)[0]))
+        field = self._new.apply(raw.mean(axis=0)[None])
+        heading = tilt_compensated_heading(field, -down[None])
+        level = self._new.undo(_levelled(field[0], heading[0], down)[None])
+        before = tilt_compensated_heading(self._old.apply(level), np.array([[0.0, 0.0, -1.0]]))
+        self._jumps.append(float((heading - before)[0]))
         self._jump_covered_s += float(np.nansum(np.minimum(dt_s, _PIECE_S)))
 
     def _metrics(self) -> TrialMetrics:
@@ -106,6 +109,14 @@ class LiveTrial:
             new_swing=float(swing[0]),
             old_swing=float(swing[1:].min()),
         )
+
+
+def _levelled(field_b: Array, heading_rad: float, down_b: Array) -> Array:
+    """The same field as it would be in the sensor's axes were it level, on the same heading."""
+    vertical = float(down_b @ field_b)
+    horizontal = float(np.linalg.norm(field_b - vertical * down_b))
+    north = np.array([np.cos(heading_rad), -np.sin(heading_rad), 0.0])
+    return np.asarray(horizontal * north + np.array([0.0, 0.0, vertical]))
 
 
 def _pieces(time_s: Array) -> list[slice]:

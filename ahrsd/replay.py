@@ -18,7 +18,7 @@ from ahrsd.core import Core
 from ahrsd.core_settings import BESIDE_KEY, CoreSettings
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
-from ahrsd.recording.bytestream import read_stream
+from ahrsd.recording.bytestream import read_stream, unpacked_size
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
 from ahrsd.recording.opening import Kind, Recording, open_recording
@@ -76,12 +76,13 @@ def replay(
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
     done = Replayed(core, recording, list(recording.notes))
     items = recording.inputs() if done.of_daemon else _registers_first(recording)
+    share = _share_of_file(recording)
     if (text := terms_text(config)) and not done.of_daemon:
         shell.feed(TermsKnown(0, text))
     for item in _paced(items, core, speed):
         shell.feed(item)
-        if progress is not None and isinstance(item, Received):
-            progress(len(item.data))
+        if progress is not None:
+            progress(share(item))
         refuse_beyond(path, core.stream.facts.samples, most_samples, "samples", _CUT)
         counters = core.conversation.session.deframer.counters
         if counters.valid == 0 and counters.fed_bytes > GARBAGE_BYTES:
@@ -91,6 +92,29 @@ def replay(
     if recording.kind is Kind.BYTES and _cut_off(core):
         done.warnings.append("the recording ends in the middle of a message")
     return done
+
+
+def _share_of_file(recording: Recording) -> Callable[[Input], int]:
+    """How many bytes of the file an input is: of what is packed as much as its part of the whole.
+
+    Of a capture the bytes that were received, as nobody knows what else is in the file.
+    """
+    scale = 1.0
+    on_disk = recording.path.stat().st_size
+    if recording.kind is Kind.TABLE and recording.table is not None:
+        scale = on_disk / max(len(recording.table.rows), 1)
+    elif recording.kind is Kind.BYTES:
+        scale = on_disk / max(unpacked_size(recording.path), 1)
+
+    def share(item: Input) -> int:
+        match item:
+            case Received(data=data):
+                return round(scale * len(data))
+            case Samples(block=block):
+                return round(scale * len(block))
+        return 0
+
+    return share
 
 
 def _settings(

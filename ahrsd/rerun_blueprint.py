@@ -40,7 +40,7 @@ GATE_LANES = "gate"
 STATE_LANE = "daemon/state"
 LOG = "log"
 
-DEVICE_TIME = "device_time"  # seconds since the device's start-up
+DEVICE_TIME = "device_time"  # of the device's clock, going on where the device restarted
 HOST_TIME = "host_time"  # the host's monotonic clock
 SAMPLE = "sample"  # counts samples since the sink was made
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import uuid
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,9 @@ from ahrsd.events import (
     SamplesSeen,
     StateChanged,
 )
+from ahrsd.gates import guards_a_write
 from ahrsd.rerun_sink import BATCH_ROWS
+from ahrsd.run_time import RunTime
 from ahrsd.samples import Array
 
 Indices = NDArray[np.signedinteger]
@@ -89,6 +91,7 @@ class Recorder:
         self._gates: dict[str, bool] = {}
         self._newest: Affine | None = None  # shown until there is a proposal
         self._state_known = False
+        self._time = RunTime()
         self._table_at_s = self._shape_at_s = -math.inf
         names.log_styles(stream)
 
@@ -97,6 +100,7 @@ class Recorder:
         rows = _Rows.of(seen, self._newest)
         if not len(rows.time_s):
             return
+        rows = replace(rows, time_s=self._time.samples(rows.time_s))
         if self._first_s is None:
             self._first_s = float(rows.time_s[0]), float(rows.host_s[0])
         every = np.arange(len(rows.time_s))
@@ -130,7 +134,8 @@ class Recorder:
 
     def _at(self, at_s: float, host_s: float, sample: int) -> None:
         self._stream.reset_time()  # a clock that is not known yet must not keep an old value
-        for timeline, value in ((names.DEVICE_TIME, at_s), (names.HOST_TIME, host_s)):
+        device_s = self._time.at(at_s)
+        for timeline, value in ((names.DEVICE_TIME, device_s), (names.HOST_TIME, host_s)):
             if math.isfinite(value):
                 self._stream.set_time(timeline, duration=value)
         self._stream.set_time(names.SAMPLE, sequence=sample)
@@ -216,7 +221,8 @@ class Recorder:
 
     def _judged(self, judged: Judged) -> None:
         changed = False
-        for gate, checks in by_gate(judged.gates).items():
+        counted = [check for check in judged.gates if guards_a_write(check.gate)]
+        for gate, checks in by_gate(counted).items():
             ok = all(check.ok for check in checks)
             if self._gates.get(gate) is ok:
                 continue
@@ -249,7 +255,7 @@ class Recorder:
 
 
 def by_gate(checks: Iterable[GateResult]) -> dict[str, list[GateResult]]:
-    """The checks of each gate: `field.spread` and `field.strongest` both belong to `field`."""
+    """The gates of each family: `field.spread` and `field.strongest` both belong to `field`."""
     gates: dict[str, list[GateResult]] = {}
     for check in checks:
         gates.setdefault(check.gate.partition(".")[0], []).append(check)
@@ -257,17 +263,16 @@ def by_gate(checks: Iterable[GateResult]) -> dict[str, list[GateResult]]:
 
 
 def gate_table(checks: Sequence[GateResult]) -> str:
-    """Markdown of a verdict: what to do first, then every check with its value and its limit."""
-    gates = by_gate(checks)
-    failing = {
-        name: bad for name, rows in gates.items() if (bad := [row for row in rows if not row.ok])
-    }
-    held = f"**Held back by {len(failing)} of {len(gates)} gates**"
-    lines = [held if failing else f"**All {len(gates)} gates ok**", ""]
-    for name, bad in failing.items():
+    """Markdown of a verdict: what to do first, then every gate with its value and its limit."""
+    checks = [check for check in checks if guards_a_write(check.gate)]
+    families = by_gate(check for check in checks if not check.ok)
+    shut = sum(map(len, families.values()))
+    held = f"**Held back by {shut} of {len(checks)} gates**"
+    lines = [held if shut else f"**All {len(checks)} gates ok**", ""]
+    for name, bad in families.items():
         more = f" *(and {len(bad) - 1} more)*" if len(bad) > 1 else ""
         lines.append(f"- **{name}**: {bad[0].advice}{more}")
-    lines += ["", "| | check | value | limit |", "|---|---|---|---|"]
+    lines += ["", "| | gate | value | limit |", "|---|---|---|---|"]
     for check in sorted(checks, key=lambda check: check.ok):
         lines.append(
             f"| {'ok' if check.ok else '**NO**'} | {_cell(check.gate)} "

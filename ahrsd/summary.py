@@ -10,7 +10,7 @@ import numpy as np
 from ahrsd.calibration import Estimate
 from ahrsd.core import Core
 from ahrsd.events import GateResult
-from ahrsd.gates import Level, for_level
+from ahrsd.gates import Level, guards_a_write
 from ahrsd.result import HeadingErrors, calibration_json, why_not_converged
 from ahrsd.unmapping import Compensation
 
@@ -105,7 +105,7 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
             f"{_count(stream.restarts, 'restart')} of the device"
         )
     lines += estimate_lines(core.calibrator.estimate)
-    lines += _gate_lines(_guarding(core.calibrator.gates, core.settings.level))
+    lines += _gate_lines(core.calibrator.gates, core.settings.level)
     lines += [f"  warning: {text}" for text in said_of(core, warnings)]
     lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
     return lines
@@ -115,13 +115,17 @@ def _count(number: int, thing: str) -> str:
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
-def _guarding(gates: Sequence[GateResult], level: Level) -> list[GateResult]:
-    """Gates of the write and of the save; those of a write without a person only where one is."""
-    guards = {g.gate for guarded in (level, Level.FLASH) for g in for_level(gates, guarded)}
-    return [gate for gate in gates if gate.gate in guards]
+def _gate_lines(gates: Sequence[GateResult], level: Level) -> list[str]:
+    """Gates that are shut: of a write and its save, and of one without a person where that is."""
+    guards = [gate for gate in gates if guards_a_write(gate.gate)]
+    alone = [gate for gate in gates if not guards_a_write(gate.gate)]
+    lines = _shut_lines(guards, "a write back")
+    return lines + (
+        _shut_lines(alone, "a write without approval back") if level > Level.FLASH else []
+    )
 
 
-def _gate_lines(gates: Sequence[GateResult]) -> list[str]:
+def _shut_lines(gates: Sequence[GateResult], what: str) -> list[str]:
     """Gates that are shut, those with the same advice together."""
     shut: dict[str, list[str]] = {}
     for gate in gates:
@@ -130,7 +134,7 @@ def _gate_lines(gates: Sequence[GateResult]) -> list[str]:
     if not shut:
         return []
     number = sum(len(names) for names in shut.values())
-    head = f"  {number} of {len(gates)} gates hold a write back:"
+    head = f"  {number} of {len(gates)} gates {'holds' if number == 1 else 'hold'} {what}:"
     return [head, *(f"    {', '.join(names)}: {advice}" for advice, names in shut.items())]
 
 

@@ -162,7 +162,7 @@ def test_another_configuration_does_not_change_what_a_capture_says(tmp_path):
 
 def test_every_sample_counts_and_the_answer_is_zero(run, tmp_path, capsys):
     path = FOLDER / "tumble_binary_restart.vnbin.gz"
-    written = ("--json", tmp_path / "c.json", "--report", tmp_path / "r.html")
+    written = ("--json", tmp_path / "c.json", "--report", tmp_path / "r")
     assert run("calibrate", path, *written) == 0
     out = capsys.readouterr().out
     found = json.loads((tmp_path / "c.json").read_text())
@@ -172,9 +172,65 @@ def test_every_sample_counts_and_the_answer_is_zero(run, tmp_path, capsys):
     assert found["method"] == "magyc"
     assert any("registers are not known" in text for text in found["warnings"])
     assert f"{path.name}: 1720 samples, method magyc" in out
-    page = (tmp_path / "r.html").read_text()
+    page = (tmp_path / "r" / "report.html").read_text()
     assert "Calibration of tumble_binary_restart" in page
     assert "registers are not known" in page
+    assert json.loads((tmp_path / "r" / "calibration.json").read_text()) == found
+
+
+def test_a_report_is_a_folder_as_with_every_command(run, tmp_path, capsys):
+    path = FOLDER / "tumble_binary_restart.vnbin.gz"
+    assert run("calibrate", path, "--report", tmp_path / "r.html") == 2
+    assert "give a folder; the page is report.html in it" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_replaced_is_told_before(run, tmp_path, capsys):
+    path, target = FOLDER / "tumble_binary_restart.vnbin.gz", tmp_path / "c.json"
+    assert run("calibrate", path, "--json", target) == 0
+    assert "replaced" not in capsys.readouterr().err
+    assert run("calibrate", path, "--json", target) == 0
+    assert f"{target}: exists and will be replaced\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [("calibrate",), ("replay",), ("diagnose",)])
+def test_json_to_a_forbidden_path_is_one_line(run, tmp_path, capsys, command):
+    path = FOLDER / "tumble_binary_restart.vnbin.gz"
+    for target in (tmp_path / "none" / "c.json", tmp_path):
+        assert run(*command, path, "--json", target) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"ahrsd: {target}: ")
+        assert error.count("\n") == 1
+
+
+def test_position_and_date_give_the_field_of_the_world_model(run, tmp_path):
+    """On the Black Sea at the beginning of 2026: 0.490 G (WMM2025), which is then no unknown."""
+    path = FOLDER / "tumble_binary_restart.vnbin.gz"
+    place = ("--position", "42.0,34.2", "--date", "2026-01-01")
+    assert run("calibrate", path, "--json", tmp_path / "a.json") == 0
+    assert run("calibrate", path, *place, "--json", tmp_path / "b.json") == 0
+    plain, placed = (json.loads((tmp_path / f"{n}.json").read_text()) for n in "ab")
+    assert placed["field_gauss"] == pytest.approx(0.490, abs=0.002)
+    assert placed["field_known"] is True
+    assert plain["field_known"] is False
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--position", "42"), "LAT,LON[,ALT] in deg and m is needed"),
+        (("--position", "142,10"), "--position 142,10: "),
+        (("--position", "x,y"), "--position x,y: "),
+        (("--date", "2026-01-01"), "--date without --position"),
+        (("--position", "42,10", "--date", "yesterday"), "--date yesterday: "),
+    ],
+)
+def test_a_bad_place_or_day_is_one_line(run, capsys, options, words):
+    path = FOLDER / "tumble_binary_restart.vnbin.gz"
+    assert run("calibrate", path, *options) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
@@ -188,14 +244,15 @@ def at_rest(tmp_path_factory) -> Path:
 def test_a_recording_that_does_not_determine_it_is_a_no_with_its_reason(
     run, at_rest, tmp_path, capsys
 ):
-    assert run("calibrate", at_rest, "--json", "-", "--report", tmp_path / "r.html") == 1
+    assert run("calibrate", at_rest, "--json", "-", "--report", tmp_path / "r") == 1
     found = json.loads(capsys.readouterr().out)
     assert faults(found, CALIBRATION) == []
     assert found["converged"] is False
     assert found["registers"] == {}
     (reason,) = [t for t in found["warnings"] if t.startswith("this motion does not determine: ")]
     assert "hard iron x" in reason
-    assert "This motion does not determine: " in (tmp_path / "r.html").read_text()
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert "This motion does not determine: " in page
 
 
 def test_the_words_for_a_person_say_what_is_not_known(run, at_rest, capsys):

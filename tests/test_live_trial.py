@@ -154,6 +154,23 @@ def test_on_its_side_a_vehicle_shows_no_jump_until_it_is_level():
     assert jump == pytest.approx(-np.degrees(np.arctan2(0.03, 0.29)), abs=1e-9)
 
 
+@pytest.mark.parametrize("roll_deg", [-14.0, 0.0, 14.0])
+@pytest.mark.parametrize("yaw_deg", [0.0, 70.0, 200.0])
+def test_a_tilt_within_what_counts_as_level_changes_no_jump(roll_deg, yaw_deg):
+    """The jump was predicted for level: a hard iron along the vertical adds none of its own."""
+    iron = Affine(np.eye(3), np.array([0.05, -0.03, 0.25]))
+    still = circle(5.0, 0.0)
+    yaw, roll = np.radians(yaw_deg), np.radians(roll_deg)
+    R_nb = so3.exp(np.array([[0.0, 0.0, yaw]]))[0] @ so3.exp(np.array([[roll, 0.0, 0.0]]))[0]
+    rolled = replace(
+        still,
+        raw_b_gauss=np.tile(FIELD_N @ R_nb + iron.offset, (len(still), 1)),
+        accel_b_m_s2=np.tile(np.array([0.0, 0.0, -9.81]) @ R_nb, (len(still), 1)),
+    )
+    jump = run(LiveTrial(iron, IDENTITY, NO_BIAS), rolled).heading_jump_deg
+    assert jump == pytest.approx(jump_deg(yaw_deg), abs=1e-6)
+
+
 def test_without_a_specific_force_there_is_no_jump_and_no_turn_but_a_figure():
     metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0, force=False))
     assert metrics.heading_jump_deg is None

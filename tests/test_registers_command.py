@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 
 import pytest
 
@@ -64,14 +65,32 @@ def test_write_journals_verifies_and_tells_how_to_go_back(run, emulated, tmp_pat
     assert "$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0*76" in shown
 
 
+@pytest.mark.parametrize("by", ["--state-directory", "default"])
+def test_the_command_that_is_printed_works_when_it_is_pasted(
+    run, emulated, tmp_path, capsys, monkeypatch, by
+):
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "of the user"))
+    place = () if by == "default" else (by, tmp_path / "with a blank")
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes", *place, *BAUD) == 0
+        assert ram(emulator) == NEW_VALUES
+        shown = capsys.readouterr().out
+        (line,) = [line for line in shown.splitlines() if line.startswith("to go back: ")]
+        pasted = shlex.split(line.removeprefix("to go back: ").removesuffix(", or send"))
+        assert pasted[0] == "ahrsd"
+        assert run(*pasted[1:]) == 0
+        assert ram(emulator) == FACTORY
+
+
 def test_without_yes_nothing_is_written(run, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
         assert run("registers", "write", path, 23, ",".join(NEW),
-                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
         assert ram(emulator) == FACTORY
     assert list(tmp_path.iterdir()) == []
     output = capsys.readouterr()
-    assert "add --yes to do it" in output.err
+    assert "nothing was written; add --yes to do it" in output.out
+    assert output.err == ""
     assert "new  1.1,0,0,0,1,0,0,0,0.9,0.125,-0.0625,0.03" in output.out
 
 

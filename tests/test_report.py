@@ -266,7 +266,7 @@ def test_gates_that_hold_back_come_first_with_their_advice(tmp_path):
     )
     shown = page(ReportData("x", gates=gates), tmp_path)
     assert shown.text.index("motion") < shown.text.index("bounds")
-    assert "1 of 2 checks are ok" in shown.text
+    assert "1 of 2 gates are ok" in shown.text
     assert "drive a full turn" in shown.text
     assert "never shown" not in shown.text
     assert "280 deg" in shown.text

@@ -6,11 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from streams import emitted, inputs
 
+from ahrsd.commands.watch import _gates as shown
 from ahrsd.config import Config
 from ahrsd.core import Core
 from ahrsd.events import GateResult
+from ahrsd.gates import GATES, Level, guards_a_write
+from ahrsd.report.data import ReportData
+from ahrsd.report.page import _gates
+from ahrsd.rerun_recorder import gate_table
 from ahrsd.settings import core_settings
 from ahrsd.summary import _gate_lines, estimate_lines, said_of, summary_json, summary_lines
 from ahrsd.writeback.permissions import Mode
@@ -90,9 +96,46 @@ def test_gates_with_one_advice_are_one_line():
         GateResult("b.size", 0.1, 1.0, True, 0.0, "", "not said"),
         GateResult("c.rate", 5.0, 1.0, False, 0.0, "Hz", "slow down"),
     ]
-    assert _gate_lines(gates) == [
+    assert _gate_lines(gates, Level.RAM) == [
         "  3 of 4 gates hold a write back:",
         "    a.rms, a.max: keep turning",
         "    c.rate: slow down",
     ]
-    assert _gate_lines([gates[2]]) == []
+    assert _gate_lines([gates[2]], Level.RAM) == []
+    assert _gate_lines(gates[2:], Level.RAM)[0] == "  1 of 2 gates holds a write back:"
+
+
+def test_gates_of_a_write_without_a_person_are_counted_apart_and_only_where_that_is_allowed():
+    gates = [
+        GateResult("field.weakest", 0.5, 1.0, False, 0.0, "", "go outside"),
+        GateResult("step.auto", 5.0, 1.0, False, 0.0, "deg", "let a person approve it"),
+    ]
+    alone = _gate_lines(gates, Level.RAM)
+    assert alone == ["  1 of 1 gates holds a write back:", "    field.weakest: go outside"]
+    assert _gate_lines(gates, Level.UNATTENDED) == [
+        *alone,
+        "  1 of 1 gates holds a write without approval back:",
+        "    step.auto: let a person approve it",
+    ]
+
+
+def test_the_number_of_gates_is_one_number_everywhere():
+    """Summary, page, live view of the terminal and the viewer's table count the same gates."""
+    results = [
+        GateResult(gate.gate, 2.0, 1.0, k % 3 > 0, 0.0, "", "do something")
+        for k, gate in enumerate(GATES)
+    ]
+    counted = [r for r in results if guards_a_write(r.gate)]
+    shut = sum(not r.ok for r in counted)
+    assert 40 < len(counted) < len(GATES)
+    assert (
+        _gate_lines(results, Level.RAM)[0] == f"  {shut} of {len(counted)} gates hold a write back:"
+    )
+    assert gate_table(results).startswith(f"**Held back by {shut} of {len(counted)} gates**")
+    page = _gates(ReportData(title="t", gates=tuple(results)))
+    assert f"{len(counted) - shut} of {len(counted)} gates are ok" in page
+    console = Console(width=200, record=True)
+    rows = [{"gate": r.gate, "ok": r.ok, "value": 2.0, "unit": "", "limit": 1.0} for r in results]
+    with console.capture() as captured:
+        console.print(shown({"gates": rows, "write_back": {"holds": []}}, 3))
+    assert f"{len(counted) - shut} of {len(counted)} gates are green" in captured.get()

@@ -6,33 +6,40 @@ from pathlib import Path
 
 import click
 
+from ahrsd.commands.json_output import refuse_unwritable
+from ahrsd.commands.running import Place, place_options
 from ahrsd.errors import AhrsdError, DeviceError
 
 
 @click.command()
-@click.option("-o", "--output", type=click.Path(path_type=Path), default="ahrsd-bundle.tar.gz")
-@click.option("--config", "path", type=click.Path(path_type=Path), help="The daemon's, TOML.")
-def command(output: Path, path: Path | None) -> None:
+@click.option("-o", "--output", type=click.Path(path_type=Path), default="ahrsd-bundle.tar.gz",
+              show_default=True, help="The archive: .tar.gz, .tgz, .tar or .zip.")  # fmt: skip
+@place_options
+def command(output: Path, place: Place) -> None:
     """Collect journal, newest capture, configuration, status and versions into one archive.
 
     It works beside a running daemon and without one. The capture holds where the sensor was turned
     to, and the location if one is configured: look before you pass it on.
     """
-    from ahrsd.bundle import write_bundle
-    from ahrsd.commands.running import connected
-    from ahrsd.config import Config, load_config
+    from ahrsd.bundle import FORMATS, format_of, write_bundle
     from ahrsd.config_text import print_config
 
-    config = load_config(path) if path else Config()
+    if format_of(output) is None:
+        raise AhrsdError(f"{output}: the archive's name must end in {', '.join(FORMATS)}")
+    refuse_unwritable(output)
     try:
-        with connected(config.socket.path, config.state) as daemon:
+        with place.connect() as daemon:
             status = daemon.ask("status")
     except DeviceError as error:
-        click.echo(f"{error}: the archive is made without its status", err=True)
+        click.echo(f"no status in the archive: {error}", err=True)
         status = None
+    config = place.config.model_copy(update={"state_directory": place.state})
     try:
         inside = write_bundle(output, config.state, config.captures, print_config(config), status)
     except OSError as error:
         raise AhrsdError(f"{output}: cannot be written: {error.strerror}") from None
+    for what, folder in (("journal/", config.state), ("captures/", config.captures)):
+        if not any(name.startswith(what) for name in inside):
+            click.echo(f"no {what.rstrip('s/')} in the archive: {folder} has none", err=True)
     size = output.stat().st_size
     click.echo(f"{output}: {size / 1e6:.1f} MB: {', '.join(inside)}")

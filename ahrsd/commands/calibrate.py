@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.commands.json_output import refuse_unwritable, write_json
+from ahrsd.commands.json_output import make_folder, refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.commands.recording_options import columns_option
 from ahrsd.config import Config, load_config
@@ -38,7 +38,10 @@ _METHODS = (  # ours first; a test holds this list against `ahrsd.methods`, slow
     help="A repaired model of `diagnose --report`: what it names is taken out first.",
 )
 @click.option("--json", "json_path", help="calibration.json into this file, - for stdout.")
-@click.option("--report", "report_path", type=click.Path(path_type=Path), help="Write a page.")
+@click.option("--position", help="LAT,LON[,ALT] in deg and m: the world model gives the field.")
+@click.option("--date", help="YYYY-MM-DD of the recording, for the world model; default: today.")
+@click.option("--report", "folder", type=click.Path(path_type=Path),
+              help="Folder for report.html and calibration.json.")  # fmt: skip
 @click.option("--figure", "figure_path", type=click.Path(path_type=Path),
               help="With --method all: the table as a picture, PNG.")  # fmt: skip
 def command(
@@ -48,8 +51,10 @@ def command(
     rate_hz: float | None,
     columns: ColumnMap,
     model_path: Path | None,
+    position: str | None,
+    date: str | None,
     json_path: str | None,
-    report_path: Path | None,
+    folder: Path | None,
     figure_path: Path | None,
 ) -> None:
     """Calibrate from all of RECORDING at once: a capture, a byte stream or a table.
@@ -62,11 +67,13 @@ def command(
     from ahrsd.summary import estimate_lines
 
     refuse_unwritable(json_path)
-    refuse_unwritable(report_path)
     refuse_unwritable(figure_path)
     if figure_path is not None and method != _ALL:
         raise AhrsdError("--figure compares the methods: give --method all with it")
-    config = load_config(path) if path else Config()
+    config = _placed(load_config(path) if path else Config(), position, date)
+    if folder is not None:
+        _refuse_page(folder)
+        make_folder(folder, ("report.html", "calibration.json"))
     model = None if model_path is None else load_model(model_path)
     with byte_progress(recording) as progress:
         result = calibrate(
@@ -76,8 +83,9 @@ def command(
         raise RecordingError(
             recording, words, "record again, away from magnets and strong currents"
         )
-    if report_path is not None:
-        result.write_report(report_path)
+    if folder is not None:
+        result.write_report(folder / "report.html")
+        write_json(str(folder / "calibration.json"), result.json(_METHODS[0]))
     if method != _METHODS[0]:
         raise SystemExit(_published(result, method, json_path, figure_path))
     if json_path is not None:
@@ -89,6 +97,40 @@ def command(
         for text in result.said():
             click.echo(f"  warning: {text}")
     raise SystemExit(EXIT_DONE if result.converged else EXIT_NO)
+
+
+def _placed(config: Config, position: str | None, date: str | None) -> Config:
+    """The configuration with the place and the day of the recording.  AhrsdError for a bad one."""
+    if position is None and date is None:
+        return config
+    from pydantic import ValidationError
+
+    from ahrsd.config_sections import Location
+
+    given = config.location.model_dump()
+    if position is not None:
+        numbers = position.split(",")
+        if len(numbers) not in (2, 3):
+            raise AhrsdError(f"--position {position}: LAT,LON[,ALT] in deg and m is needed")
+        names = ("latitude_deg", "longitude_deg", "height_m")
+        given |= {"height_m": 0.0, **dict(zip(names, numbers, strict=False))}
+    if given["latitude_deg"] is None:
+        raise AhrsdError("--date without --position: the field is that of a place; give both")
+    if date is not None:
+        given["date"] = date
+    try:
+        return config.model_copy(update={"location": Location.model_validate(given, strict=False)})
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        option = "--date" if wrong["loc"][:1] == ("date",) else "--position"
+        raise AhrsdError(
+            f"{option} {date if option == '--date' else position}: {wrong['msg']}"
+        ) from (None)
+
+
+def _refuse_page(folder: Path) -> None:
+    if folder.is_file() or folder.suffix.lower() in (".html", ".htm"):
+        raise AhrsdError(f"--report {folder}: give a folder; the page is report.html in it")
 
 
 def _published(

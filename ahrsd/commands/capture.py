@@ -16,6 +16,7 @@ import click
 
 from ahrsd import host_clock
 from ahrsd.commands.device_access import PORT, describe, driver_errors, open_port, read_all
+from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
 from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
 from ahrsd.recording.capture import CaptureStatus, CaptureWriter, Sent
@@ -93,6 +94,7 @@ def command(
         raise click.BadParameter(f"{path} exists already; name another file", param_hint="-o")
     if not path.parent.is_dir():
         raise click.BadParameter(f"{path.parent} is no folder", param_hint="-o")
+    refuse_unwritable(json_path)
     with driver_errors(), open_port(port, baud, may_query=not passive) as serial:
         before = _opened(port, serial)
         header = {} if passive else _read_device(serial, before)
@@ -205,7 +207,7 @@ def _report(path: Path, session: _Session, status: CaptureStatus, json_path: str
             f"ended by {session.reason}"
         )
         if json_path:
-            Path(json_path).write_text(json.dumps(summary) + "\n", encoding="utf-8")
+            write_json(json_path, summary)
     if status.lost_bytes:
         click.echo(f"ahrsd: {status.lost_bytes} bytes were lost: {status.error}", err=True)
         raise SystemExit(EXIT_NO)

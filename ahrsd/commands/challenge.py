@@ -5,13 +5,11 @@ See docs/validation/blind-trials.md.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
+from ahrsd.commands.progress import count_progress
 from ahrsd.errors import EXIT_DONE, EXIT_NO
 
 _RINGS = (
@@ -54,7 +52,7 @@ def make_command(
     from ahrsd.challenge.making import make
 
     key = key_path or folder.with_name(folder.name + "-key") / "key.json"
-    with _progress("cases") as done:
+    with count_progress("cases") as done:
         trial = make(
             folder, key, ring, cases, seed=seed, jobs=jobs, recordings=recordings, done=done
         )
@@ -81,7 +79,7 @@ def run_command(folder: Path, tool: str, name: str | None, jobs: int) -> None:
     from ahrsd.challenge.sealing import open_round
 
     trial = open_round(folder)
-    with _progress(name or tool.split(maxsplit=1)[0]) as done:
+    with count_progress(name or tool.split(maxsplit=1)[0]) as done:
         digest = run(trial, tool, name=name, jobs=jobs, done=done)
     click.echo(f"{len(trial.cases)} answers closed: sha256 {digest}")
 
@@ -113,19 +111,3 @@ def score_command(folder: Path, key_path: Path, output: Path | None) -> None:
         click.echo(f"  {row.name:45s} {value:>7s} of {row.cases:4d}  {row.target:>9s} {met}")
     missed = any(row.met is False for row in results[0].scores)
     raise SystemExit(EXIT_NO if missed else EXIT_DONE)
-
-
-@contextmanager
-def _progress(label: str) -> Iterator[Callable[[int, int], None] | None]:
-    """Cases done of all, with the time that is left; nothing where stderr is no terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), Remaining())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -38,7 +38,9 @@ def _program(name: str) -> str:
     show_default=True,
     help="Device time at most.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Which hidden truth.")
+@click.option(
+    "--seed", type=int, default=0, show_default=True, help="Which hidden truth, motion and noise."
+)
 @click.option(
     "--speed",
     type=click.FloatRange(1.0, 100.0),
@@ -50,7 +52,8 @@ def command(directory: Path, seconds: float, seed: int, speed: float) -> None:
     """Calibrate an emulated VN-100 with hidden iron and gyro bias, and write its registers.
 
     The real daemon on one end of a pseudo-terminal, the emulated device on the other, both many
-    times faster than real time. Exit 1 where the result is not what is promised.
+    times faster than real time. Exit 1 where the result is not what is promised. Files of an
+    earlier demo in the folder are replaced.
     """
     from ahrsd.demo import FILES, lines, run_demo
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.commands.json_output import refuse_unwritable, write_json
+from ahrsd.commands.json_output import make_folder, refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.commands.recording_options import columns_option
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
@@ -173,10 +173,7 @@ def _references(
 def _into(
     folder: Path, json_path: str | None, figure_path: Path | None
 ) -> tuple[str | None, Path | None]:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AhrsdError(f"{folder}: cannot be made: {error.strerror}") from error
+    make_folder(folder, ("evaluation.json", "evaluation.png"))
     return json_path or str(folder / "evaluation.json"), figure_path or folder / "evaluation.png"
 
 

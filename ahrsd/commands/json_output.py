@@ -1,9 +1,14 @@
-"""`--json FILE`, `-` for stdout: written whole or not at all."""
+"""Files that a command writes: refused before any work, told where one is replaced, whole or not.
+
+A file that can be made again is replaced, and a line says so. What cannot (a recording of a device)
+is never replaced: `capture` asks for another name.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,7 +18,10 @@ from ahrsd.errors import AhrsdError
 
 
 def refuse_unwritable(target: str | Path | None) -> None:
-    """Raise AhrsdError before any work is done for a file that cannot be written."""
+    """Raise AhrsdError before any work is done for a file that cannot be written.
+
+    One that exists and is going to be replaced is told on stderr.
+    """
     if target is None or str(target) == "-":
         return
     path = Path(target)
@@ -23,6 +31,26 @@ def refuse_unwritable(target: str | Path | None) -> None:
         raise AhrsdError(f"{path}: {path.parent} is no folder; make it first")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise AhrsdError(f"{path}: cannot be written: permission denied; name another file")
+    if path.is_file():
+        click.echo(f"{path}: exists and will be replaced", err=True)
+
+
+def make_folder(folder: Path, names: Iterable[str]) -> None:
+    """The folder of a `--report`, and every file in it as `refuse_unwritable` looks at it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AhrsdError(f"{folder}: cannot be made: {error.strerror}") from error
+    for name in names:
+        refuse_unwritable(folder / name)
+
+
+def write_text(target: Path, text: str) -> None:
+    """A file of text.  AhrsdError where it cannot be written."""
+    try:
+        target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise AhrsdError(f"{target}: cannot be written: {error.strerror}") from error
 
 
 def write_json(target: str, value: object) -> None:

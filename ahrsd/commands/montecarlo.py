@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.commands.json_output import write_json
+from ahrsd.commands.json_output import refuse_unwritable, write_json
+from ahrsd.commands.progress import count_progress
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 
 if TYPE_CHECKING:
@@ -89,6 +87,8 @@ def command(
 
     Exit 1 where a method had no answer at the last time in some run.
     """
+    refuse_unwritable(json_path)
+    refuse_unwritable(figure_path)
     wanted = _plans(
         scenario, motion, methods, at_s, rate_hz, noise_mg, scales, gyro_mrad, hard_iron_as_read
     )
@@ -145,7 +145,7 @@ def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[Row]:
     from ahrsd.montecarlo import run_many
     from ahrsd.montecarlo_summary import summarise
 
-    with _progress(plan.name) as done:
+    with count_progress(plan.name) as done:
         return summarise(run_many(plan, seeds, jobs=jobs, resume=resume, done=done))
 
 
@@ -205,19 +205,3 @@ def _draw(path: Path, sets: list[tuple[Plan, list[Row]]]) -> None:
         write_montecarlo_figure(path, [(plan.name, rows) for plan, rows in sets])
     except OSError as error:
         raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-@contextmanager
-def _progress(label: str) -> Iterator[Callable[[int, int], None] | None]:
-    """Runs done of all, with the time that is left; nothing where stderr is no terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), Remaining())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from ahrsd.commands.running import state_options
 from ahrsd.errors import EXIT_BUSY, EXIT_USAGE, DeviceError
 from ahrsd.operator_box import VERBS
 
@@ -15,12 +16,7 @@ _WAIT_S = 5.0
 @click.command()
 @click.argument("verb", type=click.Choice(VERBS))
 @click.argument("text", default="")
-@click.option(
-    "--state-directory",
-    "directory",
-    type=click.Path(path_type=Path),
-    help="That of the daemon's configuration.",
-)
+@state_options
 def command(verb: str, text: str, directory: Path | None) -> None:
     """Tell the running daemon what a person decided.
 

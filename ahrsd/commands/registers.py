@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -11,6 +12,7 @@ import click
 
 from ahrsd.commands import register_locks
 from ahrsd.commands.device_access import PORT, describe, open_device
+from ahrsd.commands.json_output import refuse_unwritable, write_text
 from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
 from ahrsd.commands.register_text import described
@@ -81,6 +83,7 @@ command.add_command(register_locks.unlock)
 @click.option("--json", "json_path", help="Values as JSON into this file, - for stdout.")
 def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | None) -> None:
     """Print registers of the device on PORT: those in IDS, else its whole configuration."""
+    refuse_unwritable(json_path)
     with open_device(port, baud) as device:
         identity = device.run(identify())
         procedure = read_present(ids) if ids else read_configuration(identity.profile)
@@ -94,7 +97,7 @@ def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | No
     if json_path == "-":
         click.echo(_json(values, identity), nl=False)
     elif json_path:
-        Path(json_path).write_text(_json(values, identity), encoding="utf-8")
+        write_text(Path(json_path), _json(values, identity))
     if absent:
         numbers = ", ".join(map(str, absent))
         click.echo(f"ahrsd: firmware {identity.firmware} has no register {numbers}", err=True)
@@ -204,6 +207,7 @@ def export(
     SOURCE is what `diff` takes: a port, a JSON file, or a number of the journal. Without IDS all
     that it has and that can be written, save the baud rate. In RAM until $VNWNV*57 is sent.
     """
+    refuse_unwritable(output)
     identity, values = Sources(_state(state_directory), journal_file, baud).read(source)
     if missing := [number for number in ids if number not in values]:
         raise AhrsdError(f"{source} has no register {missing[0]}")
@@ -212,7 +216,7 @@ def export(
     if output is None:
         click.echo(text, nl=False)
     else:
-        output.write_text(text, encoding="ascii")
+        write_text(output, text)
 
 
 @command.command()
@@ -274,18 +278,34 @@ def _change(
         if not changes and not save:
             return
         if not yes:
-            raise click.UsageError("nothing was written; add --yes to do it")
+            click.echo("nothing was written; add --yes to do it")
+            return
         if not identity.profile.writable:
             raise AhrsdError(f"nothing is written to it: {identity.profile.observed_for}")
         permitted.update(changes)
         record = apply(device, journal, identity, changes, **why)
         click.echo(f"written and verified in RAM, journal {journal.path} record {record.seq}")
-        click.echo(f"to go back: ahrsd registers rollback {port} {record.seq} --yes, or send")
+        again = _again(port, record.seq, state, journal_file, baud)
+        click.echo(f"to go back: {again}, or send")
         for line in wrg_lines(record):
             click.echo(f"  {line}")
         if save:
             save_to_flash(device, journal, record)
             click.echo("saved to flash")
+
+
+def _again(
+    port: Path, number: int, state: Path, journal_file: Path | None, baud: int | None
+) -> str:
+    """The command that undoes a record, as it works when it is pasted: with the same options."""
+    words = ["ahrsd", "registers", "rollback", str(port), str(number), "--yes"]
+    if journal_file is not None:
+        words += ["--journal", str(journal_file)]
+    elif state != default_state_directory():
+        words += ["--state-directory", str(state)]
+    if baud is not None:
+        words += ["--baud", str(baud)]
+    return shlex.join(words)
 
 
 def _json(values: Changes, identity: Identity | None) -> str:

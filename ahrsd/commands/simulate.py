@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from ahrsd.commands.json_output import write_json
+from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.recording_options import columns_option
 from ahrsd.errors import EXIT_DONE, AhrsdError
 
@@ -62,6 +62,7 @@ def command(**options: object) -> None:
     that an effect needs (a motor's current, a temperature, ...) are made up and written as well.
     """
     wanted = _Options(**cast("dict[str, Any]", options))
+    refuse_unwritable(wanted.output)
     if (wanted.model is None) != (wanted.along_path is None):
         raise AhrsdError("--model and --along need each other")
     if wanted.model is not None and wanted.along_path is not None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import click
@@ -14,7 +13,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from ahrsd.commands.running import connected, socket_options
+from ahrsd.commands.running import Place, place_options
+from ahrsd.gates import guards_a_write
 from ahrsd.serving.explain import explain_json, holding
 from ahrsd.serving.lines import status_lines
 
@@ -23,22 +23,22 @@ _BESIDE = 28  # lines of everything but the gates
 
 
 @click.command()
-@socket_options
+@place_options
 @click.option("--raw", is_flag=True, help="The records as JSON lines, as they come.")
 @click.option("--samples", is_flag=True, help="With --raw: the samples too.")
-def command(path: Path | None, directory: Path | None, raw: bool, samples: bool) -> None:
+def command(place: Place, raw: bool, samples: bool) -> None:
     """Rates, errors, what motion is missing, estimates, gates: until Ctrl-C.
 
     Where stdout is not a terminal, one status is printed every time it changes by a line.
     """
     streams = ("status", "events", "samples") if samples else ("status", "events")
-    with connected(path, directory) as daemon:
+    with place.connect() as daemon:
         records = daemon.watch(streams)
         try:
             if raw:
                 _raw(records)
             else:
-                _show(records)
+                _show(records, place.pasted)
         except KeyboardInterrupt:
             return
 
@@ -50,7 +50,7 @@ def _raw(records: Iterator[Mapping[str, Any]]) -> None:
         click.echo(json.dumps(record, separators=(",", ":")))
 
 
-def _show(records: Iterator[Mapping[str, Any]]) -> None:
+def _show(records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]) -> None:
     console, happened = Console(), deque[str](maxlen=_EVENTS)
     status: Mapping[str, Any] | None = None
     said: list[str] = []
@@ -58,7 +58,7 @@ def _show(records: Iterator[Mapping[str, Any]]) -> None:
         for record in records:
             if record.get("record") == "status" and (lines := status_lines(record)) != said:
                 said = lines
-                click.echo("\n".join(lines) + "\n")
+                click.echo(pasted("\n".join(lines)) + "\n")
         return
     with Live(console=console, refresh_per_second=4, screen=True) as live:
         for record in records:
@@ -67,7 +67,7 @@ def _show(records: Iterator[Mapping[str, Any]]) -> None:
             elif line := event_line(record):
                 happened.append(line)
             if status is not None:
-                live.update(screen(status, happened, console.height - _BESIDE))
+                live.update(screen(status, happened, console.height - _BESIDE, pasted))
 
 
 def event_line(record: Mapping[str, Any]) -> str:
@@ -84,11 +84,16 @@ def event_line(record: Mapping[str, Any]) -> str:
     return ""
 
 
-def screen(status: Mapping[str, Any], happened: deque[str], most: int = 99) -> RenderableType:
+def screen(
+    status: Mapping[str, Any],
+    happened: deque[str],
+    most: int = 99,
+    pasted: Callable[[str], str] = str,
+) -> RenderableType:
     """Status on top, what happened last, and `most` of the gates, nearest to the cause first."""
     explained = explain_json(status)
     head = Panel("\n".join(status_lines(status)), title="ahrsd")
-    todo = Panel(Text(str(explained["next"]), style="bold"), title="what to do next")
+    todo = Panel(Text(pasted(str(explained["next"])), style="bold"), title="what to do next")
     log = Panel("\n".join(happened) or "nothing yet", title="what happened")
     return Group(head, todo, log, _gates(status, max(most, 3)))
 
@@ -98,9 +103,10 @@ def _gates(status: Mapping[str, Any], most: int) -> RenderableType:
     holds = holding(status)[0]
     for gate in holds[:most]:
         table.add_row(gate["gate"], _value(gate, "value"), _value(gate, "limit"), _for(gate))
-    green = sum(gate["ok"] for gate in status["gates"])
+    counted = [gate for gate in status["gates"] if guards_a_write(gate["gate"])]
+    green = sum(gate["ok"] for gate in counted)
     more = f"and {len(holds) - most} more; " if len(holds) > most else ""
-    table.caption = f"{more}{green} of {len(status['gates'])} gates are green"
+    table.caption = f"{more}{green} of {len(counted)} gates are green"
     return table
 
 

@@ -4,7 +4,7 @@ Guards (`Level`): CANDIDATE - it may be shown; RAM - an operator may approve it;
 saved; UNATTENDED - RAM without an operator. docs/gates.md explains every row to a field engineer.
 """
 
-from ahrsd.gates.judging import for_level, holds, judge, limit_of
+from ahrsd.gates.judging import for_level, guards_a_write, holds, judge, limit_of
 from ahrsd.gates.limits import GateLimits
 from ahrsd.gates.row import Gate, Level
 from ahrsd.gates.table import GATES
@@ -15,6 +15,7 @@ __all__ = [
     "GateLimits",
     "Level",
     "for_level",
+    "guards_a_write",
     "holds",
     "judge",
     "limit_of",
