@@ -383,6 +383,22 @@ def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
     assert np.abs(np.diff(put_right(jittered, (fact,)).time_s) - 0.04).max() < 1e-4
 
 
+def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> None:
+    """Three samples a packet of a USB adapter: the median step is that of its driver's loop."""
+    track = track_of(experiment("wam", samples=6000, rate_hz=200.0))
+    rows = np.arange(6000)
+    stamps_s = 0.015 * (rows // 3 + 1) + 3e-5 * (rows % 3)
+    dt_s = np.diff(stamps_s, prepend=np.nan)
+    fact = next(
+        one
+        for one in hygiene(replace(track, time_s=stamps_s, dt_s=dt_s))
+        if one.effect == "timestamp_jitter"
+    )
+    assert _value(fact) == pytest.approx(np.sqrt(2 / 3) * 0.005, rel=0.1)
+    assert fact.setting["step_s"] == pytest.approx(0.005, rel=0.01)
+    assert matters(fact)
+
+
 def test_time_that_goes_back_stops_everything(track: Track) -> None:
     stamped = track.time_s.copy()
     stamped[700] -= 1.0
