@@ -23,6 +23,7 @@ from ahrsd.mismatch.diagnosis import Diagnosis
 from ahrsd.mismatch.effects.shapes import GRAVITY_M_S2
 from ahrsd.mismatch.logged import diagnose_logged
 from ahrsd.mismatch.model_file import RepairedModel, from_text
+from ahrsd.mismatch.pauses import without_jumps
 from ahrsd.mismatch.track import Spec, Track
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
@@ -78,9 +79,10 @@ def load_track(
 
 def checked(track: Track) -> tuple[Track, list[str]]:
     """The track without what no sensor gives, and one line for each such thing."""
+    track, jumped = without_jumps(track)
     track, notes = possible(track)
     accel, said = _acceleration(track)
-    return replace(track, accel_b_m_s2=accel), [*notes, *dead_axes(track), *said]
+    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
 
 
 def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
@@ -248,5 +250,11 @@ def diagnose_recording(
 def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
     try:
         return diagnose_logged(track, spec, recording=printable(path.name, 200))
+    except np.linalg.LinAlgError:
+        raise RecordingError(
+            path,
+            "the fit found no end: no calibration comes near these readings",
+            "diagnose parts of it, and look at gyro and magnetometer where a part cannot be",
+        ) from None
     except ValueError as error:
         raise RecordingError(path, str(error), "record again, with the vehicle turning") from None

@@ -51,6 +51,7 @@ from ahrsd.mismatch.null import fit_null, unusable
 from ahrsd.mismatch.omnibus import omnibus
 from ahrsd.mismatch.own_form import without_trifles
 from ahrsd.mismatch.passing import without_passing
+from ahrsd.mismatch.pauses import without_jumps
 from ahrsd.mismatch.predictive import checks, usual_noise
 from ahrsd.mismatch.problem import Problem, model_at_rate, problem_of
 from ahrsd.mismatch.quick import Quick, cleaned, quick, without_quick
@@ -92,6 +93,8 @@ def diagnose(
     """
     spec = spec or Spec()
     track, notes = roles.prepared(track)
+    track, jumped = without_jumps(track)
+    notes = (*jumped, *notes)
     if why := unusable(track) or dead(track):
         raise ValueError(why)
     facts = hygiene(track)

@@ -47,6 +47,13 @@ class Frame:
         """Whether nothing is swapped or negated."""
         return self.axes == (0, 1, 2) and self.signs == (1, 1, 1)
 
+    @property
+    def matrix(self) -> Array:
+        """(3, 3) the signed permutation P, true rate = P reading."""
+        P = np.zeros((3, 3))
+        P[range(3), self.axes] = self.signs
+        return P
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:

@@ -137,8 +137,11 @@ def gram(
 
 
 def block_edges(time_s: Array, length_s: float) -> list[int]:
-    """Row numbers that cut a recording into blocks of about `length_s`; a rest joins the last."""
-    count = max(1, round(float(time_s[-1] - time_s[0]) / length_s))
+    """Row numbers that cut a recording into blocks of about `length_s`; a rest joins the last.
+
+    Never more blocks than rows, however far the clock went.
+    """
+    count = min(max(1, round(float(time_s[-1] - time_s[0]) / length_s)), len(time_s))
     cuts = time_s[0] + (time_s[-1] - time_s[0]) * np.arange(1, count) / count
     inner = np.searchsorted(time_s, cuts)
     return sorted({0, *inner.tolist(), len(time_s)})

@@ -19,6 +19,7 @@ from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.frames import Frame, ranked, windows
+from ahrsd.mismatch.handedness import advice, gravity_permutation, odd_magnetometer
 from ahrsd.mismatch.repeats import repeats
 from ahrsd.mismatch.stamps import regular, stamps
 from ahrsd.mismatch.track import Track
@@ -110,19 +111,30 @@ def _worse(cost: float, best: float, count: int) -> bool:
 
 def _frame_error(track: Track, best: Frame, equal: int) -> Fact:
     """equal: how many frames explain the recording as well, this one among them."""
-    P = np.zeros((3, 3))
-    P[range(3), best.axes] = best.signs
-    hand = " (left-handed)" if np.linalg.det(P) < 0 else ""
-    words = f"the gyro's x y z are the magnetometer's {' '.join(_inverse_words(best))}{hand}"
+    odd = odd_magnetometer(track, best.matrix)
     return Fact(
         "frame_error",
-        words,
-        Where(_whole(track), ("x", "y", "z"), "gyro"),
+        _frame_words(track, best) if odd is None else odd.words,
+        Where(_whole(track), ("x", "y", "z"), "gyro" if odd is None else "sensor"),
         1.0 / equal,
         (Value("present", 1.0, 0.0, "1"),),
         # the true rate is signs * reading[axes]
         {"axes": list(best.axes), "signs": list(best.signs)},
         stops=True,
+    )
+
+
+def _frame_words(track: Track, best: Frame) -> str:
+    """What is said of the gyro's axes; with both ways where nothing tells which sensor is odd."""
+    P = best.matrix
+    words = f"the gyro's x y z are the magnetometer's {' '.join(_inverse_words(best))}"
+    if np.linalg.det(P) < 0:
+        return f"{words} (left-handed)"
+    if np.array_equal(gravity_permutation(track), P):
+        return f"{words} and the accelerometer's"
+    return (
+        f"{words}, or the magnetometer is left-handed ({advice(-P.T)}): turn none of them before "
+        "you know which, the wrong one turns every heading by 180 deg"
     )
 
 

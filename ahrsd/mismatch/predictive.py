@@ -274,8 +274,9 @@ def scene_of(context: Context) -> Scene:
 
 
 def segments_of(track: Track) -> NDArray[np.intp]:
-    """(N,) number of the 20 s piece that a row is in."""
-    return np.asarray((track.time_s - track.time_s[0]) // _SEGMENT_S, dtype=np.intp)
+    """(N,) number of the 20 s piece that a row is in, of those that have a row."""
+    piece = (track.time_s - track.time_s[0]) // _SEGMENT_S
+    return np.asarray(np.unique(piece, return_inverse=True)[1], dtype=np.intp)
 
 
 def statistics(e: Array, scene: Scene) -> dict[str, float]:

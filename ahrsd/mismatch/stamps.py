@@ -18,6 +18,7 @@ from ahrsd.samples import Array
 _REGULAR = 0.1  # scatter of the steps over the step, below which multiples can be told
 _MISSING_SHARE = 1e-3
 _JITTER = 0.03  # of the step
+_PIECE = 30  # rows over which a host's clock is straight
 _OPPOSED = -0.25  # correlation of neighbouring steps
 _TRUE_NATS = 5.0  # for steps as stamped, against steps of a regular clock
 _OUTLIER = 5.0  # deviations
@@ -74,14 +75,13 @@ def _jitter(track: Track) -> list[Fact]:
     steps = track.dt_s[np.isfinite(track.dt_s)]
     if len(steps) < 100:
         return []
-    usual = float(np.median(steps))
+    usual, jitter = _clock(track)
     off = np.clip(steps - usual, -0.6 * usual, 0.6 * usual)
     off = off - off.mean()
     variance = float(np.mean(off**2))
     if variance == 0.0:
         return []
     opposed = float(np.mean(off[1:] * off[:-1])) / variance
-    jitter = float(np.sqrt(variance / 2))
     if jitter < _JITTER * usual or opposed > _OPPOSED or _stamped_well(track) > _TRUE_NATS:
         return []
     where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
@@ -89,6 +89,24 @@ def _jitter(track: Track) -> list[Fact]:
     deviation = jitter / float(np.sqrt(len(steps)))
     parameters = (Value("jitter", jitter, deviation, "s"),)
     return [Fact("timestamp_jitter", words, where, 0.99, parameters, {"step_s": usual})]
+
+
+def _clock(track: Track) -> tuple[float, float]:
+    """Step of the regular clock behind the stamps, and their usual scatter about it, seconds.
+
+    Over pieces of `_PIECE` rows, most of which have no sample missing: of stamps that come in
+    bunches the median step is that within a bunch.
+    """
+    runs = [track.time_s[run] for run in track.runs or (slice(0, len(track)),)]
+    length = min(_PIECE, max(map(len, runs)))
+    pieces = [time_s[: len(time_s) // length * length].reshape(-1, length) for time_s in runs]
+    stamps_s = np.concatenate(pieces)
+    stamps_s = stamps_s - stamps_s.mean(axis=1, keepdims=True)
+    index = np.arange(length) - (length - 1) / 2
+    step_s = stamps_s @ index / np.sum(index**2)
+    off = stamps_s - step_s[:, None] * index
+    scatter = np.sqrt(np.sum(off**2, axis=1) / max(length - 2, 1))
+    return float(np.median(step_s)), float(np.median(scatter))
 
 
 def _stamped_well(track: Track) -> float:

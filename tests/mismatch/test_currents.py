@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tracks import experiment, track_of
+from tracks import experiment, track_of, true_model
 
 from ahrsd.mismatch.engine import diagnose
+from ahrsd.mismatch.thin import thinned
 from ahrsd.mismatch.track import Track
 from ahrsd.samples import Array
 
@@ -82,3 +83,54 @@ def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
     found = {one.effect: one for one in diagnose(cut).findings}
     assert found.keys() == {"motor_current_field", "dropped_samples"}
     assert found["dropped_samples"].parameters[0].value == pytest.approx(0.01, abs=0.005)
+
+
+def _at_the_instant(track: Track) -> Track:
+    """A gyro that is read at the sample, not averaged over the step before it: half a step late."""
+    rate = track.gyro_b_rad_s.copy()
+    rate[:-1] = (rate[:-1] + rate[1:]) / 2
+    return replace(track, gyro_b_rad_s=rate)
+
+
+def test_a_strong_current_is_not_turned_with_the_field_and_no_eddy_is_named_for_that() -> None:
+    """0.3 G of a rover's motor, averaged in pairs at 20 Hz: nothing but the current, and a lag."""
+    track = _at_the_instant(track_of(experiment("mam", seed=3, samples=3000, rate_hz=20.0)))
+    k = np.array([7.5e-3, -3.75e-3, 7.5e-3])
+    current = 4.0 * SHAPES["square"](track.time_s)
+    field = np.outer(current, k)
+    mag = track.mag_b_gauss + field
+    found = diagnose(replace(track, mag_b_gauss=mag, covariates={"motor_current_a": current}))
+    names = [one.effect for one in found.findings]
+    assert names[0] == "motor_current_field"
+    assert set(names[1:]) <= {"gyro_integration", "mag_time_lag"}
+    values = [one.value for one in found.findings[0].parameters]
+    np.testing.assert_allclose(values, k, atol=5e-5)
+
+
+def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
+    """Two rows of a turning sensor made one: the field is turned to the second, a motor's not."""
+    made = experiment("mam", seed=3, samples=2000, rate_hz=20.0, sigma_mag=1e-12, sigma_gyro=1e-12)
+    track = track_of(made)
+    riding = np.outer(SHAPES["square"](track.time_s), [0.03, -0.02, 0.03])
+    loud = replace(track, mag_b_gauss=track.mag_b_gauss + riding)
+    model = true_model(made)
+    pure, told, untold = (
+        thinned(*given) for given in ((track, 2, model), (loud, 2, model, riding), (loud, 2, model))
+    )
+    means = riding.reshape(-1, 2, 3).mean(axis=1)
+    assert np.abs(told.mag_b_gauss - pure.mag_b_gauss - means).max() < 1e-9
+    assert np.abs(untold.mag_b_gauss - pure.mag_b_gauss - means).max() > 1e-3
+    assert told.covariates == {}
+
+
+def test_a_rover_s_field_by_its_speed_is_named() -> None:
+    """50 mG per m/s over drive motors without a logged current."""
+    track = track_of(experiment("wam", seed=6, samples=2500))
+    k = np.array([0.04, -0.02, 0.022])
+    speed = 0.2 * SHAPES["ramps"](track.time_s) * (track.time_s % 40 > 8)
+    mag = track.mag_b_gauss + np.outer(speed, k)
+    found = diagnose(replace(track, mag_b_gauss=mag, covariates={"speed_m_s": speed}))
+    assert [one.effect for one in found.findings] == ["speed_field"]
+    assert not found.unexplained.detected
+    values = [one.value for one in found.findings[0].parameters]
+    np.testing.assert_allclose(values, k, atol=1e-3)

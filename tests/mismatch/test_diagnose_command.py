@@ -113,6 +113,18 @@ def test_recordings_that_cannot_be_diagnosed(run, saved, clean, capsys, change, 
     assert err.count("\n") == 1
 
 
+def test_a_fit_without_an_end_is_one_line_for_a_person(run, saved, clean, capsys, monkeypatch):
+    def diverging(*_, **__):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr("ahrsd.diagnosing.diagnose_logged", diverging)
+    assert run("diagnose", str(saved(clean))) == 2
+    told = capsys.readouterr().err
+    assert "Eigenvalues" not in told
+    assert "no calibration comes near these readings" in told
+    assert told.count("\n") == 1
+
+
 def test_a_column_that_cannot_be_used_is_said_and_the_rest_is_answered(run, saved, clean, capsys):
     rows = len(clean["time_s"])
     broken = np.full(rows, math.nan)

@@ -12,7 +12,7 @@ from tracks import experiment, recorded, track_of, true_model
 from ahrsd.mismatch.clipping import clipping, quantisation, step_of
 from ahrsd.mismatch.coarse import noise_of
 from ahrsd.mismatch.diagnosis import Where
-from ahrsd.mismatch.facts import Fact, around, lost_at, spans_of
+from ahrsd.mismatch.facts import Fact, around, lost_at, matters, spans_of
 from ahrsd.mismatch.frames import ranked, windows
 from ahrsd.mismatch.hygiene import as_recorded, hygiene, put_right, would_have_shown
 from ahrsd.mismatch.innovation import run_filter
@@ -100,6 +100,49 @@ def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
 def test_left_handed_axes_are_called_so(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * np.array([1.0, 1.0, -1.0]))
     assert "left-handed" in _only(hygiene(wrong)).words
+
+
+MIRRORED = [[1, 0, 0], [0, -1, 0], [0, 0, 1]]
+TURNED = [[-1, 0, 0], [0, 1, 0], [0, 0, -1]]
+SWAPPED = [[0, 1, 0], [1, 0, 0], [0, 0, 1]]
+QUARTER = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (MIRRORED, "is left-handed: negate its y (where"),
+        (TURNED, "is turned against the gyro: negate its x and z (where"),
+        (SWAPPED, "is left-handed: its right x y z are its y x z as read"),
+        (QUARTER, "is turned against the gyro: its right x y z are its -y x z as read"),
+    ],
+)
+def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words: str) -> None:
+    """By gyro and field alone m and -m are the same; gravity tells, or every heading is off."""
+    made = track_of(experiment("wam", samples=3000))
+    wrong = replace(made, mag_b_gauss=made.mag_b_gauss @ np.array(read, float).T)
+    fact = _only(hygiene(wrong))
+    assert fact.effect == "frame_error"
+    assert words in fact.words
+    assert fact.where.frame == "sensor"
+    if read is MIRRORED:
+        assert "negate its x and z" in fact.words.partition("south of the magnetic equator")[2]
+
+
+def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
+    made = track_of(experiment("wam", samples=3000))
+    wrong = replace(made, mag_b_gauss=made.mag_b_gauss * np.array([1.0, -1.0, 1.0]))
+    words = _only(hygiene(replace(wrong, accel_b_m_s2=None))).words
+    assert "or the magnetometer is left-handed (negate its y)" in words
+    assert "180 deg" in words
+
+
+def test_a_turned_gyro_is_told_by_the_accelerometer() -> None:
+    made = track_of(experiment("wam", samples=3000))
+    wrong = replace(made, gyro_b_rad_s=made.gyro_b_rad_s * np.array([-1.0, 1.0, -1.0]))
+    fact = _only(hygiene(wrong))
+    assert fact.words == "the gyro's x y z are the magnetometer's -x y -z and the accelerometer's"
+    assert fact.where.frame == "gyro"
 
 
 def test_degrees_and_swapped_axes_together(track: Track) -> None:
@@ -341,6 +384,22 @@ def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
     assert np.abs(np.diff(put_right(jittered, (fact,)).time_s) - 0.04).max() < 1e-4
 
 
+def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> None:
+    """Three samples a packet of a USB adapter: the median step is that of its driver's loop."""
+    track = track_of(experiment("wam", samples=6000, rate_hz=200.0))
+    rows = np.arange(6000)
+    stamps_s = 0.015 * (rows // 3 + 1) + 3e-5 * (rows % 3)
+    dt_s = np.diff(stamps_s, prepend=np.nan)
+    fact = next(
+        one
+        for one in hygiene(replace(track, time_s=stamps_s, dt_s=dt_s))
+        if one.effect == "timestamp_jitter"
+    )
+    assert _value(fact) == pytest.approx(np.sqrt(2 / 3) * 0.005, rel=0.1)
+    assert fact.setting["step_s"] == pytest.approx(0.005, rel=0.01)
+    assert matters(fact)
+
+
 def test_time_that_goes_back_stops_everything(track: Track) -> None:
     stamped = track.time_s.copy()
     stamped[700] -= 1.0
@@ -389,6 +448,21 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
     at_rest = track.mag_b_gauss.copy()
     at_rest[3000:3012] = at_rest[3000]
     assert hygiene(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()
+
+
+@pytest.mark.parametrize(("rate_hz", "rows", "found"), [(286.0, 9, False), (40.0, 12, True)])
+def test_a_reading_that_came_late_is_no_stuck_magnetometer(
+    rate_hz: float, rows: int, found: bool
+) -> None:
+    """Eight rows are 28 ms at 286 Hz: not used, and worth a note."""
+    made = track_of(experiment("wam", samples=4000, rate_hz=rate_hz, sigma_mag=5e-5))
+    mag = made.mag_b_gauss.copy()
+    mag[2000 : 2000 + rows] = mag[2000]
+    facts = hygiene(replace(made, mag_b_gauss=mag))
+    assert [fact.effect for fact in facts] == ["stuck_magnetometer"]
+    assert matters(facts[0]) is found
+    assert facts[0].bad is not None
+    assert facts[0].bad[2001 : 2000 + rows].all()
 
 
 def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
