@@ -23,7 +23,8 @@ def recorded(rate_hz, hold, seconds=120.0, seed=1, noise=(1e-3, 7e-4)):
     count = round(seconds * rate_hz)
     time_s = np.arange(count) / rate_hz
     rate = np.column_stack([
-        0.5 * np.sin(0.9 * time_s), 0.4 * np.sin(0.61 * time_s + 1.0), 0.4 + 0.2 * np.sin(0.3 * time_s)
+        0.5 * np.sin(0.9 * time_s), 0.4 * np.sin(0.61 * time_s + 1.0),
+        0.4 + 0.2 * np.sin(0.3 * time_s),
     ])  # fmt: skip
     R = so3.products(so3.exp(rate / rate_hz))
     h = np.einsum("nji,j->ni", R, [0.25, 0.0, 0.43])

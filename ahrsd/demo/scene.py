@@ -27,6 +27,7 @@ from ahrsd.events import (
 from ahrsd.gates import Level, for_level
 from ahrsd.headings import tilt_compensated_heading
 from ahrsd.report import EventCollector
+from ahrsd.result import UNKNOWN_HEADING_DEG
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
 
@@ -142,7 +143,9 @@ class Scene:
             return
         self.said_s = self.passed_s
         shut = [g.gate for g in self.gates if not g.ok]
-        text = f"heading known to {self.estimate.heading_sigma_deg:.2f} deg (1 sigma); "
+        sigma_deg = self.estimate.heading_sigma_deg
+        known = sigma_deg < UNKNOWN_HEADING_DEG
+        text = f"heading {f'known to {sigma_deg:.2f} deg (1 sigma)' if known else 'not known'}; "
         text += f"{len(self.gates) - len(shut)} of {len(self.gates)} gates open"
         self._line("", text + (f", next {shut[0]}" if shut else ""))
 

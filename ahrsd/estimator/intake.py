@@ -145,7 +145,7 @@ class Intake:
         return 0 < sum(map(len, self._rows)) < _RATE_ROWS
 
     def _settled(self) -> list[chain.Data]:
-        """A piece that ends before it is known how long its readings are held: as the one before."""
+        """A piece that ends before it is known how long readings are held: as in the one before."""
         if self._averager is not None or not self._rows or self._too_short:
             return []
         rows = np.vstack(self._rows)

@@ -36,6 +36,16 @@ def is_gzip(path: Path) -> bool:
         return file.read(2) == _GZIP
 
 
+def unpacked_size(path: Path) -> int:
+    """Bytes of the content: of a gzip file what its last four bytes say, modulo 4 GiB."""
+    size = path.stat().st_size
+    if size < 4 or not is_gzip(path):
+        return size
+    with path.open("rb") as file:
+        file.seek(-4, 2)
+        return int.from_bytes(file.read(4), "little")
+
+
 def read_chunks(
     path: Path, chunk_bytes: int = CHUNK_BYTES, notes: list[str] | None = None
 ) -> Iterator[bytes]:
