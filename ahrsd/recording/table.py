@@ -14,6 +14,7 @@ there is a gap.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,6 +81,7 @@ _STEP_S = (1e-4, 2.0)  # 10 kHz ... 0.5 Hz: other units of time end outside
 _TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
 _GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken for it
+_TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
 _HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
@@ -460,6 +462,8 @@ def _parsed_times(column: pyarrow.ChunkedArray) -> pyarrow.ChunkedArray | None:
         texts = np.array(column.to_pylist(), dtype=object)
         plain = [str(text).strip().replace(",", ".", 1) for text in texts]
         cut = [text[:-1] if text.endswith(("Z", "z")) else _without_zone(text) for text in plain]
+        if cut and _TIME_OF_DAY.match(cut[0]):
+            cut = [f"1970-01-01T{text.zfill(8)}" for text in cut]
         times = np.array(cut, dtype="datetime64[ns]")
     except (ValueError, TypeError):
         return None
