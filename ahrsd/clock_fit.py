@@ -22,7 +22,9 @@ _SHORT, _SHORT_SHARE = 0.3, 0.02  # of the mean step; share of such steps that t
 _FEWEST = 40  # samples of a stretch that is fitted
 _BOUND_STEPS, _BOUND_S = 8.0, 0.1  # delays stay within so many steps, or so many seconds, or
 _BOUND_STAMPS = 1.3  # so many times the usual step between different stamps
+_APART_S = 1.1  # between bunches at most; what is further apart are bursts of a sleeping logger
 _LOST = 0.6  # of a step, by which the lower envelope moves where a sample is lost
+_FEWEST_BUNCHES = 6
 _WIDTHS = 3.0  # bunches to a window of the envelope
 
 
@@ -58,7 +60,7 @@ def regular_clock(stamps_s: Array) -> RegularClock | None:
     """The clock behind stamps (N,) that never go back; None where no regular clock fits them."""
     steps = np.diff(stamps_s)
     apart = _stamp_step(steps)
-    if len(stamps_s) < _FEWEST or apart <= 0.0:
+    if len(stamps_s) < _FEWEST or not 0.0 < apart <= _APART_S:
         return None
     pauses = np.flatnonzero(steps > 1.6 * apart) + 1
     begins = [0, *pauses.tolist()]
@@ -90,12 +92,16 @@ def _step_of(stamps_s: Array, apart: float) -> tuple[float, int]:
     if not rough > 0.0:
         return 0.0, 1
     width = int(np.clip(np.ceil(_WIDTHS * apart / rough), 8, max(len(stamps_s) // 4, 8)))
-    slope = float(np.polyfit(rows, stamps_s - stamps_s[0], 1)[0])
+    # the first sample of each bunch: their delays differ by less than a step
+    firsts = np.flatnonzero(np.diff(stamps_s) > 0.5 * apart) + 1
+    firsts = firsts if len(firsts) >= _FEWEST_BUNCHES else np.arange(len(stamps_s))
+    since_s = stamps_s[firsts] - stamps_s[0]
+    slope = float(np.polyfit(rows[firsts], since_s, 1)[0])
     for _ in range(3):
         lost = np.zeros(len(stamps_s))
         for at in _losses(stamps_s - slope * rows, slope, width):
             lost[at[0] :] += at[1]
-        slope = float(np.polyfit(rows + lost, stamps_s - stamps_s[0], 1)[0])
+        slope = float(np.polyfit((rows + lost)[firsts], since_s, 1)[0])
         if not slope > 0.0:
             return 0.0, width
     return slope, width
@@ -110,7 +116,8 @@ def _losses(delay: Array, step_s: float, width: int) -> list[tuple[int, int]]:
     low = windows.min(axis=1)  # of the samples k .. k + width - 1
     before, behind = low[: n - 2 * width + 1], low[width:]
     rise = behind - before  # at the row k + width
-    steady = 2.0 * float(np.quantile(np.abs(rise - np.median(rise)), 0.5))
+    rise = rise - np.median(rise)  # which a step that is not quite right makes everywhere
+    steady = 2.0 * float(np.median(np.abs(rise)))
     limit = max(_LOST * step_s, 3.0 * steady)
     found = []
     over = rise > limit

@@ -20,6 +20,11 @@ def printable(text: object, longest: int = NAME) -> str:
     return "".join(char if char.isprintable() else _escape(char) for char in words)
 
 
+def drawn(text: object, longest: int = NAME) -> str:
+    """The same for a picture, where a dollar sign would begin a formula."""
+    return printable(text, longest).replace("$", r"\$")
+
+
 def _escape(char: str) -> str:
     code = ord(char)
     if 0xDC80 <= code <= 0xDCFF:  # how Python holds a byte of a name that is no text

@@ -13,6 +13,8 @@ from ahrsd.writeback.composition import UnwritableError, compose
 from drivers.vn100.registers import Values
 
 MAG, GYRO = 23, 84
+#: 1-sigma of the heading beyond which it is not known: any heading is within some 100 deg
+UNKNOWN_HEADING_DEG = 45.0
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which the estimator calls nothing converged
 _SIGMAS = ("soft_iron", "hard_iron_gauss", "gyro_bias_rad_s")
 
@@ -92,6 +94,13 @@ def _found(estimate: Estimate, heading: HeadingErrors) -> dict[str, object]:
     }
 
 
+def heading_words(sigma_deg: float) -> str:
+    """How well the heading is known, as a clause behind "heading"."""
+    if not sigma_deg < UNKNOWN_HEADING_DEG:
+        return "not known"
+    return f"known to {sigma_deg:.2f} deg (1 sigma, worst direction)"
+
+
 def why_not_converged(estimate: Estimate | None) -> list[str]:
     """Reasons, one clause each; empty where it has converged."""
     if estimate is None:
@@ -110,6 +119,8 @@ def why_not_converged(estimate: Estimate | None) -> list[str]:
         ]
     if blind := estimate.observability.unobservable:
         return [f"this motion does not determine: {'; '.join(blind)}"]
+    if estimate.heading_sigma_deg >= UNKNOWN_HEADING_DEG:
+        return ["not converged: the heading is not known; turn further, about more than one axis"]
     if estimate.heading_sigma_deg >= _HOPELESS_DEG:
         return [
             f"not converged: headings would be known to {estimate.heading_sigma_deg:.1f} deg only "

@@ -11,7 +11,7 @@ from ahrsd.calibration import Estimate
 from ahrsd.core import Core
 from ahrsd.events import GateResult
 from ahrsd.gates import Level, guards_a_write
-from ahrsd.result import HeadingErrors, calibration_json, why_not_converged
+from ahrsd.result import HeadingErrors, calibration_json, heading_words, why_not_converged
 from ahrsd.unmapping import Compensation
 
 _TABLE_IS_RAW = (
@@ -153,7 +153,7 @@ def estimate_lines(estimate: Estimate | None) -> list[str]:
     return [
         f"  hard iron  {', '.join(values[:3])} mG",
         f"  gyro bias  {', '.join(values[3:])} mrad/s",
-        f"  heading    known to {estimate.heading_sigma_deg:.2f} deg (1 sigma, worst direction)",
+        f"  heading    {heading_words(estimate.heading_sigma_deg)}",
         *([f"  lag        the field is {late_ms:.1f} ms late against the gyro"] if late_ms else []),
         *(f"  {text}" for text in why_not_converged(estimate)),
     ]

@@ -10,6 +10,7 @@ import logging
 from dataclasses import dataclass, field
 
 from ahrsd.core import Core
+from ahrsd.result import UNKNOWN_HEADING_DEG
 
 STATUS_S = 60.0
 _AMISS_S = 5.0  # something must be amiss for so long before it is said
@@ -106,7 +107,7 @@ class Watch:
         self._samples = (now_s, facts.samples)
         rate = (facts.samples - before) / max(now_s - before_s, 1e-9)
         estimate = core.calibrator.estimate
-        sigma = "no estimate" if estimate is None else f"{estimate.heading_sigma_deg:.2f} deg"
+        sigma = "no estimate" if estimate is None else _sigma(estimate.heading_sigma_deg)
         holds = core.writeback.holds() if core.calibrator.gates else []
         gates = [text.removeprefix("gate ") for text in holds if text.startswith("gate ")]
         waits = f", waits for {gates[0]}" if gates else "".join(f"; {text}" for text in holds[:1])
@@ -121,3 +122,8 @@ def _no_samples(core: Core) -> str:
     if not reasons:
         return "messages arrive, but no samples"
     return f"{reasons}; or let the daemon do it: device.configure_stream = true"
+
+
+def _sigma(heading_sigma_deg: float) -> str:
+    known = heading_sigma_deg < UNKNOWN_HEADING_DEG
+    return f"{heading_sigma_deg:.2f} deg" if known else "not known"

@@ -52,7 +52,7 @@ def test_tables(tmp_path):
 def test_captures_skip_what_was_sent_and_keep_the_order(tmp_path):
     items = [
         LinkOpened(1, "/dev/ttyUSB0", 115200),
-        RegistersKnown(2, {23: (1.0,)}),
+        RegistersKnown(2, {7: (40.0,)}),
         Received(3, b"x"),
     ]
     capture(tmp_path / "c.mcap", *items)

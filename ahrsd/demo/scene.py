@@ -27,6 +27,7 @@ from ahrsd.events import (
 from ahrsd.gates import Level, for_level, guards_a_write
 from ahrsd.headings import tilt_compensated_heading
 from ahrsd.report import EventCollector
+from ahrsd.result import UNKNOWN_HEADING_DEG
 from ahrsd.run_time import RunTime
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
@@ -146,7 +147,9 @@ class Scene:
         self.said_s = self.passed_s
         shut = [g.gate for g in self.gates if not g.ok]
         of_write = [g.gate for g in for_level(self.gates, Level.RAM) if not g.ok]
-        text = f"heading known to {self.estimate.heading_sigma_deg:.2f} deg (1 sigma); "
+        sigma_deg = self.estimate.heading_sigma_deg
+        known = sigma_deg < UNKNOWN_HEADING_DEG
+        text = f"heading {f'known to {sigma_deg:.2f} deg (1 sigma)' if known else 'not known'}; "
         text += f"{len(self.gates) - len(shut)} of {len(self.gates)} gates open"
         if shut:
             text += f", next {of_write[0]}" if of_write else f"; the save waits for {shut[0]}"

@@ -16,10 +16,11 @@ import itertools
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
@@ -29,6 +30,8 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from ahrsd import __version__
 from ahrsd.errors import RecordingError
+from ahrsd.printable import printable
+from ahrsd.recording.limits import BLOCK_BYTES
 
 SEQUENCES = 2**32  # `sequence` wraps here
 _MAGIC = b"\x89MCAP0\r\n"
@@ -151,12 +154,25 @@ def read_head(path: Path) -> dict[str, str]:
         reader = StreamReader(BytesIO(head), record_size_limit=_HEAD_BYTES)
         for record in itertools.islice(reader.records, 2):
             if isinstance(record, Header) and record.profile != _PROFILE:
-                raise not_ours
+                raise _of_another(path, record.profile, not_ours)
             if isinstance(record, Metadata):
                 return dict(record.metadata)
     except (McapError, struct.error, ValueError) as error:
         raise RecordingError(path, "ends within its header", "record again") from error
     raise not_ours
+
+
+def _of_another(path: Path, profile: str, not_ours: RecordingError) -> RecordingError:
+    """What an MCAP file of another program is."""
+    from ahrsd.recording.foreign import ROS
+
+    number = {"ros1": "1", "ros2": "2"}.get(profile)
+    if number is not None:
+        return RecordingError(path, f"is a ROS {number} recording (MCAP)", ROS)
+    if profile:
+        what = f"is an MCAP file of another program (profile {printable(profile, 30)})"
+        return RecordingError(path, what, not_ours.remedy)
+    return not_ours
 
 
 def read_entries(path: Path) -> Iterator[Entry | Damage]:
@@ -177,10 +193,13 @@ def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
             left -= _PREFIX.size
             if length > left:
                 break
-            data = file.read(length)
             left -= length
-            if opcode == Opcode.CHUNK:
-                yield data
+            if opcode != Opcode.CHUNK or length > BLOCK_BYTES:
+                file.seek(length, 1)
+                if opcode == Opcode.CHUNK:
+                    yield Damage(f"a block of {length} bytes, over the limit, was left out")
+                continue
+            yield file.read(length)
     if opcode != Opcode.FOOTER:
         tail = f"; its last {left} bytes are half a block" if left else ""
         yield Damage(f"was not closed (killed, or cut short){tail}")
@@ -189,7 +208,10 @@ def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
 def _unpack(data: bytes) -> list[Entry | Damage]:
     """The entries of a chunk; of channels that this version does not know, none."""
     try:
-        records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)
+        block = _plain(Chunk.read(ReadDataStream(BytesIO(data))))
+        records = breakup_chunk(block, validate_crc=True)
+    except _BlockTooLargeError as error:
+        return [Damage(f"a block that unpacks to {error} bytes, over the limit, was left out")]
     except (CRCValidationError, McapError, zstandard.ZstdError, struct.error, ValueError):
         return [Damage(f"a damaged block of {len(data)} bytes was left out")]
     return [
@@ -197,3 +219,36 @@ def _unpack(data: bytes) -> list[Entry | Damage]:
         for record in records
         if isinstance(record, Message) and record.channel_id in _TOPICS
     ]
+
+
+class _BlockTooLargeError(Exception):
+    """A block that says that it unpacks to so many bytes, or does."""
+
+
+def _plain(block: Chunk) -> Chunk:
+    """The same block unpacked; looks at every size before anything is allocated.
+
+    ValueError where it is damaged, _BlockTooLargeError where it is beyond the limit.
+    """
+    if block.uncompressed_size > BLOCK_BYTES:
+        raise _BlockTooLargeError(block.uncompressed_size)
+    if block.compression == "zstd":
+        said = zstandard.frame_content_size(block.data)
+        if said > BLOCK_BYTES:
+            raise _BlockTooLargeError(said)
+        content = zstandard.ZstdDecompressor(max_window_size=BLOCK_BYTES).decompress(
+            block.data, max_output_size=max(block.uncompressed_size, 1)
+        )
+    elif block.compression == "lz4":
+        try:
+            decoder = lz4.frame.LZ4FrameDecompressor()
+            content = decoder.decompress(block.data, max_length=block.uncompressed_size + 1)
+        except RuntimeError as error:  # whatever it does not like
+            raise ValueError(str(error)) from error
+    elif block.compression:
+        raise ValueError(f"unknown compression {block.compression!r}")
+    else:
+        content = block.data
+    if len(content) != block.uncompressed_size:
+        raise ValueError("the block is not as long as it says")
+    return replace(block, compression="", data=content)

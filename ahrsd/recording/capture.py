@@ -332,13 +332,22 @@ class CaptureReader:
     def facts(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
         """(host_ns, fact) of a JSON channel: "event", "registers" or "covariate"."""
         for entry in self._entries():
-            if entry.topic == topic:
-                yield entry.host_ns, json.loads(entry.data)
+            if entry.topic != topic:
+                continue
+            try:
+                fact = json.loads(entry.data)
+            except (ValueError, RecursionError) as error:
+                raise RecordingError(
+                    self.path, f"a record of {topic} is no JSON: {error}", "record again"
+                ) from error
+            if isinstance(fact, dict):
+                yield entry.host_ns, fact
 
     def _entries(self) -> Iterator[Entry]:
         self.notes = []
         expected: int | None = None
-        for path in _parts(self.path, int(self.header.get("part", "1"))):
+        part = self.header.get("part", "1")
+        for path in _parts(self.path, int(part) if part.isdecimal() and len(part) < 7 else 1):
             for entry in blocks.read_entries(path):
                 if isinstance(entry, Damage):
                     self.notes.append(f"{path.name}: {entry.what}")

@@ -8,7 +8,7 @@ _TABLE = (
     "write a table of it: time_s, mag_{x,y,z}_gauss, gyro_{x,y,z}_rad_s, one row a sample "
     "(other names and units: --columns mag_x=NAME:uT,...)"
 )
-_ROS = (
+ROS = (
     "write sensor_msgs/Imu and MagneticField (tesla) into one table by time, for example with the "
     "Python package rosbags, then --columns time=NAME:ns,mag_x=NAME:T,..."
 )
@@ -34,8 +34,8 @@ _STARTS: tuple[tuple[bytes, str, str], ...] = (
         "is a git-annex pointer, the recording itself is not here",
         "fetch it with `git annex get`",
     ),
-    (b"#ROSBAG V2.0", "is a ROS 1 bag", _ROS),
-    (b"SQLite format 3\0", "is an SQLite database, as ROS 2 bags (.db3) are", _ROS),
+    (b"#ROSBAG V2.0", "is a ROS 1 bag", ROS),
+    (b"SQLite format 3\0", "is an SQLite database, as ROS 2 bags (.db3) are", ROS),
     (b"ULog\x01\x12\x35", "is a PX4 ULog", _TABLE),
     (b"\xa3\x95\x80\x80", "is an ArduPilot DataFlash log", _TABLE),
     (b"\x89HDF\r\n\x1a\n", "is an HDF5 file", _TABLE),

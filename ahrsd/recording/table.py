@@ -14,6 +14,7 @@ there is a gap.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ import numpy as np
 import pyarrow
 from numpy.typing import NDArray
 
+from ahrsd import so3
 from ahrsd.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
@@ -79,8 +81,9 @@ _STEP_S = (1e-4, 2.0)  # 10 kHz ... 0.5 Hz: other units of time end outside
 _TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
 _GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken for it
+_TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
-_HOLE_S = 1.0  # without acceleration, which is filled from both sides
+_HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
 
@@ -274,9 +277,11 @@ class _Rows:
                 f"the acceleration was left out: {count} of {len(known)} rows have none"
             )
             return np.full_like(accel, np.nan)
-        filled = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])
+        filled = self._carried(accel, known, far)
         if filling := count - int(np.count_nonzero(far)):
-            self.notes.append(f"{filling} rows without acceleration were filled from those beside")
+            self.notes.append(
+                f"{filling} rows have no acceleration: the gyro carried it over from those beside"
+            )
         if far.any():
             self.notes.append(
                 f"{np.count_nonzero(far)} rows without acceleration for more than {_HOLE_S:g} s "
@@ -290,6 +295,28 @@ class _Rows:
             self._keep(kept)
             filled = filled[kept]
         return filled
+
+    def _carried(self, accel: Array, known: NDArray[np.bool], far: NDArray[np.bool]) -> Array:
+        """The force with its holes filled: gravity of the rows beside, turned as the gyro says.
+
+        known, far (N,): rows that have a force, and rows that are too far from any
+        """
+        out = accel.copy()
+        turn = self.vectors(GYRO)[1:] * np.diff(self.values[TIME])[:, None]
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], known, [True]]).astype(np.int8)))
+        for first, end in edges.reshape(-1, 2).tolist():
+            if far[first]:
+                continue
+            before, behind = max(first - 1, 0), min(end, len(known) - 1)
+            R = so3.products(so3.exp(np.vstack([np.zeros((1, 3)), turn[before:behind]])))
+            weight = np.linspace(0.0, 1.0, len(R))[:, None]
+            sides = ((0, before), (-1, behind))
+            force = [np.einsum("nji,j->ni", R, R[k] @ accel[row]) for k, row in sides]
+            weight = np.where(known[before], weight if known[behind] else 0.0, 1.0)
+            mixed = np.where(weight < 1.0, (1.0 - weight) * force[0], 0.0)
+            mixed += np.where(weight > 0.0, weight * force[1], 0.0)
+            out[first:end] = mixed[first - before : end - before]
+        return out
 
     def table(self, accel: Array) -> Table:
         """What is left as samples."""
@@ -435,6 +462,8 @@ def _parsed_times(column: pyarrow.ChunkedArray) -> pyarrow.ChunkedArray | None:
         texts = np.array(column.to_pylist(), dtype=object)
         plain = [str(text).strip().replace(",", ".", 1) for text in texts]
         cut = [text[:-1] if text.endswith(("Z", "z")) else _without_zone(text) for text in plain]
+        if cut and _TIME_OF_DAY.match(cut[0]):
+            cut = [f"1970-01-01T{text.zfill(8)}" for text in cut]
         times = np.array(cut, dtype="datetime64[ns]")
     except (ValueError, TypeError):
         return None

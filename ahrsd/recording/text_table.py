@@ -28,6 +28,7 @@ from ahrsd.recording.limits import (
 )
 
 _CHUNK_BYTES = 1 << 18
+csv.field_size_limit(HEADER_BYTES + 1)  # of a quoted name; 128 KiB as it comes
 _COMMENTS = (b"#", b"%", b"//")
 _COMMENT_LINE = re.compile(rb"(?m)^(?:#|%|//)[^\n]*(?:\n|\Z)")
 _SEPARATOR_LINE = re.compile(rb"^\"?sep=(.)\"?\s*$", re.IGNORECASE)
@@ -233,7 +234,7 @@ def _parsed(path: Path, text: _Text, notes: list[str]) -> pyarrow.Table:
         return "skip"
 
     if not bytes(memoryview(text.data)[text.at :]).strip():
-        return pyarrow.table({name: pyarrow.nulls(0) for name in names})
+        return pyarrow.Table.from_arrays([pyarrow.nulls(0) for _ in names], names=names)
     decimal = "," if text.separator != "," and _has_decimal_comma(text) else "."
     try:
         table = pyarrow.csv.read_csv(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ahrsd.result import UNKNOWN_HEADING_DEG
 from ahrsd.serving.explain import STATES, holding
 
 Status = Mapping[str, Any]
@@ -71,7 +72,7 @@ def estimate_lines_of(status: Status) -> list[str]:
     done = "converged" if estimate["converged"] else "not converged"
     unseen = ", ".join(estimate["unobservable"])
     held = f"; not determined: {unseen}" if unseen else ""
-    sigma = _number(estimate["heading_sigma_deg"], "heading known to {:.2f} deg (1 sigma)", "")
+    sigma = _heading(estimate["heading_sigma_deg"])
     iron = _vector(estimate["hard_iron_gauss"], estimate["sigma_hard_iron_gauss"])
     bias = _vector(estimate["gyro_bias_rad_s"], estimate["sigma_gyro_bias_rad_s"])
     return [
@@ -102,6 +103,13 @@ def _vector(values: Sequence[float], sigmas: Sequence[float]) -> str:
     return ", ".join(
         f"{v * 1e3:+.2f} +- {s * 1e3:.2f}" for v, s in zip(values, sigmas, strict=True)
     )
+
+
+def _heading(sigma_deg: float | None) -> str:
+    """How well the heading is known; a sigma beyond any use is no figure."""
+    if sigma_deg is None or not sigma_deg < UNKNOWN_HEADING_DEG:
+        return "heading not known"
+    return f"heading known to {sigma_deg:.2f} deg (1 sigma)"
 
 
 def _number(value: float | None, text: str, missing: str) -> str:
