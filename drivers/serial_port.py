@@ -39,7 +39,7 @@ import serial
 from drivers.port_holders import Holder, holders, is_pty
 from drivers.vn100.decode import Reply, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.errors import DriverError
+from drivers.vn100.errors import NO_CHECKSUM, DriverError
 from drivers.vn100.sentences import encode
 
 READ_BYTES = 65536
@@ -173,6 +173,7 @@ class RateHeard:
     baud: int
     received: int
     messages: int
+    unchecked: int = 0  # lines without a checksum
 
     def __str__(self) -> str:
         what = f"{self.received} bytes, no message" if self.received else "silence"
@@ -200,6 +201,8 @@ class BaudNotFound(PortError):
                 if asked
                 else "the device may be quiet: let it be asked, or give the rate"
             )
+        elif any(heard.unchecked for heard in tried):
+            advice = NO_CHECKSUM
         else:
             advice = "bytes arrive but no message: not a VN-100, or a rate that was not tried"
         super().__init__(f"{path}: {'; '.join(map(str, tried))}. {advice}")
@@ -251,7 +254,7 @@ def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     received = _collect(port, listen_s, enough)
     counters = deframer.counters
     believable = messages and counters.skipped_bytes <= _GARBAGE_TOLERATED * received
-    return RateHeard(baud, received, messages if believable else 0)
+    return RateHeard(baud, received, messages if believable else 0, counters.unchecked)
 
 
 def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
