@@ -47,6 +47,7 @@ WRITE_TIMEOUT_S = 2.0
 LISTEN_S = 0.3
 SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
 _TIOCGEXCL = 0x80045440  # Linux asm-generic/ioctls.h; termios does not have it
+_ENOUGH = 2  # messages at a rate, to believe it
 _GARBAGE_TOLERATED = 0.5  # part of the bytes at a right rate that may lie outside of messages
 
 
@@ -174,6 +175,7 @@ class RateHeard:
     received: int
     messages: int
     unchecked: int = 0  # lines without a checksum
+    answered: bool = False
 
     def __str__(self) -> str:
         what = f"{self.received} bytes, no message" if self.received else "silence"
@@ -234,7 +236,7 @@ def detect_baud(
                     continue
                 tried.append(heard)
                 if heard.messages:
-                    how = "heard" if attempt is _listen else "an answer came"
+                    how = "an answer came" if heard.answered else "heard"
                     reason = preferred.get(baud, "found by trying")
                     return BaudFound(baud, f"{how} at {baud} baud, {reason}", tuple(tried))
     raise BaudNotFound(str(path), tuple(tried), may_query)
@@ -249,7 +251,7 @@ def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     def enough(chunk: bytes) -> bool:
         nonlocal messages
         messages += len(deframer.feed(chunk))
-        return messages >= 2
+        return messages >= _ENOUGH
 
     received = _collect(port, listen_s, enough)
     counters = deframer.counters
@@ -258,7 +260,10 @@ def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
 
 
 def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
-    """Ask for the model; only a reply counts. The line end first clears what the device has."""
+    """Ask for the model. The line end first clears what the device has.
+
+    A reply counts, and so do messages of which there was none while only listened to.
+    """
     port.set_baud(baud)
     port.write(b"\r\n" + encode("VNRRG,01"))
     deframer = Deframer()
@@ -275,7 +280,10 @@ def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
         return answers > 0
 
     received = _collect(port, listen_s, enough)
-    return RateHeard(baud, received, answers)
+    counters = deframer.counters
+    others = counters.valid if counters.skipped_bytes <= _GARBAGE_TOLERATED * received else 0
+    messages = answers or (others if others >= _ENOUGH else 0)
+    return RateHeard(baud, received, messages, counters.unchecked, bool(answers))
 
 
 def _collect(port: SerialPort, listen_s: float, enough: Callable[[bytes], bool]) -> int:

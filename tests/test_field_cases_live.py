@@ -57,9 +57,9 @@ def test_a_recording_is_calibrated(name: str, samples: int, said: str, tmp_path:
     assert f"{samples} samples" in done.stdout
     assert said in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
-    text = re.findall(r"(?:hard iron|gyro bias) .*", done.stdout)
+    lines = re.findall(r"^  (?:hard iron|gyro bias) .*", done.stdout, re.MULTILINE)
     hard_mg, bias_mrad_s = (
-        [float(n) for n in re.findall(r"([+-][0-9.]+) \+-", line)] for line in text
+        [float(number) for number in re.findall(r"([+-][0-9.]+) \+-", line)] for line in lines
     )
     assert hard_mg == pytest.approx(HARD_IRON_MG, abs=1.0)
     assert bias_mrad_s == pytest.approx(GYRO_BIAS_MRAD_S, abs=0.3)
@@ -161,10 +161,10 @@ def rate_of(said: str) -> str:
 def test_packets_of_the_ros_2_driver_are_heard_live(tmp_path: Path) -> None:
     with device("f02_ros2_left_it", tmp_path) as scripted:
         said = run(scripted, tmp_path, "OBSERVING", 30)
+        assert scripted.writes == []
     assert rate_of(said) == "20 Hz, device time"
     assert " 0 rejected" in said
     assert "link lost" not in said
-    assert scripted.writes == []
 
 
 def test_what_the_ros_2_driver_had_set_is_put_back(tmp_path: Path) -> None:
