@@ -29,6 +29,7 @@ from ahrsd.stream_rate import rate_of
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.deframer import Cause
+from drivers.vn100.errors import NO_CHECKSUM
 
 _CUT = "cut it in parts"
 _PASSIVE = WriteBackPolicy(mode=Mode.PASSIVE)
@@ -178,7 +179,9 @@ def _refuse_empty(core: Core, path: Path) -> None:
         raise RecordingError(
             path,
             f"no VN-100 message in {counters.fed_bytes} bytes",
-            "wrong baud rate while recording, or not a VN-100 stream",
+            NO_CHECKSUM
+            if counters.unchecked
+            else "wrong baud rate while recording, or not a VN-100 stream",
         )
     raise RecordingError(
         path,

@@ -230,7 +230,10 @@ class Stream:
         self._decide(rate_hz, f"arrival times; {believed} said {was_hz:.4g} Hz")
         self._steps = StepClock(rate_hz, since_s)
         self._cut()
-        self._replaced = self.facts.samples > 0
+        facts, self._turns, self.all_gaps = self.facts, TurnWatch(), Gaps(self.all_gaps.keep)
+        self.warnings.pop(self._turns_said, None)
+        facts.expected, facts.duration_s = float(facts.samples), facts.samples / rate_hz
+        self._replaced = facts.samples > 0
 
     def _count(self, name: str) -> None:
         """One message; a name too many is one of the `OTHERS`."""

@@ -39,7 +39,7 @@ import serial
 from drivers.port_holders import Holder, holders, is_pty
 from drivers.vn100.decode import Reply, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.errors import DriverError
+from drivers.vn100.errors import NO_CHECKSUM, DriverError
 from drivers.vn100.sentences import encode
 
 READ_BYTES = 65536
@@ -47,6 +47,7 @@ WRITE_TIMEOUT_S = 2.0
 LISTEN_S = 0.3
 SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
 _TIOCGEXCL = 0x80045440  # Linux asm-generic/ioctls.h; termios does not have it
+_ENOUGH = 2  # messages at a rate, to believe it
 _GARBAGE_TOLERATED = 0.5  # part of the bytes at a right rate that may lie outside of messages
 
 
@@ -173,6 +174,8 @@ class RateHeard:
     baud: int
     received: int
     messages: int
+    unchecked: int = 0  # lines without a checksum
+    answered: bool = False
 
     def __str__(self) -> str:
         what = f"{self.received} bytes, no message" if self.received else "silence"
@@ -200,6 +203,8 @@ class BaudNotFound(PortError):
                 if asked
                 else "the device may be quiet: let it be asked, or give the rate"
             )
+        elif any(heard.unchecked for heard in tried):
+            advice = NO_CHECKSUM
         else:
             advice = "bytes arrive but no message: not a VN-100, or a rate that was not tried"
         super().__init__(f"{path}: {'; '.join(map(str, tried))}. {advice}")
@@ -231,7 +236,7 @@ def detect_baud(
                     continue
                 tried.append(heard)
                 if heard.messages:
-                    how = "heard" if attempt is _listen else "an answer came"
+                    how = "an answer came" if heard.answered else "heard"
                     reason = preferred.get(baud, "found by trying")
                     return BaudFound(baud, f"{how} at {baud} baud, {reason}", tuple(tried))
     raise BaudNotFound(str(path), tuple(tried), may_query)
@@ -246,16 +251,19 @@ def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     def enough(chunk: bytes) -> bool:
         nonlocal messages
         messages += len(deframer.feed(chunk))
-        return messages >= 2
+        return messages >= _ENOUGH
 
     received = _collect(port, listen_s, enough)
     counters = deframer.counters
     believable = messages and counters.skipped_bytes <= _GARBAGE_TOLERATED * received
-    return RateHeard(baud, received, messages if believable else 0)
+    return RateHeard(baud, received, messages if believable else 0, counters.unchecked)
 
 
 def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
-    """Ask for the model; only a reply counts. The line end first clears what the device has."""
+    """Ask for the model. The line end first clears what the device has.
+
+    A reply counts, and so do messages of which there was none while only listened to.
+    """
     port.set_baud(baud)
     port.write(b"\r\n" + encode("VNRRG,01"))
     deframer = Deframer()
@@ -272,7 +280,10 @@ def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
         return answers > 0
 
     received = _collect(port, listen_s, enough)
-    return RateHeard(baud, received, answers)
+    counters = deframer.counters
+    others = counters.valid if counters.skipped_bytes <= _GARBAGE_TOLERATED * received else 0
+    messages = answers or (others if others >= _ENOUGH else 0)
+    return RateHeard(baud, received, messages, counters.unchecked, bool(answers))
 
 
 def _collect(port: SerialPort, listen_s: float, enough: Callable[[bytes], bool]) -> int:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
+import grp
 import os
 import stat
 import subprocess
@@ -16,12 +18,14 @@ import tty
 import psutil
 import pytest
 
+from drivers import serial_port
 from drivers.port_holders import holders
 from drivers.serial_port import (
     BaudNotFound,
     LinkLost,
     PortAbsent,
     PortBusy,
+    PortForbidden,
     PortUnusable,
     SerialPort,
     detect_baud,
@@ -344,3 +348,26 @@ def test_a_pty_of_the_same_number_elsewhere_is_no_holder(tmp_path):
     finally:
         os.close(slave)
         os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("mode", "member", "advice"),
+    [
+        (0o660, False, "join its group: sudo usermod -aG dialout ada, then log in again"),
+        (0o660, True, "you are in its group dialout since you logged in: log in again"),
+        (0o600, False, "no group may open it: give it to one by a udev rule"),
+    ],
+)
+def test_no_permission_names_the_group_to_join(monkeypatch, tmp_path, mode, member, advice):
+    port = tmp_path / "ttyUSB0"
+    port.write_bytes(b"")
+    port.chmod(mode)
+    group = grp.struct_group(("dialout", "x", 20, ["ada"] if member else []))
+    status = os.stat_result((0o020000 | mode, 0, 0, 1, 0, 20, 0, 0, 0, 0))
+    monkeypatch.setattr(serial_port.grp, "getgrgid", lambda _: group)
+    monkeypatch.setattr(serial_port.os, "getgroups", lambda: [1000])
+    monkeypatch.setattr(serial_port, "_user", lambda: "ada")
+    monkeypatch.setattr(serial_port.Path, "stat", lambda _: status)
+    error = serial_port._why(str(port), PermissionError(errno.EACCES, "no"))
+    assert isinstance(error, PortForbidden)
+    assert str(error) == f"{port}: no permission; {advice}"

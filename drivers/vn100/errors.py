@@ -32,6 +32,12 @@ class DeviceError:
     advice: str
 
 
+# For a person who meets lines that end without one (register 30, as firmware 1 and others had it).
+NO_CHECKSUM = (
+    "lines arrive without a checksum, and what nothing protects is not used: switch it on with "
+    "$VNWRG,30,0,0,0,0,1,0,1*69"
+)
+
 _ROWS = (
     DeviceError(
         0x01, "hard fault", Outcome.RESET, "its processor restarted; RAM settings are gone"
