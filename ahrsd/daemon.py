@@ -72,6 +72,15 @@ class HostClock:
         """Nanoseconds, never falling."""
         return self.start_ns + int((time.monotonic_ns() - self.start_ns) * self.speed)
 
+    def boot(self) -> tuple[str, float]:
+        """Id of the host's boot and seconds since then; one that runs faster began with itself."""
+        if self.speed == 1.0:
+            return host_clock.boot_id(), host_clock.boot_s()
+        return self._own_boot()
+
+    def _own_boot(self) -> tuple[str, float]:
+        return f"{host_clock.boot_id()} {self.start_ns}", (self.now_ns() - self.start_ns) * 1e-9
+
 
 class Daemon:
     """Runs one device until `stop` is called. `listeners` on the shell see every event.
@@ -229,12 +238,12 @@ class Daemon:
     def _tell_wall(self) -> None:
         """The host's other clocks, at the start and when one was set or the host was suspended."""
         now_ns = self.clock.now_ns()
-        wall_s, boot_s = time.time(), host_clock.boot_s()
-        offsets_s = [told - now_ns * 1e-9 / self.clock.speed for told in (wall_s, boot_s)]
+        wall_s, (boot_id, boot_s) = time.time(), self.clock.boot()
+        offsets_s = [wall_s - now_ns * 1e-9 / self.clock.speed, boot_s - now_ns * 1e-9]
         steps_s = [abs(a - b) for a, b in zip(offsets_s, self._offsets_s, strict=True)]
         if not max(steps_s) < _WALL_STEP_S:
             self._offsets_s = offsets_s
-            self._feed(inputs.WallClock(now_ns, wall_s, host_clock.boot_id(), boot_s))
+            self._feed(inputs.WallClock(now_ns, wall_s, boot_id, boot_s))
 
     def _feed(self, item: inputs.Input) -> None:
         output = self.shell.feed(item)

@@ -60,7 +60,8 @@ def test_before_and_after_on_every_heading_of_unseen_data(done):
 def test_it_leaves_exactly_these_files(done):
     directory = done[0]
     assert sorted(p.name for p in directory.iterdir()) == sorted(FILES)
-    assert all((directory / name).stat().st_size > 1000 for name in FILES)
+    large = set(FILES) - {"journal.receipt"}
+    assert all((directory / name).stat().st_size > 1000 for name in large)
     body = json.loads((directory / "calibration.json").read_text())
     assert body["schema"] == "ahrsd.calibration/1"
     assert body["converged"] is True

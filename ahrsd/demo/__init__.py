@@ -87,6 +87,10 @@ class WorldClock(HostClock):
         """Nanoseconds, never falling."""
         return self.start_ns + int(self.world_s() * 1e9)
 
+    def boot(self) -> tuple[str, float]:
+        """The world's time, whose boot was its beginning."""
+        return self._own_boot()
+
 
 class AlwaysSafe:
     """A vehicle that never objects."""

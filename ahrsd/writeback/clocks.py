@@ -120,7 +120,7 @@ def passed_s(records: Sequence[Stamp], now: Now) -> list[float]:
 
 def _passed_s(record: Stamp, now: Now) -> float:
     wall_s = None
-    if _plausible(record.wall_s) and _plausible(now.stamp.wall_s):
+    if plausible(record.wall_s) and plausible(now.stamp.wall_s):
         wall_s = (now.stamp.wall_s or 0.0) - (record.wall_s or 0.0)
     if record.boot_id and record.boot_id == now.stamp.boot_id:
         age_s = same_boot_s(record, now.stamp)
@@ -132,5 +132,6 @@ def _passed_s(record: Stamp, now: Now) -> float:
     return max(up_s, 0.0 if wall_s is None else wall_s - WALL_ERROR_S)
 
 
-def _plausible(wall_s: float | None) -> bool:
+def plausible(wall_s: float | None) -> bool:
+    """Whether somebody has set this wall clock."""
     return wall_s is not None and wall_s >= PLAUSIBLE_FROM_S

@@ -16,7 +16,7 @@ from ahrsd.writeback.actions import (
     JournalAppend,
     RunProcedure,
 )
-from ahrsd.writeback.clocks import Now, Stamp
+from ahrsd.writeback.clocks import Now, Stamp, plausible
 from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Purpose
 from ahrsd.writeback.reconcile import Kind
@@ -41,6 +41,7 @@ class Desk:
         self.running = ""
         self._allow = allow
         self._wall_offset_s: float | None = None
+        self._least_offset_s: float | None = None  # of every wall clock that may have been right
         self._boot: tuple[str, float | None] = ("", None)  # and what to add to `host_s`
         self._serial: int | None = None
         self._bound_s = 0.0
@@ -57,20 +58,32 @@ class Desk:
         return self.host_s + (self._wall_offset_s or 0.0)
 
     @property
-    def now(self) -> Now:
-        """The present by every clock."""
+    def stamp(self) -> Stamp:
+        """The present by every clock, for a record."""
         boot_id, offset_s = self._boot
-        stamp = Stamp(
+        return Stamp(
             wall_s=None if self._wall_offset_s is None else self.wall_s,
             boot_id=boot_id,
             boot_s=None if offset_s is None else self.host_s + offset_s,
             device_s=self.device_s,
         )
-        return Now(stamp, self.host_s - self._bound_s)
+
+    @property
+    def now(self) -> Now:
+        """The present for a budget: by the earliest wall clock that this run was told."""
+        stamp, least_s = self.stamp, None
+        if self._least_offset_s is not None:
+            since_s = self.host_s if stamp.boot_s is None else stamp.boot_s
+            least_s = since_s + self._least_offset_s
+        return Now(replace(stamp, wall_s=least_s), self.host_s - self._bound_s)
 
     def set_clocks(self, wall_s: float, boot_id: str = "", boot_s: float | None = None) -> None:
         """The host's other clocks at this moment; the wall clock may have been set since."""
         self._wall_offset_s = wall_s - self.host_s
+        if plausible(wall_s):
+            offset_s = wall_s - (self.host_s if boot_s is None else boot_s)
+            least_s = offset_s if self._least_offset_s is None else self._least_offset_s
+            self._least_offset_s = min(offset_s, least_s)
         self._boot = (boot_id, None if boot_s is None else boot_s - self.host_s)
 
     def bind(self, serial: int, journal: Sequence[JournalRecord] | None) -> None:
@@ -105,7 +118,7 @@ class Desk:
         complete = {
             **({} if transaction is None else {"txn": transaction.id}),
             **facts,
-            **self.now.stamp.facts(),
+            **self.stamp.facts(),
         }
         before, self.history = self.history, self.history.with_record(kind, complete)
         self._append(kind, complete, before)

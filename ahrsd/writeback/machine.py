@@ -194,7 +194,7 @@ class WriteBack:
         uptime_s: its time since then, where that is what tells; then it must agree with the journal
         """
         self._desk.host_s = host_s
-        self._restarts.seen(self.history.last_at, self._desk.now.stamp, uptime_s)
+        self._restarts.seen(self.history.last_at, self._desk.stamp, host_s, uptime_s)
         self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
@@ -208,11 +208,11 @@ class WriteBack:
         desk.host_s = host_s
         reason = self._restarts.heard(uptime_s, host_s)
         if reason:
-            self._restarts.seen(record, desk.now.stamp, uptime_s)
+            self._restarts.seen(record, desk.stamp, host_s, uptime_s)
         elif (
             self.history.open is not None
             and self.state in RESTS
-            and self._restarts.proven(record, desk.now.stamp, host_s)
+            and self._restarts.proven(record, desk.stamp, host_s)
         ):
             self._restarts.concluded()
             reason = "the device restarted since the journal's newest record"

@@ -39,7 +39,8 @@ class VirtualRun:
         self.states: list[str] = []
         self.samples = 0
         self.finished = False
-        self.now_s = 1.0
+        self.now_s, self.wall_s = 1.0, WALL_S
+        self.boot_id, self.boot_began_s = "virtual boot", 0.0
         self._plugged = False
         self._serial = 0
         self._interlock_s = 0.0
@@ -47,9 +48,9 @@ class VirtualRun:
         self.tell_clocks()
 
     def tell_clocks(self) -> None:
-        """The computer's other clocks; it never restarts."""
-        wall_s = WALL_S + self.now_s
-        self.feed(inputs.WallClock(self.now_ns, wall_s, "virtual boot", self.now_s))
+        """The computer's other clocks, as they are now."""
+        boot_s = self.now_s - self.boot_began_s
+        self.feed(inputs.WallClock(self.now_ns, self.wall_s + self.now_s, self.boot_id, boot_s))
 
     @property
     def now_ns(self) -> int:

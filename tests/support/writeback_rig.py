@@ -163,6 +163,10 @@ class Rig:
     def start(self) -> None:
         """A new process: nothing is remembered but the journal."""
         self.wb = WriteBack(self.policy)
+        self.tell_clocks()
+
+    def tell_clocks(self) -> None:
+        """The computer's other clocks, as they are now."""
         boot_s = self.now_s - self.boot_began_s
         wall_s = self.wall_s + self.now_s
         self.do(self.wb.on_clock(wall_s, f"boot {self.boots}", boot_s, self.now_s))
