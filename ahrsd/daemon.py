@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,6 +79,7 @@ class Daemon:
 
     baud: of the port where it was found already, else as the configuration says
     terms: text of a repaired model; columns: what the vehicle measures, for its terms
+    complaints: each is asked once a second what is wrong with a file of somebody else's
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class Daemon:
         public: Public | None = None,
         terms: str = "",
         columns: ColumnsFile | None = None,
+        complaints: Iterable[Callable[[], str]] = (),
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -104,6 +107,7 @@ class Daemon:
             shell.worker.woken = self._inbox.wake
         self._interlock, self._box, self._public = interlock, box, public
         self._terms, self._columns = terms, columns
+        self._complaints = dict.fromkeys(complaints, "")  # what each said last
         self._safe: bool | None = None
         self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
@@ -253,8 +257,10 @@ class Daemon:
         error = "" if capture is None else capture.status.error
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
             self.shell.say(remark.level, remark.text, now_ns)
-        if self._columns is not None and self._columns.fault:
-            self.shell.say(logging.WARNING, self._columns.fault, now_ns)
+        for complaint, before in self._complaints.items():
+            if (text := complaint()) != before:
+                self._complaints[complaint] = text
+                self.shell.say(logging.WARNING, text or f"over: {before}", now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
         if self._public is not None:
             self._public.look(self.shell.core, self._link_facts(error), now_s)

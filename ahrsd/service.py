@@ -9,7 +9,8 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -159,10 +160,32 @@ def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudF
         time.sleep(_SEARCH_AGAIN_S)
 
 
-def _interlock(config: Config) -> InterlockFile | None:
-    """The vehicle's word, where one is configured."""
-    path = config.interlock.file
-    return None if path is None else InterlockFile(path, config.interlock.max_age_s)
+@dataclass(slots=True)
+class VehicleFiles:
+    """What the vehicle tells, as far as the configuration names files for it."""
+
+    interlock: InterlockFile | None
+    columns: ColumnsFile | None
+
+    @staticmethod
+    def of(config: Config) -> VehicleFiles:
+        """Begin to look at them."""
+        word, terms = config.interlock, config.terms
+        return VehicleFiles(
+            None if word.file is None else InterlockFile(word.file, word.max_age_s),
+            None if terms.file is None else ColumnsFile(terms.file, terms.max_age_s),
+        )
+
+    def complaints(self) -> list[Callable[[], str]]:
+        """What is wrong with each now."""
+        files = [file for file in (self.interlock, self.columns) if file is not None]
+        return [partial(getattr, file, "fault") for file in files]
+
+    def close(self) -> None:
+        """Look no more."""
+        for file in (self.interlock, self.columns):
+            if file is not None:
+                file.close()
 
 
 def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool = False) -> int:
@@ -188,18 +211,20 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     take_heap(needed_bytes(config.estimator.parameters()))
     shell = open_shell(config, clock, capture)
     box = _open_box(config)
+    vehicle = VehicleFiles.of(config)
     public = open_public(config, shell, notifier)
     daemon = Daemon(
         config,
         shell,
         port,
         clock,
-        _interlock(config),
+        vehicle.interlock,
         baud=found.baud,
         box=box,
         public=public,
         terms=terms,
-        columns=None if config.terms.file is None else ColumnsFile(config.terms.file),
+        columns=vehicle.columns,
+        complaints=vehicle.complaints(),
     )
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
     sys.setswitchinterval(SWITCH_S)
@@ -207,6 +232,7 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
         with _signals(daemon.stop):
             daemon.run()
     finally:
+        vehicle.close()
         public.close()
         close_shell(shell, (daemon.stopped_s or time.monotonic()) + _EXIT_S)
     for line in summary_lines(shell.core, str(capture or port)):

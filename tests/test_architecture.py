@@ -34,6 +34,7 @@ SHELL = (
     "ahrsd.daemon",
     "ahrsd.demo",
     "ahrsd.diagnosing",
+    "ahrsd.foreign_file",
     "ahrsd.interlock",
     "ahrsd.journal",
     "ahrsd.logs",
