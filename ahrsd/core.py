@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,6 +41,7 @@ from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.reconcile import Kind
 from ahrsd.writeback.states import State
 from drivers.vn100.decode import Measurement, Undecodable
 from drivers.vn100.registers import Values
@@ -82,6 +84,7 @@ class Core:
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
         self._out: list[events.Event] = []
+        self._answers: list[events.Answered] = []  # due once nothing waits for the journal
         if settings.policy.mode is Mode.PASSIVE:
             self._no_device()
         talk, back, add = self.conversation, self.writeback, self._errands.add
@@ -97,7 +100,7 @@ class Core:
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
             inputs.JournalOpened: self._journal_opened,
-            inputs.Journalled: lambda it: self._errands.journalled(it, self._host_s),
+            inputs.Journalled: self._journalled,
             inputs.Examined: lambda it: self._take_findings(it.pieces),
             inputs.Stop: self._stop,
         }
@@ -112,6 +115,9 @@ class Core:
         self._errands.add(self.writeback.tick(self._host_s))
         self._handlers[type(item)](item)
         self._drive()
+        if self._answers and not self._errands.awaiting_journal:
+            self._out += self._answers
+            self._answers = []
         out, self._out = self._out, []
         return out
 
@@ -148,7 +154,15 @@ class Core:
 
     def _operator(self, item: inputs.Operator) -> None:
         self._note("info", f"operator: {item.verb} {item.argument}".strip())
-        self._errands.add(self.writeback.on_operator(item.verb, item.argument, self._host_s))
+        back = self.writeback
+        self._errands.add(back.on_operator(item.verb, item.argument, self._host_s))
+        self._answers.append(events.Answered(item.word, *back.operator_answer))
+
+    def _journalled(self, item: inputs.Journalled) -> None:
+        self._errands.journalled(item, self._host_s)
+        if item.error and item.kind in (Kind.LOCKED, Kind.UNLOCKED):
+            text = f"not in the journal: {item.error}; it holds for this run only"
+            self._answers = [replace(a, accepted=False, text=text) for a in self._answers]
 
     def _registers_known(self, item: inputs.RegistersKnown) -> None:
         self._flush()

@@ -17,10 +17,10 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
-from ahrsd import inputs
+from ahrsd import events, inputs
 from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import Config
-from ahrsd.operator_box import OperatorBox
+from ahrsd.operator_box import Answer, OperatorInbox
 from ahrsd.rerun_sink import RerunSink
 from ahrsd.serial_reader import Bytes, Lost, SerialLink, find_device
 from ahrsd.serving.public import Public
@@ -91,7 +91,7 @@ class Daemon:
         interlock: Vehicle | None = None,
         *,
         baud: int | None = None,
-        box: OperatorBox | None = None,
+        words: OperatorInbox | None = None,
         public: Public | None = None,
         terms: str = "",
         columns: ColumnsFile | None = None,
@@ -105,7 +105,10 @@ class Daemon:
         self._inbox = self._link.inbox
         if shell.worker is not None:
             shell.worker.woken = self._inbox.wake
-        self._interlock, self._box, self._public = interlock, box, public
+        self._interlock, self._words, self._public = interlock, words, public
+        if words is not None:
+            words.woken = self._inbox.wake
+            shell.listeners.append(self._answer)
         self._terms, self._columns = terms, columns
         self._complaints = dict.fromkeys(complaints, "")  # what each said last
         self._safe: bool | None = None
@@ -130,9 +133,9 @@ class Daemon:
             self._stop_reason, self.stopped_s = reason, time.monotonic()
         self._inbox.wake()
 
-    def operate(self, verb: str, argument: str = "") -> None:
+    def operate(self, verb: str, argument: str = "", word: str = "") -> None:
         """A person's command; safe from another thread."""
-        self._operator.put(inputs.Operator(self.clock.now_ns(), verb, argument))
+        self._operator.put(inputs.Operator(self.clock.now_ns(), verb, argument, word))
         self._inbox.wake()
 
     # -- the run -----------------------------------------------------------------------------------
@@ -215,6 +218,8 @@ class Daemon:
             self._next_columns_ns = now + int(_COLUMNS_S * 1e9)
             if (values := self._columns.news()) is not None:
                 self._feed(inputs.Columns(now, values))
+        for word in self._words.take() if self._words is not None else ():
+            self.operate(word.verb, word.argument, word.name)
         while not self._operator.empty():
             self._feed(self._operator.get())
         self._tell_wall()
@@ -246,13 +251,11 @@ class Daemon:
                 self._lost(self.clock.now_ns(), str(error))
 
     def _look(self) -> None:
-        """Once a second: what a person said, and what one should hear."""
+        """Once a second: what a person should hear."""
         now_s = time.monotonic()
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + _WATCH_S
-        for verb, argument in self._box.take() if self._box is not None else ():
-            self.operate(verb, argument)
         capture, now_ns = self.shell.capture, self.clock.now_ns()
         error = "" if capture is None else capture.status.error
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
@@ -270,6 +273,11 @@ class Daemon:
             self._lost(now_ns, "no message in what arrives: looking for the rate")
         elif self._watch.silent and device.configure_stream and self._may_query:
             self._lost(now_ns, "silence: asking the device again for its output")
+
+    def _answer(self, event: events.Event) -> None:
+        """Tell a person what became of the word."""
+        if isinstance(event, events.Answered) and event.word and self._words is not None:
+            self._words.answer(event.word, Answer(event.accepted, event.text))
 
     def _link_facts(self, capture_error: str) -> LinkFacts:
         capture, viewer = self.shell.capture, self.shell.viewer

@@ -90,6 +90,15 @@ class Noted:
 
 
 @dataclass(frozen=True, slots=True)
+class Answered:
+    """What became of a person's command, the `word` of `inputs.Operator`; `text` says why."""
+
+    word: str
+    accepted: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class OpenJournal:
     """The device is known: open its journal and answer with `JournalOpened`."""
 
@@ -134,6 +143,7 @@ Event = (
     | StateChanged
     | RegisterWritten
     | Noted
+    | Answered
     | OpenJournal
     | JournalAppend
     | Examine

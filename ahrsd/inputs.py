@@ -79,11 +79,15 @@ class TermsKnown:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason."""
+    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason.
+
+    word: its name, for the answer (`events.Answered`)
+    """
 
     host_ns: int
     verb: str
     argument: str = ""
+    word: str = ""
 
 
 @dataclass(frozen=True, slots=True)

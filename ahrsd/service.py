@@ -23,7 +23,7 @@ from ahrsd.daemon import Daemon, HostClock
 from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.heap import needed_bytes, take_heap
 from ahrsd.interlock import InterlockFile
-from ahrsd.operator_box import OperatorBox
+from ahrsd.operator_box import OperatorBox, OperatorInbox
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
@@ -99,17 +99,14 @@ def _open_capture(config: Config, path: Path) -> CaptureWriter:
     )
 
 
-def _open_box(config: Config) -> OperatorBox | None:
-    """Where a person may speak to the daemon; a run that writes nothing needs none."""
-    if config.mode not in ("stage", "commit"):
+def _open_words(config: Config) -> OperatorInbox | None:
+    """Where a person may speak to the daemon; a run that sends nothing needs none."""
+    if config.mode == "passive":
         return None
     box = OperatorBox(config.state)
-    try:
+    with contextlib.suppress(OSError):  # the inbox says why, and when it is over
         box.prepare()
-    except OSError as error:
-        log.warning("%s cannot be made, nobody can approve: %s", box.folder, error.strerror)
-        return None
-    return box
+    return OperatorInbox(box)
 
 
 def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
@@ -210,7 +207,7 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     capture = new_capture_path(config.captures) if config.capture.enabled else None
     take_heap(needed_bytes(config.estimator.parameters()))
     shell = open_shell(config, clock, capture)
-    box = _open_box(config)
+    words = _open_words(config)
     vehicle = VehicleFiles.of(config)
     public = open_public(config, shell, notifier)
     daemon = Daemon(
@@ -220,11 +217,11 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
         clock,
         vehicle.interlock,
         baud=found.baud,
-        box=box,
+        words=words,
         public=public,
         terms=terms,
         columns=vehicle.columns,
-        complaints=vehicle.complaints(),
+        complaints=[*vehicle.complaints(), *([] if words is None else [lambda: words.fault])],
     )
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
     sys.setswitchinterval(SWITCH_S)
@@ -233,6 +230,8 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
             daemon.run()
     finally:
         vehicle.close()
+        if words is not None:
+            words.close(_LEAST_S)
         public.close()
         close_shell(shell, (daemon.stopped_s or time.monotonic()) + _EXIT_S)
     for line in summary_lines(shell.core, str(capture or port)):
