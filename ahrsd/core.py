@@ -22,7 +22,14 @@ from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
 from ahrsd.errands import Errands
 from ahrsd.evidence.values import BasisFacts
-from ahrsd.examination import Circumstances, Desk, Finding, Piece
+from ahrsd.examination import (
+    Broken,
+    Circumstances,
+    Desk,
+    EstimatorState,
+    Finding,
+    Piece,
+)
 from ahrsd.gates import Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.rollcall import Rollcall
@@ -36,6 +43,7 @@ from ahrsd.said import (
     Unanswered,
 )
 from ahrsd.samples import Array, SampleBlock
+from ahrsd.sensor_checks import SensorChecks
 from ahrsd.stream import Stream
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.vehicle_terms import VehicleTerms
@@ -73,6 +81,7 @@ class Core:
         self._from_scratch = (settings.calibrator, *self._compared)
         self.calibrator = Calibrator(*self._from_scratch)
         self._desk = Desk()
+        self.estimator, self.sensors = EstimatorState(), SensorChecks()
         self._proposed: Affine | None = None
         self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
@@ -101,7 +110,7 @@ class Core:
             inputs.Samples: self._samples_given,
             inputs.JournalOpened: self._journal_opened,
             inputs.Journalled: self._journalled,
-            inputs.Examined: lambda it: self._take_findings(it.pieces),
+            inputs.Examined: lambda it: self._take_findings(it.pieces, it.failure),
             inputs.Stop: self._stop,
         }
 
@@ -205,6 +214,9 @@ class Core:
                 self.strays += 1
         for piece in skipped:
             self.stream.damaged(piece)
+        facts = self.stream.facts
+        for text in self.sensors.count(facts.unusable, facts.samples):
+            self._note("warning", text)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
             self._device_reset("its time fell")
@@ -354,13 +366,16 @@ class Core:
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
         self._out.append(events.SamplesSeen(block, present, self._proposed))
         self._errands.add(self.writeback.on_samples(block))
+        for text in self.sensors.take(block):
+            self._note("warning", text)
         if (free := self.vehicle.without(block)) is not None:
             if self._trial is not None:
                 metrics = self._trial.take(free)
                 self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-            how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
-            now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
-            self._begin(self._desk.examine(self.calibrator, free, now))
+            if self.estimator.takes(free):
+                how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+                now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
+                self._begin(self._desk.examine(self.calibrator, free, now))
         self._errands.let_out(self)
 
     def _begin(self, piece: Piece) -> None:
@@ -370,14 +385,27 @@ class Core:
         else:
             self._take_findings(1)
 
-    def _take_findings(self, pieces: int) -> None:
-        for found in self._desk.take(pieces):
+    def _take_findings(self, pieces: int, failure: str = "") -> None:
+        for found in self._desk.take(pieces, failure):
             if found.calibrator is not self.calibrator:
                 continue  # another device or other quantities since
+            if isinstance(found, Broken):
+                self._estimator_failed(found.reason)
+                continue
             self._proposed = found.proposed
             self._out += found.notes
             if found.estimate is not None:
                 self._judged(found, found.estimate)
+
+    def _estimator_failed(self, reason: str) -> None:
+        """Nothing is written from what it made, and it begins anew after a pause."""
+        self.estimator.broke_off(reason)
+        self.calibrator = Calibrator(self.settings.calibrator, *self._compared)
+        self._proposed = None
+        left_s = self.estimator.left_s
+        self._note("error", f"ESTIMATOR FAILED: {reason}; it begins anew in {left_s:.0f} s")
+        self.decisions.add(self.at_s, "ESTIMATOR FAILED")
+        self._errands.add(self.writeback.on_estimator_failed(self._host_s))
 
     def _judged(self, found: Finding, estimate: Estimate) -> None:
         at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates

@@ -36,6 +36,7 @@ log = logging.getLogger("ahrsd")
 
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
 _LONGEST_WAIT_S = 0.2
+_BEHIND_S = 0.05
 _SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
 _STOP_S = 1.6  # for putting things back; a service manager's patience is limited
 _AMENDS_S = 2.0
@@ -163,7 +164,7 @@ class Daemon:
         """One wait and what it brought."""
         if not self._link.is_open:
             self._reopen()
-        item = self._inbox.get(self._patience_s(longest_s))
+        item = self._wait(self._patience_s(longest_s))
         if self._slept():
             return
         self._around()
@@ -174,7 +175,7 @@ class Daemon:
         # What is waited for may lie in the inbox or in the port already: a reply is late only
         # against what was taken, and a silence is one only where nothing waits to be read.
         now_ns = self.clock.now_ns() if item is None else item.host_ns
-        if item is not None or not self._link.has_more():
+        if item is not None or (self._inbox.empty and not self._link.has_more()):
             self._tick(now_ns)
         self._take_findings(now_ns)
         self._look()
@@ -182,11 +183,19 @@ class Daemon:
             well = self.shell.worker is None or not self.shell.worker.stuck
             self._public.turn(self.shell.core, time.monotonic(), well=well)
 
+    def _wait(self, longest_s: float) -> Bytes | Lost | None:
+        """The next bytes; while the estimator is behind they wait, and the rest goes on."""
+        worker = self.shell.worker
+        if worker is not None and worker.full and not self._stop_reason:
+            worker.wait_for_room(min(longest_s, _BEHIND_S))
+            return None
+        return self._inbox.get(longest_s)
+
     def _take_findings(self, now_ns: int) -> None:
         """What was done beside the core, told at the time of what was taken last."""
         worker = self.shell.worker
-        if worker is not None and (pieces := worker.take_done()):
-            self._feed(inputs.Examined(now_ns, pieces))
+        for pieces, failure in () if worker is None else worker.take_done():
+            self._feed(inputs.Examined(now_ns, pieces, failure))
 
     def _slept(self) -> bool:
         """Whether the host was suspended; then the link begins anew, with the device's registers.

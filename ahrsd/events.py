@@ -113,11 +113,19 @@ class JournalAppend:
     facts: dict[str, object]
 
 
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """How work beside the core broke off: in a line, and its traceback."""
+
+    reason: str
+    trace: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Examine:
     """Do this beside the core, each after the one before; then answer with `Examined`."""
 
-    work: Callable[[], None]
+    work: Callable[[], Failure | None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,10 +128,14 @@ class Journalled:
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """So many pieces of the work that is done beside the core are done, oldest first."""
+    """So many pieces of the work that is done beside the core are done, oldest first.
+
+    failure: how the last one of them broke off; empty where none did
+    """
 
     host_ns: int
     pieces: int
+    failure: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from planted_operator import Operator
 
+from ahrsd.config import Config
 from ahrsd.events import SamplesSeen
-from ahrsd.inputs import LinkLost, WallClock
+from ahrsd.inputs import Examined, LinkLost, WallClock
 from ahrsd.recording.capture import CaptureReader
+from ahrsd.replay import replay
 from ahrsd.shell import FoldedLog
 
 OWN_STREAM = {"configure_stream": True, "rate_hz": 50.0}
@@ -193,15 +195,23 @@ def test_a_bug_in_a_transaction_leaves_the_output_on(live):
         assert daemon.heard.rstrip().split(b"\r\n")[-1].startswith(b"$VNASY,1")
 
 
-def test_a_bug_in_the_estimator_ends_the_run_and_leaves_the_device_as_it_was(live, monkeypatch):
-    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+def test_a_bug_in_the_estimator_is_a_state_and_the_run_goes_on(live, caplog):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         daemon.core.calibrator.take = None
-        daemon.ended()
-        assert "the estimate broke off" in str(daemon.error)
+        daemon.until(lambda: daemon.core.estimator.failures)
+        assert daemon.noted("ESTIMATOR FAILED: TypeError: 'NoneType' object is not callable")
+        second = daemon.core.calibrator
+        daemon.flowing()
+        daemon.until(lambda: second.started, 30.0)
+        assert daemon.stop() < LIMIT_S
+        assert daemon.error is None
         assert daemon.emulator.memory.ram == daemon.before
-        assert streaming(daemon)
+    assert caplog.text.count("Traceback") == 1
+    recorded = [i.failure for i in CaptureReader(daemon.capture) if isinstance(i, Examined)]
+    assert [text for text in recorded if text] == ["TypeError: 'NoneType' object is not callable"]
+    again = replay(daemon.capture, Config())
+    assert again.core.decisions.sha256 == daemon.core.decisions.sha256
 
 
 def test_samples_go_on_while_the_estimator_is_at_it(live):

@@ -234,6 +234,14 @@ class WriteBack:
             self._flow.consider(estimate, gyro_is_raw)
         return self._answer()
 
+    def on_estimator_failed(self, host_s: float) -> list[Action]:
+        """There is no estimate, nor what the gates said of it: what rests on it ends."""
+        self._desk.host_s = host_s
+        self._safe.gates = self._safe.flash_gates = ()
+        self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the estimator failed")
+        self._flow.roll_back("estimator", "the estimator failed: nobody judges the new values")
+        return self._answer()
+
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
         """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
         self._desk.host_s = host_s
