@@ -112,7 +112,7 @@ class Daemon:
             shell.listeners.append(self._answer)
         self._terms, self._columns = terms, columns
         self._complaints = dict.fromkeys(complaints, "")  # what each said last
-        self._safe: bool | None = None
+        self._safe = False
         self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
@@ -300,7 +300,9 @@ class Daemon:
             capture_error=capture_error,
             viewer_dropped=0 if counters is None else counters.dropped,
             viewer_fault="" if counters is None else counters.last_fault,
-            interlock={None: "none", True: "safe", False: "not safe"}[self._safe],
+            interlock="none" if self._interlock is None else "safe" if self._safe else "not safe",
+            complaints=tuple(text for text in self._complaints.values() if text),
+            estimator_stuck=self.shell.worker is not None and self.shell.worker.stuck,
         )
 
     # -- the port ----------------------------------------------------------------------------------

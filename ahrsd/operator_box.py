@@ -29,6 +29,7 @@ from queue import SimpleQueue
 from typing import Final
 
 from ahrsd.foreign_file import ForeignFileError, boot_s, kind_of, read_regular
+from ahrsd.recording.retention import make_private_folder
 
 VERBS: Final = ("arm", "disarm", "approve", "lock", "unlock", "rollback")
 LONGEST_S: Final = 30.0
@@ -75,7 +76,7 @@ class OperatorBox:
 
     def prepare(self) -> None:
         """Make the folder for this user alone. Raises OperatorFolderError, OSError."""
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self.folder.parent)
         with suppress(FileExistsError):
             self.folder.mkdir(mode=0o700)
             self.folder.chmod(0o700)  # whatever the umask

@@ -25,7 +25,7 @@ from ahrsd.heap import needed_bytes, take_heap
 from ahrsd.interlock import InterlockFile
 from ahrsd.operator_box import OperatorBox, OperatorInbox
 from ahrsd.recording.capture import CaptureWriter
-from ahrsd.recording.retention import new_capture_path
+from ahrsd.recording.retention import make_private_folder, new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
 from ahrsd.sdnotify import Notifier
 from ahrsd.serial_reader import find_device
@@ -85,7 +85,7 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
 
 def _open_capture(config: Config, path: Path) -> CaptureWriter:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_private_folder(path.parent)
     except OSError as error:
         raise CaptureError(
             f"{path.parent}: the folder of the captures cannot be made: {error.strerror}; set "

@@ -107,4 +107,4 @@ class Worker:
         if failure.reason in self._reasons or len(self._reasons) >= _MOST_REASONS:
             return
         self._reasons.add(failure.reason)
-        log.error("the estimator broke off: %s\n%s", failure.reason, failure.trace)
+        log.error("the estimator broke off: %s", failure.reason, extra={"trace": failure.trace})

@@ -15,13 +15,16 @@ from ahrsd.errors import AhrsdError, DeviceError
 def command(output: Path, path: Path | None) -> None:
     """Collect journal, newest capture, configuration, status and versions into one archive.
 
-    It works beside a running daemon and without one. The capture holds where the sensor was turned
-    to, and the location if one is configured: look before you pass it on.
+    It works beside a running daemon and without one; the name says the format (.tar.gz, .tgz, .tar,
+    .zip). Links, FIFOs and devices are never opened, of large files only a part is taken, and what
+    was left out is printed. The capture holds where the sensor was turned to, and the location if
+    one is configured: look before you pass it on.
     """
-    from ahrsd.bundle import write_bundle
+    from ahrsd.bundle import collect, write_bundle
     from ahrsd.commands.running import connected
     from ahrsd.config import Config, load_config
     from ahrsd.config_text import print_config
+    from ahrsd.logs import printable
 
     config = load_config(path) if path else Config()
     try:
@@ -31,8 +34,11 @@ def command(output: Path, path: Path | None) -> None:
         click.echo(f"{error}: the archive is made without its status", err=True)
         status = None
     try:
-        inside = write_bundle(output, config.state, config.captures, print_config(config), status)
+        bundle = collect(config.state, config.captures, print_config(config), status)
+        write_bundle(output, bundle)
     except OSError as error:
         raise AhrsdError(f"{output}: cannot be written: {error.strerror}") from None
     size = output.stat().st_size
-    click.echo(f"{output}: {size / 1e6:.1f} MB: {', '.join(inside)}")
+    click.echo(printable(f"{output}: {size / 1e6:.1f} MB: {', '.join(bundle.parts)}"))
+    for text in bundle.left_out:
+        click.echo(printable(f"left out: {text}"))

@@ -35,6 +35,7 @@ def command(verb: str, text: str, directory: Path | None) -> None:
     root may do this, and nobody else: STATE/operator must belong to one of them.
     """
     from ahrsd.config import default_state_directory
+    from ahrsd.logs import printable
     from ahrsd.operator_box import OperatorBox, OperatorFolderError, Unanswered
 
     if verb == "approve" and not text:
@@ -53,5 +54,5 @@ def command(verb: str, text: str, directory: Path | None) -> None:
     if answer is None:
         raise DeviceError(f"no daemon took the word within {_WAIT_S:.0f} s", EXIT_BUSY)
     if not answer.accepted:
-        raise DeviceError(f"refused: {answer.text}", EXIT_NO)
-    click.echo(f"accepted: {answer.text}")
+        raise DeviceError(f"refused: {printable(answer.text)}", EXIT_NO)
+    click.echo(f"accepted: {printable(answer.text)}")

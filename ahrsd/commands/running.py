@@ -10,6 +10,7 @@ import click
 
 from ahrsd.commands.json_output import write_json
 from ahrsd.config import default_state_directory
+from ahrsd.logs import printable
 from ahrsd.serving.client import Asked, find_socket
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -38,4 +39,4 @@ def tell(
     if json_path is not None:
         write_json(json_path, answer)
     if json_path != "-":
-        click.echo("\n".join(lines(answer)))
+        click.echo("\n".join(map(printable, lines(answer))))

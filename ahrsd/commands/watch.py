@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ahrsd.commands.running import connected, socket_options
+from ahrsd.logs import printable
 from ahrsd.serving.explain import explain_json, holding
 from ahrsd.serving.lines import status_lines
 
@@ -74,9 +75,9 @@ def event_line(record: Mapping[str, Any]) -> str:
     """One line for what happened; empty for what the status shows anyway."""
     match record.get("record"):
         case "note":
-            return f"{record['level']}: {record['text']}"
+            return printable(f"{record['level']}: {record['text']}")
         case "state":
-            return f"{record['old']} -> {record['new']}: {record['reason']}"
+            return printable(f"{record['old']} -> {record['new']}: {record['reason']}")
         case "register":
             return f"register {record['register']} {record['outcome']}"
         case "gap":
@@ -87,9 +88,9 @@ def event_line(record: Mapping[str, Any]) -> str:
 def screen(status: Mapping[str, Any], happened: deque[str], most: int = 99) -> RenderableType:
     """Status on top, what happened last, and `most` of the gates, nearest to the cause first."""
     explained = explain_json(status)
-    head = Panel("\n".join(status_lines(status)), title="ahrsd")
+    head = Panel(Text("\n".join(map(printable, status_lines(status)))), title="ahrsd")
     todo = Panel(Text(str(explained["next"]), style="bold"), title="what to do next")
-    log = Panel("\n".join(happened) or "nothing yet", title="what happened")
+    log = Panel(Text("\n".join(happened) or "nothing yet"), title="what happened")
     return Group(head, todo, log, _gates(status, max(most, 3)))
 
 
