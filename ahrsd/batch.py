@@ -30,7 +30,7 @@ from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS
 from ahrsd.replay import Replayed, replay
 from ahrsd.result import calibration_json, why_not_converged
-from ahrsd.summary import said_of
+from ahrsd.summary import said_of, serial_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +82,7 @@ class BatchResult:
             samples=self.samples,
             gyro_is_raw=not self.core.stream.compensated_gyro,
             warnings=self.said(),
+            serial=serial_of(self.core),
         )
 
     def write_report(self, path: Path) -> None:

@@ -2,46 +2,68 @@
 
     {"motor_current_a": 3.2, "rudder_deg": -4.0}
 
-Written under another name and moved there, so that it is never seen half. What is no object of
-numbers is no word; why is said by `fault`.
+Written under another name and moved there, so that it is never seen half. Values count from when
+they were seen to be written; what lay there before the start is nobody's measurement of now. What
+is no object of numbers is no word; why is said by `fault`.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+from ahrsd.foreign_file import Contents, FileWatch, boot_s, read_regular
+
 _LONGEST = 4096
+_EVERY_S = 0.02
 
 
 class ColumnsFile:
-    """Reads the newest word, once."""
+    """The newest word, once, read in a thread of its own; asking never waits.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.fault = ""
-        self._seen_ns = -1
+    max_age_s: what was written longer ago than this is of no use any more
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        max_age_s: float = 0.5,
+        *,
+        read: Callable[[Path, int], Contents] = read_regular,
+        now_s: Callable[[], float] = boot_s,
+    ) -> None:
+        self.path, self.max_age_s = path, max_age_s
+        self._watch = FileWatch(path, _LONGEST, _EVERY_S, read=read, now_s=now_s)
+        self._taken = 0
+        self._wrong = ""
 
     def news(self) -> dict[str, float] | None:
         """The columns, if the file was written since the last call and can be understood."""
-        try:
-            written_ns = self.path.stat().st_mtime_ns
-            if written_ns == self._seen_ns:
-                return None
-            with self.path.open("rb") as file:
-                data = file.read(_LONGEST)
-        except OSError as error:
-            self.fault = f"{self.path}: {error.strerror}"
+        sight = self._watch.sight
+        if sight.data is None or sight.writings == self._taken:
             return None
-        self._seen_ns = written_ns
+        self._taken = sight.writings
+        if self._watch.now_s() - sight.since_s > self.max_age_s:
+            return None
         try:
-            found = columns_of(data)
+            found = columns_of(sight.data)
         except ValueError as error:
-            self.fault = f"{self.path}: {error}"
+            self._wrong = f"{self.path}: {error}"
             return None
-        self.fault = ""
+        self._wrong = ""
         return found
+
+    @property
+    def fault(self) -> str:
+        """Why there are no values, in one line; empty where there are."""
+        wrong = self._watch.fault or self._wrong
+        return f"terms.file = {wrong}" if wrong else ""
+
+    def close(self) -> None:
+        """Look no more."""
+        self._watch.close()
 
 
 def columns_of(data: bytes) -> dict[str, float]:

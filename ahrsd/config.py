@@ -34,11 +34,13 @@ from ahrsd.config_sections import (
     WriteBack,
 )
 from ahrsd.errors import ConfigError
+from ahrsd.foreign_file import ForeignFileError, text_within
 from ahrsd.writeback.permissions import Mode as Ceiling
 from ahrsd.writeback.policy import WriteBackPolicy
 
 Mode = Literal["passive", "observe", "stage", "commit"]
 
+_LARGEST_BYTES = 1 << 20
 _NAMES = 12  # more keys than this do not fit into one line
 _WORDS = {  # where pydantic speaks of Python's types and not of TOML's
     "is_instance_of": "must be text, a path",
@@ -120,11 +122,9 @@ def default_state_directory() -> Path:
 def load_config(path: Path) -> Config:
     """Read and check a file.  Raises ConfigError with one line per wrong key."""
     try:
-        body = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError([f"{path}: cannot be read: {error.strerror}"]) from error
-    except UnicodeDecodeError as error:
-        raise ConfigError([f"{path}: is not UTF-8 text (byte {error.start})"]) from error
+        body = tomllib.loads(text_within(path, _LARGEST_BYTES))
+    except ForeignFileError as error:
+        raise ConfigError([f"{path}: {error}"]) from error
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError([f"{path}: is not TOML: {error}"]) from error
     return check_config(body, str(path))

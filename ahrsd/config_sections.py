@@ -275,10 +275,12 @@ class Interlock(Section):
     """The vehicle's word that a write is safe now."""
 
     file: Path | None = None
-    """File that the vehicle rewrites while it is safe, its content the word safe; without one, or
-    with anything else in it, nothing is ever written."""
+    """File that the vehicle keeps rewriting while it is safe, its content the word safe; without
+    one, or with anything else in it, nothing is ever written. A regular file of 64 bytes at most;
+    what lay there at the start counts once it is written again."""
     max_age_s: float = Field(default=WriteBackPolicy().interlock_max_age_s, gt=0.0, le=60.0)
-    """Older than this counts as no. [s]"""
+    """Not seen to be written again for longer than this counts as no, whatever its time stamp and
+    the host's clock say. [s]"""
 
 
 class Terms(Section):
@@ -288,8 +290,8 @@ class Terms(Section):
     """The model.json; its terms that follow a column from sample to sample are taken out, what is
     left holds where those columns are at the model's zero."""
     file: Path | None = None
-    """File that the vehicle rewrites, a JSON object such as {"motor_current_a": 3.2}; temperature
-    comes with the stream."""
+    """File that the vehicle keeps rewriting, a JSON object such as {"motor_current_a": 3.2}, a
+    regular file of 4096 bytes at most; temperature comes with the stream."""
     max_age_s: float = Field(default=0.5, gt=0.0, le=60.0)
     """Samples further from the last word than this are not calibrated. [s]"""
 

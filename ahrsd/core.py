@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +22,14 @@ from ahrsd.core_settings import CoreSettings
 from ahrsd.decisions import DecisionLog
 from ahrsd.errands import Errands
 from ahrsd.evidence.values import BasisFacts
-from ahrsd.examination import Circumstances, Desk, Finding, Piece
+from ahrsd.examination import (
+    Broken,
+    Circumstances,
+    Desk,
+    EstimatorState,
+    Finding,
+    Piece,
+)
 from ahrsd.gates import Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.rollcall import Rollcall
@@ -35,11 +43,13 @@ from ahrsd.said import (
     Unanswered,
 )
 from ahrsd.samples import Array, SampleBlock
+from ahrsd.sensor_checks import SensorChecks
 from ahrsd.stream import Stream
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.reconcile import Kind
 from ahrsd.writeback.states import State
 from drivers.vn100.decode import Measurement, Undecodable, Unused
 from drivers.vn100.registers import Values
@@ -71,6 +81,7 @@ class Core:
         self._from_scratch = (settings.calibrator, *self._compared)
         self.calibrator = Calibrator(*self._from_scratch)
         self._desk = Desk()
+        self.estimator, self.sensors = EstimatorState(), SensorChecks()
         self._proposed: Affine | None = None
         self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
@@ -82,6 +93,7 @@ class Core:
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
         self._out: list[events.Event] = []
+        self._answers: list[events.Answered] = []  # due once nothing waits for the journal
         if settings.policy.mode is Mode.PASSIVE:
             self._no_device()
         talk, back, add = self.conversation, self.writeback, self._errands.add
@@ -97,8 +109,8 @@ class Core:
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
             inputs.JournalOpened: self._journal_opened,
-            inputs.Journalled: lambda it: self._errands.journalled(it, self._host_s),
-            inputs.Examined: lambda it: self._take_findings(it.pieces),
+            inputs.Journalled: self._journalled,
+            inputs.Examined: lambda it: self._take_findings(it.pieces, it.failure),
             inputs.Stop: self._stop,
         }
 
@@ -112,6 +124,9 @@ class Core:
         self._errands.add(self.writeback.tick(self._host_s))
         self._handlers[type(item)](item)
         self._drive()
+        if self._answers and not self._errands.awaiting_journal:
+            self._out += self._answers
+            self._answers = []
         out, self._out = self._out, []
         return out
 
@@ -149,7 +164,15 @@ class Core:
 
     def _operator(self, item: inputs.Operator) -> None:
         self._note("info", f"operator: {item.verb} {item.argument}".strip())
-        self._errands.add(self.writeback.on_operator(item.verb, item.argument, self._host_s))
+        back = self.writeback
+        self._errands.add(back.on_operator(item.verb, item.argument, self._host_s))
+        self._answers.append(events.Answered(item.word, *back.operator_answer))
+
+    def _journalled(self, item: inputs.Journalled) -> None:
+        self._errands.journalled(item, self._host_s)
+        if item.error and item.kind in (Kind.LOCKED, Kind.UNLOCKED):
+            text = f"not in the journal: {item.error}; it holds for this run only"
+            self._answers = [replace(a, accepted=False, text=text) for a in self._answers]
 
     def _registers_known(self, item: inputs.RegistersKnown) -> None:
         self._flush()
@@ -195,6 +218,9 @@ class Core:
                 self.strays += 1
         for piece in skipped:
             self.stream.damaged(piece)
+        facts = self.stream.facts
+        for text in self.sensors.count(facts.unusable, facts.samples):
+            self._note("warning", text)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
             self._device_reset("its time fell", self.at_s)
@@ -342,13 +368,16 @@ class Core:
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
         self._out.append(events.SamplesSeen(block, present, self._proposed))
         self._errands.add(self.writeback.on_samples(block))
+        for text in self.sensors.take(block):
+            self._note("warning", text)
         if (free := self.vehicle.without(block)) is not None:
             if self._trial is not None:
                 metrics = self._trial.take(free)
                 self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-            how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
-            now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
-            self._begin(self._desk.examine(self.calibrator, free, now))
+            if self.estimator.takes(free):
+                how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+                now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
+                self._begin(self._desk.examine(self.calibrator, free, now))
         self._errands.let_out(self)
 
     def _begin(self, piece: Piece) -> None:
@@ -358,14 +387,27 @@ class Core:
         else:
             self._take_findings(1)
 
-    def _take_findings(self, pieces: int) -> None:
-        for found in self._desk.take(pieces):
+    def _take_findings(self, pieces: int, failure: str = "") -> None:
+        for found in self._desk.take(pieces, failure):
             if found.calibrator is not self.calibrator:
                 continue  # another device or other quantities since
+            if isinstance(found, Broken):
+                self._estimator_failed(found.reason)
+                continue
             self._proposed = found.proposed
             self._out += found.notes
             if found.estimate is not None:
                 self._judged(found, found.estimate)
+
+    def _estimator_failed(self, reason: str) -> None:
+        """Nothing is written from what it made, and it begins anew after a pause."""
+        self.estimator.broke_off(reason)
+        self.calibrator = Calibrator(self.settings.calibrator, *self._compared)
+        self._proposed = None
+        left_s = self.estimator.left_s
+        self._note("error", f"ESTIMATOR FAILED: {reason}; it begins anew in {left_s:.0f} s")
+        self.decisions.add(self.at_s, "ESTIMATOR FAILED")
+        self._errands.add(self.writeback.on_estimator_failed(self._host_s))
 
     def _judged(self, found: Finding, estimate: Estimate) -> None:
         at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates

@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
-from ahrsd import host_clock, inputs
+from ahrsd import events, host_clock, inputs
 from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import Config
-from ahrsd.operator_box import OperatorBox
+from ahrsd.operator_box import Answer, OperatorInbox
 from ahrsd.rerun_sink import RerunSink
 from ahrsd.serial_reader import Bytes, Lost, SerialLink, find_device
 from ahrsd.serving.public import Public
@@ -35,6 +36,7 @@ log = logging.getLogger("ahrsd")
 
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
 _LONGEST_WAIT_S = 0.2
+_BEHIND_S = 0.05
 _SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
 _STOP_S = 1.6  # for putting things back; a service manager's patience is limited
 _AMENDS_S = 2.0
@@ -87,6 +89,7 @@ class Daemon:
 
     baud: of the port where it was found already, else as the configuration says
     terms: text of a repaired model; columns: what the vehicle measures, for its terms
+    complaints: each is asked once a second what is wrong with a file of somebody else's
     """
 
     def __init__(
@@ -98,10 +101,11 @@ class Daemon:
         interlock: Vehicle | None = None,
         *,
         baud: int | None = None,
-        box: OperatorBox | None = None,
+        words: OperatorInbox | None = None,
         public: Public | None = None,
         terms: str = "",
         columns: ColumnsFile | None = None,
+        complaints: Iterable[Callable[[], str]] = (),
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -111,9 +115,13 @@ class Daemon:
         self._inbox = self._link.inbox
         if shell.worker is not None:
             shell.worker.woken = self._inbox.wake
-        self._interlock, self._box, self._public = interlock, box, public
+        self._interlock, self._words, self._public = interlock, words, public
+        if words is not None:
+            words.woken = self._inbox.wake
+            shell.listeners.append(self._answer)
         self._terms, self._columns = terms, columns
-        self._safe: bool | None = None
+        self._complaints = dict.fromkeys(complaints, "")  # what each said last
+        self._safe = False
         self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
@@ -136,9 +144,9 @@ class Daemon:
             self._stop_reason, self.stopped_s = reason, time.monotonic()
         self._inbox.wake()
 
-    def operate(self, verb: str, argument: str = "") -> None:
+    def operate(self, verb: str, argument: str = "", word: str = "") -> None:
         """A person's command; safe from another thread."""
-        self._operator.put(inputs.Operator(self.clock.now_ns(), verb, argument))
+        self._operator.put(inputs.Operator(self.clock.now_ns(), verb, argument, word))
         self._inbox.wake()
 
     # -- the run -----------------------------------------------------------------------------------
@@ -166,7 +174,7 @@ class Daemon:
         """One wait and what it brought."""
         if not self._link.is_open:
             self._reopen()
-        item = self._inbox.get(self._patience_s(longest_s))
+        item = self._wait(self._patience_s(longest_s))
         if self._slept():
             return
         self._around()
@@ -177,7 +185,7 @@ class Daemon:
         # What is waited for may lie in the inbox or in the port already: a reply is late only
         # against what was taken, and a silence is one only where nothing waits to be read.
         now_ns = self.clock.now_ns() if item is None else item.host_ns
-        if item is not None or not self._link.has_more():
+        if item is not None or (self._inbox.empty and not self._link.has_more()):
             self._tick(now_ns)
         self._take_findings(now_ns)
         self._look()
@@ -185,11 +193,19 @@ class Daemon:
             well = self.shell.worker is None or not self.shell.worker.stuck
             self._public.turn(self.shell.core, time.monotonic(), well=well)
 
+    def _wait(self, longest_s: float) -> Bytes | Lost | None:
+        """The next bytes; while the estimator is behind they wait, and the rest goes on."""
+        worker = self.shell.worker
+        if worker is not None and worker.full and not self._stop_reason:
+            worker.wait_for_room(min(longest_s, _BEHIND_S))
+            return None
+        return self._inbox.get(longest_s)
+
     def _take_findings(self, now_ns: int) -> None:
         """What was done beside the core, told at the time of what was taken last."""
         worker = self.shell.worker
-        if worker is not None and (pieces := worker.take_done()):
-            self._feed(inputs.Examined(now_ns, pieces))
+        for pieces, failure in () if worker is None else worker.take_done():
+            self._feed(inputs.Examined(now_ns, pieces, failure))
 
     def _slept(self) -> bool:
         """Whether the host was suspended; then the link begins anew, with the device's registers.
@@ -221,6 +237,8 @@ class Daemon:
             self._next_columns_ns = now + int(_COLUMNS_S * 1e9)
             if (values := self._columns.news()) is not None:
                 self._feed(inputs.Columns(now, values))
+        for word in self._words.take() if self._words is not None else ():
+            self.operate(word.verb, word.argument, word.name)
         while not self._operator.empty():
             self._feed(self._operator.get())
         self._tell_wall()
@@ -254,19 +272,19 @@ class Daemon:
                 self._lost(self.clock.now_ns(), str(error))
 
     def _look(self) -> None:
-        """Once a second: what a person said, and what one should hear."""
+        """Once a second: what a person should hear."""
         now_s = time.monotonic()
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + _WATCH_S
-        for verb, argument in self._box.take() if self._box is not None else ():
-            self.operate(verb, argument)
         capture, now_ns = self.shell.capture, self.clock.now_ns()
         error = "" if capture is None else capture.status.error
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
             self.shell.say(remark.level, remark.text, now_ns)
-        if self._columns is not None and self._columns.fault:
-            self.shell.say(logging.WARNING, self._columns.fault, now_ns)
+        for complaint, before in self._complaints.items():
+            if (text := complaint()) != before:
+                self._complaints[complaint] = text
+                self.shell.say(logging.WARNING, text or f"over: {before}", now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
         if self._public is not None:
             self._public.look(self.shell.core, self._link_facts(error), now_s)
@@ -276,6 +294,11 @@ class Daemon:
             self._lost(now_ns, "no message in what arrives: looking for the rate")
         elif self._watch.silent and device.configure_stream and self._may_query:
             self._lost(now_ns, "silence: asking the device again for its output")
+
+    def _answer(self, event: events.Event) -> None:
+        """Tell a person what became of the word."""
+        if isinstance(event, events.Answered) and event.word and self._words is not None:
+            self._words.answer(event.word, Answer(event.accepted, event.text))
 
     def _link_facts(self, capture_error: str) -> LinkFacts:
         capture, viewer = self.shell.capture, self.shell.viewer
@@ -289,7 +312,9 @@ class Daemon:
             capture_error=capture_error,
             viewer_dropped=0 if counters is None else counters.dropped,
             viewer_fault="" if counters is None else counters.last_fault,
-            interlock={None: "none", True: "safe", False: "not safe"}[self._safe],
+            interlock="none" if self._interlock is None else "safe" if self._safe else "not safe",
+            complaints=tuple(text for text in self._complaints.values() if text),
+            estimator_stuck=self.shell.worker is not None and self.shell.worker.stuck,
         )
 
     # -- the port ----------------------------------------------------------------------------------

@@ -66,6 +66,11 @@ class Errands:
             and self._conversation.may_close
         ) or not self._conversation.limit.patient(self._now_s)
 
+    @property
+    def awaiting_journal(self) -> bool:
+        """Whether the line waits for a record to be on the disk."""
+        return self._awaiting_journal
+
     def add(self, actions: Iterable[Action]) -> None:
         """To the end of the line."""
         self._todo.extend(actions)

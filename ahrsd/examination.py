@@ -7,20 +7,31 @@ block and takes its finding later: in a run another thread does the pieces in th
 that input, and so takes the same decisions from the same findings at the same place.
 
 A calibrator belongs to its pieces: only they may change it.
+
+`supervised` is the one place where whatever breaks off is caught: what the estimator cannot take
+is a state with a reason (`core`), never an end. In a run `Examined` says which piece broke off, so
+that a replay takes the same decision.
 """
 
 from __future__ import annotations
 
+import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.calibrator import Calibrator
-from ahrsd.events import GateResult, Noted
+from ahrsd.events import Failure, GateResult, Noted
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.samples import Array, SampleBlock
+
+PAUSE_S = (5.0, 60.0)  # after a failure, and at most where it fails again soon
+HEALTHY_S = 300.0  # without a failure: the next one is a first one
+_LONGEST_REASON = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,27 +62,84 @@ class Finding:
     gates: tuple[GateResult, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Broken:
+    """A piece that broke off: `calibrator` may be anything now and is used no more."""
+
+    calibrator: Calibrator
+    reason: str
+
+
 class Piece:
     """Work that is done once, by whoever comes first."""
 
-    def __init__(self, make: Callable[[], Finding | None]) -> None:
+    def __init__(self, calibrator: Calibrator, make: Callable[[], Finding | None]) -> None:
+        self.calibrator = calibrator
         self._make = make
-        self._begun = self._done = False
+        self._begun = False
         self._finding: Finding | None = None
+        self._failure: Failure | None = None
 
-    def work(self) -> None:
-        """Do it."""
+    def work(self) -> Failure | None:
+        """Do it; how it broke off, None where it did not."""
         self._begun = True
-        self._finding = self._make()
-        self._done = True
+        self._finding, self._failure = supervised(self._make)
+        return self._failure
 
-    def finding(self) -> Finding | None:
-        """What it brought. Raises RuntimeError where it was begun and broke off."""
+    def finding(self) -> Finding | Broken | None:
+        """What it brought."""
         if not self._begun:
             self.work()
-        if not self._done:
-            raise RuntimeError("the estimate broke off, see above")
+        if self._failure is not None:
+            return Broken(self.calibrator, self._failure.reason)
         return self._finding
+
+
+def supervised(
+    make: Callable[[], Finding | None],
+) -> tuple[Finding | None, Failure | None]:
+    """What `make` returns, or how it broke off."""
+    try:
+        return make(), None
+    except Exception as error:  # noqa: BLE001 - see the module
+        text = " ".join(str(error).split())[:_LONGEST_REASON]
+        reason = f"{type(error).__name__}: {text}" if text else type(error).__name__
+        return None, Failure(reason, traceback.format_exc())
+
+
+class EstimatorState:
+    """Whether the estimator works: after it broke off it rests for a while, then begins anew.
+
+    The pauses are of samples, not of a clock, so that a replay has the same ones.
+    """
+
+    def __init__(self) -> None:
+        self.reason = ""  # of the newest failure
+        self.failures = 0
+        self.left_s = 0.0  # of the pause
+        self._pause_s = PAUSE_S[0]
+        self._since_s = 0.0
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no estimator now."""
+        return self.left_s > 0.0
+
+    def broke_off(self, reason: str) -> None:
+        """It did; soon again means a longer pause."""
+        again = self.failures > 0 and self._since_s < HEALTHY_S
+        self._pause_s = min(2 * self._pause_s, PAUSE_S[1]) if again else PAUSE_S[0]
+        self.reason, self.failures = reason, self.failures + 1
+        self.left_s, self._since_s = self._pause_s, 0.0
+
+    def takes(self, block: SampleBlock) -> bool:
+        """Whether the estimator may have this block, or it falls into a pause."""
+        span_s = float(np.nansum(block.dt_s))
+        if not self.failed:
+            self._since_s += span_s
+            return True
+        self.left_s -= span_s
+        return False
 
 
 class Desk:
@@ -84,21 +152,26 @@ class Desk:
         self, calibrator: Calibrator, block: SampleBlock, circumstances: Circumstances
     ) -> Piece:
         """Let the calibrator take the block and judge."""
-        return self._put(partial(_examined, calibrator, block, circumstances))
+        return self._put(calibrator, partial(_examined, calibrator, block, circumstances))
 
     def compare(self, calibrator: Calibrator, present: Affine, bias_b_rad_s: Array) -> Piece:
         """Tell the calibrator what a candidate must be better than."""
-        return self._put(partial(calibrator.compare_with, present, bias_b_rad_s))
+        return self._put(calibrator, partial(calibrator.compare_with, present, bias_b_rad_s))
 
-    def _put(self, make: Callable[[], Finding | None]) -> Piece:
-        piece = Piece(make)
+    def _put(self, calibrator: Calibrator, make: Callable[[], Finding | None]) -> Piece:
+        piece = Piece(calibrator, make)
         self._pieces.append(piece)
         return piece
 
-    def take(self, pieces: int) -> list[Finding]:
-        """The findings of the oldest pieces; a record that lost some of them may ask for more."""
+    def take(self, pieces: int, broken: str = "") -> list[Finding | Broken]:
+        """The findings of the oldest pieces; a record that lost some of them may ask for more.
+
+        broken: how the last one of them broke off; it is not tried again
+        """
         taken = [self._pieces.popleft() for _ in range(min(pieces, len(self._pieces)))]
-        return [found for piece in taken if (found := piece.finding()) is not None]
+        last = [Broken(taken.pop().calibrator, broken)] if broken and taken else []
+        found = [one for piece in taken if (one := piece.finding()) is not None]
+        return [*found, *last]
 
 
 def _examined(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> Finding:

@@ -85,11 +85,15 @@ class TermsKnown:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason."""
+    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason.
+
+    word: its name, for the answer (`events.Answered`)
+    """
 
     host_ns: int
     verb: str
     argument: str = ""
+    word: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +134,14 @@ class Journalled:
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """So many pieces of the work that is done beside the core are done, oldest first."""
+    """So many pieces of the work that is done beside the core are done, oldest first.
+
+    failure: how the last one of them broke off; empty where none did
+    """
 
     host_ns: int
     pieces: int
+    failure: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ def printable(text: object, longest: int = NAME) -> str:
     r"""The text as one line of at most `longest` characters.
 
     Whatever a terminal would obey or could not show (escapes, new lines, directions of writing,
-    bytes of a file name that are no text) becomes its escape, for example \x1b.
+    bytes of a file name that are no text) becomes its escape, for example \x1b or \n.
     """
     words = str(text)
     if len(words) > longest:  # before anything looks at each character
@@ -18,6 +18,11 @@ def printable(text: object, longest: int = NAME) -> str:
     if words.isprintable():
         return words
     return "".join(char if char.isprintable() else _escape(char) for char in words)
+
+
+def line(text: object) -> str:
+    """The same for a whole line."""
+    return printable(text, LINE)
 
 
 def drawn(text: object, longest: int = NAME) -> str:
@@ -29,4 +34,6 @@ def _escape(char: str) -> str:
     code = ord(char)
     if 0xDC80 <= code <= 0xDCFF:  # how Python holds a byte of a name that is no text
         return f"\\x{code - 0xDC00:02x}"
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 2**16 else "?"
+    if code < 0x100:
+        return char.encode("unicode_escape").decode()
+    return f"\\u{code:04x}" if code < 2**16 else "?"

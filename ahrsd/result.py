@@ -37,13 +37,20 @@ def calibration_json(
     gyro_is_raw: bool = True,
     heading: HeadingErrors | None = None,
     warnings: Sequence[str] = (),
+    serial: int | None = None,
 ) -> dict[str, object]:
-    """The contract's `ahrsd.calibration/1`; `registers` are those in force, empty for unknown."""
+    """The contract's `ahrsd.calibration/1`; `registers` are those in force, empty for unknown.
+
+    serial: of the device that the recording is of, where it says so; with `registers_in_force` it
+    is what `registers write --from` asks before it writes
+    """
     base: dict[str, object] = {
         "schema": "ahrsd.calibration/1",
         "method": method,
         "recording": recording,
         "samples": samples,
+        "device": None if serial is None else {"serial": serial},
+        "registers_in_force": {str(n): list(registers[n]) for n in (MAG, GYRO) if n in registers},
     }
     if estimate is None:
         return base | _nothing(warnings)

@@ -9,7 +9,8 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -22,9 +23,9 @@ from ahrsd.daemon import Daemon, HostClock
 from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.heap import needed_bytes, take_heap
 from ahrsd.interlock import InterlockFile
-from ahrsd.operator_box import OperatorBox
+from ahrsd.operator_box import OperatorBox, OperatorInbox
 from ahrsd.recording.capture import CaptureWriter
-from ahrsd.recording.retention import new_capture_path
+from ahrsd.recording.retention import make_private_folder, new_capture_path
 from ahrsd.rerun_sink import RerunLimits, RerunSink
 from ahrsd.sdnotify import Notifier
 from ahrsd.serial_reader import find_device
@@ -84,7 +85,7 @@ def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
 
 def _open_capture(config: Config, path: Path) -> CaptureWriter:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_private_folder(path.parent)
     except OSError as error:
         raise CaptureError(
             f"{path.parent}: the folder of the captures cannot be made: {error.strerror}; set "
@@ -98,17 +99,14 @@ def _open_capture(config: Config, path: Path) -> CaptureWriter:
     )
 
 
-def _open_box(config: Config) -> OperatorBox | None:
-    """Where a person may speak to the daemon; a run that writes nothing needs none."""
-    if config.mode not in ("stage", "commit"):
+def _open_words(config: Config) -> OperatorInbox | None:
+    """Where a person may speak to the daemon; a run that sends nothing needs none."""
+    if config.mode == "passive":
         return None
     box = OperatorBox(config.state)
-    try:
+    with contextlib.suppress(OSError):  # the inbox says why, and when it is over
         box.prepare()
-    except OSError as error:
-        log.warning("%s cannot be made, nobody can approve: %s", box.folder, error.strerror)
-        return None
-    return box
+    return OperatorInbox(box)
 
 
 def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
@@ -159,10 +157,32 @@ def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudF
         time.sleep(_SEARCH_AGAIN_S)
 
 
-def _interlock(config: Config) -> InterlockFile | None:
-    """The vehicle's word, where one is configured."""
-    path = config.interlock.file
-    return None if path is None else InterlockFile(path, config.interlock.max_age_s)
+@dataclass(slots=True)
+class VehicleFiles:
+    """What the vehicle tells, as far as the configuration names files for it."""
+
+    interlock: InterlockFile | None
+    columns: ColumnsFile | None
+
+    @staticmethod
+    def of(config: Config) -> VehicleFiles:
+        """Begin to look at them."""
+        word, terms = config.interlock, config.terms
+        return VehicleFiles(
+            None if word.file is None else InterlockFile(word.file, word.max_age_s),
+            None if terms.file is None else ColumnsFile(terms.file, terms.max_age_s),
+        )
+
+    def complaints(self) -> list[Callable[[], str]]:
+        """What is wrong with each now."""
+        files = [file for file in (self.interlock, self.columns) if file is not None]
+        return [partial(getattr, file, "fault") for file in files]
+
+    def close(self) -> None:
+        """Look no more."""
+        for file in (self.interlock, self.columns):
+            if file is not None:
+                file.close()
 
 
 def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool = False) -> int:
@@ -187,19 +207,21 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
     capture = new_capture_path(config.captures) if config.capture.enabled else None
     take_heap(needed_bytes(config.estimator.parameters()))
     shell = open_shell(config, clock, capture)
-    box = _open_box(config)
+    words = _open_words(config)
+    vehicle = VehicleFiles.of(config)
     public = open_public(config, shell, notifier)
     daemon = Daemon(
         config,
         shell,
         port,
         clock,
-        _interlock(config),
+        vehicle.interlock,
         baud=found.baud,
-        box=box,
+        words=words,
         public=public,
         terms=terms,
-        columns=None if config.terms.file is None else ColumnsFile(config.terms.file),
+        columns=vehicle.columns,
+        complaints=[*vehicle.complaints(), *([] if words is None else [lambda: words.fault])],
     )
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
     sys.setswitchinterval(SWITCH_S)
@@ -207,6 +229,9 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
         with _signals(daemon.stop):
             daemon.run()
     finally:
+        vehicle.close()
+        if words is not None:
+            words.close(_LEAST_S)
         public.close()
         close_shell(shell, (daemon.stopped_s or time.monotonic()) + _EXIT_S)
     for line in summary_lines(shell.core, str(capture or port)):

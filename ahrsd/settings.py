@@ -8,8 +8,11 @@ from ahrsd.calibrator import CalibratorSettings
 from ahrsd.config import Config
 from ahrsd.core_settings import CoreSettings
 from ahrsd.errors import ConfigError
+from ahrsd.foreign_file import text_within
 from ahrsd.worldfield import WorldField, world_field
 from ahrsd.writeback.policy import WriteBackPolicy
+
+_LARGEST_MODEL_BYTES = 16 << 20
 
 
 def with_date(config: Config) -> Config:
@@ -65,10 +68,8 @@ def terms_text(config: Config) -> str:
     from ahrsd.mismatch.model_file import from_text  # takes 50 MB: only where there is a model
 
     try:
-        text = path.read_text(encoding="utf-8")
+        text = text_within(path, _LARGEST_MODEL_BYTES)
         from_text(text)
-    except OSError as error:
-        raise ConfigError([f"terms.model = {path}: cannot be read: {error.strerror}"]) from error
     except ValueError as error:
         raise ConfigError([f"terms.model = {path}: {error}"]) from error
     return text

@@ -54,10 +54,17 @@ def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> di
             gyro_is_raw=not core.stream.compensated_gyro,
             heading=heading_errors(core),
             warnings=said_of(core, warnings),
+            serial=serial_of(core),
         ),
         "decisions": core.decisions.entries,
         "decision_sha256": core.decisions.sha256,
     }
+
+
+def serial_of(core: Core) -> int | None:
+    """Serial number of the device that the recording is of; None where it does not say."""
+    identity = core.conversation.identity
+    return None if identity is None else identity.serial
 
 
 def said_of(core: Core, warnings: Iterable[str] = ()) -> list[str]:

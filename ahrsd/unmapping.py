@@ -33,6 +33,10 @@ MAG, ACCEL, GYRO, ROTATION, HSI_CONTROL, HSI_RESULT = 23, 25, 84, 26, 44, 47
 HSI_APPLIED: Final = 3  # register 44, field Output
 EPOCHS_KEPT: Final = 64
 SATURATED_MAG_OR_GYRO: Final = 0b1_1100_0111  # SensSat bits 0-2 and 6-8
+IMPOSSIBLE_GAUSS: Final = (
+    50.0  # the sensor ends at 2.5, corrections are at most some times as large
+)
+IMPOSSIBLE_RAD_S: Final = 5000.0  # it ends at 35; degrees per second are another matter
 AXES: Final = ("x", "y", "z")
 
 RegisterValues = Mapping[int, tuple[float | int | str, ...]]
@@ -214,8 +218,8 @@ class MissingQuantityError(ValueError):
 class Extracted:
     """N messages of one layout as arrays, still as the device sent them.
 
-    time_s is None where the layout has no TimeStartup; usable (N,) is false for saturated and
-    non-finite samples.
+    time_s is None where the layout has no TimeStartup; usable (N,) is false for samples that are
+    saturated, not finite, or beyond anything that the sensors can read.
     """
 
     time_s: Array | None
@@ -291,7 +295,9 @@ class Extractor:
     def extract_table(self, table: Array) -> Extracted:
         """The same from an (N, columns) table, as a batch decoder yields it."""
         mag, gyro = table[:, self._mag], table[:, self._gyro]
-        usable = np.asarray(np.isfinite(np.hstack([mag, gyro])).all(axis=1), dtype=np.bool_)
+        with np.errstate(invalid="ignore"):  # nan is not possible either
+            possible = (np.abs(mag) < IMPOSSIBLE_GAUSS) & (np.abs(gyro) < IMPOSSIBLE_RAD_S)
+        usable = np.asarray(possible.all(axis=1), dtype=np.bool_)
         if self._saturation is not None:
             flags = np.nan_to_num(table[:, self._saturation]).astype(np.int64)
             usable = np.logical_and(usable, (flags & SATURATED_MAG_OR_GYRO) == 0)

@@ -41,7 +41,7 @@ from ahrsd.inputs import (
 )
 from ahrsd.recording import inputs_json
 from ahrsd.recording.capture import CaptureReader, CaptureWriter, Sent, part_path
-from ahrsd.recording.retention import new_capture_path
+from ahrsd.recording.retention import make_private_folder, new_capture_path
 from ahrsd.samples import SampleBlock
 
 EVERY_INPUT: list[Input] = [
@@ -378,3 +378,27 @@ def test_nothing_grows_with_the_file(tmp_path):
         wait_until(lambda: writer.status.queued_bytes == 0)
         assert len(writer._queue) == 0
     assert threading.active_count() == threads - 1
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
+def test_a_capture_and_its_folder_are_for_their_owner_alone(tmp_path, umask):
+    """It holds where the vehicle was."""
+    before = os.umask(umask)
+    try:
+        folder = tmp_path / "state" / "captures"
+        make_private_folder(folder)
+        with CaptureWriter(folder / "a.mcap", {}, part_bytes=1) as writer:
+            writer.write(Received(1, b"x" * 100))
+            wait_until(lambda: writer.status.records == 1, 60.0)
+            writer.write(Received(2, b"y"))
+    finally:
+        os.umask(before)
+    modes = {path.name: path.stat().st_mode & 0o777 for path in folder.iterdir()}
+    assert modes == {"a.mcap": 0o600, "a.part2.mcap": 0o600}
+    assert [p.stat().st_mode & 0o777 for p in (folder, folder.parent)] == [0o700, 0o700]
+
+
+def test_a_folder_that_exists_keeps_its_mode(tmp_path):
+    tmp_path.chmod(0o755)
+    make_private_folder(tmp_path)
+    assert tmp_path.stat().st_mode & 0o777 == 0o755

@@ -196,6 +196,29 @@ class TestLogs:
     def test_journald_gets_the_priority_and_no_time(self):
         assert self.line(True, baud=1) == "<4>daemon: port open baud=1"
 
+    @pytest.mark.parametrize("journald", [False, True])
+    def test_no_text_of_others_begins_a_line_or_moves_the_cursor(self, journald):
+        record = logging.LogRecord(
+            "ahrsd", logging.INFO, "f", 1, "operator: lock %s",
+            ("x\n<2>ahrsd: all is well\r\x1b[2J\x9b1A\u202eyes",), None,
+        )  # fmt: skip
+        vars(record).update(logs.facts(name="a\n<7>b"))
+        line = logs.FactsFormatter(journald).format(record)
+        assert "\n" not in line
+        assert line.isprintable()
+        assert r"lock x\n<2>ahrsd: all is well\r\x1b[2J\x9b1A\u202eyes name='a\n<7>b'" in line
+
+    def test_each_line_of_a_traceback_has_the_priority(self):
+        record = logging.LogRecord("ahrsd", logging.ERROR, "f", 1, "it broke off", (), None)
+        record.trace = "Traceback\n  File x\nValueError: a\x1b\n"
+        lines = logs.FactsFormatter(True).format(record).split("\n")
+        assert lines == [
+            "<3>ahrsd: it broke off",
+            "<3>Traceback",
+            "<3>  File x",
+            r"<3>ValueError: a\x1b",
+        ]
+
     def test_verbosity(self, monkeypatch):
         stream = io.StringIO()
         monkeypatch.setattr(sys, "stderr", stream)

@@ -9,14 +9,15 @@ import time
 
 import numpy as np
 import pytest
+from planted_operator import Operator
 
 from ahrsd import host_clock
-from ahrsd.calibration import Estimate, Observability
-from ahrsd.events import GateResult, SamplesSeen, StateChanged
-from ahrsd.inputs import LinkLost, WallClock
+from ahrsd.config import Config
+from ahrsd.events import SamplesSeen
+from ahrsd.inputs import Examined, LinkLost, WallClock
 from ahrsd.recording.capture import CaptureReader
+from ahrsd.replay import replay
 from ahrsd.shell import FoldedLog
-from ahrsd.writeback.states import State
 
 OWN_STREAM = {"configure_stream": True, "rate_hz": 50.0}
 LIMIT_S = 3.0
@@ -72,37 +73,6 @@ def test_observe_sends_register_reads_only(live):
         sent = bytes(daemon.heard).split(b"\r\n")
         assert len(sent) > 20
         assert all(re.fullmatch(READ, line) for line in sent if line)
-
-
-def estimate():
-    return Estimate(
-        np.diag([1.1, 1.0, 1 / 1.1]), np.array([0.03, 0.04, -0.02]), np.array([0.01, -0.02, 0.01]),
-        0.48, False, np.eye(12) * 1e-6, 1e-3, 1e-3, 1.0, 0.1,
-        Observability(np.full(12, 0.01), (), 10.0), 10_000, 300.0, True,
-    )  # fmt: skip
-
-
-class Operator:
-    """Slips a candidate under the core, approves it, and acts at one state."""
-
-    def __init__(self, live, at, act):
-        self.live, self.at, self.act = live, at, act
-        self.proposed = self.acted = False
-        live.shell.listeners.append(self)
-
-    def __call__(self, event):
-        core = self.live.core
-        if isinstance(event, SamplesSeen) and not self.proposed:
-            self.proposed = core.writeback.state is State.OBSERVING
-            if self.proposed:
-                green = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
-                core._errands.add(core.writeback.on_verdict(estimate(), green, 1.0, core._host_s))
-                core._judged = lambda *_: None  # what the gates truly say would end it
-        elif isinstance(event, StateChanged) and event.new == State.QUALIFIED:
-            self.live.daemon.operate("approve", core.writeback.proposal.id)
-        if isinstance(event, StateChanged) and event.new == self.at and not self.acted:
-            self.acted = True
-            self.act()
 
 
 @pytest.mark.parametrize(
@@ -226,15 +196,23 @@ def test_a_bug_in_a_transaction_leaves_the_output_on(live):
         assert daemon.heard.rstrip().split(b"\r\n")[-1].startswith(b"$VNASY,1")
 
 
-def test_a_bug_in_the_estimator_ends_the_run_and_leaves_the_device_as_it_was(live, monkeypatch):
-    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+def test_a_bug_in_the_estimator_is_a_state_and_the_run_goes_on(live, caplog):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         daemon.core.calibrator.take = None
-        daemon.ended()
-        assert "the estimate broke off" in str(daemon.error)
+        daemon.until(lambda: daemon.core.estimator.failures)
+        assert daemon.noted("ESTIMATOR FAILED: TypeError: 'NoneType' object is not callable")
+        second = daemon.core.calibrator
+        daemon.flowing()
+        daemon.until(lambda: second.started, 30.0)
+        assert daemon.stop() < LIMIT_S
+        assert daemon.error is None
         assert daemon.emulator.memory.ram == daemon.before
-        assert streaming(daemon)
+    assert caplog.text.count("Traceback") == 1
+    recorded = [i.failure for i in CaptureReader(daemon.capture) if isinstance(i, Examined)]
+    assert [text for text in recorded if text] == ["TypeError: 'NoneType' object is not callable"]
+    again = replay(daemon.capture, Config())
+    assert again.core.decisions.sha256 == daemon.core.decisions.sha256
 
 
 def test_samples_go_on_while_the_estimator_is_at_it(live):

@@ -12,7 +12,7 @@ from writeback_rig import estimate
 
 from ahrsd.config import Config
 from ahrsd.journal import Journal, journal_path
-from ahrsd.operator_box import OperatorBox
+from ahrsd.operator_box import Answer, OperatorBox, OperatorInbox
 from ahrsd.settings import core_settings
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
@@ -86,22 +86,31 @@ def vars_of(record):
 def test_where_a_daemon_runs_it_is_told_and_its_journal_is_left_alone(here, tmp_path, capsys):
     box, words, done = OperatorBox(tmp_path), [], threading.Event()
     box.prepare()
+    inbox = OperatorInbox(box)
+    while inbox._looked_s is None:
+        done.wait(0.01)
 
     def daemon():
         while not done.wait(0.01):
-            words.extend(box.take())
+            for word in inbox.take():
+                words.append((word.verb, word.argument))
+                inbox.answer(word.name, Answer(word.argument != "again", "said"))
 
     thread = threading.Thread(target=daemon)
     thread.start()
     try:
         assert here("registers", "lock", "crew aboard") == 0
         assert here("registers", "unlock", "gone") == 0
+        assert here("registers", "lock", "again") == 1
     finally:
         done.set()
         thread.join()
-    assert words == [("lock", "crew aboard"), ("unlock", "gone")]
+        inbox.close(10.0)
+    assert words == [("lock", "crew aboard"), ("unlock", "gone"), ("lock", "again")]
     assert list(tmp_path.glob("*.jsonl")) == []
-    assert "the daemon heard it" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "the daemon heard it" in said.out
+    assert "the daemon refused: said" in said.err
 
 
 def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, capsys):
@@ -140,7 +149,7 @@ def test_a_daemon_that_is_gone_leaves_its_folder_and_the_journal_takes_the_word(
     OperatorBox(tmp_path).prepare()
     assert here("registers", "lock", "crew aboard", "--serial", SERIAL) == 0
     assert kinds(tmp_path) == ["LOCKED"]
-    assert OperatorBox(tmp_path).take() == []
+    assert list(OperatorBox(tmp_path).folder.iterdir()) == []
 
 
 def test_of_several_devices_one_must_be_named(here, tmp_path, capsys):

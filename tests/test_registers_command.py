@@ -235,3 +235,113 @@ def test_diff_of_what_is_no_set_of_registers(
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1
+
+
+# -- write --from ----------------------------------------------------------------------------------
+
+
+def calibration(folder, **changes):
+    body = {
+        "schema": "ahrsd.calibration/1", "converged": True, "warnings": [],
+        "device": {"serial": SERIAL},
+        "registers": {"23": list(NEW_VALUES), "84": [*FACTORY[:9], 0.01, 0, 0]},
+        "registers_in_force": {"23": list(FACTORY), "84": list(FACTORY)},
+    }  # fmt: skip
+    path = folder / "calibration.json"
+    path.write_text(json.dumps(body | changes))
+    return path
+
+
+@pytest.fixture
+def write_from(run, tmp_path):
+    def call(port, path, *options):
+        words = ("registers", "write", port, "--from", path, "--state-directory", tmp_path)
+        return run(*words, *BAUD, *options)
+
+    return call
+
+
+def test_a_calibration_is_written_whole_journaled_and_can_be_undone(
+    run, write_from, emulated, tmp_path, capsys
+):
+    with emulated() as (emulator, port):
+        before = {n: emulator.memory.get(n) for n in (23, 84)}
+        path = calibration(tmp_path)
+        assert write_from(port, path) == 2  # only said
+        assert {n: emulator.memory.get(n) for n in (23, 84)} == before
+        assert write_from(port, path, "--yes") == 0
+        assert ram(emulator) == NEW_VALUES
+        assert ram(emulator, 84) == (*FACTORY[:9], 0.01, 0.0, 0.0)
+        assert emulator.counters["saves"] == 0
+        assert write_from(port, path, "--yes") == 0  # it holds them already
+        assert "holds the wanted values already" in capsys.readouterr().out
+        assert run("registers", "rollback", port, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+        assert {n: emulator.memory.get(n) for n in (23, 84)} == before
+    records = Journal.open(journal_path(tmp_path, SERIAL)).records()
+    assert [r.kind for r in records] == ["HAND_PREPARED", "HAND_VERIFIED"] * 2
+    assert records[0].facts["calibration"] == "calibration.json"
+
+
+FLIPPED = [-1.0, *FACTORY[1:]]
+FAR = [*FACTORY[:9], 1.4, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema": "ahrsd.registers/1"}, "is no calibration.json"),
+        ({"converged": False, "warnings": ["turn further"]}, "may be written: turn further"),
+        ({"registers": {}}, "nothing that may be written"),
+        ({"registers": {"6": [0]}}, "has no register 23"),
+        ({"registers": {"23": [1, 2]}}, "registers 23: "),
+        ({"registers": {"23": ["nan", *FACTORY[1:]]}}, "registers 23: "),
+        ({"registers": {"23": FLIPPED}}, "register 23 holds no usable calibration"),
+        ({"registers": {"23": FAR}}, "hard iron 1.40 gauss, limit 1.3"),
+        ({"registers_in_force": {}}, "nobody knows which registers were in force"),
+        ({"registers_in_force": {"23": list(NEW_VALUES), "84": list(FACTORY)},
+          "registers": {"84": [*FACTORY[:9], 0.01, 0, 0]}},
+         "register 23 of the device is not what was in force"),
+        ({"device": None}, "does not say of which device it is; give --serial"),
+        ({"device": {"serial": 7}}, f"is of the device 7, and this one is {SERIAL}"),
+    ],
+)  # fmt: skip
+def test_what_may_not_be_written_is_one_line(
+    write_from, emulated, tmp_path, capsys, changes, words
+):
+    with emulated() as (emulator, port):
+        before = dict(emulator.memory.ram)
+        assert write_from(port, calibration(tmp_path, **changes), "--yes") in (1, 2)
+        assert emulator.memory.ram == before
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    assert kinds(tmp_path) == []
+
+
+def test_a_person_may_say_which_device_it_is(write_from, emulated, tmp_path, capsys):
+    path = calibration(tmp_path, device=None)
+    with emulated() as (emulator, port):
+        assert write_from(port, path, "--serial", 7, "--yes") == 2
+        assert write_from(port, path, "--serial", SERIAL, "--yes") == 0
+        assert ram(emulator) == NEW_VALUES
+    path = calibration(tmp_path)
+    assert write_from("/dev/null", path, "--serial", 7, "--yes") == 2
+    assert f"is of the device {SERIAL}, not of 7" in capsys.readouterr().err
+
+
+def test_a_lock_holds_for_a_calibration_too(run, write_from, emulated, tmp_path, capsys):
+    with emulated() as (emulator, port):
+        assert run("registers", "lock", "crew aboard", "--serial", SERIAL,
+                   "--state-directory", tmp_path) == 0  # fmt: skip
+        before = dict(emulator.memory.ram)
+        assert write_from(port, calibration(tmp_path), "--yes") == 1
+        assert emulator.memory.ram == before
+    assert "locked: crew aboard" in capsys.readouterr().err
+
+
+def test_either_values_or_a_file(run, tmp_path):
+    path = calibration(tmp_path)
+    assert run("registers", "write", "/dev/null", 23, *NEW, "--from", path) == 2
+    assert run("registers", "write", "/dev/null") == 2
+    assert run("registers", "write", "/dev/null", 23) == 2
+    assert run("registers", "write", "/dev/null", 222, *NEW) == 2

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -146,21 +146,38 @@ def test_the_core_calibrates_as_if_the_current_were_off():
 
 def test_the_file_is_read_once_and_says_what_is_wrong_with_it(tmp_path):
     path = tmp_path / "columns"
-    file = ColumnsFile(path)
+    file = ColumnsFile(path, 60.0)
+    until(lambda: "No such file" in file.fault)
     assert file.news() is None
-    assert "No such file" in file.fault
-    path.write_text('{"motor_current_a": 3.2, "rudder_deg": -4}')
-    assert file.news() == {"motor_current_a": 3.2, "rudder_deg": -4.0}
+    path.write_text("{}")
+    until(lambda: file.fault == "")
+    assert file.news() is None  # nobody knows when it was written
+    rewrite(path, '{"motor_current_a": 3.2, "rudder_deg": -4}')
+    found = []
+    until(lambda: found.append(file.news()) or found[-1])
+    assert found[-1] == {"motor_current_a": 3.2, "rudder_deg": -4.0}
     assert (file.news(), file.fault) == (None, "")
-    for k, (text, words) in enumerate(
-        [("", "is not JSON"), ("[1]", "object of numbers"), ('{"a": NaN}', "object of numbers"),
-         ('{"a": true}', "object of numbers"), ("[" * 4000, "is not JSON"),
-         ('{"a": 1' + "0" * 400 + "}", "object of numbers")]
+    for text, words in (
+        ("", "is not JSON"), ("[1]", "object of numbers"), ('{"a": NaN}', "object of numbers"),
+        ('{"a": true}', "object of numbers"), ("[" * 4000, "is not JSON"),
+        ('{"a": 1' + "0" * 400 + "}", "object of numbers"),
     ):  # fmt: skip
-        path.write_text(text)
-        os.utime(path, ns=(k, k))
-        assert file.news() is None
-        assert words in file.fault
+        rewrite(path, text)
+        until(lambda words=words: file.news() is None and words in file.fault)
+    file.close()
+
+
+def until(condition):
+    end = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.005)
+
+
+def rewrite(path, text):
+    draft = path.with_name(".draft")
+    draft.write_text(text)
+    draft.rename(path)
 
 
 def test_a_configured_model_must_be_one(tmp_path):

@@ -17,7 +17,9 @@ from ahrsd.calibration import Estimate, Observability
 from ahrsd.config import Config
 from ahrsd.core import Core
 from ahrsd.events import Examine
+from ahrsd.examination import EstimatorState, Piece
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
+from ahrsd.samples import SampleBlock
 from ahrsd.serving.public import Public
 from ahrsd.settings import core_settings
 from ahrsd.worker import MOST_WAITING, Worker
@@ -50,46 +52,43 @@ def test_work_is_done_in_order_and_counted_once(worker):
 
     def all_counted():
         nonlocal counted
-        counted += worker.take_done()
+        counted += sum(pieces for pieces, _ in worker.take_done())
         return counted == 20
 
     wait(all_counted)
     assert done == list(range(20))
     assert woken.is_set()
-    assert worker.take_done() == 0
+    assert worker.take_done() == []
 
 
-def test_who_gives_too_much_waits(worker):
-    gate, given = threading.Event(), []
-
-    def give():
-        for k in range(MOST_WAITING + 1):
-            worker.put(gate.wait)
-            given.append(k)
-
-    giver = threading.Thread(target=give)
-    giver.start()
-    wait(lambda: len(given) == MOST_WAITING)
-    giver.join(0.3)
-    assert len(given) == MOST_WAITING
+def test_giving_never_waits_and_who_gives_too_much_is_told(worker):
+    gate = threading.Event()
+    for _ in range(MOST_WAITING):
+        assert not worker.full
+        worker.put(lambda: gate.wait() and None)
+    assert worker.full
+    worker.put(lambda: None)  # whoever gives all the same is not held up
+    worker.wait_for_room(0.05)
+    assert worker.full
     gate.set()
-    giver.join(5.0)
-    assert len(given) == MOST_WAITING + 1
+    wait(lambda: not worker.full)
+    worker.wait_for_room(60.0)  # there is room: at once
 
 
 def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch):
     monkeypatch.setattr("ahrsd.worker._STUCK_S", 0.05)
     gate = threading.Event()
     assert not worker.stuck
-    worker.put(gate.wait)
+    worker.put(lambda: gate.wait() and None)
     wait(lambda: worker.stuck)
-    for _ in range(2 * MOST_WAITING):  # does not wait: the service manager will end it
+    for _ in range(2 * MOST_WAITING):
         worker.put(lambda: None)
+    assert not worker.full  # bytes are taken all the same: the service manager will end it
     gate.set()
     wait(lambda: not worker.stuck)
 
 
-def test_work_that_breaks_off_is_told(worker, monkeypatch):
+def test_a_thread_that_ended_is_told(worker, monkeypatch):
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
     worker.put(lambda: 1 / 0)
 
@@ -97,7 +96,7 @@ def test_work_that_breaks_off_is_told(worker, monkeypatch):
         try:
             worker.take_done()
         except RuntimeError as error:
-            return "broke off" in str(error)
+            return "the estimator's thread ended" in str(error)
         return False
 
     wait(told)
@@ -229,3 +228,132 @@ def test_a_verdict_on_registers_that_are_in_force_no_more_writes_nothing():
     run.run(5.0)
     assert run.writes == 0
     assert "QUALIFIED" not in run.states
+
+
+# -- what breaks off -------------------------------------------------------------------------------
+
+
+def broken(*_):
+    raise np.linalg.LinAlgError("Singular matrix")
+
+
+REASON = "LinAlgError: Singular matrix"
+
+
+def failures(run):
+    return [e for e in run.core.decisions.entries if e["state"] == "ESTIMATOR FAILED"]
+
+
+def break_off(run: BesideRun) -> None:
+    """Let the next piece of the calibrator break off, and its successors work again."""
+    run.core.calibrator.take = broken
+    run.run(1.0)
+    done, failure = 0, None
+    while run.waiting and failure is None:
+        failure = run.waiting.popleft().work()
+        done += 1
+    assert failure is not None
+    assert failure.reason == REASON
+    assert "Traceback" in failure.trace
+    run.feed(Examined(run.now_ns, done, failure.reason))
+    run.work()
+
+
+def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
+    run = BesideRun()
+    run.run(5.0)
+    run.work()
+    first = run.core.calibrator
+    break_off(run)
+    assert run.core.estimator.failed
+    assert (run.core.estimator.reason, run.core.estimator.failures) == (REASON, 1)
+    assert ("error", f"ESTIMATOR FAILED: {REASON}; it begins anew in 5 s") in run.notes
+    assert len(failures(run)) == 1
+    second, samples = run.core.calibrator, run.core.stream.facts.samples
+    assert second is not first
+    run.run(3.0)  # the pause: samples go on
+    run.work()
+    assert run.core.stream.facts.samples > samples
+    assert not second.started
+    run.run(4.0)
+    run.work()
+    assert not run.core.estimator.failed
+    assert second.started
+
+
+def test_a_replay_fails_at_the_same_place_without_failing_itself():
+    run = BesideRun()
+    run.run(5.0)
+    run.work()
+    break_off(run)
+    run.run(20.0)
+    run.work()
+    again = Core(run.core.settings)
+    for item in run.fed:
+        again.handle(item)
+    assert len(failures(run)) == 1
+    assert again.decisions.sha256 == run.core.decisions.sha256
+    assert again.estimator.failures == 1
+
+
+def test_soon_again_means_a_longer_pause():
+    state = EstimatorState()
+    pauses = []
+    for _ in range(6):
+        state.broke_off(REASON)
+        pauses.append(state.left_s)
+        while state.failed:
+            state.takes(second())
+    assert pauses == [5.0, 10.0, 20.0, 40.0, 60.0, 60.0]
+    for _ in range(301):
+        assert state.takes(second())
+    state.broke_off(REASON)
+    assert state.left_s == 5.0
+
+
+def second() -> SampleBlock:
+    return SampleBlock(*([np.full(4, 0.25)] * 3), *([np.zeros((4, 3))] * 3))
+
+
+@pytest.mark.parametrize("state", ["QUALIFIED", "TRIAL"])
+def test_nothing_is_written_from_an_estimator_that_failed(state):
+    run = candidate(BesideRun(Mode.STAGE if state == "TRIAL" else Mode.OBSERVE))
+    run.work()
+    if state == "TRIAL":
+        assert run.until(lambda: run.core.writeback.state.value == "TRIAL", 20.0), run.states
+        before = run.states.count("ROLLED_BACK")
+        run.core.calibrator.take = broken
+        run.run(2.0)
+        fail_waiting(run)
+        assert run.until(lambda: run.states.count("ROLLED_BACK") > before, 20.0), run.states
+        assert run.core.writeback.history.open is None
+    else:
+        assert run.core.writeback.proposal is not None
+        run.core.calibrator.take = broken
+        run.run(1.0)
+        fail_waiting(run)
+    assert run.core.writeback.proposal is None
+    assert "no gate has judged yet" in run.core.writeback.holds()
+
+
+def fail_waiting(run: BesideRun) -> None:
+    done, failure = 0, None
+    while run.waiting and failure is None:
+        failure = run.waiting.popleft().work()
+        done += 1
+    assert failure is not None
+    run.feed(Examined(run.now_ns, done, failure.reason))
+
+
+def test_the_worker_goes_on_after_what_broke_off_and_logs_it_once(worker, caplog):
+    done = []
+    for k in range(6):
+        piece = Piece(None, broken if k in (1, 3) else lambda k=k: done.append(k))
+        worker.put(piece.work)
+    batches = []
+    wait(lambda: batches.extend(worker.take_done()) or sum(n for n, _ in batches) == 6)
+    assert done == [0, 2, 4, 5]
+    ends = np.cumsum([n for n, _ in batches]).tolist()
+    assert [end for end, (_, reason) in zip(ends, batches, strict=True) if reason] == [2, 4]
+    assert caplog.text.count("the estimator broke off: LinAlgError: Singular matrix") == 1
+    assert "Traceback" in caplog.text

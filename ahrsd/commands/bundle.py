@@ -18,14 +18,15 @@ from ahrsd.errors import AhrsdError, DeviceError
 def command(output: Path, place: Place) -> None:
     """Collect journal, newest capture, configuration, status and versions into one archive.
 
-    It works beside a running daemon and without one. The capture holds where the sensor was turned
-    to, and the location if one is configured: look before you pass it on.
+    It works beside a running daemon and without one. Links, FIFOs and devices are never opened, of
+    large files only a part is taken, and what was left out is printed. The capture holds where the
+    sensor was turned to, and the location if one is configured: look before you pass it on.
     """
-    from ahrsd.bundle import FORMATS, format_of, write_bundle
+    from ahrsd.bundle import collect, format_of, write_bundle
     from ahrsd.config_text import print_config
+    from ahrsd.printable import line
 
-    if format_of(output) is None:
-        raise AhrsdError(f"{output}: the archive's name must end in {', '.join(FORMATS)}")
+    format_of(output)
     refuse_unwritable(output)
     try:
         with place.connect() as daemon:
@@ -35,11 +36,14 @@ def command(output: Path, place: Place) -> None:
         status = None
     config = place.config.model_copy(update={"state_directory": place.state})
     try:
-        inside = write_bundle(output, config.state, config.captures, print_config(config), status)
+        bundle = collect(config.state, config.captures, print_config(config), status)
+        write_bundle(output, bundle)
     except OSError as error:
         raise AhrsdError(f"{output}: cannot be written: {error.strerror}") from None
     for what, folder in (("journal/", config.state), ("captures/", config.captures)):
-        if not any(name.startswith(what) for name in inside):
+        if not any(name.startswith(what) for name in bundle.parts):
             click.echo(f"no {what.rstrip('s/')} in the archive: {folder} has none", err=True)
     size = output.stat().st_size
-    click.echo(f"{output}: {size / 1e6:.1f} MB: {', '.join(inside)}")
+    click.echo(line(f"{output}: {size / 1e6:.1f} MB: {', '.join(bundle.parts)}"))
+    for text in bundle.left_out:
+        click.echo(line(f"left out: {text}"))

@@ -17,7 +17,7 @@ from ahrsd.commands.register_sources import journals
 from ahrsd.config import default_state_directory
 from ahrsd.errors import DeviceError, JournalError
 from ahrsd.journal import Journal, journal_path
-from ahrsd.operator_box import OperatorBox
+from ahrsd.operator_box import OperatorBox, OperatorFolderError, Unanswered
 from ahrsd.serving.client import Asked, default_socket_path
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.reconcile import Kind
@@ -81,9 +81,16 @@ def _daemon_heard(verb: str, reason: str, state: Path) -> bool:
     """Whether a daemon runs and took the word. A folder that may not be written: JournalError."""
     box = OperatorBox(state)
     try:
-        return box.folder.is_dir() and box.heard(verb, reason, _WAIT_S)
+        answer = box.say(verb, reason, _WAIT_S) if box.folder.is_dir() else None
+    except Unanswered as error:
+        raise JournalError(f"the daemon {error}; see `ahrsd status`") from None
+    except OperatorFolderError as error:
+        raise JournalError(str(error)) from None
     except OSError as error:
         raise JournalError(f"{box.folder}: {error.strerror}; try as root") from None
+    if answer is not None and not answer.accepted:
+        raise JournalError(f"the daemon refused: {answer.text}")
+    return answer is not None
 
 
 def _daemons_device(state: Path) -> int | None:

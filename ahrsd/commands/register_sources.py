@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from ahrsd.commands.device_access import open_device, read_all
 from ahrsd.commands.register_changes import Changes, to_write
 from ahrsd.errors import AhrsdError, JournalError
+from ahrsd.foreign_file import ForeignFileError, read_regular
 from ahrsd.journal import Journal, Record, journal_path, register_values
-from drivers.vn100.procedures import Identity
-from drivers.vn100.registers import REGISTERS
+from ahrsd.writeback.composition import GYRO, MAG, UnwritableError, refuse_unsafe
+from drivers.vn100.device import Device
+from drivers.vn100.procedures import Identity, read_registers
+from drivers.vn100.registers import REGISTERS, RegisterValueError, format_command, parse
+
+_LARGEST_BYTES = 4 << 20
+_SERIAL, _HSI_CONTROL, _HSI_APPLIED = 3, 44, 3
 
 
 def journals(state: Path, file: Path | None, serial: int | None) -> list[Path]:
@@ -99,6 +105,85 @@ class Sources:
             names = ", ".join(path.name for path in paths)
             raise JournalError(f"{self.state}: several journals ({names}); say which by --journal")
         return register_values(find(Journal.open(paths[0]), int(number)), which or "old")
+
+
+def calibrated(
+    path: Path, serial: int | None
+) -> Callable[[Device, Journal], tuple[Changes, Mapping[str, object]]]:
+    """What `registers write --from` wants of a device: the registers of a calibration.json.
+
+    Raises AhrsdError here where the file may not be written to any device, and later, from what is
+    returned, where it may not be written to this one.
+    """
+    body = _calibration(path)
+    new, in_force = (_registers_in(path, body, key) for key in ("registers", "registers_in_force"))
+    try:
+        refuse_unsafe({**in_force, **new})
+        for number, values in new.items():
+            format_command(number, values)
+    except (UnwritableError, RegisterValueError) as error:
+        raise AhrsdError(f"{path}: {error}") from error
+    device = body.get("device")
+    recorded = device.get("serial") if isinstance(device, dict) else None
+    if recorded is not None and serial not in (None, recorded):
+        raise AhrsdError(f"{path}: is of the device {recorded}, not of {serial}")
+    meant = serial if recorded is None else recorded
+    if meant is None:
+        raise AhrsdError(f"{path}: does not say of which device it is; give --serial NUMBER")
+
+    def wanted(device: Device, _journal: Journal) -> tuple[Changes, Mapping[str, object]]:
+        (found,) = device.run(read_registers((_SERIAL,)))[_SERIAL]
+        if found != meant:
+            raise AhrsdError(f"{path}: is of the device {meant}, and this one is {found}")
+        if device.run(read_registers((_HSI_CONTROL,)))[_HSI_CONTROL][1] == _HSI_APPLIED:
+            raise AhrsdError("the on-board estimator is applied; set register 44 to 0,1,5")
+        present = device.run(read_registers(in_force))
+        for number in to_write(present, in_force):
+            if number not in new or to_write(present, {number: new[number]}):
+                raise AhrsdError(
+                    f"{path}: register {number} of the device is not what was in force when it was "
+                    "recorded; record again and calibrate anew"
+                )
+        return new, {"reason": "write", "calibration": path.name}
+
+    return wanted
+
+
+def _calibration(path: Path) -> dict[str, object]:
+    """A calibration that determines something. Raises AhrsdError."""
+    try:
+        body = json.loads(read_regular(path, _LARGEST_BYTES).data)
+    except ForeignFileError as error:
+        raise AhrsdError(f"{path}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise AhrsdError(f"{path}: is not JSON: {error}") from error
+    if not isinstance(body, dict) or body.get("schema") != "ahrsd.calibration/1":
+        raise AhrsdError(f"{path}: is no calibration.json of `ahrsd calibrate`")
+    if body.get("converged") is not True or not body.get("registers"):
+        warnings = body.get("warnings")
+        why = "; ".join(map(str, warnings)) if isinstance(warnings, list) else ""
+        raise AhrsdError(f"{path}: nothing that may be written: {why or 'it has not converged'}")
+    if not body.get("registers_in_force"):
+        raise AhrsdError(
+            f"{path}: nobody knows which registers were in force when it was recorded; record with "
+            "`ahrsd capture` or `ahrsd run`, which read them"
+        )
+    return body
+
+
+def _registers_in(path: Path, body: Mapping[str, object], key: str) -> Changes:
+    found, values = body[key], {}
+    for number in (MAG, GYRO):
+        row = found.get(str(number)) if isinstance(found, dict) else None
+        if row is not None:
+            try:
+                values[number] = parse(number, [str(value) for value in row])
+            except (RegisterValueError, TypeError) as error:
+                raise AhrsdError(f"{path}: {key} {number}: {error}") from error
+    missing = [n for n in (MAG, GYRO) if n not in values]
+    if not values or (key == "registers_in_force" and missing):
+        raise AhrsdError(f"{path}: {key} has no register {missing[0]}")
+    return values
 
 
 def _is_port(name: str) -> bool:

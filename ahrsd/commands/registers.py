@@ -14,7 +14,7 @@ from ahrsd.commands import register_locks
 from ahrsd.commands.device_access import PORT, describe, open_device
 from ahrsd.commands.json_output import refuse_unwritable, write_text
 from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash, to_write
-from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
+from ahrsd.commands.register_sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.commands.register_text import described
 from ahrsd.config import default_state_directory
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, JournalError
@@ -50,7 +50,7 @@ _YES = click.option("--yes", is_flag=True, help="Do it; without, only say what w
 _SAVE = click.option("--save", is_flag=True, help="Also save all of RAM to flash. Keep it still.")
 
 
-Ids = TypeVar("Ids", int, tuple[int, ...])
+Ids = TypeVar("Ids", int, int | None, tuple[int, ...])
 _BAUD_RATE = 5  # a line that changes it cuts off the lines behind it
 _SHOWN = ("txn", "reason", "undoes", "error", "restored")  # facts of a record besides its registers
 
@@ -58,7 +58,7 @@ _SHOWN = ("txn", "reason", "undoes", "error", "restored")  # facts of a record b
 def _known(_context: click.Context, _option: click.Parameter, numbers: Ids) -> Ids:
     """Refuse numbers that are not in the register map before a port is opened."""
     for number in numbers if isinstance(numbers, tuple) else (numbers,):
-        if number not in REGISTERS:
+        if number is not None and number not in REGISTERS:
             raise click.BadParameter(f"the VN-100 has no register {number}")
     return numbers
 
@@ -142,8 +142,15 @@ def diff(
 
 @command.command(context_settings={"ignore_unknown_options": True})
 @click.argument("port", type=PORT)
-@click.argument("number", metavar="ID", type=int, callback=_known)
-@click.argument("values", nargs=-1, required=True)
+@click.argument("number", metavar="[ID]", type=int, required=False, callback=_known)
+@click.argument("values", nargs=-1)
+@click.option(
+    "--from",
+    "file",
+    type=click.Path(path_type=Path),
+    help="Registers 23 and 84 of a calibration.json instead of ID and VALUES.",
+)
+@click.option("--serial", type=int, help="The device of --from, where the file does not say.")
 @_YES
 @_SAVE
 @_STATE
@@ -151,14 +158,29 @@ def diff(
 def write(
     *,
     port: Path,
-    number: int,
+    number: int | None,
     values: tuple[str, ...],
+    file: Path | None,
+    serial: int | None,
     yes: bool,
     save: bool,
     state_directory: Path | None,
     baud: int | None,
 ) -> None:
-    """Write register ID of the device on PORT; VALUES in the manual's order, blanks or commas."""
+    """Write register ID of the device on PORT; VALUES in the manual's order, blanks or commas.
+
+    With --from the registers of a calibration: it must have converged, its numbers must be within
+    the daemon's limits, and the device must be the one that was recorded and still hold the values
+    that were in force then.
+    """
+    if file is not None:
+        if number is not None:
+            raise click.UsageError("give either ID and VALUES, or --from FILE")
+        wanted_of = calibrated(file, serial)
+        _change(port, baud, wanted_of, _state(state_directory), None, yes=yes, save=save)
+        return
+    if number is None or not values:
+        raise click.UsageError("give ID and VALUES, or --from FILE")
     tokens = [token for value in values for token in value.split(",") if token]
     try:
         wanted = {number: parse(number, tokens)}

@@ -14,6 +14,7 @@ import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.config import Config, load_config
+from ahrsd.printable import line
 from ahrsd.serving.client import Asked, find_socket
 
 _PLACE = click.Path(path_type=Path)
@@ -113,4 +114,4 @@ def tell(
     if json_path is not None:
         write_json(json_path, answer)
     if json_path != "-":
-        click.echo(place.pasted("\n".join(lines(answer))))
+        click.echo(place.pasted("\n".join(map(line, lines(answer)))))

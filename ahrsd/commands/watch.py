@@ -15,6 +15,7 @@ from rich.text import Text
 
 from ahrsd.commands.running import Place, place_options
 from ahrsd.gates import guards_a_write
+from ahrsd.printable import line
 from ahrsd.serving.explain import explain_json, holding
 from ahrsd.serving.lines import status_lines
 
@@ -64,8 +65,8 @@ def _show(records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]) ->
         for record in records:
             if record.get("record") == "status":
                 status = record
-            elif line := event_line(record):
-                happened.append(line)
+            elif happening := event_line(record):
+                happened.append(happening)
             if status is not None:
                 live.update(screen(status, happened, console.height - _BESIDE, pasted))
 
@@ -74,9 +75,9 @@ def event_line(record: Mapping[str, Any]) -> str:
     """One line for what happened; empty for what the status shows anyway."""
     match record.get("record"):
         case "note":
-            return f"{record['level']}: {record['text']}"
+            return line(f"{record['level']}: {record['text']}")
         case "state":
-            return f"{record['old']} -> {record['new']}: {record['reason']}"
+            return line(f"{record['old']} -> {record['new']}: {record['reason']}")
         case "register":
             return f"register {record['register']} {record['outcome']}"
         case "gap":
@@ -92,9 +93,9 @@ def screen(
 ) -> RenderableType:
     """Status on top, what happened last, and `most` of the gates, nearest to the cause first."""
     explained = explain_json(status)
-    head = Panel("\n".join(status_lines(status)), title="ahrsd")
+    head = Panel(Text("\n".join(map(line, status_lines(status)))), title="ahrsd")
     todo = Panel(Text(pasted(str(explained["next"])), style="bold"), title="what to do next")
-    log = Panel("\n".join(happened) or "nothing yet", title="what happened")
+    log = Panel(Text("\n".join(happened) or "nothing yet"), title="what happened")
     return Group(head, todo, log, _gates(status, max(most, 3)))
 
 

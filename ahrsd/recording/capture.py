@@ -69,7 +69,14 @@ def _cost(entry: Entry) -> int:
 
 
 def _create(path: Path) -> FileIO:
-    return FileIO(path, "xb")
+    """For its owner alone, whatever the umask: a capture holds where the vehicle was."""
+    return FileIO(path, "xb", opener=_private)
+
+
+def _private(path: str, flags: int) -> int:
+    descriptor = os.open(path, flags, 0o600)
+    os.fchmod(descriptor, 0o600)
+    return descriptor
 
 
 class _File:

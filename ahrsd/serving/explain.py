@@ -30,6 +30,13 @@ STATES: dict[str, str] = {
     "LOCKED": "locked: nothing is written until a person unlocks",
 }
 
+#: how the write-back calls a vehicle that says nothing, and what that is without a file for it
+UNHEARD = "the vehicle has not said that a write is safe"
+NO_INTERLOCK = (
+    "no interlock is configured, so nothing is ever written: set interlock.file, a file that the "
+    "vehicle keeps rewriting with the word safe"
+)
+
 _NEXT = {
     "STAGING": "nothing: the write takes a second or two",
     "STAGED": "nothing: the trial begins by itself",
@@ -57,6 +64,9 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "mode": status["mode"],
         "mode_now": status["mode_now"],
         "stream": _stream(status),
+        "sensors": list(status["sensors"]),
+        "estimator": _estimator(status),
+        "files": list(status["complaints"]),
         "mismatch": _mismatch(status),
         "gates": shut,
         "others": others,
@@ -74,7 +84,9 @@ def holding(status: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[st
     for text in status["write_back"]["holds"]:
         gate = gates.get(text.partition(": ")[0])
         if gate is None:
-            others.append(text)
+            others.append(
+                NO_INTERLOCK if status["interlock"] == "none" and text == UNHEARD else text
+            )
         else:
             shut.append(gate)
     return shut, others
@@ -94,6 +106,17 @@ def _stream(status: Mapping[str, Any]) -> str:
     return ""
 
 
+def _estimator(status: Mapping[str, Any]) -> str:
+    """Why there is no estimator now; empty where there is one."""
+    found = status["estimator"]
+    if found["state"] == "FAILED":
+        return (
+            f"FAILED: {found['reason']}; nothing is written from it, and it begins anew in "
+            f"{found['begins_anew_in_s']:.0f} s"
+        )
+    return "STUCK: the service manager's watchdog ends it" if found["state"] == "STUCK" else ""
+
+
 def _mismatch(status: Mapping[str, Any]) -> str:
     """What stepped on the vehicle, while the estimate still rests on data from before it."""
     found = status["mismatch"]
@@ -102,6 +125,8 @@ def _mismatch(status: Mapping[str, Any]) -> str:
 
 def _next(status: Mapping[str, Any], state: str, shut: Sequence[Mapping[str, Any]]) -> str:
     """One thing to do: what is nearest to the cause comes first."""
+    if status["sensors"] and status["link"]["open"]:
+        return str(status["sensors"][0])
     if wrong := _stream(status):
         return wrong
     if state in _NEXT:
@@ -128,6 +153,10 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
     lines = [f"{explained['state']}: {explained['meaning']}", f"mode {mode}"]
     if explained["stream"]:
         lines.append(f"stream: {explained['stream']}")
+    lines += [f"sensor: {text}" for text in explained["sensors"]]
+    if explained["estimator"]:
+        lines.append(f"estimator: {explained['estimator']}")
+    lines += [f"file: {text}" for text in explained["files"]]
     if explained["mismatch"]:
         lines.append(f"mismatch: {explained['mismatch']}")
     write = "further write" if explained["state"] in WRITTEN else "write"

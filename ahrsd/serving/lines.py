@@ -13,8 +13,11 @@ Status = Mapping[str, Any]
 
 def status_lines(status: Status) -> list[str]:
     """How the daemon stands, for a person: device, stream, motion, estimate, write-back."""
-    lines = [device_line(status), stream_line(status), errors_line(status), motion_line(status)]
-    lines += [*estimate_lines_of(status), mismatch_line(status), write_back_line(status)]
+    lines = [device_line(status), stream_line(status), errors_line(status)]
+    lines += [f"sensor: {text}" for text in status["sensors"]]
+    lines += [motion_line(status), estimator_line(status), *estimate_lines_of(status)]
+    lines += [mismatch_line(status), write_back_line(status), *candidate_lines(status)]
+    lines += [f"file: {text}" for text in status["complaints"]]
     lines += [f"warning: {text}" for text in status["warnings"]]
     return [line for line in lines if not line.endswith(": ")]
 
@@ -79,6 +82,34 @@ def estimate_lines_of(status: Status) -> list[str]:
         f"estimate: {done}; {sigma}{held}",
         f"  hard iron {iron} mG",
         f"  gyro bias {bias} mrad/s",
+    ]
+
+
+def estimator_line(status: Status) -> str:
+    """That the estimator broke off; ends in ": " where it did not."""
+    found = status["estimator"]
+    if found["state"] == "STUCK":
+        return "estimator: STUCK at one piece of work for longer than any takes"
+    if not found["failures"]:
+        return "estimator: "
+    times = "once" if found["failures"] == 1 else f"{found['failures']} times"
+    if found["state"] == "FAILED":
+        return (
+            f"estimator: FAILED: {found['reason']}; begins anew in "
+            f"{found['begins_anew_in_s']:.0f} s (it broke off {times})"
+        )
+    return f"estimator: runs again; it broke off {times}, last: {found['reason']}"
+
+
+def candidate_lines(status: Status) -> list[str]:
+    """What would be written, to be looked at before it is approved."""
+    proposal = status["write_back"]["proposal"]
+    if proposal is None:
+        return []
+    change = _number(proposal["heading_change_deg"], "heading changes by up to {:.1f} deg", "")
+    return [
+        f"candidate: {proposal['id']}, {change}; it would be written as",
+        *(f"  {line}" for line in proposal["lines"]),
     ]
 
 

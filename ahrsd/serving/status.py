@@ -27,6 +27,8 @@ class LinkFacts:
     viewer_dropped: int = 0
     viewer_fault: str = ""
     interlock: str = "none"  # none, safe, not safe
+    complaints: tuple[str, ...] = ()  # what is wrong with files of the vehicle or of an operator
+    estimator_stuck: bool = False
 
 
 class StatusMaker:
@@ -66,11 +68,14 @@ class StatusMaker:
             },
             "stream": self._stream(core),
             "motion": _motion(core.calibrator.evidence),
+            "sensors": list(core.sensors.findings.values()),
+            "estimator": _estimator(core, link.estimator_stuck),
             "estimate": _estimate(core.calibrator.estimate),
             "mismatch": _mismatch(core.calibrator),
             "gates": [_gate(gate, core.at_s) for gate in core.calibrator.gates],
             "write_back": _write_back(core),
             "interlock": link.interlock,
+            "complaints": list(link.complaints),
             "capture": {"file": link.capture, "error": link.capture_error},
             "viewer": {"dropped": link.viewer_dropped, "fault": link.viewer_fault},
             "warnings": list(core.stream.warnings),
@@ -115,6 +120,17 @@ def _motion(evidence: Evidence | None) -> dict[str, object] | None:
         "roll_deg": seen.roll_deg,
         "pitch_deg": seen.pitch_deg,
         "next": seen.turn,
+    }
+
+
+def _estimator(core: Core, stuck: bool) -> dict[str, object]:
+    """Whether the estimator works, and how it broke off last."""
+    state = core.estimator
+    return {
+        "state": "FAILED" if state.failed else "STUCK" if stuck else "RUNNING",
+        "reason": state.reason,
+        "failures": state.failures,
+        "begins_anew_in_s": max(state.left_s, 0.0),
     }
 
 

@@ -212,6 +212,12 @@ def _named(soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array) -> 
     return dict(zip(_NAMES, numbers.tolist(), strict=True))
 
 
+def refuse_unsafe(values: Mapping[int, Values]) -> None:
+    """Raise UnwritableError where registers 23 and 84 hold what is refused whoever asks for it."""
+    mag, gyro = (_affine(values, number) for number in (MAG, GYRO))
+    _refuse_out_of_bounds(mag, gyro.offset)
+
+
 def _refuse_out_of_bounds(written: Affine, gyro_bias_rad_s: Array) -> None:
     eigenvalues = np.linalg.eigvalsh(0.5 * (written.matrix + written.matrix.T))
     if eigenvalues[0] <= 0.0:

@@ -32,6 +32,7 @@ from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values, same
 
 RETRY_SAVE_S = 600.0  # after a save that was not sent
+Answer = tuple[bool, str]  # to a person: whether it is accepted, and what follows or why not
 COUNTED = frozenset({"trial", "interlock", "operator"})  # rollbacks that speak against the values
 
 
@@ -130,12 +131,16 @@ class Flow:
         if Signal.ROLL_BACK in TABLE[self.state] and (by_hand or self.state is not State.FAULT):
             self._cause = cause
             self.signal(Signal.TRIAL_FAILED if cause == "trial" else Signal.ROLL_BACK, reason)
-        elif by_hand:
-            self.desk.note(
-                "warning",
+
+    def roll_back_by_hand(self) -> Answer:
+        """An operator wants the old values back."""
+        if Signal.ROLL_BACK not in TABLE[self.state]:
+            return False, (
                 f"nothing to roll back in {self.state.value}; for values that are in flash use "
-                "the registers rollback command",
+                "the registers rollback command"
             )
+        self.roll_back("operator", "an operator asked for it")
+        return True, "the old values are being put back"
 
     # -- the candidate -----------------------------------------------------------------------------
 
@@ -167,15 +172,25 @@ class Flow:
         if signal in TABLE[self.state]:
             self.signal(signal, reason)
 
-    def approve(self, text: str) -> None:
+    def approve(self, text: str) -> Answer:
         """An operator's yes to the candidate with this id; holds as long as it stays qualified."""
         if self.state is not State.QUALIFIED or self.proposal is None:
-            self.desk.note("warning", f"no candidate to approve in {self.state.value}")
-        elif text.strip().lower() != self.proposal.id:
-            self.desk.note("warning", f"{text!r} is not the candidate, it is {self.proposal.id}")
-        else:
-            self.approver, self.safe.armed = "operator", True
-            self.desk.note("info", f"{self.proposal.id} approved")
+            return False, f"no candidate to approve in {self.state.value}"
+        if text.strip().lower() != self.proposal.id:
+            return False, f"{text!r} is not the candidate, it is {self.proposal.id}"
+        if self.policy.mode < Mode.STAGE:
+            return False, self.mode_forbids
+        self.approver, self.safe.armed = "operator", True
+        said = f"{self.proposal.id} approved"
+        self.desk.note("info", said)
+        held = self.safe.write_holds(self.desk.history, self.desk.host_s, self.desk.wall_s)
+        waits = f"; it is written once this is over: {'; '.join(held)}" if held else ""
+        return True, f"{said}{waits}"
+
+    @property
+    def mode_forbids(self) -> str:
+        """Why nothing can be written in this run at all."""
+        return f"the mode is {self.policy.mode.name.lower()}: nothing is written in this run"
 
     def _compose(self, estimate: Estimate, gyro_is_raw: bool) -> Proposal | None:
         if not estimate.converged:
@@ -188,19 +203,21 @@ class Flow:
 
     # -- locks -------------------------------------------------------------------------------------
 
-    def lock(self, reason: str) -> None:
+    def lock(self, reason: str) -> Answer:
         """No writes from now on; what is only in RAM is undone first."""
         self.desk.record(Kind.LOCKED, reason=reason)
         if Signal.ROLL_BACK in TABLE[self.state] and self.state is not State.FAULT:
             self.roll_back("operator", reason)
         self.signal_if(Signal.LOCK, reason)
+        return True, f"locked: {reason}"
 
-    def unlock(self, reason: str) -> None:
+    def unlock(self, reason: str) -> Answer:
         """A person looked and found it right. In FAULT: look again."""
         self.desk.record(Kind.UNLOCKED, reason=reason)
         if self.state is State.FAULT:
             self.desk.ask(IdentifyAgain())
         self.signal_if(Signal.UNLOCK, reason)
+        return True, f"unlocked: {reason}"
 
     # -- arriving ----------------------------------------------------------------------------------
 

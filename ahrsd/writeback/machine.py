@@ -23,7 +23,7 @@ from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.actions import Action, IdentifyAgain
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
-from ahrsd.writeback.flow import Flow
+from ahrsd.writeback.flow import Answer, Flow
 from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
@@ -71,6 +71,7 @@ class WriteBack:
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._restarts = RestartWatch()
+        self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
 
     # -- what others ask ---------------------------------------------------------------------------
 
@@ -256,22 +257,32 @@ class WriteBack:
             self._flow.consider(estimate, gyro_is_raw)
         return self._answer()
 
+    def on_estimator_failed(self, host_s: float) -> list[Action]:
+        """There is no estimate, nor what the gates said of it: what rests on it ends."""
+        self._desk.host_s = host_s
+        self._safe.gates = self._safe.flash_gates = ()
+        self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the estimator failed")
+        self._flow.roll_back("estimator", "the estimator failed: nobody judges the new values")
+        return self._answer()
+
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
         """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
         self._desk.host_s = host_s
         reason = argument or "no reason given"
-        verbs: dict[str, Callable[[], None]] = {
+        verbs: dict[str, Callable[[], Answer]] = {
             "arm": partial(self._arm, True),
             "disarm": partial(self._arm, False),
             "approve": partial(self._flow.approve, argument),
             "lock": partial(self._flow.lock, reason),
             "unlock": partial(self._flow.unlock, reason),
-            "rollback": partial(self._flow.roll_back, "operator", "an operator asked for it"),
+            "rollback": self._flow.roll_back_by_hand,
         }
         if verb in verbs:
-            verbs[verb]()
+            self.operator_answer = verbs[verb]()
         else:
-            self._desk.note("warning", f"{verb!r} is no command; possible: {', '.join(verbs)}")
+            self.operator_answer = False, f"{verb!r} is no command; possible: {', '.join(verbs)}"
+        if not self.operator_answer[0]:
+            self._desk.note("warning", f"operator: {verb} refused: {self.operator_answer[1]}")
         return self._answer()
 
     def on_trial_metrics(self, metrics: TrialMetrics, host_s: float) -> list[Action]:
@@ -328,10 +339,14 @@ class WriteBack:
             self._flow.on_failure(str(error))
         return self._answer()
 
-    def _arm(self, armed: bool) -> None:
+    def _arm(self, armed: bool) -> Answer:
         """Whether this run may begin a write or a save; what is under way is not undone."""
         self._safe.armed = armed
-        self._desk.note("info", "armed: this run may write" if armed else NOT_ARMED)
+        text = "armed: this run may write" if armed else NOT_ARMED
+        self._desk.note("info", text)
+        if armed and self.policy.mode < Mode.STAGE:
+            return False, f"{self._flow.mode_forbids}"
+        return True, text if armed else "disarmed: this run writes nothing by itself"
 
     def _answer(self) -> list[Action]:
         """Take the steps that are due now, then hand over everything that was asked for."""

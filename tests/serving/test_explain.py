@@ -3,6 +3,9 @@
 import pytest
 
 from ahrsd.serving.explain import STATES, explain_json, explain_lines
+from ahrsd.serving.lines import candidate_lines, estimator_line
+from ahrsd.writeback.machine import WriteBack
+from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
 
 
@@ -14,6 +17,10 @@ def status(**changes):
         "link": {"open": True, "port": "/dev/vn100"},
         "stream": {"samples": 5000, "refused": [], "waits_for": []},
         "mismatch": {"open": False, "step": None},
+        "sensors": [],
+        "estimator": {"state": "RUNNING", "reason": "", "failures": 0, "begins_anew_in_s": 0.0},
+        "complaints": [],
+        "interlock": "safe",
         "gates": [],
         "write_back": {"state": "CANDIDATE", "holds": [], "proposal": None},
     }
@@ -119,3 +126,63 @@ def test_gates_that_were_not_measured_say_so_together_where_the_reason_is_one():
 )
 def test_what_to_do_next(changes, words):
     assert words in explain_json(status(**changes))["next"]
+
+
+STUCK = "the magnetometer gives the same value on all axes"
+
+
+def test_a_sensor_an_estimator_and_a_file_that_are_wrong_are_said():
+    failed = {"state": "FAILED", "reason": "LinAlgError: Singular matrix", "failures": 2}
+    changes = {
+        "sensors": [STUCK],
+        "estimator": failed | {"begins_anew_in_s": 8.2},
+        "complaints": ["interlock.file = /run/safe: is a FIFO, not a regular file"],
+    }
+    explained = explain_json(status(**changes))
+    assert explained["next"] == STUCK
+    assert explain_lines(explained)[2:5] == [
+        f"sensor: {STUCK}",
+        "estimator: FAILED: LinAlgError: Singular matrix; nothing is written from it, and it "
+        "begins anew in 8 s",
+        "file: interlock.file = /run/safe: is a FIFO, not a regular file",
+    ]
+    assert explain_json(status(sensors=[STUCK], stream={"samples": 0, "refused": []}))["next"] == (
+        STUCK
+    )
+
+
+def test_without_an_interlock_the_key_is_named():
+    unheard = WriteBack(WriteBackPolicy()).holds()[-2]
+    held = {"state": "CANDIDATE", "holds": [unheard], "proposal": None}
+    (text,) = explain_json(status(interlock="none", write_back=held))["others"]
+    assert text.startswith("no interlock is configured, so nothing is ever written: set interlock.")
+    (text,) = explain_json(status(interlock="not safe", write_back=held))["others"]
+    assert text == unheard
+
+
+def test_the_status_shows_the_candidate_that_is_to_be_looked_at():
+    proposal = {
+        "id": "12ab34cd",
+        "lines": ["$VNWRG,23,1.1*XX", "$VNWRG,84,1*XX"],
+        "heading_change_deg": 12.34,
+    }
+    assert candidate_lines(status(write_back={"proposal": proposal})) == [
+        "candidate: 12ab34cd, heading changes by up to 12.3 deg; it would be written as",
+        "  $VNWRG,23,1.1*XX",
+        "  $VNWRG,84,1*XX",
+    ]
+    assert candidate_lines(status()) == []
+
+
+def test_the_status_says_how_the_estimator_broke_off():
+    found = {"state": "RUNNING", "reason": "", "failures": 0, "begins_anew_in_s": 0.0}
+    assert estimator_line({"estimator": found}) == "estimator: "
+    found |= {"failures": 1, "reason": "LinAlgError: Singular matrix"}
+    assert estimator_line({"estimator": found}) == (
+        "estimator: runs again; it broke off once, last: LinAlgError: Singular matrix"
+    )
+    found |= {"failures": 3, "state": "FAILED", "begins_anew_in_s": 20.0}
+    assert estimator_line({"estimator": found}) == (
+        "estimator: FAILED: LinAlgError: Singular matrix; begins anew in 20 s "
+        "(it broke off 3 times)"
+    )
