@@ -183,7 +183,7 @@ class Flow:
         self.approver, self.safe.armed = "operator", True
         said = f"{self.proposal.id} approved"
         self.desk.note("info", said)
-        held = self.safe.write_holds(self.desk.history, self.desk.host_s, self.desk.wall_s)
+        held = self.safe.write_holds(self.desk.history, self.desk.host_s, self.desk.now)
         waits = f"; it is written once this is over: {'; '.join(held)}" if held else ""
         return True, f"{said}{waits}"
 
