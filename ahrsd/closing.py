@@ -15,6 +15,7 @@ from drivers.vn100.procedures import (
     quiet,
     read,
     read_configuration,
+    read_unit,
     restore,
 )
 from drivers.vn100.registers import Values, format_command, same
@@ -78,23 +79,38 @@ def again_after(error: Exception) -> tuple[float, float] | None:
 
 
 def identify_in(seconds: float) -> Procedure[Identity]:
-    """`identify` after a while."""
+    """`identify_surely` after a while."""
     yield Pause(seconds)
-    return (yield from identify())
+    return (yield from identify_surely())
+
+
+def identify_surely() -> Procedure[Identity]:
+    """Who answers, asked twice: an altered reply must not pass for another device.
+
+    Raises Unsteady.
+    """
+    identity = yield from identify()
+    again = yield from read_unit()
+    if again != identity.unit:
+        raise Unsteady(f"the device says that it is {identity.unit}, then {again}")
+    return identity
 
 
 def read_surely(profile: Profile, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
-    """The configuration; registers that will be put back are read `twice`, and can be written.
+    """The configuration; some registers are read `twice`. Those that will be put back can be written.
 
     A reading that was altered on the way would else become what the user had. Raises Unsteady,
     RegisterValueError.
     """
     values = yield from read_configuration(profile)
     for number in twice:
+        if number not in values:
+            continue
         again = yield from read(number)
         if not same(number, values[number], again):
             raise Unsteady(f"register {number} reads {values[number]}, then {again}")
-        format_command(number, again)
+        if number in SESSION_SETTINGS:
+            format_command(number, again)
     return values
 
 

@@ -32,12 +32,12 @@ from ahrsd.said import (
 )
 from ahrsd.silence import Silence
 from ahrsd.writeback.journal_history import JournalRecord
-from ahrsd.writeback.permissions import Mode, Purpose, permitted
+from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
 from ahrsd.writeback.reconcile import Kind
 from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
 from drivers.vn100.commands import RESUME, Command, LinkGone, Procedure
 from drivers.vn100.decode import Measurement
-from drivers.vn100.procedures import SESSION_SETTINGS, Identity, identify, quiet, restore, resume
+from drivers.vn100.procedures import SESSION_SETTINGS, Identity, quiet, restore, resume
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
 
@@ -155,7 +155,9 @@ class Conversation:
             return []
         events = self._abandon(now_s)
         self.phase = Phase.IDENTIFYING
-        return events + self._digest(self._start(identify(), Purpose.READ, now_s), now_s)
+        return events + self._digest(
+            self._start(closing.identify_surely(), Purpose.READ, now_s), now_s
+        )
 
     def received(self, data: bytes, now_s: float) -> list[Event]:
         """Bytes came; returns measurements, faults and strays, in order."""
@@ -382,7 +384,7 @@ class Conversation:
             self.identity, self._serial = result, result.serial
             self._said.append(Identified(result))
             self.phase = Phase.READING
-            twice = SESSION_SETTINGS if self.change_stream else ()
+            twice = (*CALIBRATION, *(SESSION_SETTINGS if self.change_stream else ()))
             return self._start(closing.read_surely(result.profile, twice), Purpose.READ, now_s)
         if phase is Phase.READING and isinstance(result, dict):
             self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]

@@ -26,7 +26,7 @@ from ahrsd.writeback.safeguards import Safeguards
 from ahrsd.writeback.states import ON_TIMEOUT, TABLE, Signal, State
 from ahrsd.writeback.transaction import Outcome, Transaction, check, roll_back, save, stage
 from ahrsd.writeback.trial import Trial
-from drivers.vn100.procedures import Identity
+from drivers.vn100.procedures import Identity, Unit
 from drivers.vn100.registers import Values, same
 
 RETRY_SAVE_S = 600.0  # after a save that was not sent
@@ -49,6 +49,7 @@ class Flow:
         self.approver = ""
         self.trial = Trial(policy.trial, 0.0)
         self._cause = "device"
+        self._from_fault = False
         self._since_s = 0.0
         self._save_from_s = float("-inf")
         self._on_entry: dict[State, Callable[[str], None]] = {
@@ -85,6 +86,7 @@ class Flow:
         """Arrive in a state. A conversation of the old one ends."""
         self.desk.stop_running()
         old, self.state = self.state, state
+        self._from_fault = old is State.FAULT
         self._since_s = self.desk.host_s
         wait = ON_TIMEOUT.get(state)
         self.deadline_s = None if wait is None else self.desk.host_s + wait[0]
@@ -239,6 +241,7 @@ class Flow:
             snapshot=self.registers,
             heading_change_deg=proposal.heading_change_deg,
             approver=self.approver,
+            model=identity.model,
         )
         gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
         self.desk.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
@@ -255,7 +258,7 @@ class Flow:
         transaction = self.transaction()
         self._now_in_force(transaction.new)
         self.desk.written(transaction.old, transaction.new, "verified")
-        self.desk.record(Kind.RAM_VERIFIED)
+        self.desk.record(Kind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
         self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
@@ -271,12 +274,17 @@ class Flow:
         self.desk.run("save", Purpose.SAVE, make)
 
     def _enter_rolling_back(self, reason: str) -> None:
-        if self.desk.history.last is not Kind.ROLLBACK:
+        # what was read back as ours and holds something else by now is somebody else's; out of a
+        # FAULT a person has looked, and after a write that failed it is what that write left
+        last = self.desk.history.last
+        only_ours = last is not Kind.RAM_FAILED and not self._from_fault
+        if last is not Kind.ROLLBACK:
             self.desk.record(
                 Kind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
             )
         self.desk.in_force(None)
-        self.desk.run("roll back", Purpose.ROLL_BACK, partial(roll_back, self.transaction()))
+        make = partial(roll_back, self.transaction(), only_ours=only_ours)
+        self.desk.run("roll back", Purpose.ROLL_BACK, make)
 
     def _enter_fault(self, reason: str) -> None:
         transaction = self.desk.history.open
@@ -287,6 +295,9 @@ class Flow:
 
     def on_outcome(self, outcome: Outcome) -> None:
         """A conversation came to its end and says how it found the device."""
+        if outcome.other is not None:
+            self._another(outcome.other, outcome.written)
+            return
         endings: dict[State, Callable[[Outcome], None]] = {
             State.CHECKING: self._checked,
             State.STAGING: self._written,
@@ -294,6 +305,27 @@ class Flow:
             State.ROLLING_BACK: self._rolled_back,
         }
         endings[self.state](outcome)
+
+    def another(self, unit: Unit) -> None:
+        """Another device has the cable: nothing that was judged here is for it."""
+        wanted = "nobody knew" if self.identity is None else str(self.identity.unit)
+        self.desk.note("error", f"another device answers: {unit}, not {wanted}; nothing is written")
+        self.look_closer(f"another device answers: {unit}")
+
+    def look_closer(self, reason: str) -> None:
+        """What the device is or holds is not what it ought to: identify it, read it, compare."""
+        self.desk.in_force(None)
+        self.desk.ask(IdentifyAgain())
+        self.signal(Signal.IN_DOUBT, reason)
+
+    def _another(self, unit: Unit, written: bool) -> None:
+        """In the middle of a conversation; the journal that is open is still the first device's."""
+        reason = f"another device answers: {unit}"
+        if self.state is State.SAVING:
+            self.desk.record(Kind.PROVEN, reason=reason, unsent=True)
+        elif self.state in (State.CHECKING, State.STAGING) and not written:
+            self.desk.record(Kind.ABORTED, reason=reason)
+        self.another(unit)
 
     def _checked(self, outcome: Outcome) -> None:
         if outcome.as_expected:
@@ -304,12 +336,16 @@ class Flow:
         self.signal(Signal.DIFFERS, f"somebody else changed the device: {outcome}")
 
     def _written(self, outcome: Outcome) -> None:
-        signal = Signal.DONE if outcome.as_expected else Signal.DIFFERS
-        self.signal(signal, f"read back: {outcome}")
+        if outcome.as_expected:
+            self.signal(Signal.DONE, "both registers and the device's identity were read back")
+        elif outcome.written:  # a restart, or somebody else, between the writes
+            self.look_closer(f"after the writes {outcome}")
+        else:
+            self.signal(Signal.DIFFERS, f"read back: {outcome}")
 
     def _saved(self, outcome: Outcome) -> None:
         if outcome.as_expected:
-            self.desk.record(Kind.FLASH_ACKED)
+            self.desk.record(Kind.FLASH_ACKED, serial=self.transaction().serial)
             self.signal(Signal.DONE, "the device acknowledged the save")
         else:
             self.desk.note("warning", f"not saved: {outcome}")
@@ -336,9 +372,12 @@ class Flow:
 
     def _rolled_back(self, outcome: Outcome) -> None:
         transaction = self.transaction()
+        if not outcome.as_expected:
+            self.look_closer(f"not rolled back: {outcome}")
+            return
         self._now_in_force(transaction.old)
         self.desk.written(transaction.new, transaction.old, "undone")
-        self.desk.record(Kind.ROLLED_BACK)
+        self.desk.record(Kind.ROLLED_BACK, serial=transaction.serial)
         history = self.desk.history
         if history.rollbacks >= self.policy.rollbacks_to_lock and history.locked is None:
             self.desk.record(Kind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")

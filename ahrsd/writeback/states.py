@@ -18,8 +18,9 @@ before the device does: nothing is sent until the record of what the device held
 
 "verified", "proven", "committed" and "confirmed" are different words on purpose.
 
-RECONCILING is entered at the start and whenever the link or the device went away: the registers are
-read and compared with the journal (`reconcile`), which says where to go on. FAULT is a device in a
+RECONCILING is entered at the start, whenever the link or the device went away, and whenever another
+device answers or this one holds what it should not: the registers are read and compared with the
+journal (`reconcile`), which says where to go on. FAULT is a device in a
 state that this program cannot mend alone; FLASH_TORN one whose flash holds neither the old nor the
 new values. Neither ends by itself. LOCKED: no writes until a person unlocks. In FAULT "unlock"
 means: look again.
@@ -79,6 +80,7 @@ class Signal(StrEnum):
     TIMEOUT = "timeout"
     LINK_LOST = "link lost"
     DEVICE_RESET = "device reset"
+    IN_DOUBT = "device in doubt"
     LOCK = "lock"
     UNLOCK = "unlock"
     NOTHING_OPEN = "nothing open"
@@ -94,7 +96,11 @@ class Signal(StrEnum):
 
 S, E = State, Signal
 
-_AWAY: Final = {E.LINK_LOST: S.RECONCILING, E.DEVICE_RESET: S.RECONCILING}
+_AWAY: Final = {
+    E.LINK_LOST: S.RECONCILING,
+    E.DEVICE_RESET: S.RECONCILING,
+    E.IN_DOUBT: S.RECONCILING,  # another device answers, or it holds what it should not
+}
 _WATCHING: Final = {**_AWAY, E.LOCK: S.LOCKED, E.WORTH_WRITING: S.CANDIDATE}
 
 TABLE: Final[dict[State, dict[Signal, State]]] = {

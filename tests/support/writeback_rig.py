@@ -36,7 +36,7 @@ from drivers.vn100.firmware import profile_of
 from drivers.vn100.procedures import CONFIGURATION, Identity
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_reply, parse
 
-FIRMWARE, SERIAL = "3.1.0.0", 100130608
+MODEL, FIRMWARE, SERIAL = "VN-100T-CR", "3.1.0.0", 100130608
 PROFILE = profile_of(FIRMWARE)
 GREEN = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
 RED = (GateResult("observability", 0.3, 1.0, False, 0.0, "", "turn more"),)
@@ -91,7 +91,9 @@ class Device:
             raise NoReply(command)
         if isinstance(command, Read | Write):
             word = "VNRRG" if isinstance(command, Read) else "VNWRG"
-            text = format_reply(command.register, self.ram[command.register])
+            who = {1: (MODEL,), 3: (self.serial,), 4: (FIRMWARE,)}
+            values = who.get(command.register) or self.ram[command.register]
+            text = format_reply(command.register, values)
             return Reply(word, command.register, tuple(text.split(",")[1:]))
         return Reply("", None, ())
 
@@ -166,7 +168,7 @@ class Rig:
 
     def connect(self, uptime_s: float | None = None, **changes: Any) -> None:
         registers = {n: printed(n, v) for n, v in self.device.ram.items()}
-        identity = Identity("VN-100T-CR", 7, self.device.serial, FIRMWARE, PROFILE)
+        identity = Identity(MODEL, 7, self.device.serial, FIRMWARE, PROFILE)
         arguments: dict[str, Any] = {
             "identity": identity,
             "registers": registers,
