@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from drivers.vn100.calibration_stream import DoesNotFit, NoStream, NotPutBack
 from drivers.vn100.commands import Pause, Procedure, SessionError
-from drivers.vn100.firmware import Profile
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -96,13 +95,15 @@ def identify_surely() -> Procedure[Identity]:
     return identity
 
 
-def read_surely(profile: Profile, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
-    """The configuration; some registers are read `twice`. Those that will be put back can be written.
+def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """The configuration of this device, and at the end it still is this device that answers.
+
+    Some registers are read `twice`; those that will be put back can be written.
 
     A reading that was altered on the way would else become what the user had. Raises Unsteady,
     RegisterValueError.
     """
-    values = yield from read_configuration(profile)
+    values = yield from read_configuration(identity.profile)
     for number in twice:
         if number not in values:
             continue
@@ -111,6 +112,8 @@ def read_surely(profile: Profile, twice: Iterable[int]) -> Procedure[dict[int, V
             raise Unsteady(f"register {number} reads {values[number]}, then {again}")
         if number in SESSION_SETTINGS:
             format_command(number, again)
+    if (unit := (yield from read_unit())) != identity.unit:
+        raise Unsteady(f"{unit} answers, and a moment ago it was {identity.unit}")
     return values
 
 

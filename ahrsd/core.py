@@ -30,18 +30,21 @@ from ahrsd.said import (
     Completed,
     ConfigurationRead,
     Identified,
+    Looked,
     Said,
     StreamChanged,
     Unanswered,
 )
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream import Stream
+from ahrsd.stream_watch import StreamWatch
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.states import State
 from drivers.vn100.decode import Measurement, Undecodable
+from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import Values
 from drivers.vn100.session import DeviceFault, Stray
 from drivers.vn100.session import Event as SessionEvent
@@ -77,7 +80,8 @@ class Core:
         self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
         self._stopping = ""
         self._closing = self._uptime_due = self._unread = False
-        self._serial: int | None = None
+        self._unit: Unit | None = None
+        self._watch = StreamWatch()
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
@@ -176,6 +180,8 @@ class Core:
     def take(self, found: list[SessionEvent]) -> None:
         """Measurements to the stream, with what was damaged between them; the rest is counted."""
         skipped = deque(self.conversation.session.deframer.take_skipped())
+        if any(isinstance(event, Measurement) for event in found):
+            self._doubt(self._watch.heard(self._host_s, self.stream.facts.rate_hz))
         for event in found:
             if isinstance(event, Measurement):
                 while skipped and skipped[0].offset < event.offset:
@@ -194,6 +200,11 @@ class Core:
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
             self._device_reset("its time fell")
+
+    def _doubt(self, reason: str) -> None:
+        """Whose samples these are is not sure any more; empty: it is."""
+        if reason and self.conversation.listening and self.conversation.identity is not None:
+            self._errands.add(self.writeback.on_doubt(reason, self._host_s))
 
     def _fault(self, code: int) -> None:
         self.faults += 1
@@ -242,10 +253,13 @@ class Core:
                 name = f"{identity.model} serial {identity.serial}"
                 self._note("info", f"{name} firmware {identity.firmware}")
                 self._rollcall.identified()
-                if self._serial not in (None, identity.serial):
+                if self._unit not in (None, identity.unit):
+                    self._flush()
+                    self.stream.forget()
+                    self._watch.forget()
                     self._note("warning", "another device: its calibration begins anew")
                     self.calibrator = Calibrator(*self._from_scratch)
-                self._serial = identity.serial
+                self._unit = identity.unit
                 self._out.append(events.OpenJournal(identity.serial))
             case ConfigurationRead(values):
                 self._flush()
@@ -257,8 +271,12 @@ class Core:
                 self._in_force(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
+            case Looked(seen, error):
+                more = self.writeback.on_looked(seen, str(error or ""), self._host_s)
+                self._errands.add(more)
             case StreamChanged(text, level):
                 self._flush()
+                self._watch.forget()
                 self.stream.forget()
                 if text:
                     self._note(level, text)
@@ -269,6 +287,7 @@ class Core:
                 self._no_device()
             case Completed(name, result, error):
                 self._flush()
+                self._watch.forget()
                 self.stream.forget()
                 if error is None:
                     more = self.writeback.on_procedure_finished(name, result, self._host_s)
@@ -311,6 +330,13 @@ class Core:
         else:
             self._in_force(dict(registers))
 
+    def calibrate_anew(self, reason: str) -> None:
+        """Nobody knows since when the registers that un-map the samples are not in force."""
+        self._flush()
+        self._unread = True  # from scratch as soon as they are read
+        self._breaks += 1
+        self._note("warning", f"calibrated anew: {reason}")
+
     def _on_state(self, change: events.StateChanged) -> None:
         self.decisions.add(self.at_s, change.new, reason=change.reason)
         if change.new == State.TRIAL:
@@ -337,6 +363,8 @@ class Core:
         if self.stream.take_replaced():
             self.calibrator = self.calibrator.anew()
             self._begin(self._desk.compare(self.calibrator, *self._compared))
+        reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
+        self._doubt(reason)
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
         self._out.append(events.SamplesSeen(block, present, self._proposed))
         self._errands.add(self.writeback.on_samples(block))

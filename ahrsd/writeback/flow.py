@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from ahrsd.calibration import Estimate
-from ahrsd.writeback.actions import IdentifyAgain, SetUpStream
+from ahrsd.writeback.actions import CalibrateAnew, IdentifyAgain, SetUpStream
 from ahrsd.writeback.composition import (
     Proposal,
     UnwritableError,
@@ -48,6 +48,7 @@ class Flow:
         self.proposal: Proposal | None = None
         self.approver = ""
         self.trial = Trial(policy.trial, 0.0)
+        self.passed = ""  # why the trial is passed, until the device was asked again
         self._cause = "device"
         self._from_fault = False
         self._since_s = 0.0
@@ -261,6 +262,7 @@ class Flow:
         self.desk.record(Kind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
+        self.passed = ""
         self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
 
     def _enter_proven(self, reason: str) -> None:
@@ -317,6 +319,18 @@ class Flow:
         self.desk.in_force(None)
         self.desk.ask(IdentifyAgain())
         self.signal(Signal.IN_DOUBT, reason)
+
+    def expected(self, read: Mapping[int, Values]) -> dict[int, Values]:
+        """What these registers hold, as far as is known."""
+        return {n: self.registers[n] for n in read if n in self.registers}
+
+    def changed(self, numbers: tuple[int, ...]) -> None:
+        """The device holds something else than it was left with, nobody knows since when."""
+        which = f"register{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
+        reason = f"{which} changed: the device restarted unseen, or somebody else wrote"
+        self.desk.note("warning", reason)
+        self.desk.ask(CalibrateAnew(reason))
+        self.look_closer(reason)
 
     def _another(self, unit: Unit, written: bool) -> None:
         """In the middle of a conversation; the journal that is open is still the first device's."""

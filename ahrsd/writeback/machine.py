@@ -21,12 +21,13 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.actions import Action, IdentifyAgain
+from ahrsd.writeback.actions import Action, IdentifyAgain, Look
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
 from ahrsd.writeback.flow import Flow
 from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
+from ahrsd.writeback.recheck import Recheck
 from ahrsd.writeback.reconcile import Kind
 from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
@@ -38,16 +39,18 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import Outcome
 from ahrsd.writeback.trial import Finding, TrialMetrics
-from drivers.vn100.procedures import Identity
+from drivers.vn100.procedures import Identity, Seen, differences
 from drivers.vn100.registers import Values
 
 UPTIME_MARGIN_S = 0.5  # what a message may take to get here
+RECHECKED = (23, 25, 26, 44, 84)  # what a sample went through depends on them
 
 _AWAITED = {
     State.PREPARING: Kind.PREPARED,
     State.STAGED: Kind.RAM_VERIFIED,
     State.SAVE_PREPARING: Kind.FLASH_SENT,
 }
+_NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
 
 class WriteBack:
@@ -59,6 +62,7 @@ class WriteBack:
         self._desk = self._flow.desk
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
+        self._recheck = Recheck(policy.recheck_s)
         self._saw_reset = False
         self._read_from_s = float("inf")  # since when the registers were being read; inf: told
 
@@ -92,7 +96,7 @@ class WriteBack:
     @property
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
-        deadlines = [self._flow.deadline_s]
+        deadlines = [self._flow.deadline_s, self._recheck.due_s]
         if self._flow.watches_interlock:
             deadlines.append(self._desk.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
@@ -119,6 +123,8 @@ class WriteBack:
         self._desk.host_s = host_s
         if self._flow.deadline_s is not None and host_s >= self._flow.deadline_s:
             self._flow.on_timeout()
+        if self._recheck.is_due(host_s):
+            self._ask_again()
         return self._answer()
 
     def on_device(
@@ -143,6 +149,7 @@ class WriteBack:
         uptime_s:     the device's own time since its start-up, where its stream says it
         """
         flow, self._desk.host_s = self._flow, host_s
+        self._recheck.begin(host_s)
         self._desk.bind(identity.serial, journal, wall_s)
         self._safe.bind(identity, registers, journal is not None)
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
@@ -161,6 +168,7 @@ class WriteBack:
     def on_no_device(self, registers: Mapping[int, Values] | None, host_s: float) -> list[Action]:
         """There is nobody to ask: mode passive, or a recording. Registers where they are known."""
         self._desk.host_s = host_s
+        self._recheck.off()
         identity = Affine.identity().to_register()
         self._flow.registers = {MAG: identity, GYRO: identity, **(registers or {})}
         self._safe.no_device("there is no device to write to")
@@ -198,6 +206,33 @@ class WriteBack:
             self._saw_reset = True
             self._flow.signal(Signal.DEVICE_RESET, "the device restarted since the save")
             self._desk.ask(IdentifyAgain())
+        return self._answer()
+
+    def on_looked(self, seen: Seen | None, error: str, host_s: float) -> list[Action]:
+        """Who answered and what it holds, or why nobody did."""
+        self._desk.host_s, flow = host_s, self._flow
+        if flow.identity is None or self.state is State.RECONCILING or self._desk.running:
+            return self._answer()  # overtaken
+        if seen is None:
+            self._desk.note(
+                "warning", f"the device does not say who it is and what it holds: {error}"
+            )
+            self._recheck.soon(host_s)
+        elif seen.unit != flow.identity.unit:
+            flow.another(seen.unit)
+        elif changed := differences(flow.expected(seen.values), seen.values):
+            flow.changed(tuple(changed))
+        elif self.state is State.TRIAL and self._flow.passed:
+            self._desk.record(Kind.PROVEN, reason=self._flow.passed)
+            flow.signal(Signal.TRIAL_PASSED, self._flow.passed)
+        return self._answer()
+
+    def on_doubt(self, reason: str, host_s: float) -> list[Action]:
+        """The stream makes it doubtful whether this is still the device that was read."""
+        self._desk.host_s = host_s
+        self._desk.note("debug", f"{reason}: the device is asked again who it is")
+        self._safe.doubt(host_s)
+        self._recheck.soon(host_s)
         return self._answer()
 
     def on_samples(self, block: SampleBlock) -> list[Action]:
@@ -259,9 +294,10 @@ class WriteBack:
             finding, reason = self._flow.trial.judge(metrics)
             if finding is Finding.FAILED:
                 self._flow.roll_back("trial", reason)
-            elif finding is Finding.PASSED:
-                self._desk.record(Kind.PROVEN, reason=reason)
-                self._flow.signal(Signal.TRIAL_PASSED, reason)
+            elif finding is Finding.PASSED and not self._flow.passed:
+                self._recheck.now(host_s)  # proven is what the device still holds
+                self._ask_again()
+            self._flow.passed = reason if finding is Finding.PASSED else ""
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:
@@ -301,6 +337,15 @@ class WriteBack:
             self._desk.running = ""
             self._flow.on_failure(str(error))
         return self._answer()
+
+    def _ask_again(self) -> None:
+        """Have the device say who it is and what it holds, unless something else runs."""
+        flow, now_s = self._flow, self._desk.host_s
+        self._recheck.begin(now_s)
+        if flow.identity is None or self._desk.running or self.state in _NOT_ASKED:
+            return
+        expected = {n: flow.registers[n] for n in RECHECKED if n in flow.registers}
+        self._desk.ask(Look(flow.identity.unit, expected))
 
     def _arm(self, armed: bool) -> None:
         """Whether this run may begin a write or a save; what is under way is not undone."""

@@ -32,6 +32,7 @@ class Safeguards:
         self.armed = policy.armed_at_start
         self.gates: tuple[GateResult, ...] = ()
         self.flash_gates: tuple[GateResult, ...] = ()
+        self.doubt_s = float("-inf")  # host time of the last doubt about the device
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
         self._is_ours = False
@@ -68,6 +69,11 @@ class Safeguards:
             self._limits.append(f"registers {missing} could not be read")
         if not journal_readable:
             self._limits.append("the journal cannot be read; see its error")
+
+    def doubt(self, host_s: float) -> None:
+        """What was judged of samples until now is of before a doubt: nothing is saved by it."""
+        self.flash_gates, self.doubt_s = (), host_s
+        self.stillness.reset()
 
     def hear_interlock(self, safe: bool, host_s: float) -> None:
         """The vehicle's word."""

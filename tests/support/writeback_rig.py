@@ -22,6 +22,7 @@ from ahrsd.writeback.actions import (
     IdentifyAgain,
     InForce,
     JournalAppend,
+    Look,
     RunProcedure,
     SetUpStream,
 )
@@ -33,7 +34,7 @@ from drivers.vn100.commands import Command, NoReply, NotPermitted, Pause, Read, 
 from drivers.vn100.decode import Reply
 from drivers.vn100.errors import DeviceRefused, DriverError
 from drivers.vn100.firmware import profile_of
-from drivers.vn100.procedures import CONFIGURATION, Identity
+from drivers.vn100.procedures import CONFIGURATION, Identity, Seen, Unit
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_reply, parse
 
 MODEL, FIRMWARE, SERIAL = "VN-100T-CR", "3.1.0.0", 100130608
@@ -188,6 +189,8 @@ class Rig:
                 queue = self._append(action) + queue
             elif isinstance(action, RunProcedure):
                 queue += self._carry_out(action)
+            elif isinstance(action, Look):
+                queue += self._look(action)
             elif isinstance(action, Emit):
                 self.events.append(action.event)
             elif isinstance(action, InForce):
@@ -234,6 +237,12 @@ class Rig:
             return error
         self._point()
         return reply
+
+    def _look(self, action: Look) -> list[Action]:
+        """Who answers and what it holds, without a word in the log."""
+        unit = Unit(MODEL, self.device.serial, FIRMWARE)
+        held = {n: printed(n, self.device.ram[n]) for n in action.expected}
+        return self.wb.on_looked(Seen(unit, held), "", self.now_s)
 
     def _point(self) -> None:
         """A place where the power may go."""

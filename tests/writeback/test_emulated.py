@@ -43,7 +43,7 @@ class Bench:
     def identify(self):
         def everything():
             who = yield from identify_surely()
-            return who, (yield from read_surely(who.profile, (23, 84)))
+            return who, (yield from read_surely(who, (23, 84)))
 
         self.waiting.append(RunProcedure("identify", Purpose.READ, everything, lambda _: True))
 
