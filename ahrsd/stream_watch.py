@@ -25,9 +25,9 @@ class StreamWatch:
         self._heard_s: float | None = None
         self._last: tuple[float, Array] | None = None
 
-    def forget(self) -> None:
-        """The output was paused by ourselves, or begins anew."""
-        self._heard_s = self._last = None
+    def resumed(self, host_s: float) -> None:
+        """The output was paused by ourselves, or begins anew: from now on it ought to come."""
+        self._heard_s, self._last = host_s, None
 
     def heard(self, host_s: float, rate_hz: float) -> str:
         """Messages came at `host_s`; the rate is nan while nobody knows it."""

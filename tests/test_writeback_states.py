@@ -23,7 +23,6 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "write-back.md"
 RESTING = {
     State.OBSERVING,
     State.CANDIDATE,
-    State.PROVEN,
     State.COMMITTED,
     State.CONFIRMED,
     State.ROLLED_BACK,

@@ -19,12 +19,20 @@ from ahrsd.writeback.composition import (
 )
 from ahrsd.writeback.desk import Desk
 from ahrsd.writeback.permissions import Mode, Purpose
-from ahrsd.writeback.policy import WriteBackPolicy, worth_writing
+from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
 from ahrsd.writeback.reconcile import Kind, found
 from ahrsd.writeback.safeguards import Safeguards
-from ahrsd.writeback.states import ON_TIMEOUT, TABLE, Signal, State
+from ahrsd.writeback.states import (
+    LIVED_WITH,
+    ON_TIMEOUT,
+    TABLE,
+    WITHOUT_TRANSACTION,
+    Signal,
+    State,
+)
 from ahrsd.writeback.transaction import Outcome, Transaction, check, roll_back, save, stage
+from ahrsd.writeback.trial import Finding as Verdict
 from ahrsd.writeback.trial import Trial
 from drivers.vn100.procedures import Identity, Unit
 from drivers.vn100.registers import Values, same
@@ -50,7 +58,8 @@ class Flow:
         self.trial = Trial(policy.trial, 0.0)
         self.passed = ""  # why the trial is passed, until the device was asked again
         self._cause = "device"
-        self._from_fault = False
+        self._from_fault = self._resumed = False
+        self._against_since_s: float | None = None
         self._since_s = 0.0
         self._save_from_s = float("-inf")
         self._on_entry: dict[State, Callable[[str], None]] = {
@@ -87,7 +96,7 @@ class Flow:
         """Arrive in a state. A conversation of the old one ends."""
         self.desk.stop_running()
         old, self.state = self.state, state
-        self._from_fault = old is State.FAULT
+        self._from_fault, self._resumed = old is State.FAULT, old is State.RECONCILING
         self._since_s = self.desk.host_s
         wait = ON_TIMEOUT.get(state)
         self.deadline_s = None if wait is None else self.desk.host_s + wait[0]
@@ -100,6 +109,8 @@ class Flow:
         now = (self.desk.history, self.desk.host_s, self.desk.wall_s)
         if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
             self.signal(Signal.APPROVED, f"approved: {self.approver}")
+        elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
+            self.roll_back("void", self.safe.void)
         elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
             if not self.safe.save_holds(*now):
                 self.signal(Signal.SAVE_DUE, "proven, safe and still")
@@ -187,6 +198,55 @@ class Flow:
             self.desk.note("warning", f"this estimate cannot be written: {error}")
             return None
 
+    # -- what is in force, judged by what comes in ------------------------------------------------
+
+    def compare(self, estimate: Estimate, gyro_is_raw: bool) -> None:
+        """Does the present estimate still ask for what was written, and do its gates pass?
+
+        The smallest disagreement holds the pass of a trial and a save; one that is clear and lasts
+        as long as a bad figure may ends them.
+        """
+        reason = clear = ""
+        if red := [gate.gate for gate in self.safe.gates if not gate.ok]:
+            reason = clear = f"gates not met: {', '.join(red)}"
+        elif (fresh := self._compose(estimate, gyro_is_raw)) is None:
+            reason = "there is no present estimate to compare with what was written"
+        elif worth_writing(self.policy, self.desk.history, fresh):
+            reason = (
+                f"the present estimate asks for another {fresh.heading_change_deg:.1f} deg and "
+                f"{fresh.gyro_change_rad_s:.4f} rad/s"
+            )
+            clear = reason if contradicts(self.policy, fresh, estimate) else ""
+        self.safe.disagrees = reason
+        if not clear:
+            self._against_since_s = None
+        elif self._against_since_s is None:
+            self._against_since_s = self.desk.host_s
+        elif self.desk.host_s - self._against_since_s >= self.policy.trial.worse_for_s:
+            self.void(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
+
+    def void(self, reason: str) -> None:
+        """What was calibrated before holds no more: what is not in flash yet never gets there."""
+        if self.state in WITHOUT_TRANSACTION:
+            self.signal_if(Signal.GATES_FAILED, reason)
+            return
+        self.safe.void = reason
+        self.roll_back("void", reason)
+
+    def prove_again(self, reason: str) -> None:
+        """What was proven was so before a doubt."""
+        if self.state in LIVED_WITH:
+            self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
+            self.passed = ""
+            self.safe.proof_waits = f"{reason}: what is in force is on trial again"
+
+    def judge_proof(self, finding: Verdict, reason: str) -> None:
+        """What is proven goes on being judged until it is saved."""
+        if finding is Verdict.FAILED:
+            self.roll_back("trial", reason)
+        elif finding is Verdict.PASSED:
+            self.safe.proof_waits = ""
+
     # -- locks -------------------------------------------------------------------------------------
 
     def lock(self, reason: str) -> None:
@@ -232,6 +292,8 @@ class Flow:
         )
 
     def _enter_preparing(self, reason: str) -> None:
+        self.safe.void = self.safe.disagrees = self.safe.proof_waits = ""
+        self._against_since_s = None
         proposal, identity = self._the_proposal(), self._the_identity()
         transaction = Transaction(
             id=f"{proposal.id}-{self.desk.wall_s:.0f}",
@@ -266,7 +328,13 @@ class Flow:
         self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
 
     def _enter_proven(self, reason: str) -> None:
-        """Also the way back from a save that was not sent: it does not count and waits a while."""
+        """Also the way back from a save that was not sent: it does not count and waits a while.
+
+        What an earlier run, or one before an interruption, has proven is proven again before it is
+        saved: nobody knows what happened to the vehicle meanwhile.
+        """
+        if self._resumed:
+            self.prove_again(reason)
         if self.desk.history.last is Kind.FLASH_SENT:
             self._save_from_s = self.desk.host_s + RETRY_SAVE_S
             self.desk.record(Kind.PROVEN, reason=reason, unsent=True)

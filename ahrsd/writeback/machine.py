@@ -32,6 +32,7 @@ from ahrsd.writeback.reconcile import Kind
 from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
+    LIVED_WITH,
     ON_TIMEOUT,
     WITHOUT_TRANSACTION,
     Signal,
@@ -222,21 +223,29 @@ class WriteBack:
             flow.another(seen.unit)
         elif changed := differences(flow.expected(seen.values), seen.values):
             flow.changed(tuple(changed))
-        elif self.state is State.TRIAL and self._flow.passed:
+        elif self.state is State.TRIAL and self._flow.passed and not self._safe.disagrees:
+            self._safe.proof_waits = ""
             self._desk.record(Kind.PROVEN, reason=self._flow.passed)
             flow.signal(Signal.TRIAL_PASSED, self._flow.passed)
         return self._answer()
 
-    def on_doubt(self, reason: str, host_s: float) -> list[Action]:
-        """The stream makes it doubtful whether this is still the device that was read."""
+    def on_doubt(self, reason: str, host_s: float, *, jumped: bool = False) -> list[Action]:
+        """The stream makes it doubtful whether this is still the device that was read.
+
+        jumped: its readings did, so what was proven before must be proven again.
+        """
         self._desk.host_s = host_s
         self._desk.note("debug", f"{reason}: the device is asked again who it is")
         self._safe.doubt(host_s)
+        if jumped:
+            self._flow.prove_again(reason)
         self._recheck.soon(host_s)
         return self._answer()
 
     def on_samples(self, block: SampleBlock) -> list[Action]:
         """Raw samples: for the proof that the vehicle stands still."""
+        if len(block):
+            self._safe.sampled_s = float(block.host_s[-1])
         self._safe.stillness.update(block, self._gyro_bias_rad_s)
         return self._answer()
 
@@ -255,17 +264,35 @@ class WriteBack:
         *,
         flash_gates: tuple[GateResult, ...] = (),
         gyro_is_raw: bool = True,
+        sampled_s: float | None = None,
     ) -> list[Action]:
         """A new estimate and what the gates say: for RAM (none at all is no pass), and for flash.
 
         gyro_is_raw: see `composition.compose`.
+        sampled_s:   host time of the newest sample that was judged; None: now
         """
         self._desk.host_s, self._desk.at_s = host_s, at_s
-        self._safe.gates, self._safe.flash_gates = gates, flash_gates
+        self._safe.judged_s = host_s if sampled_s is None else sampled_s
+        fresh = sampled_s is None or sampled_s > self._safe.doubt_s
+        self._safe.gates, self._safe.flash_gates = gates, flash_gates if fresh else ()
         if np.isfinite(estimate.gyro_bias_rad_s).all():
             self._gyro_bias_rad_s = estimate.gyro_bias_rad_s
         if self.state in WITHOUT_TRANSACTION:
             self._flow.consider(estimate, gyro_is_raw)
+        elif self.state in LIVED_WITH:
+            self._flow.compare(estimate, gyro_is_raw)
+        return self._answer()
+
+    def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
+        """What was calibrated until now holds no more: something on the vehicle changed."""
+        self._desk.host_s, self._desk.at_s = host_s, at_s
+        self._safe.doubt(host_s)
+        self._flow.void(reason)
+        return self._answer()
+
+    def on_examined(self, sampled_s: float, host_s: float) -> list[Action]:
+        """The estimate has taken the samples up to this host time into account."""
+        self._desk.host_s, self._safe.examined_s = host_s, sampled_s
         return self._answer()
 
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
@@ -289,15 +316,18 @@ class WriteBack:
     def on_trial_metrics(self, metrics: TrialMetrics, host_s: float) -> list[Action]:
         """The new registers against the old ones on live samples."""
         self._desk.host_s = host_s
-        if self.state is State.TRIAL and metrics.finite:
-            self._flow.deadline_s = host_s + ON_TIMEOUT[State.TRIAL][0]
+        if self.state in (State.TRIAL, State.PROVEN) and metrics.finite:
+            self._flow.deadline_s = host_s + ON_TIMEOUT[self.state][0]
             finding, reason = self._flow.trial.judge(metrics)
-            if finding is Finding.FAILED:
+            if self.state is State.PROVEN:
+                self._flow.judge_proof(finding, reason)
+            elif finding is Finding.FAILED:
                 self._flow.roll_back("trial", reason)
             elif finding is Finding.PASSED and not self._flow.passed:
                 self._recheck.now(host_s)  # proven is what the device still holds
                 self._ask_again()
-            self._flow.passed = reason if finding is Finding.PASSED else ""
+            if self.state is State.TRIAL:
+                self._flow.passed = reason if finding is Finding.PASSED else ""
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:
@@ -328,6 +358,8 @@ class WriteBack:
         if name == self._desk.running and isinstance(result, Outcome):
             self._desk.running = ""
             self._flow.on_outcome(result)
+            if not result.as_expected:
+                self._recheck.now(host_s)
         return self._answer()
 
     def on_procedure_failed(self, name: str, error: Exception, host_s: float) -> list[Action]:
@@ -336,6 +368,7 @@ class WriteBack:
         if name == self._desk.running:
             self._desk.running = ""
             self._flow.on_failure(str(error))
+            self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()
 
     def _ask_again(self) -> None:
@@ -343,6 +376,7 @@ class WriteBack:
         flow, now_s = self._flow, self._desk.host_s
         self._recheck.begin(now_s)
         if flow.identity is None or self._desk.running or self.state in _NOT_ASKED:
+            self._recheck.soon(now_s)
             return
         expected = {n: flow.registers[n] for n in RECHECKED if n in flow.registers}
         self._desk.ask(Look(flow.identity.unit, expected))

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from ahrsd.calibration import Estimate
 from ahrsd.writeback.composition import Proposal
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.permissions import Mode
 
 DAY_S: Final = 86400.0
+CLEAR_SIGMAS: Final = 4.0
+VERDICT_AGE_S: Final = 600.0  # a save must be of what is true now, as an approval must
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +111,18 @@ def worth_writing(policy: WriteBackPolicy, history: History, proposal: Proposal)
         proposal.heading_change_deg >= factor * policy.min_change_deg
         or proposal.gyro_change_rad_s >= factor * policy.min_gyro_change_rad_s
     )
+
+
+def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate) -> bool:
+    """Whether an estimate clearly speaks against the values that are in force.
+
+    By twice what is worth a write, and beyond its own uncertainty.
+    """
+    heading_deg = max(2.0 * policy.min_change_deg, CLEAR_SIGMAS * estimate.heading_sigma_deg)
+    gyro_rad_s = max(
+        2.0 * policy.min_gyro_change_rad_s, CLEAR_SIGMAS * float(estimate.sigma[9:].max())
+    )
+    return proposal.heading_change_deg > heading_deg or proposal.gyro_change_rad_s > gyro_rad_s
 
 
 def ram_budget(policy: WriteBackPolicy, history: History, wall_s: float) -> list[str]:

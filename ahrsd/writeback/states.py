@@ -11,7 +11,8 @@ before the device does: nothing is sent until the record of what the device held
     STAGING       23 and 84 written and read back; from here on only ROLLING_BACK leads out
     STAGED        the device holds the new values in RAM; waits for the journal to say so too
     TRIAL         lives with them, is judged against the old ones on the same samples
-    PROVEN        was better, or not worse, for long enough; in mode `stage` it rests here
+    PROVEN        was better, or not worse, for long enough, and goes on being judged; what voids a
+                  trial ends it too; in mode `stage` it rests here
     SAVE_PREPARING waits for the journal to say that the flash is about to be written
     SAVING        session settings put back, every register compared, then VNWNV: one conversation
     COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
@@ -169,7 +170,13 @@ TABLE: Final[dict[State, dict[Signal, State]]] = {
         E.ROLL_BACK: S.ROLLING_BACK,
         E.TIMEOUT: S.ROLLING_BACK,
     },
-    S.PROVEN: {**_AWAY, E.SAVE_DUE: S.SAVE_PREPARING, E.ROLL_BACK: S.ROLLING_BACK},
+    S.PROVEN: {
+        **_AWAY,
+        E.SAVE_DUE: S.SAVE_PREPARING,
+        E.TRIAL_FAILED: S.ROLLING_BACK,
+        E.ROLL_BACK: S.ROLLING_BACK,
+        E.TIMEOUT: S.ROLLING_BACK,
+    },
     S.SAVE_PREPARING: {
         **_AWAY,
         E.JOURNALLED: S.SAVING,
@@ -208,6 +215,7 @@ ON_TIMEOUT: Final[dict[State, tuple[float, State]]] = {
     S.STAGING: (30.0, S.ROLLING_BACK),  # it may have been changed
     S.STAGED: (5.0, S.ROLLING_BACK),
     S.TRIAL: (60.0, S.ROLLING_BACK),  # since the last finite metric: unjudged is not proven
+    S.PROVEN: (600.0, S.ROLLING_BACK),  # since the last finite metric: a proof ages
     S.SAVE_PREPARING: (5.0, S.PROVEN),  # VNWNV was not sent
     S.SAVING: (30.0, S.FAULT),  # it may have been carried out: only a reset tells
     S.ROLLING_BACK: (30.0, S.FAULT),
@@ -225,6 +233,8 @@ CHANGED_IN_RAM: Final = frozenset(
         S.ROLLING_BACK,
     }
 )
+# The vehicle lives with new values that may still be undone: whatever voids them ends it.
+LIVED_WITH: Final = frozenset({S.TRIAL, S.PROVEN, S.SAVE_PREPARING, S.SAVING})
 WITHOUT_TRANSACTION: Final = frozenset(
     {S.OBSERVING, S.CANDIDATE, S.QUALIFIED, S.COMMITTED, S.CONFIRMED, S.ROLLED_BACK}
 )

@@ -120,8 +120,10 @@ def read(register: int, port: int | None = None) -> Procedure[Values]:
 
 
 def read_unit() -> Procedure[Unit]:
-    """Who answers now: registers 1, 3 and 4."""
-    values = yield from read_registers((1, 3, 4))
+    """Who answers now. The serial number is the last that is read: only that of whoever has the
+    cable by then counts, whatever was heard of another unit before.
+    """
+    values = yield from read_registers((1, 4, 3))
     return Unit(str(values[1][0]), int(values[3][0]), str(values[4][0]))
 
 
