@@ -55,6 +55,7 @@ class Calibrator:
         self.step: Step | None = None  # the newest one that was told
         self.step_open = False  # the estimate still rests on data from before it
         self._notes: list[tuple[float, str]] = []
+        self._void = ""
         self._at_s = float("nan")
         self._heeded_s: float | None = None  # the estimator's restart that was told
 
@@ -63,6 +64,11 @@ class Calibrator:
         """The correction of the estimate, once it has converged."""
         found = self.estimate
         return found.correction if found is not None and found.converged else None
+
+    def take_void(self) -> str:
+        """Why a calibration from before the last call holds no more; empty where it may hold."""
+        void, self._void = self._void, ""
+        return void
 
     def take_notes(self, host_s: float) -> list[Noted]:
         """Warnings since the last call: what changed on the vehicle."""
@@ -101,6 +107,7 @@ class Calibrator:
         if step is not None:
             self.step, self.step_open = step, True
             self._notes.append((step.told_s, step.words))
+            self._void = step.words
         elif self.step_open and self._waited_enough:
             self.estimator = Estimator(
                 self.settings.estimator, self.present, self.present_gyro_bias_rad_s
@@ -118,7 +125,8 @@ class Calibrator:
         at_s = self.estimator.restarted_s
         if estimate is not None and at_s is not None and at_s != self._heeded_s:
             self._heeded_s = at_s
-            self._begin_anew([change.spoken(at_s)])
+            self._void = change.spoken(at_s)
+            self._begin_anew([self._void])
 
     def _begin_anew(self, notes: list[str]) -> None:
         """The estimate forgot what was before a change: evidence from then proves nothing now."""

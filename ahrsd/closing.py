@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from drivers.vn100.calibration_stream import DoesNotFit, NoStream, NotPutBack
 from drivers.vn100.commands import Pause, Procedure, SessionError
-from drivers.vn100.firmware import Profile
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -15,6 +14,7 @@ from drivers.vn100.procedures import (
     quiet,
     read,
     read_configuration,
+    read_unit,
     restore,
 )
 from drivers.vn100.registers import Values, format_command, same
@@ -78,23 +78,40 @@ def again_after(error: Exception) -> tuple[float, float] | None:
 
 
 def identify_in(seconds: float) -> Procedure[Identity]:
-    """`identify` after a while."""
+    """`identify_surely` after a while."""
     yield Pause(seconds)
-    return (yield from identify())
+    return (yield from identify_surely())
 
 
-def read_surely(profile: Profile, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
-    """The configuration; registers that will be put back are read `twice`, and can be written.
+def identify_surely() -> Procedure[Identity]:
+    """Who answers, asked twice: an altered reply must not pass for another device.
+
+    Raises Unsteady.
+    """
+    identity = yield from identify()
+    again = yield from read_unit()
+    if again != identity.unit:
+        raise Unsteady(f"the device says that it is {identity.unit}, then {again}")
+    return identity
+
+
+def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """The configuration of this device, and at the end it still is this device that answers.
+
+    Some registers are read `twice`; those that will be put back can be written.
 
     A reading that was altered on the way would else become what the user had. Raises Unsteady,
     RegisterValueError.
     """
-    values = yield from read_configuration(profile)
+    values = yield from read_configuration(identity.profile)
     for number in (n for n in twice if n in values):
         again = yield from read(number)
         if not same(number, values[number], again):
             raise Unsteady(f"register {number} reads {values[number]}, then {again}")
-        format_command(number, again, held=True)
+        if number in SESSION_SETTINGS:
+            format_command(number, again, held=True)
+    if (unit := (yield from read_unit())) != identity.unit:
+        raise Unsteady(f"{unit} answers, and a moment ago it was {identity.unit}")
     return values
 
 

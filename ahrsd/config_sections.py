@@ -338,6 +338,9 @@ class WriteBack(Section):
     """And a change of the gyro bias below this neither. [rad/s]"""
     margin_after_rollback: float = Field(default=_POLICY.margin_after_rollback, ge=1.0, le=100.0)
     """After a rollback only changes so many times as large are worth a write. [1]"""
+    recheck_s: float = Field(default=_POLICY.recheck_s, ge=5.0, le=600.0)
+    """How often the device is asked again who it is and what registers 23, 25, 26, 44 and 84 hold,
+    in every mode but passive. [s]"""
 
 
 class Trial(Section):

@@ -3,6 +3,7 @@
 ```
  CLOSED -> IDENTIFYING -> READING -> [KEEPING -> SETTING_UP] -> READY -> RESTORING -> DONE
                                                                 READY <-> RUNNING (the write-back)
+                                                                READY <-> LOOKING (who answers?)
 ```
 Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_outputs`).
 A device that falls silent though it may be told to talk is asked for its output (`silence`), and
@@ -25,6 +26,7 @@ from ahrsd.said import (
     Completed,
     ConfigurationRead,
     Identified,
+    Looked,
     Phase,
     Said,
     StreamChanged,
@@ -32,12 +34,21 @@ from ahrsd.said import (
 )
 from ahrsd.silence import Silence
 from ahrsd.writeback.journal_history import JournalRecord
-from ahrsd.writeback.permissions import Mode, Purpose, permitted
+from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
 from ahrsd.writeback.reconcile import Kind
 from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
 from drivers.vn100.commands import RESUME, Command, LinkGone, Procedure
 from drivers.vn100.decode import Measurement
-from drivers.vn100.procedures import SESSION_SETTINGS, Identity, identify, quiet, restore, resume
+from drivers.vn100.procedures import (
+    SESSION_SETTINGS,
+    Identity,
+    Seen,
+    Unit,
+    look,
+    quiet,
+    restore,
+    resume,
+)
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, Failed, Finished, Session
 
@@ -93,6 +104,11 @@ class Conversation:
     def idle(self) -> bool:
         """Whether a procedure may be started now."""
         return self.phase is Phase.READY and not self.session.busy
+
+    @property
+    def listening(self) -> bool:
+        """Whether the device's output runs as it is, undisturbed by a procedure."""
+        return self.phase in (Phase.READY, Phase.LOOKING)
 
     @property
     def may_close(self) -> bool:
@@ -159,7 +175,9 @@ class Conversation:
             return []
         events = self._abandon(now_s)
         self.phase = Phase.IDENTIFYING
-        return events + self._digest(self._start(identify(), Purpose.READ, now_s), now_s)
+        return events + self._digest(
+            self._start(closing.identify_surely(), Purpose.READ, now_s), now_s
+        )
 
     def received(self, data: bytes, now_s: float) -> list[Event]:
         """Bytes came; returns measurements, faults and strays, in order."""
@@ -201,6 +219,17 @@ class Conversation:
         """Start a procedure of the write-back; only while `idle`. `gate` is asked per command."""
         self.phase, self._name, self._extra_gate = Phase.RUNNING, name, gate
         return self._digest(self._start(procedure, purpose, now_s), now_s)
+
+    def look(self, unit: Unit, expected: Mapping[int, Values], now_s: float) -> list[Event]:
+        """Ask who answers and what it holds, beside the running output; only while `idle`."""
+        self.phase = Phase.LOOKING
+        return self._digest(self._start(look(unit, expected), Purpose.READ, now_s), now_s)
+
+    def stop_looking(self, now_s: float) -> list[Event]:
+        """Something more urgent waits."""
+        if self.phase is not Phase.LOOKING:
+            return []
+        return self._digest(self.session.cancel(now_s), now_s)
 
     def cancel(self, name: str, now_s: float) -> list[Event]:
         """End the procedure of this name, if it runs; it may still send what puts things back."""
@@ -336,6 +365,10 @@ class Conversation:
             self._ready(now_s)
             self._said.append(Completed(self._name, result, error))
             return []
+        if phase is Phase.LOOKING:
+            self._ready(now_s)
+            self._said.append(Looked(result if isinstance(result, Seen) else None, error))
+            return []
         if phase is Phase.CLOSED:
             return []
         if phase is Phase.RESTORING:
@@ -392,8 +425,8 @@ class Conversation:
             self.identity, self._serial = result, result.serial
             self._said.append(Identified(result))
             self.phase = Phase.READING
-            twice = SESSION_SETTINGS if self.change_stream else ()
-            return self._start(closing.read_surely(result.profile, twice), Purpose.READ, now_s)
+            twice = (*CALIBRATION, *(SESSION_SETTINGS if self.change_stream else ()))
+            return self._start(closing.read_surely(result, twice), Purpose.READ, now_s)
         if phase is Phase.READING and isinstance(result, dict) and self.identity is not None:
             self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]
             self.identity = self.identity.observed_without(result)

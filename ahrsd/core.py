@@ -38,6 +38,7 @@ from ahrsd.said import (
     Completed,
     ConfigurationRead,
     Identified,
+    Looked,
     Said,
     StreamChanged,
     Unanswered,
@@ -45,13 +46,15 @@ from ahrsd.said import (
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.sensor_checks import SensorChecks
 from ahrsd.stream import Stream
+from ahrsd.stream_watch import StreamWatch
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.vehicle_terms import VehicleTerms
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import Kind
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import LIVED_WITH, State
 from drivers.vn100.decode import Measurement, Undecodable, Unused
+from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import Values
 from drivers.vn100.session import DeviceFault, LineEchoes, Stray
 from drivers.vn100.session import Event as SessionEvent
@@ -88,7 +91,8 @@ class Core:
         self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
         self._stopping = ""
         self._closing = self._unread = False
-        self._serial: int | None = None
+        self._unit: Unit | None = None
+        self._watch = StreamWatch()
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
@@ -199,6 +203,8 @@ class Core:
     def take(self, found: list[SessionEvent]) -> None:
         """Measurements to the stream, with what was damaged between them; the rest is counted."""
         skipped = deque(self.conversation.session.deframer.take_skipped())
+        if any(isinstance(event, Measurement) for event in found):
+            self._doubt(self._watch.heard(self._host_s, self.stream.facts.rate_hz))
         for event in found:
             if isinstance(event, Measurement):
                 while skipped and skipped[0].offset < event.offset:
@@ -224,6 +230,14 @@ class Core:
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
             self._device_reset("its time fell", self.at_s)
+
+    def _doubt(self, reason: str, *, jumped: bool = False) -> None:
+        """Whose samples these are is not sure any more; empty: it is."""
+        if reason and self.conversation.listening and self.conversation.identity is not None:
+            more = self.writeback.on_doubt(reason, self._host_s, jumped=jumped)
+            self._errands.add(more)
+            if jumped and self._trial is not None:
+                self._begin_trial()  # it is judged by what comes after the jump
 
     def _fault(self, code: int) -> None:
         self.faults += 1
@@ -262,17 +276,24 @@ class Core:
         self._compared = user_compensation(users)
         self._begin(self._desk.compare(self.calibrator, *self._compared))
 
+    def _identified(self, unit: Unit) -> None:
+        """A device said who it is; what was estimated of another one is not for it."""
+        self._note("info", str(unit))
+        self._rollcall.identified()
+        if self._unit not in (None, unit):
+            self._flush()
+            self.stream.forget()
+            self._watch.resumed(self._host_s)
+            text = f"{self._unit} was here before: the calibration begins anew for this one"
+            self._note("warning", f"another device, {unit}; {text}")
+            self.calibrator = Calibrator(*self._from_scratch)
+        self._unit = unit
+        self._out.append(events.OpenJournal(unit.serial))
+
     def _digest(self, said: Said) -> None:
         match said:
             case Identified(identity):
-                name = f"{identity.model} serial {identity.serial}"
-                self._note("info", f"{name} firmware {identity.firmware}")
-                self._rollcall.identified()
-                if self._serial not in (None, identity.serial):
-                    self._note("warning", "another device: its calibration begins anew")
-                    self.calibrator = Calibrator(*self._from_scratch)
-                self._serial = identity.serial
-                self._out.append(events.OpenJournal(identity.serial))
+                self._identified(identity.unit)
             case ConfigurationRead(values):
                 self._flush()
                 believed = {} if self.writeback.history.open else self.registers
@@ -283,8 +304,12 @@ class Core:
                 self._in_force(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
+            case Looked(seen, error):
+                more = self.writeback.on_looked(seen, str(error or ""), self._host_s)
+                self._errands.add(more)
             case StreamChanged(text, level):
                 self._flush()
+                self._watch.resumed(self._host_s)
                 self.stream.forget()
                 if text:
                     self._note(level, text)
@@ -295,6 +320,7 @@ class Core:
                 self._no_device()
             case Completed(name, result, error):
                 self._flush()
+                self._watch.resumed(self._host_s)
                 self.stream.forget()
                 if error is None:
                     more = self.writeback.on_procedure_finished(name, result, self._host_s)
@@ -337,16 +363,30 @@ class Core:
         else:
             self._in_force(dict(registers))
 
+    def calibrate_anew(self, reason: str) -> None:
+        """Nobody knows since when the registers that un-map the samples are not in force."""
+        self._flush()
+        self._unread = True  # from scratch as soon as they are read
+        self._breaks += 1
+        self._note("warning", f"calibrated anew: {reason}")
+
     def _on_state(self, change: events.StateChanged) -> None:
         self.decisions.add(self.at_s, change.new, reason=change.reason)
-        if change.new == State.TRIAL:
-            transaction = self.writeback.history.open
-            old = {} if transaction is None else transaction.old
-            mag, bias = user_compensation(self.registers)
-            old_mag, old_bias = user_compensation({**self.registers, **old})
-            self._trial = LiveTrial(mag, old_mag, bias, old_bias)
-        elif change.old == State.TRIAL:
+        if change.new == State.TRIAL or (change.new, change.old) == (
+            State.PROVEN,
+            State.RECONCILING,
+        ):
+            self._begin_trial()
+        elif change.new not in LIVED_WITH:
             self._trial = None
+
+    def _begin_trial(self) -> None:
+        """From here on the registers in force are compared with those before them."""
+        transaction = self.writeback.history.open
+        old = {} if transaction is None else transaction.old
+        mag, bias = user_compensation(self.registers)
+        old_mag, old_bias = user_compensation({**self.registers, **old})
+        self._trial = LiveTrial(mag, old_mag, bias, old_bias)
 
     # -- samples -----------------------------------------------------------------------------------
 
@@ -365,6 +405,8 @@ class Core:
         if self.stream.take_replaced():
             self.calibrator = self.calibrator.anew()
             self._begin(self._desk.compare(self.calibrator, *self._compared))
+        reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
+        self._doubt(reason, jumped=jumped)
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
         self._out.append(events.SamplesSeen(block, present, self._proposed))
         self._errands.add(self.writeback.on_samples(block))
@@ -396,6 +438,10 @@ class Core:
                 continue
             self._proposed = found.proposed
             self._out += found.notes
+            back, when = self.writeback, found.when
+            self._errands.add(back.on_examined(when.host_s, self._host_s))
+            if found.void:
+                self._errands.add(back.on_void(found.void, when.at_s, self._host_s))
             if found.estimate is not None:
                 self._judged(found, found.estimate)
 
@@ -423,6 +469,7 @@ class Core:
                 self._host_s,
                 gyro_is_raw=not self.stream.compensated_gyro,
                 flash_gates=for_level(gates, Level.FLASH),
+                sampled_s=host_s,
             )
         )
 

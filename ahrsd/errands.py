@@ -15,11 +15,13 @@ from ahrsd.conversation import Conversation
 from ahrsd.inputs import Journalled
 from ahrsd.writeback.actions import (
     Action,
+    CalibrateAnew,
     CancelProcedure,
     Emit,
     IdentifyAgain,
     InForce,
     JournalAppend,
+    Look,
     RunProcedure,
     SetUpStream,
 )
@@ -41,6 +43,9 @@ class Office(Protocol):
     def in_force(self, registers: Mapping[int, Values] | None) -> None:
         """These registers act from now on."""
 
+    def calibrate_anew(self, reason: str) -> None:
+        """What was estimated until now rests on samples that prove nothing."""
+
 
 class Errands:
     """A line of actions. `pausing` is called before a procedure that may pause the output."""
@@ -52,6 +57,7 @@ class Errands:
         self._pausing = pausing
         self._todo: deque[Action] = deque()
         self._procedure: RunProcedure | None = None
+        self._look: Look | None = None
         self._awaiting_journal = False
         self._now_s = 0.0
 
@@ -82,7 +88,7 @@ class Errands:
 
     def forget_procedure(self) -> None:
         """The link or the device went away before it could start; the write-back knows."""
-        self._procedure = None
+        self._procedure = self._look = None
 
     def journalled(self, item: Journalled, host_s: float) -> None:
         """The record that the line waits for is on the disk, or is not."""
@@ -112,10 +118,17 @@ class Errands:
         while self._todo and not self._awaiting_journal:
             self._act(self._todo.popleft(), office, host_s)
             done = True
+        if self._procedure is not None:  # goes before a look, which only wants to know
+            self._look = None
+            office.take(self._conversation.stop_looking(host_s))
         if self._procedure is not None and self._conversation.idle:
             run, self._procedure = self._procedure, None
             self._pausing()
             office.take(self._conversation.run(run.name, run.make(), run.purpose, host_s, run.gate))
+            done = True
+        if self._look is not None and self._conversation.idle:
+            wanted, self._look = self._look, None
+            office.take(self._conversation.look(wanted.unit, wanted.expected, host_s))
             done = True
         return done
 
@@ -134,8 +147,13 @@ class Errands:
                 office.take(self._conversation.cancel(name, host_s))
             case InForce(registers):
                 office.in_force(registers)
+            case Look():
+                self._look = action
+            case CalibrateAnew(reason):
+                office.calibrate_anew(reason)
             case SetUpStream():
                 self._pausing()
                 office.take(self._conversation.set_up_again(host_s))
             case IdentifyAgain():
+                self._look = None
                 office.take(self._conversation.identify_again(host_s))

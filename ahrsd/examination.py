@@ -52,7 +52,10 @@ class Circumstances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """What a block brought. `estimate` is None where there is nothing new to judge."""
+    """What a block brought. `estimate` is None where there is nothing new to judge.
+
+    void: why a calibration from before this block holds no more, empty where it may hold
+    """
 
     calibrator: Calibrator
     when: Circumstances
@@ -60,6 +63,7 @@ class Finding:
     notes: tuple[Noted, ...]
     estimate: Estimate | None = None
     gates: tuple[GateResult, ...] = ()
+    void: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +181,8 @@ class Desk:
 def _examined(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> Finding:
     new = calibrator.take(block)
     proposed, notes = calibrator.proposed, tuple(calibrator.take_notes(now.host_s))
+    void = calibrator.take_void()
     if not new:
-        return Finding(calibrator, now, proposed, notes)
+        return Finding(calibrator, now, proposed, notes, void=void)
     gates = calibrator.judged(now.at_s, now.health, now.basis, now.margin)
-    return Finding(calibrator, now, proposed, notes, calibrator.estimate, gates)
+    return Finding(calibrator, now, proposed, notes, calibrator.estimate, gates, void)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from drivers.vn100.procedures import Identity
+from drivers.vn100.procedures import Identity, Seen
 from drivers.vn100.registers import Values
 
 
@@ -19,6 +19,7 @@ class Phase(Enum):
     SETTING_UP = "setting up the stream"
     READY = "ready"
     RUNNING = "running a procedure"
+    LOOKING = "asking who answers and what it holds"
     RESTORING = "restoring"
     CLOSING = "noting that all is put back"
     DONE = "done"
@@ -63,10 +64,18 @@ class Completed:
 
 
 @dataclass(frozen=True, slots=True)
+class Looked:
+    """Who answered and what it holds; None where there was no answer, and why."""
+
+    seen: Seen | None
+    error: Exception | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Closed:
     """Everything is put back; `error` says what is not."""
 
     error: Exception | None
 
 
-Said = Identified | ConfigurationRead | StreamChanged | Unanswered | Completed | Closed
+Said = Identified | ConfigurationRead | StreamChanged | Unanswered | Completed | Looked | Closed

@@ -23,7 +23,6 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "write-back.md"
 RESTING = {
     State.OBSERVING,
     State.CANDIDATE,
-    State.PROVEN,
     State.COMMITTED,
     State.CONFIRMED,
     State.ROLLED_BACK,
@@ -66,9 +65,10 @@ def test_every_waiting_state_handles_silence() -> None:
 
 
 @pytest.mark.parametrize("state", State)
-def test_link_loss_and_reset_lead_to_reconciling_everywhere(state: State) -> None:
+def test_link_loss_reset_and_doubt_lead_to_reconciling_everywhere(state: State) -> None:
     assert TABLE[state][Signal.LINK_LOST] is State.RECONCILING
     assert TABLE[state][Signal.DEVICE_RESET] is State.RECONCILING
+    assert TABLE[state][Signal.IN_DOUBT] is State.RECONCILING
 
 
 @pytest.mark.parametrize("state", [State.STAGING, State.STAGED, State.TRIAL, State.PROVEN])
@@ -96,7 +96,7 @@ def test_only_an_approval_leads_into_a_transaction() -> None:
 
 @pytest.mark.parametrize("state", [State.FAULT, State.FLASH_TORN, State.LOCKED])
 def test_only_a_person_or_the_device_ends_an_alarm(state: State) -> None:
-    away = {Signal.LINK_LOST, Signal.DEVICE_RESET}
+    away = {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT}
     assert set(TABLE[state]) - away <= {Signal.ROLL_BACK, Signal.UNLOCK}
 
 

@@ -21,17 +21,19 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.actions import Action, IdentifyAgain
+from ahrsd.writeback.actions import Action, IdentifyAgain, Look
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
 from ahrsd.writeback.flow import Answer, Flow
 from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
+from ahrsd.writeback.recheck import Recheck
 from ahrsd.writeback.reconcile import Kind
 from ahrsd.writeback.restarts import RestartWatch
 from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
+    LIVED_WITH,
     ON_TIMEOUT,
     WITHOUT_TRANSACTION,
     Signal,
@@ -39,7 +41,7 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import Outcome
 from ahrsd.writeback.trial import Finding, TrialMetrics
-from drivers.vn100.procedures import Identity
+from drivers.vn100.procedures import Identity, Seen, differences
 from drivers.vn100.registers import Values
 
 RESTS = frozenset(  # states in which a proven restart since the newest record has it read again
@@ -53,12 +55,14 @@ RESTS = frozenset(  # states in which a proven restart since the newest record h
         State.LOCKED,
     }
 )
+RECHECKED = (23, 25, 26, 44, 84)  # what a sample went through depends on them
 
 _AWAITED = {
     State.PREPARING: Kind.PREPARED,
     State.STAGED: Kind.RAM_VERIFIED,
     State.SAVE_PREPARING: Kind.FLASH_SENT,
 }
+_NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
 
 class WriteBack:
@@ -72,6 +76,7 @@ class WriteBack:
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._restarts = RestartWatch()
         self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
+        self._recheck = Recheck(policy.recheck_s)
 
     # -- what others ask ---------------------------------------------------------------------------
 
@@ -103,7 +108,7 @@ class WriteBack:
     @property
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
-        deadlines = [self._flow.deadline_s, self._desk.journal_again_s]
+        deadlines = [self._flow.deadline_s, self._desk.journal_again_s, self._recheck.due_s]
         if self._flow.watches_interlock:
             deadlines.append(self._desk.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
@@ -132,6 +137,8 @@ class WriteBack:
             self._flow.on_timeout()
         if (again_s := self._desk.journal_again_s) is not None and host_s >= again_s:
             self._desk.journal_again()
+        if self._recheck.is_due(host_s):
+            self._ask_again()
         return self._answer()
 
     def on_clock(
@@ -160,6 +167,7 @@ class WriteBack:
         journal:      this device's records, oldest first; None where they cannot be trusted
         """
         flow, self._desk.host_s = self._flow, host_s
+        self._recheck.begin(host_s)
         self._desk.bind(identity.serial, journal)
         restarted = self._restarts.bind(identity.serial, read_from_s)
         self._safe.bind(identity, registers, journal is not None)
@@ -176,6 +184,7 @@ class WriteBack:
         """There is nobody to ask: mode passive, or a recording. Registers where they are known."""
         self._desk.host_s = host_s
         self._restarts.lost()
+        self._recheck.off()
         identity = Affine.identity().to_register()
         self._flow.registers = {MAG: identity, GYRO: identity, **(registers or {})}
         self._safe.no_device("there is no device to write to")
@@ -224,8 +233,43 @@ class WriteBack:
             desk.ask(IdentifyAgain())
         return self._answer()
 
+    def on_looked(self, seen: Seen | None, error: str, host_s: float) -> list[Action]:
+        """Who answered and what it holds, or why nobody did."""
+        self._desk.host_s, flow = host_s, self._flow
+        if flow.identity is None or self.state is State.RECONCILING or self._desk.running:
+            return self._answer()  # overtaken
+        if seen is None:
+            self._desk.note(
+                "warning", f"the device does not say who it is and what it holds: {error}"
+            )
+            self._recheck.soon(host_s)
+        elif seen.unit != flow.identity.unit:
+            flow.another(seen.unit)
+        elif changed := differences(flow.expected(seen.values), seen.values):
+            flow.changed(tuple(changed))
+        elif self.state is State.TRIAL and self._flow.passed and not self._safe.disagrees:
+            self._safe.proof_waits = ""
+            self._desk.record(Kind.PROVEN, reason=self._flow.passed)
+            flow.signal(Signal.TRIAL_PASSED, self._flow.passed)
+        return self._answer()
+
+    def on_doubt(self, reason: str, host_s: float, *, jumped: bool = False) -> list[Action]:
+        """The stream makes it doubtful whether this is still the device that was read.
+
+        jumped: its readings did, so what was proven before must be proven again.
+        """
+        self._desk.host_s = host_s
+        self._desk.note("debug", f"{reason}: the device is asked again who it is")
+        self._safe.doubt(host_s)
+        if jumped:
+            self._flow.prove_again(reason)
+        self._recheck.soon(host_s)
+        return self._answer()
+
     def on_samples(self, block: SampleBlock) -> list[Action]:
         """Raw samples: for the proof that the vehicle stands still."""
+        if len(block):
+            self._safe.sampled_s = float(block.host_s[-1])
         self._safe.stillness.update(block, self._gyro_bias_rad_s)
         return self._answer()
 
@@ -244,17 +288,35 @@ class WriteBack:
         *,
         flash_gates: tuple[GateResult, ...] = (),
         gyro_is_raw: bool = True,
+        sampled_s: float | None = None,
     ) -> list[Action]:
         """A new estimate and what the gates say: for RAM (none at all is no pass), and for flash.
 
         gyro_is_raw: see `composition.compose`.
+        sampled_s:   host time of the newest sample that was judged; None: now
         """
         self._desk.host_s, self._desk.at_s = host_s, at_s
-        self._safe.gates, self._safe.flash_gates = gates, flash_gates
+        self._safe.judged_s = host_s if sampled_s is None else sampled_s
+        fresh = sampled_s is None or sampled_s > self._safe.doubt_s
+        self._safe.gates, self._safe.flash_gates = gates, flash_gates if fresh else ()
         if np.isfinite(estimate.gyro_bias_rad_s).all():
             self._gyro_bias_rad_s = estimate.gyro_bias_rad_s
         if self.state in WITHOUT_TRANSACTION:
             self._flow.consider(estimate, gyro_is_raw)
+        elif self.state in LIVED_WITH:
+            self._flow.compare(estimate, gyro_is_raw)
+        return self._answer()
+
+    def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
+        """What was calibrated until now holds no more: something on the vehicle changed."""
+        self._desk.host_s, self._desk.at_s = host_s, at_s
+        self._safe.doubt(host_s)
+        self._flow.void(reason)
+        return self._answer()
+
+    def on_examined(self, sampled_s: float, host_s: float) -> list[Action]:
+        """The estimate has taken the samples up to this host time into account."""
+        self._desk.host_s, self._safe.examined_s = host_s, sampled_s
         return self._answer()
 
     def on_estimator_failed(self, host_s: float) -> list[Action]:
@@ -288,14 +350,18 @@ class WriteBack:
     def on_trial_metrics(self, metrics: TrialMetrics, host_s: float) -> list[Action]:
         """The new registers against the old ones on live samples."""
         self._desk.host_s = host_s
-        if self.state is State.TRIAL and metrics.finite:
-            self._flow.deadline_s = host_s + ON_TIMEOUT[State.TRIAL][0]
+        if self.state in (State.TRIAL, State.PROVEN) and metrics.finite:
+            self._flow.deadline_s = host_s + ON_TIMEOUT[self.state][0]
             finding, reason = self._flow.trial.judge(metrics)
-            if finding is Finding.FAILED:
+            if self.state is State.PROVEN:
+                self._flow.judge_proof(finding, reason)
+            elif finding is Finding.FAILED:
                 self._flow.roll_back("trial", reason)
-            elif finding is Finding.PASSED:
-                self._desk.record(Kind.PROVEN, reason=reason)
-                self._flow.signal(Signal.TRIAL_PASSED, reason)
+            elif finding is Finding.PASSED and not self._flow.passed:
+                self._recheck.now(host_s)  # proven is what the device still holds
+                self._ask_again()
+            if self.state is State.TRIAL:
+                self._flow.passed = reason if finding is Finding.PASSED else ""
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:
@@ -329,6 +395,8 @@ class WriteBack:
         if name == self._desk.running and isinstance(result, Outcome):
             self._desk.running = ""
             self._flow.on_outcome(result)
+            if not result.as_expected:
+                self._recheck.now(host_s)
         return self._answer()
 
     def on_procedure_failed(self, name: str, error: Exception, host_s: float) -> list[Action]:
@@ -337,7 +405,18 @@ class WriteBack:
         if name == self._desk.running:
             self._desk.running = ""
             self._flow.on_failure(str(error))
+            self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()
+
+    def _ask_again(self) -> None:
+        """Have the device say who it is and what it holds, unless something else runs."""
+        flow, now_s = self._flow, self._desk.host_s
+        self._recheck.begin(now_s)
+        if flow.identity is None or self._desk.running or self.state in _NOT_ASKED:
+            self._recheck.soon(now_s)
+            return
+        expected = {n: flow.registers[n] for n in RECHECKED if n in flow.registers}
+        self._desk.ask(Look(flow.identity.unit, expected))
 
     def _arm(self, armed: bool) -> Answer:
         """Whether this run may begin a write or a save; what is under way is not undone."""

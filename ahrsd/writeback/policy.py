@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from ahrsd.calibration import Estimate
 from ahrsd.writeback.clocks import Now, passed_s
 from ahrsd.writeback.composition import Proposal
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.permissions import Mode
 
 DAY_S: Final = 86400.0
+CLEAR_SIGMAS: Final = 4.0
+VERDICT_AGE_S: Final = 600.0  # a save must be of what is true now, as an approval must
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,8 @@ class WriteBackPolicy:
     margin_after_rollback: and then only for changes so many times as large [2]
     rollbacks_to_lock: so many in a row lock the write-back [2]
     interlock_max_age_s: an older word of the vehicle counts as no [1]
+    recheck_s:         who answers and what it holds is read again so often, beside the running
+                       output, in every mode but passive [30 s]
     """
 
     mode: Mode = Mode.OBSERVE
@@ -90,6 +95,7 @@ class WriteBackPolicy:
     margin_after_rollback: float = 2.0
     rollbacks_to_lock: int = 2
     interlock_max_age_s: float = 1.0
+    recheck_s: float = 30.0
     trial: TrialPolicy = field(default_factory=TrialPolicy)
     still: StillPolicy = field(default_factory=StillPolicy)
 
@@ -106,6 +112,18 @@ def worth_writing(policy: WriteBackPolicy, history: History, proposal: Proposal)
         proposal.heading_change_deg >= factor * policy.min_change_deg
         or proposal.gyro_change_rad_s >= factor * policy.min_gyro_change_rad_s
     )
+
+
+def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate) -> bool:
+    """Whether an estimate clearly speaks against the values that are in force.
+
+    By twice what is worth a write, and beyond its own uncertainty.
+    """
+    heading_deg = max(2.0 * policy.min_change_deg, CLEAR_SIGMAS * estimate.heading_sigma_deg)
+    gyro_rad_s = max(
+        2.0 * policy.min_gyro_change_rad_s, CLEAR_SIGMAS * float(estimate.sigma[9:].max())
+    )
+    return proposal.heading_change_deg > heading_deg or proposal.gyro_change_rad_s > gyro_rad_s
 
 
 def ram_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:

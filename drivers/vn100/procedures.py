@@ -64,6 +64,26 @@ class RestoreFailed(SessionError):
 
 
 @dataclass(frozen=True, slots=True)
+class Unit:
+    """One device and no other, from registers 1, 3 and 4."""
+
+    model: str
+    serial: int
+    firmware: str
+
+    def __str__(self) -> str:
+        return f"{self.model} serial {self.serial} firmware {self.firmware}"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Who answers, and some registers read in the same breath."""
+
+    unit: Unit
+    values: dict[int, Values]
+
+
+@dataclass(frozen=True, slots=True)
 class Identity:
     """Who the device is, from registers 1 to 4; `hardware` is None where it cannot be read."""
 
@@ -72,6 +92,11 @@ class Identity:
     serial: int
     firmware: str
     profile: Profile
+
+    @property
+    def unit(self) -> Unit:
+        """What tells it from every other device."""
+        return Unit(self.model, self.serial, self.firmware)
 
     def observed_without(self, values: Mapping[int, Values]) -> Identity:
         """The same, not to be written where an essential register is not among `values`."""
@@ -103,6 +128,25 @@ def read(register: int, port: int | None = None) -> Procedure[Values]:
     """One register's values."""
     reply = yield Read(register, port)
     return parse(register, reply.tokens)
+
+
+def read_unit() -> Procedure[Unit]:
+    """Who answers now. The serial number is the last that is read: only that of whoever has the
+    cable by then counts, whatever was heard of another unit before.
+    """
+    values = yield from read_registers((1, 4, 3))
+    return Unit(str(values[1][0]), int(values[3][0]), str(values[4][0]))
+
+
+def look(unit: Unit, expected: Mapping[int, Values]) -> Procedure[Seen]:
+    """Who answers, and the registers of `expected`; needs no pause of the output.
+
+    What is not as expected is read once more, for a reply may be altered on its way.
+    """
+    seen = Seen((yield from read_unit()), (yield from read_registers(expected)))
+    if seen.unit == unit and not differences(expected, seen.values):
+        return seen
+    return Seen((yield from read_unit()), (yield from read_registers(expected)))
 
 
 def read_registers(ids: Iterable[int]) -> Procedure[dict[int, Values]]:

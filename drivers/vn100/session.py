@@ -282,7 +282,7 @@ class Session:
             events.append(DeviceFault(code))
         else:  # VNERR names no command, so it may be another one's and the reply may still come
             self._abandon_flight(now_s)
-            if code in RETRIED_ERRORS and flight.attempts < patience(flight.command).tries:
+            if code in RETRIED_ERRORS and flight.attempts < patience(flight.command).damaged:
                 self._repeat(flight, now_s, events)
             else:
                 self._advance(DeviceRefused(code, flight.command), now_s, events)

@@ -22,6 +22,7 @@ from ahrsd.writeback.actions import (
     IdentifyAgain,
     InForce,
     JournalAppend,
+    Look,
     RunProcedure,
     SetUpStream,
 )
@@ -33,10 +34,10 @@ from drivers.vn100.commands import Command, NoReply, NotPermitted, Pause, Read, 
 from drivers.vn100.decode import Reply
 from drivers.vn100.errors import DeviceRefused, DriverError
 from drivers.vn100.firmware import profile_of
-from drivers.vn100.procedures import CONFIGURATION, Identity
+from drivers.vn100.procedures import CONFIGURATION, Identity, Seen, Unit
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_reply, parse
 
-FIRMWARE, SERIAL = "3.1.0.0", 100130608
+MODEL, FIRMWARE, SERIAL = "VN-100T-CR", "3.1.0.0", 100130608
 PROFILE = profile_of(FIRMWARE)
 GREEN = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
 RED = (GateResult("observability", 0.3, 1.0, False, 0.0, "", "turn more"),)
@@ -91,7 +92,9 @@ class Device:
             raise NoReply(command)
         if isinstance(command, Read | Write):
             word = "VNRRG" if isinstance(command, Read) else "VNWRG"
-            text = format_reply(command.register, self.ram[command.register])
+            who = {1: (MODEL,), 3: (self.serial,), 4: (FIRMWARE,)}
+            values = who.get(command.register) or self.ram[command.register]
+            text = format_reply(command.register, values)
             return Reply(word, command.register, tuple(text.split(",")[1:]))
         return Reply("", None, ())
 
@@ -175,7 +178,7 @@ class Rig:
 
     def connect(self, **changes: Any) -> None:
         registers = {n: printed(n, v) for n, v in self.device.ram.items()}
-        identity = Identity("VN-100T-CR", 7, self.device.serial, FIRMWARE, PROFILE)
+        identity = Identity(MODEL, 7, self.device.serial, FIRMWARE, PROFILE)
         arguments: dict[str, Any] = {
             "identity": identity,
             "registers": registers,
@@ -193,6 +196,8 @@ class Rig:
                 queue = self._append(action) + queue
             elif isinstance(action, RunProcedure):
                 queue += self._carry_out(action)
+            elif isinstance(action, Look):
+                queue += self._look(action)
             elif isinstance(action, Emit):
                 self.events.append(action.event)
             elif isinstance(action, InForce):
@@ -239,6 +244,12 @@ class Rig:
             return error
         self._point()
         return reply
+
+    def _look(self, action: Look) -> list[Action]:
+        """Who answers and what it holds, without a word in the log."""
+        unit = Unit(MODEL, self.device.serial, FIRMWARE)
+        held = {n: printed(n, self.device.ram[n]) for n in action.expected}
+        return self.wb.on_looked(Seen(unit, held), "", self.now_s)
 
     def _point(self) -> None:
         """A place where the power may go."""

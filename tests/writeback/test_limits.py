@@ -107,11 +107,12 @@ def test_thirty_days_of_changing_iron_stay_within_the_budget(make_rig):
     for hour in range(30 * 24):
         rig.now_s += 3600.0
         another(rig, 0.02 * (hour % 5))
-        if rig.wb.state is State.TRIAL:
+        if rig.wb.state in (State.TRIAL, State.PROVEN):
             rig.live()
         if rig.wb.state is State.PROVEN:
             rig.stand_still()
-    assert 25 <= rig.device.flash_writes <= 30
+    # an iron of another hour is not saved, so not quite one a day
+    assert 20 <= rig.device.flash_writes <= 30
     times = [stamp.boot_s for stamp in rig.wb.history.flashes_at]
     assert rig.wb.history.flashes == rig.device.flash_writes
     assert np.diff(times).min() >= DAY_S
@@ -436,6 +437,10 @@ def test_a_new_process_saves_nothing_before_its_own_gates_have_judged(make_rig):
     rig.stand_still()
     assert rig.device.flash_writes == 0
     rig.verdict()
+    rig.stand_still()
+    assert rig.device.flash_writes == 0  # nor before it has proven them itself
+    assert any("on trial again" in text for text in rig.wb.holds())
+    rig.live()
     rig.stand_still()
     assert rig.device.flash_writes == 1
 
