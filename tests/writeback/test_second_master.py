@@ -143,7 +143,7 @@ def test_the_reads_are_rare_and_the_stream_goes_on():
     run.run(300.0)
     reads = run.cable.unit.log[heard:]
     assert 60 <= len(reads) <= 8 * 11
-    assert set(line.split(",")[0] for line in reads) == {"VNRRG"}
+    assert {line.split(",")[0] for line in reads} == {"VNRRG"}
     assert run.core.stream.facts.samples - samples >= 300.0 * 20 - 20
     assert run.core.stream.gaps == []
 
