@@ -354,6 +354,11 @@ class Trial(Section):
     """Roll back where the live figure is worse than with the old registers by this ... [%]"""
     worse_for_s: float = Field(default=_TRIAL.worse_for_s, ge=0.0, le=86400.0)
     """... for this long. [s]"""
+    max_wrong_percent: float = Field(default=_TRIAL.max_wrong_percent, gt=0.0, le=100.0)
+    """Roll back where an error of the calibration explains more of the corrected field than this,
+    ... [%]"""
+    wrong_sigmas: float = Field(default=_TRIAL.wrong_sigmas, ge=1.0, le=100.0)
+    """... by so many of the figure's own standard deviations. [1]"""
     max_spread_percent: float = Field(default=_TRIAL.max_spread_percent, gt=0.0, le=100.0)
     """Roll back where the corrected field scatters by more than this. [%]"""
     max_jump_deg: float = Field(default=_TRIAL.max_jump_deg, gt=0.0, le=180.0)

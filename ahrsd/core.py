@@ -386,7 +386,8 @@ class Core:
         old = {} if transaction is None else transaction.old
         mag, bias = user_compensation(self.registers)
         old_mag, old_bias = user_compensation({**self.registers, **old})
-        self._trial = LiveTrial(mag, old_mag, bias, old_bias)
+        limit = 0.01 * self.settings.policy.trial.max_wrong_percent
+        self._trial = LiveTrial(mag, old_mag, bias, old_bias, wrong_limit=limit)
 
     # -- samples -----------------------------------------------------------------------------------
 

@@ -2,7 +2,9 @@
 
 The figure is the spread (std / mean) of the corrected field over the newest minute: both
 corrections see the same motion and the same disturbances, so only their quality differs. At rest
-both show the sensor's noise and neither is worse. That says nothing of the gyroscope, nor of a
+both show the sensor's noise and neither is worse. Whether the new ones are *right* is not told by
+the spread, which noise has as well, but by how much of it an error of the calibration explains
+(`leftover_error`). That says nothing of the gyroscope, nor of a
 matrix that is turned: `carried_field` does, with the new registers and with each alternative to
 them (either one put back, or both). The heading's jump is the difference of the two
 tilt-compensated headings of the same samples, averaged over the first seconds of samples in which
@@ -22,6 +24,7 @@ import numpy as np
 from ahrsd.calibration import Affine
 from ahrsd.carried_field import CarriedField
 from ahrsd.headings import tilt_compensated_heading
+from ahrsd.leftover_error import LeftoverError
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.trial import TrialMetrics
 
@@ -41,7 +44,11 @@ class LiveTrial:
         old: Affine,
         gyro_bias_rad_s: Array,
         old_gyro_bias_rad_s: Array | None = None,
+        *,
+        wrong_limit: float = 0.005,
     ) -> None:
+        self._wrong_limit = wrong_limit
+        self._leftover, self._old_leftover = LeftoverError(), LeftoverError()
         self._new, self._old, self._bias = new, old, gyro_bias_rad_s.copy()
         before = self._bias if old_gyro_bias_rad_s is None else old_gyro_bias_rad_s
         self._carried = CarriedField(
@@ -65,6 +72,8 @@ class LiveTrial:
         for t, m in zip(block.time_s.tolist(), block.raw_b_gauss, strict=True):
             if not self._rows or t - self._rows[-1][0] >= _SPACING_S:
                 self._rows.append((t, m))
+                self._leftover.add(t, self._new.apply(m[None])[0])
+                self._old_leftover.add(t, self._old.apply(m[None])[0])
         now_s = float(block.time_s[-1])
         while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
             self._rows.popleft()
@@ -97,6 +106,7 @@ class LiveTrial:
         if self._jumps:
             angles = np.array(self._jumps)
             jump = float(np.degrees(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())))
+        left = self._leftover.leftover(self._wrong_limit)
         swing = np.nan_to_num(self._carried.spreads)
         start = self._last_s if self._start_s is None else self._start_s
         return TrialMetrics(
@@ -108,6 +118,9 @@ class LiveTrial:
             heading_jump_deg=jump,
             new_swing=float(swing[0]),
             old_swing=float(swing[1:].min()),
+            wrong=left.share,
+            old_wrong=self._old_leftover.leftover(self._wrong_limit).share,
+            wrong_sigmas=left.sigmas,
         )
 
 

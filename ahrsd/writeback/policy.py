@@ -23,7 +23,10 @@ class TrialPolicy:
     duration_s, turns: whichever comes first ends the trial; longer proves more [600 s, 2 turns]
     worse_percent, worse_for_s: undo where the live figure is worse than the old registers' on the
                        same samples by this, for this long [10 %, 60 s]
-    max_spread_percent: undo where std/mean of the corrected field exceeds this [2 %]
+    max_wrong_percent, wrong_sigmas: undo where an error of the calibration explains more of the
+                       corrected field than this, by so many of the figure's own sigmas [0.5 %, 2.5]
+    max_spread_percent: undo where std/mean of the corrected field exceeds this, whatever explains
+                       it [10 %]
     max_jump_deg:      undo where the heading jumped by this much more than predicted [5 deg]
     interlock:         undo where the vehicle withdraws its word; false lets the trial live through
                        driving, for vehicles whose word is only about the moment of writing [true]
@@ -33,7 +36,9 @@ class TrialPolicy:
     turns: float = 2.0
     worse_percent: float = 10.0
     worse_for_s: float = 60.0
-    max_spread_percent: float = 2.0
+    max_wrong_percent: float = 0.5
+    wrong_sigmas: float = 2.5
+    max_spread_percent: float = 10.0
     max_jump_deg: float = 5.0
     interlock: bool = True
 

@@ -137,6 +137,7 @@ def metrics(**changes: Any) -> TrialMetrics:
         "new_figure": 0.5,
         "old_figure": 10.0,
         "field_spread": 0.005,
+        "wrong_sigmas": -10.0,
     }
     return TrialMetrics(**{**values, **changes})
 
