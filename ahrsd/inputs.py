@@ -139,6 +139,14 @@ class Examined:
 
 
 @dataclass(frozen=True, slots=True)
+class LimitsChanged:
+    """A person changed the limits of the gates, by name; what was judged by others is void."""
+
+    host_ns: int
+    limits: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Shut down: undo what was changed for the session, then finish."""
 
@@ -161,5 +169,6 @@ Input = (
     | JournalOpened
     | Journalled
     | Examined
+    | LimitsChanged
     | Stop
 )

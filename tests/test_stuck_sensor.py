@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import subprocess
 import sys
 import time
@@ -14,8 +13,9 @@ import pytest
 from ahrsd.config import Config
 from ahrsd.recording.capture import CaptureReader
 from ahrsd.replay import replay
+from ahrsd.serving.client import Asked, default_socket_path
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 def constant(field):
@@ -60,13 +60,12 @@ def daemon(emulated, folder, change_field=None, **setup):
             )  # fmt: skip
 
         def ask(what):
-            done = subprocess.run(
-                [sys.executable, "-m", "ahrsd", what, "--state-directory", str(folder)]
-                + ["--json", "-"] * (what != "text"),
-                capture_output=True, text=True, check=False,
-            )  # fmt: skip
             assert process.poll() is None, log.read_text()
-            return json.loads(done.stdout) if done.returncode == 0 else None
+            path = default_socket_path(folder)
+            if not path.exists():
+                return None
+            with Asked(path) as running:
+                return running.ask(what)
 
         try:
             yield ask

@@ -19,6 +19,7 @@ from ahrsd.inputs import (
     Interlock,
     Journalled,
     JournalOpened,
+    LimitsChanged,
     LinkLost,
     LinkOpened,
     Operator,
@@ -47,6 +48,7 @@ _TYPES = {
         JournalOpened,
         Journalled,
         Examined,
+        LimitsChanged,
         Stop,
     )
 }
