@@ -81,6 +81,10 @@ class Calibrator:
             self.estimator = Estimator(self.settings.estimator, present, present_gyro_bias_rad_s)
         self.present, self.present_gyro_bias_rad_s = present, present_gyro_bias_rad_s
 
+    def adopt(self, settings: CalibratorSettings) -> None:
+        """Other limits from now on."""
+        self.settings = settings
+
     def anew(self) -> Calibrator:
         """One that has seen nothing: what follows cannot be mixed with what came before."""
         return Calibrator(self.settings, self.present, self.present_gyro_bias_rad_s)

@@ -30,7 +30,7 @@ from ahrsd.examination import (
     Finding,
     Piece,
 )
-from ahrsd.gates import Level, for_level
+from ahrsd.gates import GateLimits, Level, for_level
 from ahrsd.live_trial import LiveTrial
 from ahrsd.rollcall import Rollcall
 from ahrsd.said import (
@@ -89,7 +89,7 @@ class Core:
         self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
         self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
-        self._stopping = ""
+        self._stopping, self._judged_anew = "", 0
         self._closing = self._unread = False
         self._unit: Unit | None = None
         self._watch = StreamWatch()
@@ -115,6 +115,7 @@ class Core:
             inputs.JournalOpened: self._journal_opened,
             inputs.Journalled: self._journalled,
             inputs.Examined: lambda it: self._take_findings(it.pieces, it.failure),
+            inputs.LimitsChanged: self._limits_changed,
             inputs.Stop: self._stop,
         }
 
@@ -193,6 +194,15 @@ class Core:
             self._note("error", f"journal: {error}; nothing can be written")
         self._device_known()
 
+    def _limits_changed(self, item: inputs.LimitsChanged) -> None:
+        calibrator = replace(self.settings.calibrator, limits=GateLimits(**item.limits))
+        self.settings = replace(self.settings, calibrator=calibrator)
+        self._from_scratch = (calibrator, *self._from_scratch[1:])
+        self._judged_anew += 1
+        self._note("info", "the limits of the gates were changed")
+        self._begin(self._desk.adopt(self.calibrator, calibrator))
+        self._errands.add(self.writeback.on_limits_changed(self._host_s))
+
     def _stop(self, item: inputs.Stop) -> None:
         self._flush()
         self._stopping = item.reason
@@ -225,7 +235,7 @@ class Core:
         for piece in skipped:
             self.stream.damaged(piece)
         facts = self.stream.facts
-        for text in self.sensors.count(facts.unusable, facts.samples):
+        for text in self.sensors.count(facts.unusable + self.undecodable, facts.samples):
             self._note("warning", text)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
@@ -475,7 +485,7 @@ class Core:
         )
 
     def _era(self) -> tuple[int, int]:
-        return self.epochs.now.number, self._breaks
+        return self.epochs.now.number, self._breaks + self._judged_anew
 
     def _basis(self) -> BasisFacts:
         """What is known of where the samples come from."""

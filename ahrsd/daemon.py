@@ -12,7 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
@@ -21,6 +21,7 @@ from ahrsd import events, host_clock, inputs
 from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import Config
 from ahrsd.operator_box import Answer, OperatorInbox
+from ahrsd.reloading import Change, Reloader
 from ahrsd.rerun_sink import RerunSink
 from ahrsd.serial_reader import Bytes, Lost, SerialLink, find_device
 from ahrsd.serving.public import Public
@@ -106,6 +107,7 @@ class Daemon:
         terms: str = "",
         columns: ColumnsFile | None = None,
         complaints: Iterable[Callable[[], str]] = (),
+        reloader: Reloader | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -121,6 +123,8 @@ class Daemon:
             shell.listeners.append(self._answer)
         self._terms, self._columns = terms, columns
         self._complaints = dict.fromkeys(complaints, "")  # what each said last
+        self._reloader = reloader
+        self.on_change: Callable[[Change], None] = lambda change: None  # who made the files
         self._safe = False
         self._latency_timer_ms: int | None = None
         self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
@@ -285,6 +289,8 @@ class Daemon:
             if (text := complaint()) != before:
                 self._complaints[complaint] = text
                 self.shell.say(logging.WARNING, text or f"over: {before}", now_ns)
+        for well, text in () if self._reloader is None else self._reloader.take(self._change):
+            self.shell.say(logging.INFO if well else logging.WARNING, text, now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
         if self._public is not None:
             self._public.look(self.shell.core, self._link_facts(error), now_s)
@@ -294,6 +300,27 @@ class Daemon:
             self._lost(now_ns, "no message in what arrives: looking for the rate")
         elif self._watch.silent and device.configure_stream and self._may_query:
             self._lost(now_ns, "silence: asking the device again for its output")
+
+    def watch_files(
+        self,
+        interlock: Vehicle | None,
+        columns: ColumnsFile | None,
+        complaints: Iterable[Callable[[], str]],
+    ) -> None:
+        """Other files of the vehicle from now on; the word begins anew with them."""
+        self._interlock, self._columns = interlock, columns
+        self._complaints = dict.fromkeys(complaints, "")
+
+    def _change(self, change: Change) -> None:
+        """What a person changed in the configuration takes effect."""
+        before, self.config = self.config, change.config
+        self.on_change(change)
+        capture, gates = change.config.capture, change.config.gates
+        if self.shell.capture is not None:
+            sizes = capture.part_megabytes * 1_000_000, capture.keep_megabytes * 1_000_000
+            self.shell.capture.resize(*sizes)
+        if gates != before.gates:
+            self._feed(inputs.LimitsChanged(self.clock.now_ns(), asdict(gates.limits())))
 
     def _answer(self, event: events.Event) -> None:
         """Tell a person what became of the word."""

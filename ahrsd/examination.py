@@ -24,7 +24,7 @@ from functools import partial
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.calibrator import Calibrator
+from ahrsd.calibrator import Calibrator, CalibratorSettings
 from ahrsd.events import Failure, GateResult, Noted
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.samples import Array, SampleBlock
@@ -161,6 +161,10 @@ class Desk:
     def compare(self, calibrator: Calibrator, present: Affine, bias_b_rad_s: Array) -> Piece:
         """Tell the calibrator what a candidate must be better than."""
         return self._put(calibrator, partial(calibrator.compare_with, present, bias_b_rad_s))
+
+    def adopt(self, calibrator: Calibrator, settings: CalibratorSettings) -> Piece:
+        """Let the calibrator judge by other limits from now on."""
+        return self._put(calibrator, partial(calibrator.adopt, settings))
 
     def _put(self, calibrator: Calibrator, make: Callable[[], Finding | None]) -> Piece:
         piece = Piece(calibrator, make)

@@ -145,6 +145,14 @@ class Examined:
 
 
 @dataclass(frozen=True, slots=True)
+class LimitsChanged:
+    """A person changed the limits of the gates, by name; what was judged by others is void."""
+
+    host_ns: int
+    limits: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Shut down: undo what was changed for the session, then finish."""
 
@@ -167,5 +175,6 @@ Input = (
     | JournalOpened
     | Journalled
     | Examined
+    | LimitsChanged
     | Stop
 )

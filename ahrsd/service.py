@@ -26,6 +26,7 @@ from ahrsd.interlock import InterlockFile
 from ahrsd.operator_box import OperatorBox, OperatorInbox
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import make_private_folder, new_capture_path
+from ahrsd.reloading import Reloader
 from ahrsd.rerun_sink import RerunLimits, RerunSink
 from ahrsd.sdnotify import Notifier
 from ahrsd.serial_reader import find_device
@@ -50,13 +51,24 @@ class _Stopped(Exception):
 
 
 @contextlib.contextmanager
-def _signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """SIGTERM and SIGINT call `stop` with their name."""
+def _signals(stop: Callable[[str], None], reload: Callable[[], None]) -> Iterator[None]:
+    """SIGTERM and SIGINT call `stop` with their name, SIGHUP calls `reload`.
+
+    Where the daemon runs in a terminal, SIGHUP means that it was closed, and is a stop; where
+    somebody had it ignored (nohup), it stays so.
+    """
 
     def handler(number: int, _: FrameType | None) -> None:
-        stop(signal.Signals(number).name)
+        in_terminal = sys.stdin is not None and sys.stdin.isatty()
+        if number == signal.SIGHUP and not in_terminal:
+            reload()
+        else:
+            stop(signal.Signals(number).name)
 
-    before = {s: signal.signal(s, handler) for s in (signal.SIGTERM, signal.SIGINT)}
+    numbers = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {s: signal.signal(s, handler) for s in numbers}
     try:
         yield
     finally:
@@ -178,6 +190,16 @@ class VehicleFiles:
         files = [file for file in (self.interlock, self.columns) if file is not None]
         return [partial(getattr, file, "fault") for file in files]
 
+    def change(self, config: Config, daemon: Daemon, words: OperatorInbox | None) -> None:
+        """Look at other files, where they are others."""
+        now = (config.interlock.file, config.terms.file)
+        if now == tuple(None if f is None else f.path for f in (self.interlock, self.columns)):
+            return
+        self.close()
+        new = VehicleFiles.of(config)
+        self.interlock, self.columns = new.interlock, new.columns
+        daemon.watch_files(self.interlock, self.columns, complaints(self, words))
+
     def close(self) -> None:
         """Look no more."""
         for file in (self.interlock, self.columns):
@@ -185,18 +207,29 @@ class VehicleFiles:
                 file.close()
 
 
-def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool = False) -> int:
-    """`ahrsd run`: until a signal; returns the exit code.
+def complaints(vehicle: VehicleFiles, words: OperatorInbox | None) -> list[Callable[[], str]]:
+    """What is wrong with files of others now."""
+    return [*vehicle.complaints(), *([] if words is None else [partial(getattr, words, "fault")])]
+
+
+def run_daemon(
+    config: Config,
+    say: Callable[[str], None] = print,
+    *,
+    wait: bool = False,
+    load: Callable[[], Config] | None = None,
+) -> int:
+    """`ahrsd run`: until a signal; returns the exit code. `load` gives the configuration on SIGHUP.
 
     A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
     PortError (not with `wait`: then it looks again and again), ConfigError, CaptureError.
     """
-    port, notifier = config.device.port, Notifier()
+    port, notifier, reloader = config.device.port, Notifier(), Reloader(load, config)
     if port is None:
         raise ConfigError(["device.port: no port is given"])
     terms = terms_text(config)
     try:
-        with _signals(_stop_searching):
+        with _signals(_stop_searching, lambda: None):
             found = _search(config, port, notifier, wait)
     except _Stopped as stopped:
         log.info("stopped (%s) before a device was found", stopped)
@@ -221,12 +254,14 @@ def run_daemon(config: Config, say: Callable[[str], None] = print, *, wait: bool
         public=public,
         terms=terms,
         columns=vehicle.columns,
-        complaints=[*vehicle.complaints(), *([] if words is None else [lambda: words.fault])],
+        complaints=complaints(vehicle, words),
+        reloader=reloader,
     )
+    daemon.on_change = lambda change: vehicle.change(change.config, daemon, words)
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
     sys.setswitchinterval(SWITCH_S)
     try:
-        with _signals(daemon.stop):
+        with _signals(daemon.stop, reloader.ask):
             daemon.run()
     finally:
         vehicle.close()

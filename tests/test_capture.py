@@ -28,6 +28,7 @@ from ahrsd.inputs import (
     Interlock,
     Journalled,
     JournalOpened,
+    LimitsChanged,
     LinkLost,
     LinkOpened,
     Operator,
@@ -58,7 +59,8 @@ EVERY_INPUT: list[Input] = [
     LinkLost(15, "unplugged"),
     JournalOpened(15, 100012345, [{"seq": 1, "old": {"23": [1.0, 1e-7]}}], "line 2 is damaged"),
     Journalled(15, "PREPARED"),
-    Examined(15, 3),
+    Examined(15, 3, "LinAlgError: Singular matrix"),
+    LimitsChanged(15, {"max_heading_sigma_deg": 0.5, "min_rate_hz": 10.0}),
     Stop(16, "SIGTERM"),
 ]
 

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 
 import numpy as np
 import pytest
 
+from ahrsd.config import Config
+from ahrsd.core import Core
+from ahrsd.events import Noted
+from ahrsd.inputs import RegistersKnown, Samples
+from ahrsd.recording.inputs_json import to_json
 from ahrsd.samples import SampleBlock
 from ahrsd.sensor_checks import Limits, SensorChecks
+from ahrsd.serving.explain import explain_json, explain_lines
+from ahrsd.serving.lines import status_lines
+from ahrsd.serving.status import LinkFacts, StatusMaker
+from ahrsd.settings import core_settings
 from ahrsd.so3 import exp
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
 
 RATE_HZ = 40.0
 FIELD = np.array([0.22, 0.02, 0.42])
@@ -186,3 +198,34 @@ def test_a_device_that_restarts_begins_anew():
     )
     (text,) = checks.take(block)
     assert text.startswith("over: ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.degrees, "deg/s where rad/s are wanted"),
+        (np.negative, "the field turns against the gyroscope on axis x, y, z"),
+    ],
+    ids=["degrees", "negated"],
+)
+def test_status_and_explain_say_it_and_the_core_goes_on(change, words):
+    core = Core(core_settings(Config(), policy=WriteBackPolicy(mode=Mode.PASSIVE)))
+    core.handle(RegistersKnown(0, {}, "test"))
+    time_s, field, gyro = stream(seconds=40.0)
+    out = []
+    for a in range(0, len(time_s), 10):
+        part = slice(a, a + 10)
+        block = SampleBlock(
+            time_s[part], np.full(10, 1 / RATE_HZ), time_s[part], field[part], change(gyro[part]),
+            np.full((10, 3), np.nan), gap_before=a == 0,
+        )  # fmt: skip
+        out += core.handle(Samples(int(time_s[part][-1] * 1e9), block))
+    noted = [e.text for e in out if isinstance(e, Noted) and words in e.text]
+    assert len(noted) == 1
+    status = json.loads(to_json(StatusMaker(0.0).make(core, LinkFacts("x", 115200, True), 1.0)))
+    assert words in status["sensors"][0]
+    assert any(line.startswith("sensor: ") and words in line for line in status_lines(status))
+    explained = explain_json(status)
+    assert words in explained["next"]
+    assert any(words in line for line in explain_lines(explained))
+    assert core.stream.facts.samples == len(time_s)

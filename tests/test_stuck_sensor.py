@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import subprocess
 import sys
 import time
@@ -12,10 +11,12 @@ import numpy as np
 import pytest
 
 from ahrsd.config import Config
+from ahrsd.errors import DeviceError
 from ahrsd.recording.capture import CaptureReader
 from ahrsd.replay import replay
+from ahrsd.serving.client import Asked, default_socket_path
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 def constant(field):
@@ -60,13 +61,13 @@ def daemon(emulated, folder, change_field=None, **setup):
             )  # fmt: skip
 
         def ask(what):
-            done = subprocess.run(
-                [sys.executable, "-m", "ahrsd", what, "--state-directory", str(folder)]
-                + ["--json", "-"] * (what != "text"),
-                capture_output=True, text=True, check=False,
-            )  # fmt: skip
             assert process.poll() is None, log.read_text()
-            return json.loads(done.stdout) if done.returncode == 0 else None
+            path = default_socket_path(folder)
+            if not path.exists():
+                return None
+            with contextlib.suppress(DeviceError), Asked(path) as running:  # busy, or just begun
+                return running.ask(what)
+            return None
 
         try:
             yield ask
@@ -104,11 +105,11 @@ def test_it_is_said_and_the_daemon_runs_on(emulated, tmp_path, change, words):
             return status if status and any(words in t for t in status["sensors"]) else None
 
         status = until(said)
-        explained = ask("explain")
+        explained = until(lambda: ask("explain"))
         assert any(words in text for text in explained["sensors"])
         assert words in explained["next"]
-        count = status["stream"]["samples"]
-        until(lambda: ask("status")["stream"]["samples"] > count)
+        count = status["stream"]["messages"]
+        until(lambda: (now := ask("status")) and now["stream"]["messages"] > count)
     (capture,) = (tmp_path / "captures").glob("*.mcap")
     again = replay(capture, Config())
     assert any(words in text for text in again.core.sensors.findings.values())

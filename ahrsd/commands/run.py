@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -32,14 +33,12 @@ def command(
     observe  reads registers, says exactly what it would write (the default)
     stage    may write RAM
     commit   may write flash
+
+    SIGHUP reads the configuration again: limits of the gates, the vehicle's files and the sizes of
+    captures change at once, the rest at the next start; a file that is wrong changes nothing.
     """
-    config = load_config(path) if path else Config()
-    if port:
-        config = config.model_copy(
-            update={"device": config.device.model_copy(update={"port": port})}
-        )
-    if mode:
-        config = config.model_copy(update={"mode": mode})
+    load = partial(_configured, path, port, mode)
+    config = load()
     if print_only:
         click.echo(print_config(config), nl=False)
         return
@@ -49,4 +48,13 @@ def command(
     from ahrsd.service import run_daemon
 
     with driver_errors():
-        raise SystemExit(run_daemon(config, wait=wait))
+        raise SystemExit(run_daemon(config, wait=wait, load=load if path else None))
+
+
+def _configured(path: Path | None, port: Path | None, mode: Mode | None) -> Config:
+    """The file, with what the command line says instead. Raises ConfigError."""
+    config = load_config(path) if path else Config()
+    if port:
+        device = config.device.model_copy(update={"port": port})
+        config = config.model_copy(update={"device": device})
+    return config.model_copy(update={"mode": mode}) if mode else config

@@ -158,6 +158,10 @@ class CaptureWriter:
         self._thread = threading.Thread(target=self._work, name="capture", daemon=True)
         self._thread.start()
 
+    def resize(self, part_bytes: int, keep_bytes: int) -> None:
+        """Other sizes from the next part on."""
+        self._part_bytes, self._keep_bytes = part_bytes, keep_bytes
+
     def write(self, item: Input) -> None:
         """Record an input; call it before the core sees the input."""
         if isinstance(item, Received):

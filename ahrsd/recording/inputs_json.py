@@ -26,6 +26,7 @@ from ahrsd.inputs import (
     Interlock,
     Journalled,
     JournalOpened,
+    LimitsChanged,
     LinkLost,
     LinkOpened,
     Operator,
@@ -56,6 +57,7 @@ _TYPES = {
         JournalOpened,
         Journalled,
         Examined,
+        LimitsChanged,
         Stop,
     )
 }

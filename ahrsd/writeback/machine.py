@@ -327,6 +327,13 @@ class WriteBack:
         self._flow.roll_back("estimator", "the estimator failed: nobody judges the new values")
         return self._answer()
 
+    def on_limits_changed(self, host_s: float) -> list[Action]:
+        """The gates have other limits: what they said before allows nothing."""
+        self._desk.host_s = host_s
+        self._safe.gates = self._safe.flash_gates = ()
+        self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the limits of the gates were changed")
+        return self._answer()
+
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
         """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
         self._desk.host_s = host_s
