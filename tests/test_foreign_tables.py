@@ -603,3 +603,19 @@ def test_a_file_with_a_name_that_is_no_text(tmp_path):
     )  # fmt: skip
     assert done.returncode == 2
     assert b"\\xff\\x1b[31mred.xyz: does not exist" in done.stderr
+
+
+@pytest.mark.parametrize(("hold", "first"), [(10, 0), (5, 3), (2, 1)])
+def test_a_slower_magnetometer_leaves_cells_empty(tmp_path, hold, first):
+    columns = sensor(4000, 100.0)
+    cells = texts(columns)
+    for name in MAG:
+        for k in range(4000):
+            if k % hold != first:
+                cells[name][k] = ""
+    table = read_table(save(tmp_path / "t.csv", cells))
+    assert len(table.rows) == 4000 - first
+    assert f"a reading in {4000 // hold} of 4000 rows" in table.notes[0]
+    for name, held in zip(MAG, table.rows.raw_b_gauss.T, strict=True):
+        np.testing.assert_allclose(held[::hold], columns[name][first::hold], rtol=1e-6, atol=1e-7)
+        np.testing.assert_array_equal(held[1::hold], held[: len(held[1::hold]) * hold : hold])
