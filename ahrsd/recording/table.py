@@ -52,6 +52,7 @@ from ahrsd.recording.limits import (
 )
 from ahrsd.samples import Array, SampleBlock
 
+PARQUET = b"PAR1"  # how such a file begins
 BLOCK_ROWS = 1024
 MINIMUM_ROWS = 20
 GAP_FACTOR = 1.6
@@ -135,7 +136,7 @@ def read_table(path: Path, *, check_units: bool = True, columns: ColumnMap = NO_
 
 
 def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
-    if path.suffix.lower() == ".parquet":
+    if _is_parquet(path):
         table, first_row, notes = _read_parquet(path, given), 1, []
     else:
         from ahrsd.recording.text_table import read_text_table
@@ -350,6 +351,16 @@ class _Rows:
             covariates=self.covariates,
         )
         return Table(rows, starts, tuple(printable(note, 300) for note in self.notes))
+
+
+def _is_parquet(path: Path) -> bool:
+    if path.suffix.lower() == ".parquet":
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(len(PARQUET)) == PARQUET
+    except OSError:  # said with its reason by the reader of text
+        return False
 
 
 def _plain(value: float) -> str:
