@@ -47,7 +47,11 @@ from ahrsd.samples import SampleBlock
 
 EVERY_INPUT: list[Input] = [
     LinkOpened(5, "/dev/ttyUSB0", 115200, 16),
-    RegistersKnown(6, {23: (1.0, 0.0, 1e-7), 1: ("VN-100",), 5: (115200, 0)}, "capture"),
+    RegistersKnown(
+        6,
+        {23: (1.0, 0.0, 1e-7, 0, 1, 0, 0, 0, 1, 0.1, -0.2, 1e-9), 1: ("VN-100",), 5: (115200, 0)},
+        "capture",
+    ),
     Received(10, b"\xfa\x00\r\n$VN"),
     Tick(11),
     WallClock(11, 1762171200.25),

@@ -533,11 +533,11 @@ def limited(*arguments: str | Path, gigabytes: float = 3.0) -> subprocess.Comple
     )  # fmt: skip
 
 
-def zeros(path: Path, gigabytes: int, start: bytes = b"") -> Path:
-    """A gzip file of some megabytes that unpacks to so much."""
+def zeros(path: Path, start: bytes = b"") -> Path:
+    """A gzip file of some megabytes that unpacks to 640 MB, above the limit of a table."""
     with gzip.open(path, "wb", compresslevel=1) as file:
         file.write(start)
-        for _ in range(gigabytes * 64):
+        for _ in range(40):
             file.write(bytes(2**24))
     return path
 
@@ -551,15 +551,15 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 
 
 def test_a_gzip_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
-    bomb = zeros(tmp_path / "bomb.csv.gz", 1)
+    bomb = zeros(tmp_path / "bomb.csv.gz")
     refused(limited("calibrate", bomb, gigabytes=1.5), "has no line end within its first")
-    rows = zeros(tmp_path / "rows.csv.gz", 1, PLAIN.encode())
+    rows = zeros(tmp_path / "rows.csv.gz", PLAIN.encode())
     refused(limited("calibrate", rows, gigabytes=2.5), "bytes of text and more; the limit is")
 
 
 def test_a_stream_without_a_message_is_given_up(tmp_path):
-    bomb = zeros(tmp_path / "bomb.vnraw.gz", 1)
-    refused(limited("calibrate", bomb, gigabytes=1.5), "no VN-100 message in 6", "bytes")
+    bomb = zeros(tmp_path / "bomb.vnraw.gz")
+    refused(limited("calibrate", bomb, gigabytes=1.5), "no VN-100 message in 16", "bytes")
 
 
 def test_parquet_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
@@ -603,3 +603,19 @@ def test_a_file_with_a_name_that_is_no_text(tmp_path):
     )  # fmt: skip
     assert done.returncode == 2
     assert b"\\xff\\x1b[31mred.xyz: does not exist" in done.stderr
+
+
+@pytest.mark.parametrize(("hold", "first"), [(10, 0), (5, 3), (2, 1)])
+def test_a_slower_magnetometer_leaves_cells_empty(tmp_path, hold, first):
+    columns = sensor(4000, 100.0)
+    cells = texts(columns)
+    for name in MAG:
+        for k in range(4000):
+            if k % hold != first:
+                cells[name][k] = ""
+    table = read_table(save(tmp_path / "t.csv", cells))
+    assert len(table.rows) == 4000 - first
+    assert f"a reading in {4000 // hold} of 4000 rows" in table.notes[0]
+    for name, held in zip(MAG, table.rows.raw_b_gauss.T, strict=True):
+        np.testing.assert_allclose(held[::hold], columns[name][first::hold], rtol=1e-6, atol=1e-7)
+        np.testing.assert_array_equal(held[1::hold], held[: len(held[1::hold]) * hold : hold])

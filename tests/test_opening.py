@@ -98,6 +98,24 @@ def test_an_unknown_name_is_judged_by_its_content(tmp_path, content, kind):
     assert open_recording(tmp_path / "a.logger_mixed_stream.gz").kind is kind
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "kind"),
+    [
+        ("a.txt", TABLE.encode(), Kind.TABLE),
+        ("a.log.gz", gzip.compress(TABLE.encode("utf-16")), Kind.TABLE),
+        ("a.csv", SENTENCES, Kind.BYTES),
+        ("a.csv", b"PAR1", None),
+    ],
+)
+def test_a_wrong_name_does_not_hide_what_a_file_is(tmp_path, name, content, kind):
+    (tmp_path / name).write_bytes(content)
+    if kind is None:
+        with pytest.raises(RecordingError, match="is no Parquet table"):
+            open_recording(tmp_path / name)
+        return
+    assert open_recording(tmp_path / name).kind is kind
+
+
 def test_an_unused_rate_is_noted(tmp_path):
     (tmp_path / "t.csv").write_text(TABLE)
     assert "--rate is not used" in open_recording(tmp_path / "t.csv", 40.0).notes[0]
@@ -110,7 +128,9 @@ def test_an_unused_rate_is_noted(tmp_path):
         ("a.vnraw.gz", gzip.compress(SENTENCES, mtime=0)[:20], "truncated"),
         ("a.mcap", SENTENCES, "is not a capture of ahrsd"),
         ("a.doc", b"hello", "by its name nor by its content"),
-        ("a.csv", SENTENCES, "has no column"),
+        ("a.csv", b"a,b\n1,2\n", "has no column"),
+        ("a.mcap.gz", gzip.compress(b"\x89MCAP0\r\n"), "is packed with gzip; unpack it: gunzip"),
+        ("a.txt", b"PK\x03\x04", "is a zip archive"),
     ],
 )
 def test_what_is_no_recording_ends_in_one_line(tmp_path, name, content, words):

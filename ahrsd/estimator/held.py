@@ -62,8 +62,8 @@ class HeldReadings:
         if len(self._rows):
             rows = np.vstack([self._rows, rows])
         new = np.concatenate([[False], np.any(rows[1:, FIELD] != rows[:-1, FIELD], axis=1)])
-        at = self._not_too_far(np.flatnonzero(new), len(rows))
-        out = []
+        at = self._not_too_far(np.flatnonzero(new).tolist(), len(rows))
+        out: list[Array] = []
         before = 0
         for row in at:
             out.append(self._merged(rows[before + 1 : row + 1]))
@@ -71,11 +71,12 @@ class HeldReadings:
         self._rows = rows[before:] if self._begun else rows[-1:]
         return np.array(out).reshape(-1, rows.shape[1])
 
-    def _not_too_far(self, at: Array, count: int) -> list[int]:
+    def _not_too_far(self, at: list[int], count: int) -> list[int]:
         """The rows with new readings, and some of those between that are very far apart."""
         most = _LONGEST * self.length
-        out, last = [], 0
-        for row in [*at.tolist(), count]:
+        out: list[int] = []
+        last = 0
+        for row in [*at, count]:
             out += range(last + most, row, most) if self._begun or out else []
             if row < count:
                 out.append(row)
@@ -84,7 +85,7 @@ class HeldReadings:
 
     def _merged(self, rows: Array) -> Array:
         """One row for those up to a new reading; nothing leads to the first one of a piece."""
-        row = rows[-1].copy()
+        row: Array = rows[-1].copy()
         if not self._begun:
             self._begun = True
             row[STEP] = np.nan

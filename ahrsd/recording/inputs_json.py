@@ -153,7 +153,7 @@ def _check(kind: type, body: dict[str, Any]) -> None:
             if not 0 <= number <= _MOST_REGISTER or len(values) > _MOST_VALUES:
                 raise ValueError(f"register {_short(number)} of {len(values)} values")
             _check_register(number, values)
-    elif kind is JournalOpened:
+    elif kind is JournalOpened and not body.get("error"):
         for record in body.get("records", []):
             RecordRead.of(record)
     elif kind is Journalled:

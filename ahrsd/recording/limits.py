@@ -14,7 +14,7 @@ TABLE_CELLS = 64_000_000  # numbers that are kept: 512 MB
 HEADER_BYTES = 1024**2  # within which a table's column names must end
 SPAN_S = 366 * 86400.0  # from the first to the last row, pauses shortened
 STREAM_BYTES = 8 * 1024**3  # of a byte stream, unpacked: 4 days at 230,400 baud
-GARBAGE_BYTES = 64 * 1024**2  # without one message, after which a stream is given up
+GARBAGE_BYTES = 16 * 1024**2  # without one message, after which a stream is given up
 BLOCK_BYTES = 64 * 1024**2  # of a capture, unpacked; ours have 256 KiB and one record
 
 

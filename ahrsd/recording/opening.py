@@ -1,6 +1,7 @@
 """One way to open any recording: what kind it is, its inputs in order, and what is to be known.
 
-The name decides the kind; where it says nothing, the content does. Every recording yields what
+The name decides the kind; where it says nothing or the content is another kind beyond doubt, the
+content does. Every recording yields what
 the core takes and ends in `Stop`, so that `replay` is `run` with another source.
 """
 
@@ -14,10 +15,10 @@ from pathlib import Path
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples, Stop
 from ahrsd.printable import printable
-from ahrsd.recording.bytestream import read_chunks, read_received, utf16_of
+from ahrsd.recording.bytestream import is_gzip, read_chunks, read_received, utf16_of
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.foreign import recognised
-from ahrsd.recording.table import Table, read_table
+from ahrsd.recording.table import PARQUET, Table, read_table
 
 _END = "end of recording"
 _HEAD_BYTES = 4096
@@ -130,7 +131,8 @@ def open_recording(
     start = next(read_chunks(path, _HEAD_BYTES))  # empty or no gzip: say so now
     if (found := recognised(start)) is not None:
         raise RecordingError(path, found.what, found.remedy)
-    kind = _SUFFIXES.get(suffix.lower()) or _by_content(path, start)
+    named = _SUFFIXES.get(suffix.lower())
+    kind = _in_spite_of_its_name(path, start, named) or named or _by_content(path, start)
     unused = (
         ["--columns is not used: it is for tables"] if columns and kind is not Kind.TABLE else []
     )
@@ -147,15 +149,34 @@ def open_recording(
     return Recording(path, kind, notes=[*unused, *table.notes], table=table)
 
 
-def _by_content(path: Path, start: bytes) -> Kind:
+def _in_spite_of_its_name(path: Path, start: bytes, named: Kind | None) -> Kind | None:
+    """What a file is beyond doubt whatever it is called.  RecordingError where it is packed."""
     from ahrsd.recording import blocks
 
-    if (encoding := utf16_of(start)) is not None:
-        start = start.decode(encoding, "ignore").encode("utf-8")
+    if blocks.is_mcap(start) or start.startswith(PARQUET):
+        if is_gzip(path):
+            raise RecordingError(path, "is packed with gzip", f"unpack it: gunzip {path.name}")
+        return Kind.CAPTURE if blocks.is_mcap(start) else Kind.TABLE
+    line = _as_utf8(start).lstrip().split(b"\n", 1)[0]
+    if named is Kind.BYTES and _names_columns(line):
+        return Kind.TABLE
+    if named is Kind.TABLE and line.startswith(b"$VN"):
+        return Kind.BYTES
+    return None
 
-    if blocks.is_mcap(start):
-        return Kind.CAPTURE
-    if b"time_s" in start.split(b"\n", 1)[0] or b"TimeStartup," in start.split(b"\n", 1)[0]:
+
+def _names_columns(line: bytes) -> bool:
+    return b"$VN" not in line and (b"mag_x_gauss" in line or b"TimeStartup," in line)
+
+
+def _as_utf8(start: bytes) -> bytes:
+    encoding = utf16_of(start)
+    return start if encoding is None else start.decode(encoding, "ignore").encode("utf-8")
+
+
+def _by_content(path: Path, start: bytes) -> Kind:
+    line = _as_utf8(start).split(b"\n", 1)[0]
+    if b"time_s" in line or _names_columns(line):
         return Kind.TABLE
     if b"$VN" in start or b"\xfa" in start:
         return Kind.BYTES

@@ -52,6 +52,7 @@ from ahrsd.recording.limits import (
 )
 from ahrsd.samples import Array, SampleBlock
 
+PARQUET = b"PAR1"  # how such a file begins
 BLOCK_ROWS = 1024
 MINIMUM_ROWS = 20
 GAP_FACTOR = 1.6
@@ -83,6 +84,7 @@ _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
 _GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken for it
 _TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
+_SPARSE_SHARE = 0.3  # of the rows without a field: a slower magnetometer, not a fault
 _HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
@@ -134,7 +136,7 @@ def read_table(path: Path, *, check_units: bool = True, columns: ColumnMap = NO_
 
 
 def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
-    if path.suffix.lower() == ".parquet":
+    if _is_parquet(path):
         table, first_row, notes = _read_parquet(path, given), 1, []
     else:
         from ahrsd.recording.text_table import read_text_table
@@ -150,6 +152,7 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     covariates, text_names = _covariates(table, found)
     notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
     columns = _Rows(path, values, covariates, np.arange(len(table)) + first_row, notes)
+    columns.hold_readings()
     columns.drop_doubles()
     columns.set_clock()
     if check_units:
@@ -182,6 +185,22 @@ class _Rows:
         self.values = {name: values[rows] for name, values in self.values.items()}
         self.covariates = {name: values[rows] for name, values in self.covariates.items()}
         self.numbers = self.numbers[rows]
+
+    def hold_readings(self) -> None:
+        """Rows between the readings of a slower magnetometer repeat the last one."""
+        known = np.isfinite(self.vectors(MAG)).all(axis=1)
+        if known.all():
+            return
+        count = int(np.count_nonzero(known))
+        _check_length(self.path, count)
+        self.notes.append(
+            f"the magnetometer has a reading in {count} of {len(known)} rows: the rows between "
+            "hold the last one"
+        )
+        rows = np.arange(len(known))
+        last = np.maximum.accumulate(np.where(known, rows, 0))
+        self.values |= {name: self.values[name][last] for name in MAG}
+        self._keep(rows >= np.argmax(known))
 
     def drop_doubles(self) -> None:
         """Rows that have the same time and readings as the row before."""
@@ -334,6 +353,16 @@ class _Rows:
         return Table(rows, starts, tuple(printable(note, 300) for note in self.notes))
 
 
+def _is_parquet(path: Path) -> bool:
+    if path.suffix.lower() == ".parquet":
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(len(PARQUET)) == PARQUET
+    except OSError:  # said with its reason by the reader of text
+        return False
+
+
 def _plain(value: float) -> str:
     return f"{value:.3f}".rstrip("0").rstrip(".")
 
@@ -397,7 +426,8 @@ def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_
     if values is None:
         _refuse_text(path, column, source.column, first_row)
     wrong = np.flatnonzero(~np.isfinite(values))
-    if len(wrong):
+    sparse = name in MAG and _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
+    if len(wrong) and not sparse:
         raise RecordingError(
             path,
             f"row {wrong[0] + first_row}, column {printable(source.column)}: empty, nan or "
