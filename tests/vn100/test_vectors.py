@@ -1,7 +1,7 @@
 """Every wire example, three ways: whole, byte by byte, cut at random; with noise around it.
 
-The examples are those of fixtures/vn100/manual_examples.toml, and the reference's own file where it
-is there. Both have the device's bytes, so a mistake shared by encoder and decoder is caught.
+The examples are those of fixtures/vn100: of the manual, and of public documents and recordings.
+Both have the device's bytes, so a mistake shared by encoder and decoder is caught.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drivers.vn100.deframer import Cause, Deframer, Packet, Sentence
 
 PROJECT = Path(__file__).parent.parent.parent
 OWN = PROJECT / "fixtures" / "vn100" / "manual_examples.toml"
-REFERENCE = PROJECT.parent / "shared" / "reference" / "vn100-vectors.json"
+REFERENCE = PROJECT / "fixtures" / "vn100" / "vectors.json"
 
 Case = dict[str, Any]
 
@@ -42,12 +42,7 @@ def load() -> list[Any]:
         cases = [
             pytest.param(case, id=f"own-{case['name']}") for case in tomllib.load(file)["case"]
         ]
-    if REFERENCE.exists():
-        for case in json.loads(REFERENCE.read_text()):
-            cases.append(pytest.param(case, id=case["name"]))
-    else:
-        why = "the reference's examples (../shared/reference/vn100-vectors.json) are not here"
-        cases.append(pytest.param({}, id="reference", marks=pytest.mark.skip(reason=why)))
+    cases += [pytest.param(case, id=case["name"]) for case in json.loads(REFERENCE.read_text())]
     return cases
 
 
@@ -70,7 +65,7 @@ DAMAGE = {
     "bin_manual_misprint": {Cause.CRC: 1},  # its header announces 22 of its 24 bytes
     "bin_truncated": {Cause.CUT: 1},
     "bit6_flip_header_real": {Cause.CRC: 1},
-    "bit6_flip_wrong_fieldword_real": {},  # a position: no VN-100 sends it
+    "bit6_flip_wrong_fieldword_real": {},  # a position: no VN-100 has one
     "bit6_flip_ascii_real": {},  # its V is damaged
     "bin_reserved_bit": {},
     "bin_group_zero": {},
