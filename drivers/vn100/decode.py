@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.vn100.binary import BinaryLayout
 from drivers.vn100.deframer import Packet, Sentence
+from drivers.vn100.errors import code_of
 from drivers.vn100.fields import Layout
 from drivers.vn100.sentences import (
     COMMAND_WORDS,
@@ -26,7 +27,6 @@ from drivers.vn100.sentences import (
     sentence_layout,
 )
 
-_ERROR_CODE = re.compile(r"[0-9A-Fa-f]{1,2}")
 _REGISTER = re.compile(r"[0-9]{1,3}")
 _COUNT = re.compile(r"T[0-9]{1,20}")  # a time in ns has more digits than a count
 _STATUS = re.compile(r"S[0-9A-Fa-f]{1,4}")
@@ -105,9 +105,10 @@ def _decode_reply(
     if word in COMMAND_WORDS:
         return Reply(word, None, tuple(tokens))
     if word == "VNERR":
-        if len(tokens) != 1 or not _ERROR_CODE.fullmatch(tokens[0]):
+        code = code_of(tokens)
+        if code is None:
             return Undecodable("VNERR without an error code", frame.offset)
-        return ErrorReply(int(tokens[0], 16))
+        return ErrorReply(code)
     if _OTHER.fullmatch(word):
         return Unused(word, frame.offset)
     return Undecodable(f"{word} is not a message of a VN-100", frame.offset)

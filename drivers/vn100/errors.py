@@ -9,6 +9,8 @@ Codes are hexadecimal on the wire (vn100-protocol 3.1).
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -62,6 +64,22 @@ _ROWS = (
     DeviceError(0xFF, "error buffer overflow", Outcome.STOP, "errors came faster than it reports"),
 )
 ERRORS: dict[int, DeviceError] = {row.code: row for row in _ROWS}
+_CODE = re.compile(r"[0-9A-Fa-f]{1,2}")
+_BY_NAME = {row.name.replace(" ", ""): row.code for row in _ROWS}
+_BY_NAME["serialbufferoverflow"] = 0x02  # the manual's name
+
+
+def code_of(tokens: Sequence[str]) -> int | None:
+    """The code of what follows VNERR: in hexadecimal, or the error's name as a text; else None."""
+    if not tokens:
+        return None
+    if _CODE.fullmatch(tokens[0]):
+        return int(tokens[0], 16)
+    return _BY_NAME.get(_letters("".join(tokens)))
+
+
+def _letters(text: str) -> str:
+    return "".join(character for character in text.lower() if character.isalpha())
 
 
 def device_error(code: int) -> DeviceError:
