@@ -10,7 +10,8 @@ would turn against the filter's own by all of the gyro's noise, which is in the 
 
 Rates in regressors: the raw rate shares its noise with the innovation (errors in variables), so
 everything here is made of rates smoothed without phase.  The bandwidth is the recording's own: up
-to where its motion sinks into SINK times the gyro's noise.
+to where its motion sinks into SINK times the gyro's noise.  Of a motion over minutes, smoothed over
+a second, the columns of a lag were the gyro's own noise: a lag of 15 nats in nothing.
 
 Fields in regressors: one that is smoothed both ways has a part of the reading's own noise in it,
 more of it the poorer the gyro is.  A soft iron of 1.6 made of that explained a quarter of white
@@ -39,7 +40,9 @@ DRIFT_S = 20.0
 SINK = 4.0
 #: chance with which noise alone may stand above the floor at one frequency
 BY_CHANCE = 1e-5
-_SLOWEST_HZ = 0.5  # the smoothing is never longer than about a second
+_SLOWEST_HZ = 0.5  # by segments of four seconds, no motion is told to be slower
+#: bins that a slow motion reaches by the window; longer segments, as long as there are so many
+_WINDOW_BINS, _LONGER, _FEWEST = 2, 4, 8
 
 
 class Fit(Protocol):
@@ -153,16 +156,25 @@ def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) 
     nyquist = 0.5 / dt_s
     if rows < 64:
         return nyquist
-    segment = _segment(rows, dt_s)
+    segment, slowest_hz = _segment(rows, dt_s), _SLOWEST_HZ
+    top_hz = _top_hz(rate, runs, dt_s, sigma, segment)
+    # what ends in the window's own width is slower than these segments tell
+    while top_hz <= _WINDOW_BINS / (segment * dt_s) and _FEWEST * _LONGER * segment <= rows:
+        segment, slowest_hz = _LONGER * segment, slowest_hz / _LONGER
+        top_hz = _top_hz(rate, runs, dt_s, sigma, segment)
+    # the Gaussian pair is 3 dB down at about 1.3 times its nominal corner
+    return float(np.clip(2.0 * top_hz, slowest_hz, nyquist))
+
+
+def _top_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float, segment: int) -> float:
+    """Highest frequency above the floor, by segments of so many rows; 0 where none is."""
     long = [rate[run] for run in runs if run.stop - run.start >= segment]
     count = np.array([len(part) // segment for part in long])  # of segments, overlaps apart
     densities = np.array([_density(part, segment) for part in long])
     density = np.average(densities, axis=0, weights=count).max(axis=0) * dt_s
     by_chance = float(chdtri(2.0 * count.sum(), BY_CHANCE)) / (2 * count.sum())  # of its mean
     above = np.flatnonzero(density > max(1.0, by_chance / SINK) * _floor(sigma, dt_s))
-    top = float(above[-1]) / (segment * dt_s) if len(above) else 0.0
-    # the Gaussian pair is 3 dB down at about 1.3 times its nominal corner
-    return float(np.clip(2.0 * top, _SLOWEST_HZ, nyquist))
+    return float(above[-1]) / (segment * dt_s) if len(above) else 0.0
 
 
 def _segment(count: int, dt_s: float) -> int:

@@ -26,6 +26,7 @@ from ahrsd.mismatch.track import Track
 
 _EXPLAINED = 0.6  # cost of the best frame, of that of no motion, at most
 _BETTER = 1.5  # times the cost that the frame as recorded must be worse
+_BENT = 3.0  # times, by which iron that deforms may favour another frame: it is left out here
 _NATS = 20.0  # log likelihood by which it must be worse
 _FAST_RAD_S, _NEAR = 3.0, 1.1  # rates that no vehicle has for long; a factor that is another's
 _UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
@@ -80,7 +81,9 @@ def _gyro(track: Track) -> list[Fact]:
     best = order[0]
     if best.cost > _EXPLAINED:
         return _gyro_unit(track, best) if _in_degrees(track, best, found.count) else []
-    if same is not None and not _worse(same.cost, best.cost, found.count):
+    if same is not None and (
+        same.cost < _BENT * best.cost or not _worse(same.cost, best.cost, found.count)
+    ):
         best = same
     facts = []
     if not best.is_identity:

@@ -140,7 +140,9 @@ def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> Nu
         return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
     free = _by_ratio(track, base, differenced, below)
     if free.sigma_gyro_rad_s <= _cap(differenced):
-        return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
+        gyro = max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S)
+        mag = max(free.sigma_mag_gauss, _FLOOR_MAG_GAUSS)
+        return replace(free, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
     return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
 
 

@@ -94,6 +94,22 @@ def test_quick_motion_keeps_its_bandwidth() -> None:
     assert bandwidth_hz(slow, runs, 0.01, 0.01) == 0.5
 
 
+def test_a_slow_motion_is_smoothed_as_long_as_it_is_slow() -> None:
+    """Minutes a turn beside 5 mrad/s of noise: over a second its slope would be mostly noise."""
+    rng = np.random.default_rng(5)
+    t = np.arange(10_000) / 25.0
+    clean = 0.08 * np.cos(2 * np.pi * np.outer(t, [8e-3, 6e-3, 5e-3]))
+    noisy = clean + 5e-3 * rng.standard_normal(clean.shape)
+    runs = (slice(0, 10_000),)
+    assert bandwidth_hz(noisy, runs, 0.04, 5e-3) < 0.25
+    error = (smoothed_rate(noisy, runs, 0.04, 5e-3) - clean)[250:-250]
+    assert np.sqrt(np.mean(error**2)) < 0.2 * 5e-3
+    slope = np.gradient(clean, 0.04, axis=0)[250:-250]
+    assert np.std(np.gradient(error, 0.04, axis=0)) < 0.5 * np.std(slope)
+    briefly = noisy + 0.05 * np.sin(2 * np.pi * 3 * t)[:, None] * (t % 100 < 20)[:, None]
+    assert bandwidth_hz(briefly, runs, 0.04, 5e-3) > 5.0
+
+
 def test_a_rate_that_does_not_change_is_no_noise() -> None:
     """Columns made of the gyro's noise would be held against what it did to the field."""
     rng = np.random.default_rng(1)
