@@ -16,6 +16,7 @@ from ahrsd.commands.json_output import refuse_unwritable, write_text
 from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.commands.register_sources import Sources, find, journals, newest_in_force
 from ahrsd.config import default_state_directory
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.journal import Journal, Record, journal_path, register_values, typed_lines, wrg_lines
 from drivers.vn100.device import Device
@@ -121,7 +122,7 @@ def diff(
         click.echo(f"{number:3}  {REGISTERS[number].name}")
         click.echo(f"  -  {_text(number, before[number])}")
         click.echo(f"  +  {_text(number, after[number])}")
-    click.echo(f"{len(shared)} registers compared, {len(different)} differ")
+    click.echo(f"{counted(len(shared), 'register')} compared, {len(different)} differ")
     raise SystemExit(EXIT_NO if different else EXIT_DONE)
 
 
@@ -162,7 +163,7 @@ def history(state_directory: Path | None, journal_file: Path | None, serial: int
     """Print the journal: what was written, when, and the lines that put the old values back."""
     for path in journals(_state(state_directory), journal_file, serial):
         journal = Journal.open(path)
-        click.echo(f"{path}: {len(journal.records())} records")
+        click.echo(f"{path}: {counted(len(journal.records()), 'record')}")
         if journal.torn:
             click.echo(f"  a torn last line of {len(journal.torn)} bytes was never acknowledged")
         for record in journal.records():

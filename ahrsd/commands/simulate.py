@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, AhrsdError
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def _simulate_scenario(wanted: _Options) -> None:
     _write_experiment(wanted.output, experiment)
     write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
     count, name = len(experiment), experiment.name
-    click.echo(f"{wanted.output}: {count} samples of {name}; truth beside it")
+    click.echo(f"{wanted.output}: {counted(count, 'sample')} of {name}; truth beside it")
 
 
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
@@ -195,7 +196,9 @@ def _simulate_along(output: Path, model_path: Path, recording: Path, seed: int) 
         "made_from": {"model": model_path.name, "along": recording.name, "seed": seed},
     }
     write_json(f"{output}.truth.json", truth)
-    click.echo(f"{output}: {len(columns['time_s'])} samples of {truth['name']}; truth beside it")
+    click.echo(
+        f"{output}: {counted(len(columns['time_s']), 'sample')} of {truth['name']}; truth beside it"
+    )
 
 
 def _write_experiment(path: Path, experiment: Experiment) -> None:
