@@ -310,11 +310,11 @@ def test_gates_are_lanes_that_change_once_and_a_table_of_advice(story):
     assert values(story["/gate/motion"], "StateChange:state") == [["not met"], ["ok"]]
     assert values(story["/gate/field"], "StateChange:state") == [["ok"]]
     tables = [row[0] for row in values(story["/gate_table"], "text")]
-    assert "**Held back by 4 of 8 gates**" in tables[0]
+    assert "**Held back by 5 of 9 gates**" in tables[0]
     assert "- **motion**: drive a full turn\n" in tables[0]
     assert "- **observability**: pitch by 30 deg *(and 1 more)*\n" in tables[0]
     assert "| **NO** | motion.turn | 8.1 deg | 280 deg |" in tables[0]
-    assert "**All 8 gates ok**" in tables[-1]
+    assert "**All 9 gates ok**" in tables[-1]
 
 
 def test_points_show_the_newest_estimate_before_there_is_a_proposal(tmp_path):
