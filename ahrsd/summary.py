@@ -9,6 +9,7 @@ import numpy as np
 
 from ahrsd.calibration import Estimate
 from ahrsd.core import Core
+from ahrsd.counting import counted
 from ahrsd.events import GateResult
 from ahrsd.gates import Level, guards_a_write
 from ahrsd.result import HeadingErrors, calibration_json, heading_words, why_not_converged
@@ -96,30 +97,26 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
     rate = f"{facts.rate_hz:.4g} Hz" if math.isfinite(facts.rate_hz) else "unknown rate"
     source = f", {facts.rate_source}" if facts.rate_source else ""
     lines = [
-        f"{recording}: {_count(facts.samples, 'sample')} in {facts.duration_s:.1f} s "
+        f"{recording}: {counted(facts.samples, 'sample')} in {facts.duration_s:.1f} s "
         f"({rate}{source})"
     ]
     if counters.fed_bytes:
         rejected = counters.rejected + core.undecodable
         lines.append(
             f"  messages: {counters.valid} valid, {rejected} rejected, "
-            f"{_count(counters.skipped_bytes, 'byte')} skipped"
+            f"{counted(counters.skipped_bytes, 'byte')} skipped"
         )
     gaps = stream.all_gaps
     if gaps.count or stream.restarts:
         lines.append(
-            f"  {_count(gaps.count, 'gap')}, {gaps.length_s:.1f} s in all; "
-            f"{_count(stream.restarts, 'restart')} of the device"
+            f"  {counted(gaps.count, 'gap')}, {gaps.length_s:.1f} s in all; "
+            f"{counted(stream.restarts, 'restart')} of the device"
         )
     lines += estimate_lines(core.calibrator.estimate)
     lines += _gate_lines(core.calibrator.gates, core.settings.level)
     lines += [f"  warning: {text}" for text in said_of(core, warnings)]
     lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
     return lines
-
-
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def _gate_lines(gates: Sequence[GateResult], level: Level) -> list[str]:

@@ -10,6 +10,7 @@ import logging
 from dataclasses import dataclass, field
 
 from ahrsd.core import Core
+from ahrsd.counting import counted
 from ahrsd.result import UNKNOWN_HEADING_DEG
 
 STATUS_S = 60.0
@@ -112,7 +113,8 @@ class Watch:
         gates = [text.removeprefix("gate ") for text in holds if text.startswith("gate ")]
         waits = f", waits for {gates[0]}" if gates else "".join(f"; {text}" for text in holds[:1])
         return (
-            f"{facts.samples} samples, {rate:.1f} Hz, {core.stream.all_gaps.count} gaps, "
+            f"{counted(facts.samples, 'sample')}, {rate:.1f} Hz, "
+            f"{counted(core.stream.all_gaps.count, 'gap')}, "
             f"{core.writeback.state.value}, heading sigma {sigma}{waits}"
         )
 

@@ -204,7 +204,7 @@ def test_diff_of_device_file_and_journal(run, emulated, tmp_path, capsys):
         assert shown[1:] == [
             "  -  c [1 0 0; 0 1 0; 0 0 1]  b [0 0 0] gauss",
             "  +  c [1.1 0 0; 0 1 0; 0 0 0.9]  b [0.125 -0.0625 0.03] gauss",
-            "1 registers compared, 1 differ",
+            "1 register compared, 1 differ",
         ]
         assert run("registers", "write", path, 23, *NEW, "--yes", *state, *BAUD) == 0
         assert run("registers", "diff", "1:new", path, *state, *BAUD) == 0

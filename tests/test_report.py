@@ -6,12 +6,14 @@ import base64
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from ahrsd.calibration import Affine, Estimate, Observability
@@ -25,17 +27,20 @@ from ahrsd.events import (
     StateChanged,
 )
 from ahrsd.report import (
+    EstimateHistory,
     EventCollector,
     FieldClouds,
+    FieldNorm,
     HeadingError,
     KeyFigure,
     RegisterChange,
     ReportData,
     before_after_figure,
+    figures,
     write_report,
 )
 from ahrsd.report.collector import KEPT
-from ahrsd.report.figures import _binned, clouds
+from ahrsd.report.figures import _binned, _settled_range, clouds
 from ahrsd.report.page import number
 from ahrsd.samples import SampleBlock
 
@@ -367,3 +372,46 @@ def test_the_outline_touches_the_cloud_from_outside():
 )
 def test_numbers_as_people_write_them(value, text):
     assert number(value, "deg") == text
+
+
+def test_time_goes_on_where_the_device_restarted():
+    """Nothing jumps back at a power cut: samples, estimates and states go on behind it."""
+    collector = EventCollector()
+    collector.add(seen(200, None))
+    collector.add(Estimated(11.9, 0.0, estimate(0.01)))
+    collector.add(StateChanged(11.95, 0.0, "SAVING", "COMMITTED", "saved"))
+    first = seen(200, None)
+    again = replace(first, block=replace(first.block, time_s=0.5 + np.arange(200) / 100.0))
+    collector.add(again)
+    collector.add(Estimated(2.4, 0.0, estimate(0.01)))
+    collector.add(StateChanged(2.45, 0.0, "COMMITTED", "CONFIRMED", "read"))
+    data = collector.report("t")
+    assert np.all(np.diff(data.norm.time_s) > 0.0)
+    assert data.history[0].time_s.tolist() == pytest.approx([11.9, 14.89])
+    assert [state.at_s for state in data.states] == pytest.approx([11.95, 14.94])
+
+
+def test_settling_is_scaled_by_the_end_not_by_the_first_guess():
+    count = 40
+    value = np.full((count, 3), 0.1)
+    value[:8] += 3.0
+    sigma = np.full((count, 3), 1e-3)
+    sigma[:15] = 2.0
+    low, high = _settled_range(
+        EstimateHistory("Hard iron", "gauss", ("x", "y", "z"), np.arange(40.0), value, sigma)
+    )
+    assert 0.1 - 5e-3 < low < 0.1 - 3e-3
+    assert 0.1 + 3e-3 < high < 0.1 + 5e-3
+
+
+@pytest.mark.parametrize("draw", [
+    lambda: figures.norm(FieldNorm(np.arange(9.0), np.full(9, 0.1), np.full(9, 0.5))),
+    lambda: figures.heading(heading_error(), "title"),
+])  # fmt: skip
+def test_no_legend_lies_on_a_curve(draw):
+    figure = draw()
+    assert [axes.get_legend() for axes in figure.axes] == [None] * len(figure.axes)
+    (legend,) = figure.legends
+    FigureCanvasAgg(figure).draw()
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)

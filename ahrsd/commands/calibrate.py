@@ -11,6 +11,7 @@ from ahrsd.commands.json_output import make_folder, refuse_unwritable, write_jso
 from ahrsd.commands.progress import byte_progress
 from ahrsd.commands.recording_options import columns_option
 from ahrsd.config import Config, load_config
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def command(
     if json_path is not None:
         write_json(json_path, result.json(method))
     if json_path != "-":
-        click.echo(f"{result.name}: {result.samples} samples, method {method}")
+        click.echo(f"{result.name}: {counted(result.samples, 'sample')}, method {method}")
         for line in estimate_lines(result.estimate):
             click.echo(line)
         for text in result.said():

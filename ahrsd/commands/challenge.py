@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from ahrsd.commands.progress import count_progress
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO
 
 _RINGS = (
@@ -56,7 +57,7 @@ def make_command(
         trial = make(
             folder, key, ring, cases, seed=seed, jobs=jobs, recordings=recordings, done=done
         )
-    click.echo(f"{len(trial.cases)} cases in {folder}, key in {key}")
+    click.echo(f"{counted(len(trial.cases), 'case')} in {folder}, key in {key}")
     click.echo(f"sealed: sha256 {trial.sha256}")
 
 
@@ -81,7 +82,7 @@ def run_command(folder: Path, tool: str, name: str | None, jobs: int) -> None:
     trial = open_round(folder)
     with count_progress(name or tool.split(maxsplit=1)[0]) as done:
         digest = run(trial, tool, name=name, jobs=jobs, done=done)
-    click.echo(f"{len(trial.cases)} answers closed: sha256 {digest}")
+    click.echo(f"{counted(len(trial.cases), 'answer')} closed: sha256 {digest}")
 
 
 @command.command("score")
@@ -103,7 +104,7 @@ def score_command(folder: Path, key_path: Path, output: Path | None) -> None:
     for result in results:
         rate = result.mistakes
         if rate.value is not None:
-            cases = "1 case" if rate.cases == 1 else f"{rate.cases} cases"
+            cases = counted(rate.cases, "case")
             click.echo(f"{result.tool}: {rate.value:.1%} mistakes in {cases}")
     for row in results[0].scores:
         value = "" if row.value is None else f"{row.value:.3f}"

@@ -10,6 +10,7 @@ import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.progress import count_progress
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 
 if TYPE_CHECKING:
@@ -158,7 +159,7 @@ def _say(plan: Plan, rows: list[Row]) -> None:
         *(1e3 * truth.hard_iron_gauss).tolist(),
         *(1e3 * truth.gyro_bias_rad_s).tolist(),
     ]
-    click.echo(f"\n{plan.name}, {rows[0].runs} runs")
+    click.echo(f"\n{plan.name}, {counted(rows[0].runs, 'run')}")
     for line in [*accuracy_lines(rows), *bound_lines(rows)]:
         click.echo(line)
     click.echo(

@@ -17,6 +17,7 @@ from ahrsd.commands.register_changes import Changes, apply, gate, save_to_flash,
 from ahrsd.commands.register_sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.commands.register_text import described
 from ahrsd.config import default_state_directory
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, JournalError
 from ahrsd.journal import Journal, Record, journal_path, register_values, typed_lines, wrg_lines
 from ahrsd.writeback.journal_history import of_another_device
@@ -136,7 +137,7 @@ def diff(
         click.echo(f"{number:3}  {REGISTERS[number].name}")
         click.echo(f"  -  {_text(number, before[number])}")
         click.echo(f"  +  {_text(number, after[number])}")
-    click.echo(f"{len(shared)} registers compared, {len(different)} differ")
+    click.echo(f"{counted(len(shared), 'register')} compared, {len(different)} differ")
     raise SystemExit(EXIT_NO if different else EXIT_DONE)
 
 
@@ -199,7 +200,7 @@ def history(state_directory: Path | None, journal_file: Path | None, serial: int
     """Print the journal: what was written, when, and the lines that put the old values back."""
     for path in journals(_state(state_directory), journal_file, serial):
         journal = Journal.open(path)
-        click.echo(f"{path}: {len(journal.records())} records")
+        click.echo(f"{path}: {counted(len(journal.records()), 'record')}")
         if journal.torn:
             click.echo(f"  a torn last line of {len(journal.torn)} bytes was never acknowledged")
         for record in journal.records():

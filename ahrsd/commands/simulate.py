@@ -12,6 +12,7 @@ import click
 
 from ahrsd.commands.json_output import refuse_unwritable, write_json
 from ahrsd.commands.recording_options import columns_option
+from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, AhrsdError
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def _simulate_scenario(wanted: _Options) -> None:
     _write_experiment(wanted.output, experiment)
     write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
     count, name = len(experiment), experiment.name
-    click.echo(f"{wanted.output}: {count} samples of {name}; truth beside it")
+    click.echo(f"{wanted.output}: {counted(count, 'sample')} of {name}; truth beside it")
 
 
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
@@ -198,7 +199,9 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
         "made_from": {"model": model_path.name, "along": recording.name, "seed": seed},
     }
     write_json(f"{output}.truth.json", truth)
-    click.echo(f"{output}: {len(columns['time_s'])} samples of {truth['name']}; truth beside it")
+    click.echo(
+        f"{output}: {counted(len(columns['time_s']), 'sample')} of {truth['name']}; truth beside it"
+    )
 
 
 def _write_experiment(path: Path, experiment: Experiment) -> None:

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ahrsd.commands.running import Place, place_options
+from ahrsd.counting import counted
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import line
 from ahrsd.serving.explain import explain_json, holding
@@ -81,7 +82,7 @@ def event_line(record: Mapping[str, Any]) -> str:
         case "register":
             return f"register {record['register']} {record['outcome']}"
         case "gap":
-            return f"(this terminal was too slow: {record['lost']} records lost)"
+            return f"(this terminal was too slow: {counted(record['lost'], 'record')} lost)"
     return ""
 
 

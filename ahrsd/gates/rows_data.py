@@ -49,7 +49,7 @@ STREAM = (
         0.0,
         Level.CANDIDATE,
         meaning="times at which the device's clock went backwards",
-        advice="the device's clock went back {v:.0f} times: it was reset; start again",
+        advice="the device's clock went back ({v:.0f} x): it was reset; start again",
     ),
     least(
         "stream_health.rate",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ahrsd.counting import counted
 from ahrsd.result import UNKNOWN_HEADING_DEG
 from ahrsd.serving.explain import STATES, holding
 
@@ -37,7 +38,7 @@ def stream_line(status: Status) -> str:
     stream = status["stream"]
     rate = _number(stream["samples_per_s"], "{:.1f} Hz", "rate not known yet")
     refused = f"; {stream['refused'][0]}" if stream["refused"] and not stream["samples"] else ""
-    return f"stream: {stream['samples']} samples, {rate}{refused}"
+    return f"stream: {counted(stream['samples'], 'sample')}, {rate}{refused}"
 
 
 def errors_line(status: Status) -> str:

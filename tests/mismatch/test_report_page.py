@@ -1,12 +1,18 @@
 """The report of a diagnosis in a real browser, and its words."""
 
+import inspect
+import re
 from dataclasses import replace
 from html import escape
+from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import BROWSER, look_at
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from ahrsd.mismatch import predictive
 from ahrsd.mismatch.diagnosis import (
     Baseline,
     Check,
@@ -29,7 +35,7 @@ from ahrsd.mismatch.shown import MOST, shown
 from ahrsd.mismatch.spoken import lines
 from ahrsd.mismatch.values import NullModel
 from ahrsd.report import diagnosis_figures
-from ahrsd.report.diagnosis_page import write_diagnosis_report
+from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report
 from ahrsd.rerun_diagnosis import write_rrd
 
 
@@ -128,6 +134,91 @@ def test_one_line_where_before_and_after_are_the_same():
     assert labels(drawn) == ["before", "after"]
     alike = replace(drawn, after_gauss=drawn.before_gauss)
     assert labels(alike) == ["nothing named"]
+
+
+def page_of(found, folder):
+    write_diagnosis_report(folder / "report.html", found, "ahrsd diagnose x")
+    return (folder / "report.html").read_text()
+
+
+def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
+    found = diagnosis()
+    drawn = found.drawn
+    worse = replace(drawn, after=10.0 * drawn.before)
+    better = replace(drawn, before=10.0 * drawn.after)
+    assert diagnosis_figures.spectrum_is_worse(worse)
+    assert not diagnosis_figures.spectrum_is_worse(better)
+    assert not diagnosis_figures.spectrum_is_worse(replace(drawn, after=drawn.before))
+    title = diagnosis_figures.spectrum(worse).axes[0].get_title(loc="left")
+    assert title == "" or "Farther" in title
+    assert "Here it is farther from 1 after than before" in page_of(
+        replace(found, drawn=worse), tmp_path
+    )
+    assert "farther from 1" not in page_of(replace(found, drawn=better), tmp_path)
+
+
+def test_a_longer_grey_bar_is_explained(tmp_path):
+    found = diagnosis()
+    assert "A longer grey bar" not in page_of(found, tmp_path)
+    longer = replace(found.drawn, evidence={"motor_current_field": 80.0, "hysteresis": 300.0})
+    assert "A longer grey bar is no contradiction" in page_of(
+        replace(found, drawn=longer), tmp_path
+    )
+
+
+@pytest.mark.parametrize(("size", "real"), [(0.5e-3, False), (5e-3, True)])
+def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
+    edges = tuple(np.linspace(0.0, 333.0, 11))
+    course = np.zeros((10, 3))
+    course[4] = size
+    drawn_course = SimpleNamespace(
+        frame="world", course=course, deviation=np.full(10, 1e-3), evidence=20.0,
+        cut=SimpleNamespace(edges_s=edges),
+    )  # fmt: skip
+    found = diagnosis()
+    found = replace(found, drawn=replace(found.drawn, courses=(drawn_course,)))
+    text = page_of(found, tmp_path)
+    assert ("It is real" in text) is real
+    assert ("at no moment does it leave the band" in text) is not real
+
+
+def test_statistics_are_named_in_words(tmp_path):
+    text = page_of(diagnosis(), tmp_path)
+    assert "how much innovations remember of those before them" in text
+    assert "mean square of the innovations, 1: as the noise says" in text
+    assert ">autocorrelation<" not in text
+
+
+def test_every_statistic_that_is_compared_has_its_words():
+    source = inspect.getsource(predictive.statistics)
+    compared = set(re.findall(r'"([a-z_]+)"[:\]]', source))
+    assert compared == set(_STATISTICS)
+
+
+@pytest.mark.parametrize("draw", ["residual", "spectrum", "contribution"])
+def test_no_legend_lies_on_the_curves(draw):
+    found = diagnosis()
+    drawn = found.drawn
+    figure = {
+        "residual": lambda: diagnosis_figures.residual(found, drawn),
+        "spectrum": lambda: diagnosis_figures.spectrum(drawn),
+        "contribution": lambda: diagnosis_figures.contribution(drawn.contributions[0]),
+    }[draw]()
+    assert [axes.get_legend() for axes in figure.axes] == [None] * len(figure.axes)
+    (legend,) = figure.legends
+    FigureCanvasAgg(figure).draw()
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_labels_of_the_map_do_not_overlap():
+    row = diagnosis().regime_map[0]
+    figure = diagnosis_figures.regime_map((row,) * 10)
+    FigureCanvasAgg(figure).draw()
+    for axes in figure.axes[:2]:
+        boxes = [label.get_window_extent() for label in axes.get_yticklabels()]
+        assert len(boxes) == 10
+        assert not any(one.overlaps(other) for one, other in pairwise(boxes))
 
 
 def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees():
