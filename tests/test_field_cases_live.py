@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -129,7 +129,7 @@ def run(scripted: Scripted, folder: Path, until: str, kilobytes: int, config: st
             stderr=file,
         )
 
-    def wait_for(condition) -> None:
+    def wait_for(condition: Callable[[], object]) -> None:
         end_s = time.monotonic() + PATIENCE_S
         while not condition():
             assert process.poll() is None, log.read_text()
