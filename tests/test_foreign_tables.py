@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import importlib
 import os
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pyarrow.parquet
 import pytest
 
 from ahrsd import so3
+from ahrsd.__main__ import main
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, REQUIRED, TIME, parse_columns
 from ahrsd.recording.opening import open_recording
@@ -619,3 +621,26 @@ def test_a_slower_magnetometer_leaves_cells_empty(tmp_path, hold, first):
     for name, held in zip(MAG, table.rows.raw_b_gauss.T, strict=True):
         np.testing.assert_allclose(held[::hold], columns[name][first::hold], rtol=1e-6, atol=1e-7)
         np.testing.assert_array_equal(held[1::hold], held[: len(held[1::hold]) * hold : hold])
+
+
+@pytest.mark.parametrize("name", ["calibrate", "replay", "diagnose", "evaluate", "simulate"])
+def test_every_command_that_takes_a_recording_takes_names_of_columns(name):
+    command = importlib.import_module(f"ahrsd.commands.{name}").command
+    assert "--columns" in [text for option in command.params for text in option.opts]
+
+
+@pytest.mark.parametrize("command", ["calibrate", "replay"])
+def test_the_command_line_reads_a_foreign_table(tmp_path, capsys, command):
+    unit = {"time": 1e-3, "mag": 1e4, "gyro": DEG, "accel": G}
+    columns = foreign(unit, ("field.", "rate.", "acc."))
+    path = save(tmp_path / "t.csv", {k: [repr(float(x)) for x in v] for k, v in columns.items()})
+    given = ["time=stamp:ms", *(f"mag_{a}=field.{a.upper()}:T" for a in "xyz")]
+    given += [f"gyro_{a}=rate.{a.upper()}:deg/s" for a in "xyz"]
+    with pytest.raises(SystemExit) as end:
+        main(
+            [command, str(path), "--columns", ",".join(given[:4]), "--columns", ",".join(given[4:])]
+        )
+    shown = capsys.readouterr().out
+    assert end.value.code in (0, 1)
+    assert "400 samples" in shown
+    assert "it looks like" not in shown

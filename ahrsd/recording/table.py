@@ -188,7 +188,7 @@ class _Rows:
 
     def hold_readings(self) -> None:
         """Rows between the readings of a slower magnetometer repeat the last one."""
-        known = np.isfinite(self.vectors(MAG)).all(axis=1)
+        known: NDArray[np.bool] = np.asarray(np.isfinite(self.vectors(MAG)).all(axis=1))
         if known.all():
             return
         count = int(np.count_nonzero(known))
@@ -244,8 +244,8 @@ class _Rows:
         rows = np.column_stack([self.values[name] for name in REQUIRED])
         row = int(jumps[0])
         back = rows[row, 0] < rows[row - 1, 0]
-        same = np.flatnonzero((rows[:row] == rows[row]).all(axis=1)) if back else []
-        if len(same):
+        same = np.flatnonzero((rows[:row] == rows[row]).all(axis=1))
+        if back and len(same):
             raise RecordingError(
                 self.path,
                 f"row {self.numbers[row]} and those behind it repeat row {self.numbers[same[0]]}",
@@ -282,7 +282,7 @@ class _Rows:
         return accel
 
     def _without_holes(self, accel: Array) -> Array:
-        known = np.isfinite(accel).all(axis=1)
+        known: NDArray[np.bool] = np.asarray(np.isfinite(accel).all(axis=1))
         count = int(np.count_nonzero(~known))
         if count in (0, len(known)):
             return accel
