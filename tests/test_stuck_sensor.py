@@ -86,6 +86,7 @@ def until(condition):
     return found
 
 
+@pytest.mark.filterwarnings("ignore:invalid value encountered")  # the emulator, at an infinity
 @pytest.mark.parametrize(
     ("change", "words"),
     [
