@@ -136,8 +136,9 @@ class SensorChecks:
         if share > self.limits.share:
             found["readings"] = (
                 f"{100 * share:.0f} % of the newest {bad + good} readings are of no use: not a "
-                "number, marked as saturated, or larger than the sensor can read; look for a "
-                "magnet beside it, a damaged cable, or another program that changes the stream"
+                "number, marked as saturated, larger than the sensor can read, or one that came "
+                "twice; look for a magnet beside it, a damaged cable, or another program that "
+                "changes the stream"
             )
         told, self._by_count = self._by_count, found
         return _changed(told, found)
