@@ -76,7 +76,7 @@ def test_the_live_trial_says_it():
 @pytest.mark.parametrize("motion", ["level", "tumble"])
 @pytest.mark.parametrize("noise_gauss", NOISES)
 def test_right_and_wrong_are_far_apart_at_every_level_of_noise(noise_gauss, motion):
-    """25 mG, some 6 deg of heading, or six times a larger noise; the statistic's limit is 2.5."""
+    """25 mG, some 6 deg of heading, or six times a larger noise; the limit is 2.5."""
     right, wrong = [], []
     for seed in SEEDS:
         block = lived(seed, noise_gauss, motion)
