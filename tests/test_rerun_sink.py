@@ -371,7 +371,7 @@ def test_quaternion_of_any_rotation(seed):
 ALL_DISK = RerunLimits(reserve_bytes=0)
 
 
-def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+def wait_for(condition: Callable[[], bool], timeout_s: float = 120.0) -> None:
     end_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end_s, "waited in vain"
