@@ -31,7 +31,7 @@ from ahrsd.rerun_sink import HEADER, REMEMBERED, Item, ProcessSettings
 READ_BYTES = 1 << 18
 TICK_S = 1.0
 FLUSH_S = 3.0
-FINISH_FLUSH_S = 2.0
+FINISH_FLUSH_S = 30.0  # the parent kills earlier, where it does not wait for so long
 RETRY_S = 30.0
 EXIT_FILE_LOST = 3
 

@@ -146,7 +146,7 @@ def test_a_world_that_stands_still_ends_it(monkeypatch):
 
     monkeypatch.setattr(demo, "_STUCK_S", 0.0)
     monkeypatch.setattr(demo, "_WATCH_S", 0.01)
-    monkeypatch.setattr(demo, "close_shell", lambda _: None)
+    monkeypatch.setattr(demo, "close_shell", lambda *_: None)
     with pytest.raises(DeviceError, match="the emulated device stood still"):
         demo._run(Waiting(), None, Frozen(), 100.0)
     monkeypatch.setattr(demo, "_STUCK_S", 1e9)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from ahrsd.commands.json_output import refuse_unwritable
 from ahrsd.commands.progress import count_progress
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO
@@ -98,6 +99,9 @@ def score_command(folder: Path, key_path: Path, output: Path | None) -> None:
     from ahrsd.challenge.sealing import open_round
 
     trial = open_round(folder)
+    for name in ("score.json", "report.md", "report.html"):
+        if (path := (output or folder) / name).exists():
+            refuse_unwritable(path)
     results = score(trial, key_path, output or folder)
     for tool, why in unable(trial).items():
         click.echo(f"{tool}: not scored: {why}", err=True)

@@ -60,6 +60,8 @@ def command(directory: Path, seconds: float, seed: int, speed: float) -> None:
     click.echo(f"An emulated VN-100 (seed {seed}) with hidden iron and gyro bias, and the real")
     click.echo(f"daemon on its serial port, {speed:g} times faster than real time.")
     click.echo("")
+    if any((directory / name).is_file() for name in FILES):
+        click.echo(f"{directory}: the files of an earlier demo will be replaced", err=True)
     log = logging.getLogger("ahrsd")
     if log.level == logging.WARNING:  # what is worth one with a device of one's own is planned here
         log.setLevel(logging.ERROR)

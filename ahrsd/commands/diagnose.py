@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.commands.json_output import refuse_unwritable, write_json
+from ahrsd.commands.json_output import make_folder, refuse_unwritable, write_json
 from ahrsd.commands.progress import byte_progress
 from ahrsd.commands.recording_options import columns_option
 from ahrsd.errors import AhrsdError
@@ -52,6 +52,8 @@ def command(
     from ahrsd.mismatch.spoken import lines
 
     refuse_unwritable(json_path)
+    if folder is not None:
+        make_folder(folder, ("report.html", "diagnosis.rrd", "diagnosis.json", "model.json"))
     keep_heap()
     with byte_progress(real) as progress:
         found = diagnose_recording(

@@ -72,6 +72,7 @@ _REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `s
 _REST_S = 10.0  # longer than the stops between pirouettes, which are too short for a save
 _LONGEST_AGE_S = 60.0  # of the vehicle's word, as far as the configuration goes
 _WATCH_S = 0.5
+_CLOSE_S = 60.0  # real time at most for the files to be whole: nobody waits for a demo's end
 _STUCK_S = 120.0  # real time in which the emulated world goes on by nothing
 # Of device time in all. A busy machine makes the demo slow; no such machine makes it longer.
 _LONGEST, _SPARE_S = 2.0, 600.0
@@ -207,7 +208,7 @@ def _run(daemon: Daemon, shell: Shell, emulated: EmulatorProcess, longest_s: flo
     finally:
         over.set()
         watcher.join()
-        close_shell(shell)
+        close_shell(shell, time.monotonic() + _CLOSE_S)
     if trouble:
         raise DeviceError(f"the demo ended early: {trouble[0]}", EXIT_BUSY)
 

@@ -43,8 +43,10 @@ _NEXT = {
     "TRIAL": "drive as usual: two turns or ten minutes, then the new values are proven or undone",
     "SAVING": "stand still: the save takes a second",
     "COMMITTED": "nothing: the device's next restart confirms the save",
-    "FAULT": "look at `ahrsd registers diff`, then `ahrsd operator rollback` or `unlock`",
-    "FLASH_TORN": "see `ahrsd registers history`, write the old values back, then unlock",
+    "FAULT": "see `ahrsd registers history`, then `ahrsd operator rollback` or "
+    "`ahrsd operator unlock REASON`",
+    "FLASH_TORN": "see `ahrsd registers history`, write the old values back, then "
+    "`ahrsd operator unlock REASON`",
     "LOCKED": "find out why (`ahrsd registers history`), then `ahrsd operator unlock REASON`",
 }
 
