@@ -39,6 +39,8 @@ class Case:
 
 
 CASES = (
+    Case("f19_mag_y_mirrored.csv.gz", "calibrate", 1, has=("the magnetometer is left-handed",)),
+    Case("f19_mag_y_mirrored.csv.gz", "diagnose", 0, has=("the magnetometer is left-handed",)),
     Case("f11_sdk_export_FA_06_0001_003E.csv.gz", "calibrate", 0, 1600, 1.0,
          has=("VectorNav's SDK",)),
     Case("f14_imu_mag.bag", "calibrate", 2, has=("is a ROS 1 bag; write",)),
