@@ -60,7 +60,7 @@ def odd_magnetometer(track: Track, gyro: Array) -> Odd | None:
 
     gyro: (3, 3) the signed permutation P by which the gyro's readings would be the magnetometer's
     """
-    if np.linalg.det(gyro) < 0.0 or not np.array_equal(gravity_permutation(track), np.eye(3)):
+    if np.linalg.det(gyro) < 0.0 or not turns_gravity(track, np.eye(3)):
         return None
     ways = sorted((gyro.T, -gyro.T), key=_negations)
     if _down(track, ways[0]) < -_STEEP:
@@ -68,14 +68,14 @@ def odd_magnetometer(track: Track, gyro: Array) -> Odd | None:
     return Odd(ways[0], ways[1])
 
 
-def gravity_permutation(track: Track) -> Array | None:
-    """(3, 3) by which the gyro's readings are the accelerometer's; None where none is clear."""
+def turns_gravity(track: Track, P: Array) -> bool:
+    """Whether the gyro's readings are the accelerometer's by P (3, 3), clearly."""
     accel = track.accel_b_m_s2
     found = None if accel is None else windows(replace(track, mag_b_gauss=accel))
     order = [] if found is None else ranked(found)
     if len(order) < 2 or order[0].cost > _EXPLAINED or order[1].cost < _BETTER * order[0].cost:
-        return None
-    return order[0].matrix
+        return False
+    return bool(np.array_equal(order[0].matrix, P))
 
 
 def _down(track: Track, way: Array) -> float:

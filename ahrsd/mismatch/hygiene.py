@@ -19,7 +19,7 @@ from ahrsd.mismatch.diagnosis import Value, Where
 from ahrsd.mismatch.effects import series
 from ahrsd.mismatch.facts import Fact
 from ahrsd.mismatch.frames import Frame, ranked, windows
-from ahrsd.mismatch.handedness import advice, gravity_permutation, odd_magnetometer
+from ahrsd.mismatch.handedness import advice, odd_magnetometer, turns_gravity
 from ahrsd.mismatch.repeats import repeats
 from ahrsd.mismatch.stamps import regular, stamps
 from ahrsd.mismatch.track import Track
@@ -133,7 +133,7 @@ def _frame_words(track: Track, best: Frame) -> str:
     words = f"the gyro's x y z are the magnetometer's {' '.join(_inverse_words(best))}"
     if np.linalg.det(P) < 0:
         return f"{words} (left-handed)"
-    if np.array_equal(gravity_permutation(track), P):
+    if turns_gravity(track, P):
         return f"{words} and the accelerometer's"
     return (
         f"{words}, or the magnetometer is left-handed ({advice(-P.T)}): turn none of them before "
