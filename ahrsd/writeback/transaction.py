@@ -250,7 +250,7 @@ def _write(
 
 
 def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _stranger(transaction))) is not None:
         return Outcome(False, other=other)
     if only_ours and (strange := (yield from _strange(transaction))):
         return Outcome(False, strange)
