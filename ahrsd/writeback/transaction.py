@@ -178,6 +178,13 @@ def _other(transaction: Transaction) -> Procedure[Unit | None]:
     return None if transaction.is_of(unit) else unit
 
 
+def _stranger(transaction: Transaction) -> Procedure[Unit | None]:
+    """The same within a conversation that has asked already: the serial number is enough."""
+    if int((yield from read(3))[0]) == transaction.serial:
+        return None
+    return (yield from _other(transaction))
+
+
 def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
     """Registers that do not hold what is expected, in two readings."""
     changed = differences(expected, (yield from read_registers(expected)))
@@ -232,7 +239,7 @@ def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
 
 def _together(transaction: Transaction, expected: Mapping[int, Values]) -> Procedure[Outcome]:
     """Both registers in one reading, and whose they are: a restart between two writes shows."""
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _stranger(transaction))) is not None:
         return Outcome(False, other=other, written=True)
     changed = yield from _changed(expected)
     return Outcome(not changed, changed, written=True)
@@ -250,7 +257,7 @@ def _write(
     """
     back: Values = ()
     for _ in range(WRITE_TRIES):
-        if (other := (yield from _other(transaction))) is not None:
+        if (other := (yield from _stranger(transaction))) is not None:
             return Outcome(False, other=other, written=written)
         written = True
         with suppress(NoReply):  # carried out or not: the read says which
@@ -262,7 +269,7 @@ def _write(
 
 
 def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _stranger(transaction))) is not None:
         return Outcome(False, other=other)
     if only_ours and (strange := (yield from _strange(transaction))):
         return Outcome(False, strange)
