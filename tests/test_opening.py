@@ -129,7 +129,11 @@ def test_an_unused_rate_is_noted(tmp_path):
         ("a.mcap", SENTENCES, "is not a capture of ahrsd"),
         ("a.doc", b"hello", "by its name nor by its content"),
         ("a.csv", b"a,b\n1,2\n", "has no column"),
-        ("a.mcap.gz", gzip.compress(b"\x89MCAP0\r\n", mtime=0), "is packed with gzip; unpack it: gunzip"),
+        (
+            "a.mcap.gz",
+            gzip.compress(b"\x89MCAP0\r\n", mtime=0),
+            "is packed with gzip; unpack it: gunzip",
+        ),
         ("a.txt", b"PK\x03\x04", "is a zip archive"),
     ],
 )
