@@ -85,6 +85,7 @@ class Program:
         self.word: str | None = "safe"
         self.log = folder / "log"
         self.log.touch()
+        self.set_wall(0.0)
         self.process: subprocess.Popen[bytes] | None = None
         self.records: list[tuple[int, str, dict[str, object]]] = []
         self._read: dict[Path, int] = {}
@@ -112,7 +113,17 @@ class Program:
             if self.word is not None:
                 draft = self.folder / "interlock.new"
                 draft.write_text(self.word)
+                at_s = time.time() + float(
+                    self.offset.read_text() or 0.0
+                )  # one computer, one clock
+                os.utime(draft, (at_s, at_s))
                 draft.rename(self.interlock)
+
+    def set_wall(self, ahead_s: float) -> None:
+        """Let the computer's wall clock be ahead by so much, at once."""
+        draft = self.folder / "wall-offset.new"
+        draft.write_text(str(ahead_s))
+        draft.rename(self.offset)
 
     # -- the program -------------------------------------------------------------------------------
 
