@@ -49,6 +49,7 @@ max_step_auto_deg = 180.0
 max_step_operator_deg = 180.0
 [trial]
 duration_s = {trial_s}
+interlock = {trial_interlock}
 turns = 100.0
 [still]
 duration_s = 1.0
@@ -66,12 +67,12 @@ class Program:
     """`with Program(folder) as program:` serves the device; `start` starts the daemon.
 
     word:   what the vehicle says ("safe"); None: it says nothing any more
-    approval, trial_s, more: for the configuration
+    approval, trial_s, trial_interlock, more: for the configuration
     """
 
     def __init__(
         self, folder: Path, *, stream: str = "binary", approval: str = "auto",
-        trial_s: float = 2.0, more: str = "",
+        trial_s: float = 2.0, trial_interlock: bool = True, more: str = "",
     ) -> None:  # fmt: skip
         self.folder, self.state = folder, folder / "state"
         self.state.mkdir(exist_ok=True)
@@ -90,6 +91,7 @@ class Program:
         self.records: list[tuple[int, str, dict[str, object]]] = []
         self._read: dict[Path, int] = {}
         self._config = {"approval": approval, "trial_s": trial_s, "more": more}
+        self._config["trial_interlock"] = str(trial_interlock).lower()
         self._ending = threading.Event()
         self._saying = threading.Thread(target=self._say, name="vehicle")
 
@@ -154,7 +156,7 @@ class Program:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in paths if p)}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                self.command("-v", "run", "--config", self.config, *options),
+                self.command("-v", "run", "--wait", "--config", self.config, *options),
                 stdout=log, stderr=log, umask=umask, user=user, env=environment, cwd=self.folder,
             )  # fmt: skip
 
