@@ -151,7 +151,24 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     }
     covariates, text_names = _covariates(table, found)
     notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
-    columns = _Rows(path, values, covariates, np.arange(len(table)) + first_row, notes)
+    numbers = np.arange(len(table)) + first_row
+    return _checked(_Rows(path, values, covariates, numbers, notes), check_units)
+
+
+def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
+    """The same checks for columns, by canonical names, that another reader made of a file."""
+    _check_length(path, len(columns[TIME]))
+    refuse_beyond(path, len(columns[TIME]), TABLE_ROWS, "rows", "cut it in parts")
+    cells = len(columns) * len(columns[TIME])
+    refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
+    values = {name: columns[name] for name in REQUIRED}
+    covariates = {name: column for name, column in columns.items() if name not in REQUIRED}
+    rows = _Rows(path, values, covariates, np.arange(len(columns[TIME])) + 1, list(notes))
+    return _checked(rows, True)
+
+
+def _checked(columns: _Rows, check_units: bool) -> Table:
+    path = columns.path
     columns.hold_readings()
     columns.drop_doubles()
     columns.set_clock()
