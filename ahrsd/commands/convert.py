@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("recording", metavar="FILE", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The table, OUT.parquet.")
-@click.option("--list", "only_list", is_flag=True, help="Say what FILE holds, and write nothing.")
+@click.option("--list", "only_list", is_flag=True, help="Say what FILE holds only.")
 @click.option("--topic", "topics", multiple=True, metavar="T",
-              help="Topic to use where FILE holds several sensors; may be given twice.")  # fmt: skip
+              help="Topic to use where FILE holds several sensors; may be repeated.")  # fmt: skip
 @click.option("--compass", type=click.IntRange(min=0), metavar="N",
-              help="Number of the magnetometer, from 0, in the log of an autopilot.")  # fmt: skip
+              help="Number of the magnetometer, from 0, in an autopilot's log.")  # fmt: skip
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
 @columns_option
 def command(

@@ -165,6 +165,11 @@ def open_recording(
 def _of_another(path: Path, other: Format, choice: Choice, rate_hz: float | None) -> Recording:
     """A recording of another program: a table of its sensors, or what the device sent."""
     ready(path, other)
+    for option, given in (("topic", choice.topics), ("compass", choice.compass is not None)):
+        if given and option != other.picks:
+            raise RecordingError(
+                path, f"{other.what}: --{option} is not for it", f"--{other.picks} is"
+            )
     notes = [] if rate_hz is None else ["--rate is not used: the recording has its own time"]
     try:
         found = other.read(path, choice)

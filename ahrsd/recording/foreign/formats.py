@@ -26,12 +26,14 @@ class Format:
 
     what:    as a sentence about the file goes on
     begins:  whether a file with this start is one
+    picks:   the option that chooses where it holds several sensors
     library: Python package that reads it, of the extra; empty where we do
     read:    its sensors, or the bytes of its device; list: one line about each thing in it
     """
 
     what: str
     begins: Callable[[bytes], bool]
+    picks: str
     library: str
     extra: str
     read: Callable[[Path, Choice], Sensors | RawBytes]
@@ -58,7 +60,19 @@ def _ros(what: str, suffix: str, begins: Callable[[bytes], bool]) -> Format:
 
         return ros.listed(path, suffix)
 
-    return Format(what, begins, "rosbags", "ros", read, listed)
+    return Format(what, begins, "topic", "rosbags", "ros", read, listed)
+
+
+def _read_ardupilot(path: Path, choice: Choice) -> Sensors:
+    from ahrsd.recording.foreign import ardupilot
+
+    return ardupilot.read(path, choice)
+
+
+def _list_ardupilot(path: Path) -> list[str]:
+    from ahrsd.recording.foreign import ardupilot
+
+    return ardupilot.listed(path)
 
 
 FOLDER = _ros("is a ROS 2 recording", "", lambda _: False)  # a folder with metadata.yaml
@@ -70,7 +84,12 @@ FORMATS: tuple[Format, ...] = (
         ".db3",
         lambda start: start.startswith(b"SQLite format 3\0"),
     ),
-)
+    Format(
+        "is an ArduPilot DataFlash log",
+        lambda start: start.startswith(b"\xa3\x95\x80\x80"),
+        "compass", "", "", _read_ardupilot, _list_ardupilot,
+    ),
+)  # fmt: skip
 
 
 def format_of(path: Path, start: bytes) -> Format | None:
