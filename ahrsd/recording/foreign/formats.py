@@ -75,6 +75,18 @@ def _list_ardupilot(path: Path) -> list[str]:
     return ardupilot.listed(path)
 
 
+def _read_px4(path: Path, choice: Choice) -> Sensors:
+    from ahrsd.recording.foreign import ulog
+
+    return ulog.read(path, choice)
+
+
+def _list_px4(path: Path) -> list[str]:
+    from ahrsd.recording.foreign import ulog
+
+    return ulog.listed(path)
+
+
 FOLDER = _ros("is a ROS 2 recording", "", lambda _: False)  # a folder with metadata.yaml
 FORMATS: tuple[Format, ...] = (
     _ros("is a ROS 1 bag", ".bag", lambda start: start.startswith(b"#ROSBAG V2.0")),
@@ -88,6 +100,11 @@ FORMATS: tuple[Format, ...] = (
         "is an ArduPilot DataFlash log",
         lambda start: start.startswith(b"\xa3\x95\x80\x80"),
         "compass", "", "", _read_ardupilot, _list_ardupilot,
+    ),
+    Format(
+        "is a PX4 log (ULog)",
+        lambda start: start.startswith(b"ULog\x01\x12\x35"),
+        "compass", "pyulog", "px4", _read_px4, _list_px4,
     ),
 )  # fmt: skip
 
