@@ -340,6 +340,7 @@ def test_convert_keeps_the_samples_and_says_where_they_come_from(tmp_path):
     assert facts["ahrsd.undone"].startswith("nothing")
     assert facts["ahrsd.axes"] == "field and gyro agree"
     wanted, found = open_recording(path).table.rows, read_table(out).rows
+    assert any(n.startswith("converted: a ROS 1 bag: field of") for n in read_table(out).notes)
     for name in ("time_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 

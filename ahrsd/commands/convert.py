@@ -52,15 +52,24 @@ def command(
         raise AhrsdError("nothing to do: give -o OUT.parquet, or --list to see what FILE holds")
     if output.suffix != ".parquet":
         raise AhrsdError(f"-o {output}: the table is written as Parquet; name it *.parquet")
-    refuse_unwritable(str(output))
     if output.exists() and recording.exists() and output.samefile(recording):
         raise AhrsdError(f"-o {output}: is the recording itself; give another name")
+    refuse_unwritable(str(output))
     with byte_progress(recording) as progress:
         table = converted(recording, Choice(topics, compass, columns), rate_hz, progress)
     save(table, output)
     rows = len(next(iter(table.columns.values())))
     click.echo(f"{output}: {counted(rows, 'row')}, {', '.join(table.columns)}")
-    for name in ("format", "mag source", "mag unit", "gyro source", "frame", "clock", "undone"):
+    for name in (
+        "format",
+        "source",
+        "mag source",
+        "mag unit",
+        "gyro source",
+        "frame",
+        "clock",
+        "undone",
+    ):
         if name in table.facts:
             click.echo(f"  {name}: {table.facts[name]}")
     for note in table.notes:

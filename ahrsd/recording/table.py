@@ -53,6 +53,7 @@ from ahrsd.recording.limits import (
 from ahrsd.samples import Array, SampleBlock
 
 PARQUET = b"PAR1"  # how such a file begins
+NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
 BLOCK_ROWS = 1024
 MINIMUM_ROWS = 20
 GAP_FACTOR = 1.6
@@ -85,6 +86,7 @@ _GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken fo
 _TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
 _SPARSE_SHARE = 0.3  # of the rows without a field: a slower magnetometer, not a fault
+_NOTES = 30  # that are repeated of a converted table
 _HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
@@ -137,7 +139,8 @@ def read_table(path: Path, *, check_units: bool = True, columns: ColumnMap = NO_
 
 def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     if _is_parquet(path):
-        table, first_row, notes = _read_parquet(path, given), 1, []
+        table, first_row = _read_parquet(path, given), 1
+        notes = _noted(table)
     else:
         from ahrsd.recording.text_table import read_text_table
 
@@ -423,6 +426,13 @@ def _read_parquet(path: Path, given: ColumnMap) -> pyarrow.Table:
     for name in others:  # as empty text, so that it is said that they were left out
         table = table.append_column(name, pyarrow.nulls(table.num_rows).cast(pyarrow.string()))
     return table
+
+
+def _noted(table: pyarrow.Table) -> list[str]:
+    """What was said of the recording that `ahrsd convert` made the table of."""
+    kept = (table.schema.metadata or {}).get(NOTES_KEY.encode(), b"")
+    lines = bytes(kept).decode("utf-8", "replace").splitlines()
+    return [f"converted: {line}" for line in lines[:_NOTES] if line]
 
 
 def _is_plain(kind: pyarrow.DataType) -> bool:

@@ -31,13 +31,17 @@ _CODES: dict[str, str] = {
 _SCALES = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Type:
+    """A kind of message: what it holds, how many there are, and where they begin if wanted."""
+
     name: str
     length: int
     fields: tuple[str, ...]
     codes: str
     layout: np.dtype[np.void] | None
+    places: array[int] | None = None
+    count: int = 0
 
 
 @dataclass(slots=True)
@@ -56,7 +60,8 @@ class Log:
     def column(self, message: str, name: str) -> Array:
         """(N,) in the field's unit; KeyError where there is none."""
         scale = _SCALES.get(self.codes[message][name], 1.0)
-        return np.asarray(self.rows[message][name], dtype=np.float64) * scale
+        with np.errstate(invalid="ignore"):  # signalling nan of damaged bytes
+            return np.asarray(self.rows[message][name], dtype=np.float64) * scale
 
     def texts(self, message: str, name: str) -> list[str]:
         """The strings of a field."""
@@ -66,63 +71,59 @@ class Log:
 
 def read_log(path: Path, wanted: Container[str]) -> Log:
     """The messages of these names.  Raises RecordingError."""
+    log = Log()
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        types, places, log = _indexed(path, data, wanted)
-        for number, where in places.items():
-            kind = types[number]
-            log.counts[kind.name] = log.counts.get(kind.name, 0) + where[0]
-            if kind.layout is None or not len(where[1]):
+        types = _indexed(path, data, wanted, log)
+        for kind in types.values():
+            if not kind.count:
                 continue
-            starts = np.frombuffer(where[1], np.int64) + 3
-            raw = np.frombuffer(data, np.uint8)
-            rows = raw[starts[:, None] + np.arange(kind.length - 3)].view(kind.layout)[:, 0]
+            log.counts[kind.name] = log.counts.get(kind.name, 0) + kind.count
+            if kind.layout is None or not kind.places:
+                continue
+            starts = np.frombuffer(kind.places, np.int64) + 3
+            raw: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
+            log.rows[kind.name] = raw[starts[:, None] + np.arange(kind.length - 3)].view(
+                kind.layout
+            )[:, 0]
             del raw  # it holds the map of the file open
-            log.rows[kind.name] = rows
             log.codes[kind.name] = dict(zip(kind.fields, kind.codes, strict=False))
     return log
 
 
-def _indexed(
-    path: Path, data: mmap.mmap, wanted: Container[str]
-) -> tuple[dict[int, _Type], dict[int, tuple[int, array[int]]], Log]:
-    """Types, and by type how many messages there are and where those that are wanted begin."""
-    log, end, at = Log(), len(data), 0
-    types = {_FMT: _Type("FMT", _FMT_BYTES, (), "", None)}
-    lengths = [0] * 256
-    lengths[_FMT] = _FMT_BYTES
-    counts = [0] * 256
-    places: dict[int, array[int]] = {}
-    kept = [False] * 256
+def _indexed(path: Path, data: mmap.mmap, wanted: Container[str], log: Log) -> dict[bytes, _Type]:
+    """The kinds of messages by their first three bytes, with their places."""
+    formats = _HEADER + bytes([_FMT])
+    types = {formats: _Type("FMT", _FMT_BYTES, (), "", None)}
+    end, at = len(data), 0
     while at + 3 <= end:
-        number = data[at + 2]
-        length = lengths[number]
-        if length and data[at] == 0xA3 and data[at + 1] == 0x95 and at + length <= end:
-            if number == _FMT:
-                _learn(data[at + 3 : at + _FMT_BYTES], types, lengths)
-                kept = [n in types and types[n].name in wanted for n in range(256)]
-            counts[number] += 1
-            if kept[number]:
-                places.setdefault(number, array("q")).append(at)
-            at += length
+        start = data[at : at + 3]
+        kind = types.get(start)
+        if kind is not None and at + kind.length <= end:
+            kind.count += 1
+            if kind.places is not None:
+                kind.places.append(at)
+            elif start == formats:
+                _learn(data[at + 3 : at + _FMT_BYTES], types, wanted)
+            at += kind.length
             continue
         following = data.find(_HEADER, at + 1)
         following = end if following < 0 else following
         log.damaged_bytes += following - at
         at = following
     log.damaged_bytes += end - at
-    numbers = sum(len(where) * len(types[n].fields) for n, where in places.items())
+    numbers = sum(len(kind.places) * len(kind.fields) for kind in types.values() if kind.places)
     refuse_beyond(path, numbers, TABLE_CELLS, "numbers", "cut it in parts")
-    found = {n: (counts[n], places.get(n, array("q"))) for n in types if counts[n]}
-    return types, found, log
+    return types
 
 
-def _learn(body: bytes, types: dict[int, _Type], lengths: list[int]) -> None:
+def _learn(body: bytes, types: dict[bytes, _Type], wanted: Container[str]) -> None:
     """A format message; one whose codes do not give its length is skipped over as it is."""
     number, length = body[0], body[1]
+    start = _HEADER + bytes([number])
     name, codes, names = (
         body[a:b].split(b"\0")[0].decode("ascii", "replace") for a, b in ((2, 6), (6, 22), (22, 86))
     )
-    if number == _FMT or length < 3:
+    if number == _FMT or length < 3 or (start in types and types[start].count):
         return
     fields = tuple(part for part in names.split(",") if part)
     layout = None
@@ -130,8 +131,8 @@ def _learn(body: bytes, types: dict[int, _Type], lengths: list[int]) -> None:
         layout = np.dtype([(one, _CODES[code]) for one, code in zip(fields, codes, strict=True)])
     if layout is not None and layout.itemsize != length - 3:
         layout = None
-    types[number] = _Type(name, length, fields, codes, layout)
-    lengths[number] = length
+    places = array("q") if name in wanted and layout is not None else None
+    types[start] = _Type(name, length, fields, codes, layout, places)
 
 
 def refuse_empty(path: Path, log: Log) -> None:

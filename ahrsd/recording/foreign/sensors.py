@@ -25,6 +25,7 @@ _FRESH = 0.67  # share of new readings below which the magnetometer is logged fa
 _MAG_UNITS = {"T": 1e4, "gauss": 1.0, "mG": 1e-3, "uT": 1e-2, "nT": 1e-5}
 _MAG_SIZES = ((0.2, 0.8), (0.05, 3.0))  # of the Earth's field; with much iron about it
 _FASTEST_RAD_S = 20.0  # which nothing turns in the median
+_LARGEST = 1e9  # what no sensor reads in any unit
 _EARTH_M = 6371008.8
 _SENSORS = {"mag": MAG, "gyro": GYRO, "accel": ACCEL}
 
@@ -156,9 +157,11 @@ def _called(what: str, found: Sensors, key: str) -> str:
 def _tidy(path: object, stream: Stream, name: str, notes: list[str]) -> Stream:
     """In order of time, finite, each time once."""
     refuse_beyond(path, len(stream.time_s), TABLE_ROWS, f"readings of {name}", "cut it in parts")
-    known = np.isfinite(stream.time_s) & np.isfinite(stream.values).all(axis=1)
+    known = np.isfinite(stream.time_s) & (np.abs(stream.values) < _LARGEST).all(axis=1)
     if count := int(np.count_nonzero(~known)):
-        notes.append(f"{count} readings of {name} are no numbers: left out")
+        notes.append(
+            f"{count} readings of {name} are no readings (nan, or beyond any sensor): left out"
+        )
     time_s, values = stream.time_s[known], stream.values[known]
     if np.any(np.diff(time_s) < 0.0):
         order = np.argsort(time_s, kind="stable")
@@ -250,9 +253,10 @@ def _covariate(time_s: Array, stream: Stream, angle: bool) -> Array | None:
     if len(t_s) < 2:
         return None
     if angle:
-        turned = np.interp(time_s, t_s, np.degrees(np.unwrap(np.radians(values))))
+        turned: Array = np.interp(time_s, t_s, np.degrees(np.unwrap(np.radians(values))))
         return (turned + 180.0) % 360.0 - 180.0
-    return np.interp(time_s, t_s, values)
+    held: Array = np.interp(time_s, t_s, values)
+    return held
 
 
 def _scaled(

@@ -68,7 +68,8 @@ def read(path: Path, choice: Choice) -> Sensors:
     log = _loaded(path, _TOPICS)
     sets: dict[str, list[_Set]] = {}
     for one in sorted(log.data_list, key=lambda one: (one.name, one.multi_id)):
-        sets.setdefault(one.name, []).append(one)
+        if "timestamp" in one.data:
+            sets.setdefault(one.name, []).append(one)
     if "sensor_combined" not in sets:
         there = ", ".join(sorted(sets)) or "no sensor at all"
         raise RecordingError(
@@ -102,7 +103,8 @@ def _three(path: Path, one: _Set, stem: str) -> Array:
         raise RecordingError(
             path, f"{one.name} has no field {absent[0]}", "`ahrsd convert FILE --list` names them"
         )
-    return np.column_stack([one.data[name] for name in names]).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # signalling nan of damaged bytes
+        return np.column_stack([one.data[name] for name in names]).astype(np.float64)
 
 
 def _field(
@@ -112,7 +114,8 @@ def _field(
     combined = sets["sensor_combined"][0]
     found = {int(one.multi_id): one for one in sets.get("vehicle_magnetometer", ())}
     number = choice.compass if choice.compass is not None else min(found, default=0)
-    if not found and "magnetometer_ga[0]" in combined.data and not number:
+    old = {"magnetometer_ga[0]", "magnetometer_timestamp_relative"} <= set(combined.data)
+    if not found and old and not number:
         relative = combined.data["magnetometer_timestamp_relative"].astype(np.int64)
         new = relative != _NO_TIME
         at = (combined.data["timestamp"] + relative)[new] * 1e-6
