@@ -256,11 +256,8 @@ def _of_ros(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
 
 def _with_units(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
     """Columns whose names end in their unit in brackets, where only one can be meant."""
-    told = [
-        (found[1].lower(), found[2], name)
-        for name in names[:1000]
-        if (found := _WITH_UNIT.match(name)) is not None
-    ]
+    matches = [(name, _WITH_UNIT.match(name)) for name in names[:1000]]
+    told = [(match[1].lower(), match[2], name) for name, match in matches if match is not None]
     taken: list[str] = []
     for wanted in ((TIME,), MAG, GYRO, ACCEL):
         if any(name in sources for name in wanted):

@@ -74,20 +74,22 @@ def read_log(path: Path, wanted: Container[str]) -> Log:
     log = Log()
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         types = _indexed(path, data, wanted, log)
-        for kind in types.values():
-            if not kind.count:
-                continue
-            log.counts[kind.name] = log.counts.get(kind.name, 0) + kind.count
-            if kind.layout is None or not kind.places:
-                continue
-            starts = np.frombuffer(kind.places, np.int64) + 3
-            raw: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
-            log.rows[kind.name] = raw[starts[:, None] + np.arange(kind.length - 3)].view(
-                kind.layout
-            )[:, 0]
-            del raw  # it holds the map of the file open
+    for kind in types.values():
+        if not kind.count:
+            continue
+        log.counts[kind.name] = log.counts.get(kind.name, 0) + kind.count
+        if kind.places and kind.layout is not None:
+            log.rows[kind.name] = _rows(path, kind.places, kind.length, kind.layout)
             log.codes[kind.name] = dict(zip(kind.fields, kind.codes, strict=False))
     return log
+
+
+def _rows(
+    path: Path, places: array[int], length: int, layout: np.dtype[np.void]
+) -> NDArray[np.void]:
+    """The bodies of the messages that begin at these places."""
+    bodies = np.frombuffer(places, np.int64)[:, None] + np.arange(3, length)
+    return np.memmap(path, np.uint8, "r")[bodies].view(layout)[:, 0]
 
 
 def _indexed(path: Path, data: mmap.mmap, wanted: Container[str], log: Log) -> dict[bytes, _Type]:
