@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import shutil
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -172,6 +173,19 @@ def test_what_the_device_sent_calibrates_as_its_byte_stream(tmp_path, container,
     assert any("what the device sent" in text for text in result.said())
 
 
+def test_a_real_stream_in_a_bag_calibrates_as_the_stream(recordings, tmp_path):
+    packed = recordings / "vn100" / "circles_2022_rahul.vnraw.gz"
+    lines = gzip.decompress(packed.read_bytes()).splitlines(keepends=True)
+    messages = [
+        ("/raw", "std_msgs/msg/String", ns_of(k / 40.0), {"data": line.decode("latin-1")})
+        for k, line in enumerate(lines)
+    ]
+    path = ros_files.save(tmp_path, "bag", messages)
+    wanted = calibrate(packed, Config(), rate_hz=40.0).estimate.hard_iron_gauss
+    found = calibrate(path, Config()).estimate.hard_iron_gauss
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6)
+
+
 def stream_of(kind: str) -> list[bytes]:
     """What a VN-100 sent, message by message or in pieces."""
     name = {"text": "clean_tumble_vnymr.vnraw.gz", "bytes": "clean_tumble_binary.vnraw.gz"}[kind]
@@ -300,6 +314,16 @@ def test_a_huge_gap_is_a_gap(tmp_path, container):
     assert len(table.rows) == 600
     assert table.starts == (0, 300)
     assert any("the clock was set" in note for note in table.notes)
+
+
+def test_a_database_of_another_program_is_told(tmp_path):
+    path = tmp_path / "notes.db3"
+    database = sqlite3.connect(path)
+    database.execute("create table notes(text)")
+    database.commit()
+    database.close()
+    with pytest.raises(RecordingError, match="is a database of another program"):
+        open_recording(path)
 
 
 def test_a_topic_that_is_not_there_is_told(tmp_path):

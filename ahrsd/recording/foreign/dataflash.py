@@ -65,7 +65,9 @@ class Log:
 
     def texts(self, message: str, name: str) -> list[str]:
         """The strings of a field."""
-        raw = self.rows[message][name] if self.has(message, name) else []
+        if not self.has(message, name):
+            return []
+        raw = self.rows[message][name].tolist()
         return [bytes(one).split(b"\0")[0].decode("ascii", "replace") for one in raw]
 
 
@@ -89,7 +91,8 @@ def _rows(
 ) -> NDArray[np.void]:
     """The bodies of the messages that begin at these places."""
     bodies = np.frombuffer(places, np.int64)[:, None] + np.arange(3, length)
-    return np.memmap(path, np.uint8, "r")[bodies].view(layout)[:, 0]
+    rows: NDArray[np.void] = np.memmap(path, np.uint8, "r")[bodies].view(layout)[:, 0]
+    return rows
 
 
 def _indexed(path: Path, data: mmap.mmap, wanted: Container[str], log: Log) -> dict[bytes, _Type]:

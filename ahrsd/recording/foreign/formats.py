@@ -17,7 +17,7 @@ from ahrsd.recording.foreign.sensors import Choice, RawBytes, Sensors
 from ahrsd.recording.limits import STREAM_BYTES, refuse_beyond
 
 _MCAP = b"\x89MCAP0\r\n"
-_OURS = b"ahrsd"
+_ROS_2 = b"\x04\0\0\0ros2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +40,9 @@ class Format:
     list: Callable[[Path], list[str]]
 
 
-def _foreign_mcap(start: bytes) -> bool:
-    """An MCAP file whose header names another profile than ours, or none."""
-    if not start.startswith(_MCAP) or len(start) < 21:
-        return False
-    length = int.from_bytes(start[17:21], "little")
-    profile = start[21 : 21 + min(length, 64)]
-    return start[8] == 1 and profile != _OURS and profile in (b"ros1", b"ros2")
+def _ros_2_mcap(start: bytes) -> bool:
+    """An MCAP file whose header, the first record, names the profile of ROS 2."""
+    return start.startswith(_MCAP + b"\x01") and start[17:].startswith(_ROS_2)
 
 
 def _ros(what: str, suffix: str, begins: Callable[[bytes], bool]) -> Format:
@@ -90,7 +86,7 @@ def _list_px4(path: Path) -> list[str]:
 FOLDER = _ros("is a ROS 2 recording", "", lambda _: False)  # a folder with metadata.yaml
 FORMATS: tuple[Format, ...] = (
     _ros("is a ROS 1 bag", ".bag", lambda start: start.startswith(b"#ROSBAG V2.0")),
-    _ros("is a ROS 2 recording (MCAP)", ".mcap", _foreign_mcap),
+    _ros("is a ROS 2 recording (MCAP)", ".mcap", _ros_2_mcap),
     _ros(
         "is a ROS 2 recording (SQLite)",
         ".db3",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+import sys
 import tempfile
 from array import array
 from collections.abc import Callable, Iterator
@@ -189,11 +190,14 @@ class _Found:
 def damages() -> tuple[type[BaseException], ...]:
     """What rosbags raises on files that are damaged, beside its own errors."""
     import apsw
-    from backports import zstd
     from rosbags.highlevel.anyreader import AnyReaderError, ReaderErrors
     from rosbags.serde import SerdeError
     from rosbags.typesys import TypesysError
 
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
     return (
         AnyReaderError, *ReaderErrors, SerdeError, TypesysError, apsw.Error, zstd.ZstdError,
         sqlite3.Error, struct.error, LookupError, ValueError, TypeError, AttributeError,
@@ -221,10 +225,10 @@ def _opened(path: Path, suffix: str) -> Iterator[_Message]:
 
 def _refused(path: Path, suffix: str, error: BaseException) -> RecordingError:
     words = printable(" ".join(str(error).split()) or type(error).__name__, 160)
-    return RecordingError(
-        path, f"is damaged, cut off or was never closed ({words})",
-        _REINDEX.get(suffix, "record again"),
-    )  # fmt: skip
+    what = "is damaged, cut off or was never closed"
+    if suffix == ".db3":
+        what += ", or is a database of another program"
+    return RecordingError(path, f"{what} ({words})", _REINDEX.get(suffix, "record again"))
 
 
 def listed(path: Path, suffix: str) -> list[str]:
