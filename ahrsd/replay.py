@@ -62,17 +62,18 @@ def replay(
     settings: CoreSettings | None = None,
     columns: ColumnMap = NO_MAP,
     most_samples: float = math.inf,
+    opened: Recording | None = None,
 ) -> Replayed:
     """Feed a recording to a core; speed 0 is as fast as it goes, 1 real time.
 
     settings: of the core, else those of `config`; a capture of the daemon brings its own
     configuration, and its own `held_out`. columns: names and units of a table. most_samples: for
-    who keeps them all. Raises RecordingError where nothing in the recording can
-    be calibrated.
+    who keeps them all. opened: the recording at `path`, where it is open already. Raises
+    RecordingError where nothing in the recording can be calibrated.
     """
     if rate_hz is not None and not math.isfinite(rate_hz):
         raise RecordingError(path, f"a rate of {rate_hz} Hz is none", "give --rate in Hz")
-    recording = open_recording(path, rate_hz, columns=columns)
+    recording = opened or open_recording(path, rate_hz, columns=columns)
     core = Core(settings or _settings(recording, config, rate_hz, held_out))
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
     done = Replayed(core, recording, list(recording.notes))

@@ -32,6 +32,7 @@ SHELL = (
     "ahrsd.config",
     "ahrsd.config_sections",
     "ahrsd.config_text",
+    "ahrsd.converting",
     "ahrsd.daemon",
     "ahrsd.demo",
     "ahrsd.diagnosing",

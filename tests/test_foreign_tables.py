@@ -644,3 +644,88 @@ def test_the_command_line_reads_a_foreign_table(tmp_path, capsys, command):
     assert end.value.code in (0, 1)
     assert "400 samples" in shown
     assert "it looks like" not in shown
+
+
+# -- names that other programs write ---------------------------------------------------------------
+
+
+def renamed(names: dict[str, tuple[str, float]]) -> dict[str, list[str]]:
+    """Cells under other names, in other units."""
+    columns = sensor()
+    return {
+        other: [f"{value:.12g}" for value in factor * columns[name]]
+        for name, (other, factor) in names.items()
+    }
+
+
+def vectors(names: tuple[str, ...], pattern: str, factor: float = 1.0):
+    return {n: (pattern.format(axis), factor) for n, axis in zip(names, "xyz", strict=True)}
+
+
+def rostopic(mag_factor: float = 1e-4) -> dict[str, list[str]]:
+    cells = renamed(
+        {
+            **vectors(MAG, "field.mag.magnetic_field.{}", mag_factor),
+            **vectors(GYRO, "field.imu.angular_velocity.{}"),
+            **vectors(ACCEL, "field.imu.linear_acceleration.{}"),
+        }
+    )
+    stamps = [str(1_747_130_000_000_000_000 + round(1e9 * t)) for t in sensor()[TIME]]
+    return {"%time": stamps, "field.header.frame_id": ["imu"] * COUNT, **cells}
+
+
+def test_the_table_of_rostopic_is_read(tmp_path):
+    table = read_table(save(tmp_path / "imu.csv", rostopic()))
+    columns = sensor()
+    np.testing.assert_allclose(table.rows.time_s - table.rows.time_s[0], columns[TIME], atol=1e-6)
+    np.testing.assert_allclose(
+        table.rows.raw_b_gauss, np.column_stack([columns[name] for name in MAG]), rtol=1e-9
+    )
+    assert any("those of ROS messages" in note for note in table.notes)
+
+
+def test_a_field_of_rostopic_that_is_in_gauss_is_told_and_the_option_reads_it(tmp_path):
+    path = save(tmp_path / "imu.csv", rostopic(1.0))
+    with pytest.raises(RecordingError, match="it looks like gauss") as refused:
+        read_table(path)
+    option = str(refused.value).split("--columns ")[1]
+    assert option.startswith("mag_x=field.mag.magnetic_field.x:gauss,")
+    given = parse_columns([option])
+    mag = np.column_stack([sensor()[name] for name in MAG])
+    np.testing.assert_allclose(read_table(path, columns=given).rows.raw_b_gauss, mag, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("time", "mag", "gyro", "accel", "factors"),
+    [
+        ("Time (s)", "Magnetic field {} (µT)", "Gyroscope {} (rad/s)", "Acceleration {} (m/s^2)",
+         (1.0, 100.0, 1.0, 1.0)),
+        ("TimeStartup [ns]", "UnCompMag{} [Gauss]", "UnCompGyro{} [rad/s]", "UnCompAcc{} [m/s^2]",
+         (1e9, 1.0, 1.0, 1.0)),
+        ("timestamp (ms)", "mag_{} (uT)", "gyro_{} (deg/s)", "acc_{} (g)",
+         (1e3, 100.0, 180.0 / np.pi, 1 / 9.80665)),
+    ],
+)  # fmt: skip
+def test_units_in_brackets_are_read(tmp_path, time, mag, gyro, accel, factors):
+    cells = renamed(
+        {
+            TIME: (time, factors[0]),
+            **vectors(MAG, mag, factors[1]),
+            **vectors(GYRO, gyro, factors[2]),
+            **vectors(ACCEL, accel, factors[3]),
+        }
+    )
+    same(read_table(save(tmp_path / "phone.csv", cells)), sensor())
+
+
+def test_of_two_columns_that_could_be_meant_none_is_taken(tmp_path):
+    cells = renamed(
+        {
+            TIME: ("Time (s)", 1.0),
+            **vectors(MAG, "Mag {} (uT)", 100.0),
+            **vectors(GYRO, "Gyro {} (rad/s)"),
+        }
+    )
+    cells["Mag filtered x (uT)"] = cells["Mag x (uT)"]
+    with pytest.raises(RecordingError, match="has no column mag_x_gauss"):
+        read_table(save(tmp_path / "phone.csv", cells))

@@ -16,6 +16,7 @@ COMMANDS: dict[str, str] = {
     "run": "The daemon: estimate from the stream, judge, and write back as far as the mode allows.",
     "emulate": "An emulated VN-100 on a pseudo-terminal.",
     "capture": "Record what a device sends.",
+    "convert": "A recording of another program as a Parquet table that says where it comes from.",
     "replay": "The pipeline of `run` over a recording.",
     "calibrate": "Batch calibration of a recording.",
     "evaluate": "What a calibration is worth: heading, field and dead reckoning, before and after.",

@@ -135,6 +135,15 @@ _PROGRAMS: tuple[dict[str, Source], ...] = (
     _program(("mag", "Mag", 1.0), ("gyro", "AngularRate", 1.0), ("accel", "Accel", 1.0)),
     {"time_s": Source("TimeGps", 1e-9)},
 )  # fmt: skip
+#: the parts of ROS messages that hold a vector, with the factor from their unit
+_ROS_PARTS = (
+    ("magnetic_field", MAG, 1e4),
+    ("angular_velocity", GYRO, 1.0),
+    ("linear_acceleration", ACCEL, 1.0),
+)
+_ROS_TIMES = ("field.header.stamp", "%time")  # in ns, best first
+_WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+_WORDS = {"time": "time|stamp", "mag": "mag|field", "gyro": "gyr|ang|rate|omega", "accel": "acc"}
 _SDK_MARKS = {"TimeStartup", "TimeGps", "UncompMagX", "AngularRateX"}
 
 
@@ -177,6 +186,8 @@ def resolve(names: Sequence[str], given: ColumnMap = NO_MAP) -> Resolved:
         notes.append(f"columns {', '.join(recased[:3])} ... were read without their capitals")
     if _SDK_MARKS & present:
         notes += _of_programs(sources, present)
+    notes += _of_ros(sources, names)
+    notes += _with_units(sources, names)
     used = {source.column for source in sources.values()}
     for name in double:
         if name in used:
@@ -220,6 +231,61 @@ def _of_programs(sources: dict[str, Source], present: set[str]) -> list[str]:
     return [f"the columns are those of VectorNav's SDK: {', '.join(taken[:3])}, ... were taken"]
 
 
+def _of_ros(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
+    """Columns of `rostopic echo -p` and of tools that write paths of messages."""
+    taken: list[str] = []
+    for part, wanted, factor in _ROS_PARTS:
+        ends = re.compile(rf"(?:^|[./]){part}([./])x$")
+        stems = [name[:-1] for name in names if ends.search(name)]
+        whole = len(stems) == 1 and all(f"{stems[0]}{axis}" in names for axis in "xyz")
+        if not whole or any(name in sources for name in wanted):
+            continue
+        for name, axis in zip(wanted, "xyz", strict=True):
+            sources[name] = Source(f"{stems[0]}{axis}", factor)
+        taken.append(f"{stems[0]}x")
+    if taken and TIME not in sources:
+        clock = next((name for name in _ROS_TIMES if name in names), None)
+        if clock is not None:
+            sources[TIME] = Source(clock, 1e-9)
+            taken.append(clock)
+    if not taken:
+        return []
+    shown = ", ".join(printable(name) for name in taken)
+    return [f"the columns are those of ROS messages: {shown} (T, rad/s, m/s^2, ns) were taken"]
+
+
+def _with_units(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
+    """Columns whose names end in their unit in brackets, where only one can be meant."""
+    matches = [(name, _WITH_UNIT.match(name)) for name in names[:1000]]
+    told = [(match[1].lower(), match[2], name) for name, match in matches if match is not None]
+    taken: list[str] = []
+    for wanted in ((TIME,), MAG, GYRO, ACCEL):
+        if any(name in sources for name in wanted):
+            continue
+        kind = _KINDS[wanted[0]]
+        found = [_only(kind, axis, told) for axis in ("xyz" if len(wanted) > 1 else ("",))]
+        known = [one for one in found if one is not None]
+        if len(known) == len(wanted):
+            sources.update(zip(wanted, known, strict=True))
+            taken.append(printable(known[0].column))
+    if not taken:
+        return []
+    return [f"names and units are those in the file's names: {', '.join(taken)} ... were taken"]
+
+
+def _only(kind: str, axis: str, told: Sequence[tuple[str, str, str]]) -> Source | None:
+    """The one column of this kind and axis; None where there is none, or several."""
+    place = rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$" if axis else ""
+    found = [
+        Source(name, factor)
+        for stem, unit, name in told
+        if re.search(_WORDS[kind], stem)
+        and re.search(place, stem)
+        and (factor := _factor(kind, unit)) is not None
+    ]
+    return found[0] if len(found) == 1 else None
+
+
 def _remedy(missing: Sequence[str], names: Sequence[str], used: set[str]) -> str:
     """The option that names the missing columns, as far as the others are alike."""
     others = [name for name in names[:1000] if name not in used and name.strip()]
@@ -242,7 +308,7 @@ def _alike(name: str, others: Sequence[str]) -> str | None:
         times = [other for other in others if re.search(r"time|stamp|date|^t$", other.lower())]
         return times[0] if times else None
     kind, axis = name.split("_")[:2]
-    words = {"mag": "mag|field", "gyro": "gyr|ang|rate|omega", "accel": "acc"}[kind]
+    words = _WORDS[kind]
     fit = [
         other
         for low, other in folded.items()

@@ -7,8 +7,8 @@ the core takes and ends in `Stop`, so that `replay` is `run` with another source
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
@@ -17,8 +17,10 @@ from ahrsd.inputs import Input, Received, Samples, Stop
 from ahrsd.printable import printable
 from ahrsd.recording.bytestream import is_gzip, read_chunks, read_received, utf16_of
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.foreign import recognised
-from ahrsd.recording.table import PARQUET, Table, read_table
+from ahrsd.recording.foreign.formats import Format, format_of, ready
+from ahrsd.recording.foreign.recognised import recognised
+from ahrsd.recording.foreign.sensors import NO_CHOICE, Choice, RawBytes, merged
+from ahrsd.recording.table import PARQUET, Table, read_table, table_of
 
 _END = "end of recording"
 _HEAD_BYTES = 4096
@@ -46,6 +48,8 @@ class Recording:
     rate_hz: rate to assume where a byte stream has no device time; None: there is none
     header:  a capture's metadata
     notes:   what is missing or was left out; a capture adds to it while its inputs are read
+    sent:    what the device sent, in a recording of another program that kept it
+    facts:   of a recording of another program: format, source, unit, frame, clock, undone
     """
 
     path: Path
@@ -54,6 +58,8 @@ class Recording:
     header: Mapping[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     table: Table | None = None
+    sent: Sequence[Received] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -64,6 +70,8 @@ class Recording:
         """Everything that the core takes, in order, ending in `Stop`; RecordingError as found."""
         if self.table is not None:
             return _table_inputs(self.table)
+        if self.sent:
+            return iter((*self.sent, Stop(self.sent[-1].host_ns, _END)))
         if self.kind is Kind.CAPTURE:
             return self._capture_inputs()
         return _byte_inputs(self)
@@ -114,21 +122,26 @@ def open_recording(
     *,
     check_units: bool = True,
     columns: ColumnMap = NO_MAP,
+    choice: Choice = NO_CHOICE,
 ) -> Recording:
-    """Open a capture, a byte stream or a table.
+    """Open a capture, a byte stream, a table, or a recording of another program.
 
     rate_hz is for byte streams without a device clock and is not used otherwise; check_units and
-    columns as in `read_table`, for tables only.
-    Raises RecordingError, one line, where the file is none of the three.
+    columns as in `read_table`, for tables only. choice: what of a recording that holds several.
+    Raises RecordingError, one line, where the file is none of them.
     """
     if rate_hz is not None and not rate_hz > 0.0:
         raise RecordingError(path, f"the rate {rate_hz:g} Hz is not positive", "give --rate in Hz")
+    if path.is_dir() and (other := format_of(path, b"")) is not None:
+        return _of_another(path, other, replace(choice, columns=columns), rate_hz)
     if not path.is_file():
         there = "is no regular file" if path.exists() else "does not exist"
         what = "is a folder" if path.is_dir() else there
         raise RecordingError(path, what, "give the path of a recording")
     suffix = path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
     start = next(read_chunks(path, _HEAD_BYTES))  # empty or no gzip: say so now
+    if (other := format_of(path, start)) is not None:
+        return _of_another(path, other, replace(choice, columns=columns), rate_hz)
     if (found := recognised(start)) is not None:
         raise RecordingError(path, found.what, found.remedy)
     named = _SUFFIXES.get(suffix.lower())
@@ -147,6 +160,41 @@ def open_recording(
         return Recording(path, kind, header=header, notes=unused)
     table = read_table(path, check_units=check_units, columns=columns)
     return Recording(path, kind, notes=[*unused, *table.notes], table=table)
+
+
+def _of_another(path: Path, other: Format, choice: Choice, rate_hz: float | None) -> Recording:
+    """A recording of another program: a table of its sensors, or what the device sent."""
+    ready(path, other)
+    for option, given in (("topic", choice.topics), ("compass", choice.compass is not None)):
+        if given and option != other.picks:
+            raise RecordingError(
+                path, f"{other.what}: --{option} is not for it", f"--{other.picks} is"
+            )
+    notes = [] if rate_hz is None else ["--rate is not used: the recording has its own time"]
+    try:
+        found = other.read(path, choice)
+        if isinstance(found, RawBytes):
+            if choice.columns:
+                notes.append("--columns is not used: the recording holds what the device sent")
+            notes += [f"{other.what.removeprefix('is ')}: {note}" for note in found.notes]
+            facts = {"format": other.what.removeprefix("is "), **found.facts}
+            return Recording(path, Kind.CAPTURE, notes=notes, sent=found.received, facts=facts)
+        rows = merged(path, found, choice.columns)
+    except MemoryError as error:
+        raise RecordingError(
+            path, "does not fit into this computer's memory", "cut it in parts"
+        ) from error
+    facts = {"format": other.what.removeprefix("is "), **rows.facts}
+    table = table_of(path, rows.columns, [*rows.notes, _said(facts)])
+    return Recording(path, Kind.TABLE, notes=[*notes, *table.notes], table=table, facts=facts)
+
+
+def _said(facts: Mapping[str, str]) -> str:
+    """The one line about what was taken of a recording of another program."""
+    return (
+        f"{facts['format']}: field of {facts['mag source']} ({facts['mag unit']}), rates of "
+        f"{facts['gyro source']}; frame: {facts['frame']}; undone: {facts['undone']}"
+    )
 
 
 def _in_spite_of_its_name(path: Path, start: bytes, named: Kind | None) -> Kind | None:

@@ -15,8 +15,8 @@ there is a gap.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
@@ -53,6 +53,7 @@ from ahrsd.recording.limits import (
 from ahrsd.samples import Array, SampleBlock
 
 PARQUET = b"PAR1"  # how such a file begins
+NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
 BLOCK_ROWS = 1024
 MINIMUM_ROWS = 20
 GAP_FACTOR = 1.6
@@ -85,6 +86,7 @@ _GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken fo
 _TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
 _SPARSE_SHARE = 0.3  # of the rows without a field: a slower magnetometer, not a fault
+_NOTES = 30  # that are repeated of a converted table
 _HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
@@ -137,7 +139,8 @@ def read_table(path: Path, *, check_units: bool = True, columns: ColumnMap = NO_
 
 def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     if _is_parquet(path):
-        table, first_row, notes = _read_parquet(path, given), 1, []
+        table, first_row = _read_parquet(path, given), 1
+        notes = _noted(table)
     else:
         from ahrsd.recording.text_table import read_text_table
 
@@ -151,13 +154,31 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     }
     covariates, text_names = _covariates(table, found)
     notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
-    columns = _Rows(path, values, covariates, np.arange(len(table)) + first_row, notes)
+    numbers = np.arange(len(table)) + first_row
+    rows = _Rows(path, values, covariates, numbers, notes, sources=found.sources)
+    return _checked(rows, check_units)
+
+
+def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
+    """The same checks for columns, by canonical names, that another reader made of a file."""
+    _check_length(path, len(columns[TIME]))
+    refuse_beyond(path, len(columns[TIME]), TABLE_ROWS, "rows", "cut it in parts")
+    cells = len(columns) * len(columns[TIME])
+    refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
+    values = {name: columns[name] for name in REQUIRED}
+    covariates = {name: column for name, column in columns.items() if name not in REQUIRED}
+    rows = _Rows(path, values, covariates, np.arange(len(columns[TIME])) + 1, list(notes))
+    return _checked(rows, True)
+
+
+def _checked(columns: _Rows, check_units: bool) -> Table:
+    path = columns.path
     columns.hold_readings()
     columns.drop_doubles()
     columns.set_clock()
     if check_units:
         for limits in _RANGES:
-            _check_units(path, columns.vectors(limits.columns), limits)
+            _check_units(path, columns.vectors(limits.columns), limits, columns.sources)
     accel = columns.acceleration()
     _check_length(path, len(accel))
     return columns.table(accel)
@@ -167,7 +188,7 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
 class _Rows:
     """A table's columns on their way to samples: what is dropped here is dropped in all of them.
 
-    numbers (N,): of the rows in the file; step_s: of the regular clock behind the stamps, if any
+    numbers (N,): of the rows in the file; sources: the file's columns by canonical name
     """
 
     path: Path
@@ -176,6 +197,7 @@ class _Rows:
     numbers: NDArray[np.intp]
     notes: list[str]
     starts: tuple[int, ...] = ()
+    sources: Mapping[str, Source] = field(default_factory=dict)
 
     def vectors(self, names: tuple[str, str, str]) -> Array:
         """(N, 3) of three columns."""
@@ -408,6 +430,13 @@ def _read_parquet(path: Path, given: ColumnMap) -> pyarrow.Table:
     return table
 
 
+def _noted(table: pyarrow.Table) -> list[str]:
+    """What was said of the recording that `ahrsd convert` made the table of."""
+    kept = (table.schema.metadata or {}).get(NOTES_KEY.encode(), b"")
+    lines = bytes(kept).decode("utf-8", "replace").splitlines()
+    return [f"converted: {line}" for line in lines[:_NOTES] if line]
+
+
 def _is_plain(kind: pyarrow.DataType) -> bool:
     types = pyarrow.types
     return bool(
@@ -587,26 +616,36 @@ def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
         )
 
 
-def _check_units(path: Path, vectors: Array, limits: _Range) -> None:
+def _check_units(path: Path, vectors: Array, limits: _Range, sources: Mapping[str, Source]) -> None:
     median = float(np.median(np.linalg.norm(vectors, axis=1)))
     if limits.minimum <= median <= limits.maximum:
         return
-    guess = next((unit for level, unit in limits.above if median > level), None)
-    if limits.below is not None and limits.below[0] <= median <= limits.below[1]:
+    own = [sources.get(name, Source(name)) for name in limits.columns]
+    factor = abs(own[0].factor)
+    native = median / factor  # as the file has it
+    guess = next((unit for level, unit in limits.above if native > level), None)
+    if limits.below is not None and limits.below[0] <= native <= limits.below[1]:
         guess = limits.below[2]
+    if factor != 1.0 and limits.minimum < native <= limits.maximum and guess is None:
+        guess = limits.unit
     words = f"it looks like {guess}" if guess else "it looks like another unit or a dead sensor"
+    read_as = limits.unit if factor == 1.0 else f"times {factor:g} is {median:.4g} {limits.unit}"
+    name = printable(own[0].column)
     raise RecordingError(
         path,
-        f"columns {limits.columns[0]} ... : median magnitude {median:.4g} {limits.unit}, {words}",
-        f"convert it to {limits.unit}{_with_option(limits, guess)}",
+        f"columns {name} ... : median magnitude {native:.4g} {read_as}, {words}",
+        f"convert it to {limits.unit}{_with_option(limits, [one.column for one in own], guess)}",
     )
 
 
-def _with_option(limits: _Range, unit: str | None) -> str:
+def _with_option(limits: _Range, columns: list[str], unit: str | None) -> str:
     if unit is None:
         return ""
     short = [name.removesuffix("_gauss").removesuffix("_rad_s") for name in limits.columns]
-    pairs = [f"{a}={b}:{unit}" for a, b in zip(short, limits.columns, strict=True)]
+    pairs = [
+        f"{a}={printable(b).replace(',', chr(92) + ',')}:{unit}"
+        for a, b in zip(short, columns, strict=True)
+    ]
     return f", or say so: --columns {','.join(pairs)}"
 
 

@@ -18,7 +18,7 @@ import pyarrow.csv
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.bytestream import read_chunks, utf16_of
-from ahrsd.recording.foreign import recognised
+from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.limits import (
     HEADER_BYTES,
     TABLE_BYTES,
@@ -30,6 +30,7 @@ from ahrsd.recording.limits import (
 _CHUNK_BYTES = 1 << 18
 csv.field_size_limit(HEADER_BYTES + 1)  # of a quoted name; 128 KiB as it comes
 _COMMENTS = (b"#", b"%", b"//")
+_ROSTOPIC = b"%time,"  # how the names of `rostopic echo -p` begin, which are no comment
 _COMMENT_LINE = re.compile(rb"(?m)^(?:#|%|//)[^\n]*(?:\n|\Z)")
 _SEPARATOR_LINE = re.compile(rb"^\"?sep=(.)\"?\s*$", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(rb"^\s*[+-]?\d+,\d+\s*$")
@@ -131,6 +132,8 @@ def _with_header(path: Path, data: bytearray, notes: list[str]) -> _Text:
         after = end + 1 if end >= 0 else len(data)
         if (found := _SEPARATOR_LINE.match(line)) is not None:
             separator = found[1]
+        elif line.startswith(_ROSTOPIC):
+            break
         elif line.startswith(_COMMENTS):
             comment = line
         elif line:
