@@ -1,6 +1,7 @@
 """`ahrsd run` as a program on a scripted device: exchange, second master, clocks, changed iron.
 
-The same promises as in tests/test_write_moments.py, each once with real processes, files and time.
+The same promises as in tests/test_write_moments.py, each once with real processes, files and time:
+half a minute to two minutes each (`pytest -m slow`).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from scripted_process import SERIAL, Program
 
-pytestmark = pytest.mark.timeout(400)
+pytestmark = [pytest.mark.timeout(400), pytest.mark.slow]
 
 
 @pytest.fixture

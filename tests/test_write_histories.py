@@ -5,14 +5,14 @@ from __future__ import annotations
 import write_histories
 from scripted_world import fitted
 
-HISTORIES, REAL = 250, 1
+HISTORIES, REAL = 100, 1
 
 
 def test_random_histories_write_nothing_wrong():
     tally = write_histories.HistoriesTally()
     with fitted():
         for number in range(HISTORIES):
-            write_histories.run_one(number, 11, tally)
+            write_histories.run_one(number, 1, tally)
     assert tally.wrong == []
     assert tally.seen["writes"] > HISTORIES
     assert tally.seen["saves"] > HISTORIES / 10
