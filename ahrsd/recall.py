@@ -21,7 +21,7 @@ from ahrsd.inputs import EarlierRun, EarlierSamples
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.writeback.clocks import Stamp
 
-LONGEST_S = 60.0
+LONGEST_S = 120.0
 
 log = logging.getLogger("ahrsd")
 

@@ -47,7 +47,7 @@ from drivers.vn100.registers import Values, parse, same
 
 RUNS = 4  # captures that are looked at
 FIRST_S = 2.0  # of a capture that is read for its clocks, however long ago it began
-AT_ONCE_S = 60.0  # a run that began warm and ended sooner after that may have died of it
+AT_ONCE_S = 180.0  # a run that began warm and ended sooner after that may have died of it
 PIECE_ROWS = 300  # of an input: the work of a second or less
 _NAME = "ahrsd-*.mcap"
 _PART = re.compile(r"\.part\d+$")
@@ -75,6 +75,7 @@ class Run:
     compensated: tuple[bool, ...]
     clock: WallClock
     blocks: list[SampleBlock] = field(default_factory=list)
+    failed: bool = False  # its estimator did, before these samples: older ones may be why
 
     def stamp(self) -> Stamp:
         """The host's clocks at the newest sample."""
@@ -139,6 +140,7 @@ class Reading:
             (self._stream.compensated_mag, self._stream.compensated_gyro),
             self.clock,
             self._kept,
+            self.failed,
         )
 
     def _input(self, item: object) -> None:
@@ -297,6 +299,8 @@ def _runs(
             break
         if run is not None:
             found.append(run)
+            if run.failed:
+                break
         elif not found:
             why = f"{path.name}: {reason}"
     if not found:
