@@ -457,14 +457,14 @@ class Core:
             self.at_s,
             self._host_s,
             open=self.writeback.history.open is not None,
-            calibrated=self._proposed is not None,
+            candidate=self.writeback.proposal is not None,
             terms=bool(self.vehicle.terms),
         )
         blocks, text = self.warm.due(present, float(block.time_s[0]))
         self._say_warm(text)
         if not blocks:
             return block
-        self.calibrator = self.calibrator.anew()
+        self.calibrator = Calibrator(*self._from_scratch)
         self._begin(self._desk.compare(self.calibrator, *self._compared))
         how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
         now = Circumstances(self.at_s, self._host_s, *how)

@@ -70,7 +70,7 @@ class Present:
     at_s: float
     host_s: float
     open: bool = False
-    calibrated: bool = False
+    candidate: bool = False
     terms: bool = False
 
 
@@ -159,7 +159,7 @@ class WarmStart:
             return "a write is under way or on trial: this run alone judges it"
         if present.terms:
             return "terms.model is set, and what the vehicle measured then is not known"
-        return "this run is calibrated already" if present.calibrated else ""
+        return "this run has a candidate of its own already" if present.candidate else ""
 
     def _now(self, host_s: float) -> Stamp:
         told = self._clock

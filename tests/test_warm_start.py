@@ -164,7 +164,7 @@ def warmed(run=None, clock=NOW, limit_s=LIMIT_S):
         ({}, {}, {"wall_s": 1.8e9 + 86400.0}, "by the wall clock"),
         ({}, {"open": True}, {}, "a write is under way or on trial"),
         ({}, {"terms": True}, {}, "terms.model is set"),
-        ({}, {"calibrated": True}, {}, "calibrated already"),
+        ({}, {"candidate": True}, {}, "has a candidate of its own"),
         ({"why": "a.mcap: damaged"}, {}, {}, "a.mcap: damaged"),
     ],
 )

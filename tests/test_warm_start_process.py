@@ -20,9 +20,9 @@ from ahrsd.warm_start import CONFIRM_S
 from drivers.vn100.emulator_process import EmulatorProcess
 from drivers.vn100.emulator_scenarios import Setup
 
-SPEED = 12.0
+SPEED = 8.0
 PATIENCE_S = 240.0
-AGAIN_S = 8.0  # within it the device is read once more, which every used sample needs
+AGAIN_S = 7.0  # within it the device is read once more, which every used sample needs
 MOTION = (("static", 12.0), ("tumble", 5000.0))
 SCENE = Setup("rov", seed=2, output="binary", rate_hz=50, baud=115200, motion=MOTION)
 
@@ -99,7 +99,7 @@ def test_a_kill_does_not_lose_the_drive(tmp_path):
     assert f"from {cold.capture.name}" in warm.said
     needed_s = warm.qualified_s() - warm.warm_s()
     assert needed_s + 1.0 >= CONFIRM_S
-    assert needed_s < 0.6 * cold.qualified_s()
+    assert needed_s < 0.8 * cold.qualified_s()
     done = replay(warm.capture, warm.config)  # the samples are inputs: nothing else is needed
     assert done.core.warm.text.endswith("this run agrees")
     states = [entry["state"] for entry in done.core.decisions.entries if "reason" in entry]
