@@ -95,7 +95,7 @@ def test_a_kill_does_not_lose_the_drive(tmp_path):
             time.sleep(1.0)  # what is said is on its way to the capture
         finally:
             warm.kill()
-    assert "warm start: " not in cold.said
+    assert "no warm start: there is no earlier capture" in cold.said
     assert f"from {cold.capture.name}" in warm.said
     needed_s = warm.qualified_s() - warm.warm_s()
     assert needed_s + 1.0 >= CONFIRM_S
