@@ -127,6 +127,10 @@ class Estimator(Section):
     gyro_noise_floor_rad_s: float = Field(default=_ESTIMATOR.gyro_noise_floor_rad_s, gt=0.0, le=1.0)
     """Never believe less rate noise than this. [rad/s]"""
 
+    warm_start_s: float = Field(default=1800.0, ge=0.0, le=7200.0)
+    """At its start `ahrsd run` goes on with the samples of the newest captures of the same device
+    with the same registers that are not older than this; 0: every run begins with nothing. [s]"""
+
     @model_validator(mode="after")
     def _window_of_epochs(self) -> Estimator:
         if self.window_steps < self.epoch_steps:
@@ -135,7 +139,7 @@ class Estimator(Section):
 
     def parameters(self) -> EstimatorParameters:
         """What the estimator takes."""
-        return EstimatorParameters(**self.model_dump())
+        return EstimatorParameters(**self.model_dump(exclude={"warm_start_s"}))
 
 
 _LIMITS = GateLimits()

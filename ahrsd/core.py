@@ -49,6 +49,7 @@ from ahrsd.stream import Stream
 from ahrsd.stream_watch import StreamWatch
 from ahrsd.unmapping import Compensation, RegisterEpochs, user_compensation
 from ahrsd.vehicle_terms import VehicleTerms
+from ahrsd.warm_start import Present, WarmStart
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import Kind
@@ -86,6 +87,8 @@ class Core:
         self._desk = Desk()
         self.estimator, self.sensors = EstimatorState(), SensorChecks()
         self._proposed: Affine | None = None
+        passive = settings.policy.mode is Mode.PASSIVE
+        self.warm = WarmStart(settings.warm_start_s, passive=passive)
         self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
         self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
@@ -112,6 +115,8 @@ class Core:
             **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.hear),
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
+            inputs.EarlierSamples: self.warm.sampled,
+            inputs.EarlierRun: lambda it: self._say_warm(self.warm.ended(it)),
             inputs.JournalOpened: self._journal_opened,
             inputs.Journalled: self._journalled,
             inputs.Examined: lambda it: self._take_findings(it.pieces, it.failure),
@@ -146,6 +151,7 @@ class Core:
 
     def _wall_clock(self, item: inputs.WallClock) -> None:
         add, back = self._errands.add, self.writeback
+        self.warm.clock(item)
         add(back.on_clock(item.wall_s, item.boot_id, item.boot_s, self._host_s))
 
     def _link_opened(self, item: inputs.LinkOpened) -> None:
@@ -244,6 +250,7 @@ class Core:
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
         """Whose samples these are is not sure any more; empty: it is."""
         if reason and self.conversation.listening and self.conversation.identity is not None:
+            self.warm.doubt()
             more = self.writeback.on_doubt(reason, self._host_s, jumped=jumped)
             self._errands.add(more)
             if jumped and self._trial is not None:
@@ -297,6 +304,7 @@ class Core:
             text = f"{self._unit} was here before: the calibration begins anew for this one"
             self._note("warning", f"another device, {unit}; {text}")
             self.calibrator = Calibrator(*self._from_scratch)
+            self.warm.over("another device was here")
         self._unit = unit
         self._out.append(events.OpenJournal(unit.serial))
 
@@ -311,6 +319,7 @@ class Core:
                     self._note("warning", f"somebody changed registers {others}: calibrated anew")
                 if self._unread or others:  # as it came does not mix with what is un-mapped
                     self.calibrator, self._unread = Calibrator(*self._from_scratch), False
+                    self.warm.over("calibrated anew")
                 self._in_force(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
@@ -416,6 +425,7 @@ class Core:
         if self.stream.take_replaced():
             self.calibrator = self.calibrator.anew()
             self._begin(self._desk.compare(self.calibrator, *self._compared))
+            self.warm.again()
         reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
         self._doubt(reason, jumped=jumped)
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
@@ -428,10 +438,46 @@ class Core:
                 metrics = self._trial.take(free)
                 self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
             if self.estimator.takes(free):
+                free = self._recall(free)
+                self.warm.live(free)
                 how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
                 now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
                 self._begin(self._desk.examine(self.calibrator, free, now))
         self._errands.let_out(self)
+
+    def _recall(self, block: SampleBlock) -> SampleBlock:
+        """The block, after the calibrator was given the samples of an earlier run, if any."""
+        if not self.warm.pending or self.writeback.state is State.RECONCILING:
+            return block
+        identity, read = self.conversation.identity, self.epochs.now.compensation is not None
+        present = Present(
+            identity.unit if identity is not None and read else None,
+            self.registers,
+            (self.stream.compensated_mag, self.stream.compensated_gyro),
+            self.at_s,
+            self._host_s,
+            open=self.writeback.history.open is not None,
+            candidate=self.writeback.proposal is not None,
+            terms=bool(self.vehicle.terms),
+        )
+        blocks, text = self.warm.due(present, float(block.time_s[0]))
+        self._say_warm(text)
+        if not blocks:
+            return block
+        self.calibrator = Calibrator(*self._from_scratch)
+        self._begin(self._desk.compare(self.calibrator, *self._compared))
+        how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+        now = Circumstances(self.at_s, self._host_s, *how)
+        for old in blocks:
+            old = replace(old, epoch=self.epochs.now.number)
+            self._begin(self._desk.recall(self.calibrator, old, now))
+        self._errands.add(self.writeback.on_doubt("samples of an earlier run", self._host_s))
+        unknown = np.concatenate([[np.nan], block.dt_s[1:]])
+        return replace(block, dt_s=unknown, gap_before=True)
+
+    def _say_warm(self, text: str) -> None:
+        if text:
+            self._note("info", text)
 
     def _begin(self, piece: Piece) -> None:
         """Have it done beside the core, or do it now."""
@@ -452,6 +498,7 @@ class Core:
             back, when = self.writeback, found.when
             self._errands.add(back.on_examined(when.host_s, self._host_s))
             if found.void:
+                self.warm.doubt()
                 self._errands.add(back.on_void(found.void, when.at_s, self._host_s))
             if found.estimate is not None:
                 self._judged(found, found.estimate)
@@ -461,6 +508,7 @@ class Core:
         self.estimator.broke_off(reason)
         self.calibrator = Calibrator(self.settings.calibrator, *self._compared)
         self._proposed = None
+        self.warm.over("the estimator failed")
         left_s = self.estimator.left_s
         self._note("error", f"ESTIMATOR FAILED: {reason}; it begins anew in {left_s:.0f} s")
         self.decisions.add(self.at_s, "ESTIMATOR FAILED")
@@ -472,6 +520,8 @@ class Core:
         self.decisions.judged(at_s, self.writeback.state.value, gates, estimate)
         if found.when.era != self._era():
             return  # it judged what is in force no more; nothing may be written by it
+        if not self.warm.confirms(estimate):
+            return  # it rests on an earlier run: nothing is written before this one agrees
         self._errands.add(
             self.writeback.on_verdict(
                 estimate,

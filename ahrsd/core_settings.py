@@ -22,6 +22,7 @@ class CoreSettings:
         a summary; None: all, for a recording, whose length is known. Counts and hash are always
         those of everything.
     columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
+    warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
     beside: the slow part of the work is done beside the core (`examination`), not at once
     """
 
@@ -34,6 +35,7 @@ class CoreSettings:
     keep: int | None = None
     columns_max_age_s: float = 0.5
     beside: bool = False
+    warm_start_s: float = 0.0
 
     @property
     def level(self) -> Level:

@@ -21,6 +21,7 @@ from ahrsd import events, host_clock, inputs
 from ahrsd.columns_file import ColumnsFile
 from ahrsd.config import Config
 from ahrsd.operator_box import Answer, OperatorInbox
+from ahrsd.recall import Recall
 from ahrsd.reloading import Change, Reloader
 from ahrsd.rerun_sink import RerunSink
 from ahrsd.serial_reader import Bytes, Lost, SerialLink, find_device
@@ -90,6 +91,7 @@ class Daemon:
 
     baud: of the port where it was found already, else as the configuration says
     terms: text of a repaired model; columns: what the vehicle measures, for its terms
+    recall: reads what earlier runs left
     complaints: each is asked once a second what is wrong with a file of somebody else's
     """
 
@@ -108,6 +110,7 @@ class Daemon:
         columns: ColumnsFile | None = None,
         complaints: Iterable[Callable[[], str]] = (),
         reloader: Reloader | None = None,
+        recall: Recall | None = None,
     ) -> None:
         self.config, self.shell, self.clock = config, shell, clock
         self._may_query = config.mode != "passive"
@@ -123,7 +126,7 @@ class Daemon:
             shell.listeners.append(self._answer)
         self._terms, self._columns = terms, columns
         self._complaints = dict.fromkeys(complaints, "")  # what each said last
-        self._reloader = reloader
+        self._reloader, self._recall = reloader, recall
         self.on_change: Callable[[Change], None] = lambda change: None  # who made the files
         self._safe = False
         self._latency_timer_ms: int | None = None
@@ -192,6 +195,8 @@ class Daemon:
         if item is not None or (self._inbox.empty and not self._link.has_more()):
             self._tick(now_ns)
         self._take_findings(now_ns)
+        if self._recall is not None and (earlier := self._recall.take(now_ns)) is not None:
+            self._feed(earlier)
         self._look()
         if self._public is not None:
             well = self.shell.worker is None or not self.shell.worker.stuck

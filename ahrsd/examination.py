@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from ahrsd.samples import Array, SampleBlock
 PAUSE_S = (5.0, 60.0)  # after a failure, and at most where it fails again soon
 HEALTHY_S = 300.0  # without a failure: the next one is a first one
 _LONGEST_REASON = 200
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +101,7 @@ class Piece:
         return self._finding
 
 
-def supervised(
-    make: Callable[[], Finding | None],
-) -> tuple[Finding | None, Failure | None]:
+def supervised(make: Callable[[], T | None]) -> tuple[T | None, Failure | None]:
     """What `make` returns, or how it broke off."""
     try:
         return make(), None
@@ -158,6 +158,12 @@ class Desk:
         """Let the calibrator take the block and judge."""
         return self._put(calibrator, partial(_examined, calibrator, block, circumstances))
 
+    def recall(
+        self, calibrator: Calibrator, block: SampleBlock, circumstances: Circumstances
+    ) -> Piece:
+        """Let the calibrator take a block of an earlier run; nothing is judged by it."""
+        return self._put(calibrator, partial(_recalled, calibrator, block, circumstances))
+
     def compare(self, calibrator: Calibrator, present: Affine, bias_b_rad_s: Array) -> Piece:
         """Tell the calibrator what a candidate must be better than."""
         return self._put(calibrator, partial(calibrator.compare_with, present, bias_b_rad_s))
@@ -180,6 +186,12 @@ class Desk:
         last = [Broken(taken.pop().calibrator, broken)] if broken and taken else []
         found = [one for piece in taken if (one := piece.finding()) is not None]
         return [*found, *last]
+
+
+def _recalled(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> Finding:
+    calibrator.take(block)
+    notes, void = tuple(calibrator.take_notes(now.host_s)), calibrator.take_void()
+    return Finding(calibrator, now, None, notes, void=void)
 
 
 def _examined(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> Finding:

@@ -113,6 +113,36 @@ class Samples:
     block: SampleBlock
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlierSamples:
+    """Samples of an earlier run, averaged to the estimator's steps; `EarlierRun` ends them."""
+
+    host_ns: int
+    block: SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierRun:
+    """Whose the samples of `EarlierSamples` are and when the newest was taken, or why none come.
+
+    registers:  that their un-mapping depends on, as that capture has them
+    compensated: whether field and rate are only known compensated
+    boot_id, boot_s, wall_s: the host's clocks at the newest sample, as `WallClock`
+    """
+
+    host_ns: int
+    why: str = ""
+    source: str = ""
+    model: str = ""
+    serial: int = 0
+    firmware: str = ""
+    registers: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
+    compensated: tuple[bool, ...] = (False, False)
+    boot_id: str = ""
+    boot_s: float | None = None
+    wall_s: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class JournalOpened:
     """The journal of the device with this serial number; `error` where it cannot be trusted."""
@@ -172,6 +202,8 @@ Input = (
     | Operator
     | RegistersKnown
     | Samples
+    | EarlierSamples
+    | EarlierRun
     | JournalOpened
     | Journalled
     | Examined

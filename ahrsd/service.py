@@ -24,6 +24,7 @@ from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.heap import needed_bytes, take_heap
 from ahrsd.interlock import InterlockFile
 from ahrsd.operator_box import OperatorBox, OperatorInbox
+from ahrsd.recall import Recall
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import make_private_folder, new_capture_path
 from ahrsd.reloading import Reloader
@@ -243,6 +244,7 @@ def run_daemon(
     words = _open_words(config)
     vehicle = VehicleFiles.of(config)
     public = open_public(config, shell, notifier)
+    recall = Recall.of(config, capture)
     daemon = Daemon(
         config,
         shell,
@@ -256,6 +258,7 @@ def run_daemon(
         columns=vehicle.columns,
         complaints=complaints(vehicle, words),
         reloader=reloader,
+        recall=recall,
     )
     daemon.on_change = lambda change: vehicle.change(change.config, daemon, words)
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
@@ -265,6 +268,8 @@ def run_daemon(
             daemon.run()
     finally:
         vehicle.close()
+        if recall is not None:
+            recall.close()
         if words is not None:
             words.close(_LEAST_S)
         public.close()

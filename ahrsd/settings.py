@@ -57,6 +57,7 @@ def core_settings(
         reply_timeout_s=config.device.reply_timeout_s,
         stream_rate_hz=stream_rate_hz,
         columns_max_age_s=config.terms.max_age_s,
+        warm_start_s=config.estimator.warm_start_s,
     )
 
 

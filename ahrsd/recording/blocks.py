@@ -15,10 +15,11 @@ from __future__ import annotations
 import itertools
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from typing import overload
 
 import lz4.frame
 import zstandard
@@ -38,6 +39,8 @@ _MAGIC = b"\x89MCAP0\r\n"
 _PROFILE = "ahrsd"
 _HEAD_BYTES = 64 * 1024
 _PREFIX = struct.Struct("<BQ")  # of every MCAP record: opcode, length
+_TIMES = struct.Struct("<QQ")  # how a chunk begins: of its first and of its last message
+Wanted = Callable[[int, int], bool]
 
 _ENCODINGS = {
     "rx": "application/octet-stream",
@@ -63,9 +66,10 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A part of the file that cannot be read."""
+    """A part of the file that cannot be read; `unclosed`: only its end is missing."""
 
     what: str
+    unclosed: bool = False
 
 
 def is_mcap(start: bytes) -> bool:
@@ -175,13 +179,27 @@ def _of_another(path: Path, profile: str, not_ours: RecordingError) -> Recording
     return not_ours
 
 
-def read_entries(path: Path) -> Iterator[Entry | Damage]:
-    """Everything in a file in recorded order, and what could not be read of it."""
+@overload
+def read_entries(path: Path) -> Iterator[Entry | Damage]: ...
+
+
+@overload
+def read_entries(path: Path, wanted: Wanted) -> Iterator[Entry | Damage | None]: ...
+
+
+def read_entries(path: Path, wanted: Wanted | None = None) -> Iterator[Entry | Damage | None]:
+    """Everything in a file in recorded order, and what could not be read of it.
+
+    wanted: asked with the first and the last time of a block, in ns; None comes for each that is
+    left out
+    """
     for data in _read_chunks(path):
         if isinstance(data, Damage):
             yield data
-        else:
+        elif wanted is None or len(data) < _TIMES.size or wanted(*_TIMES.unpack_from(data)):
             yield from _unpack(data)
+        else:
+            yield None
 
 
 def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
@@ -202,7 +220,7 @@ def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
             yield file.read(length)
     if opcode != Opcode.FOOTER:
         tail = f"; its last {left} bytes are half a block" if left else ""
-        yield Damage(f"was not closed (killed, or cut short){tail}")
+        yield Damage(f"was not closed (killed, or cut short){tail}", unclosed=True)
 
 
 def _unpack(data: bytes) -> list[Entry | Damage]:

@@ -21,6 +21,8 @@ import numpy as np
 
 from ahrsd.inputs import (
     Columns,
+    EarlierRun,
+    EarlierSamples,
     Examined,
     Input,
     Interlock,
@@ -54,6 +56,8 @@ _TYPES = {
         Operator,
         RegistersKnown,
         Samples,
+        EarlierSamples,
+        EarlierRun,
         JournalOpened,
         Journalled,
         Examined,
@@ -96,7 +100,10 @@ def decode(data: bytes) -> Input:
         kind = _TYPES[body.pop("type")]
         if kind is RegistersKnown:
             body["values"] = {int(k): _row(v) for k, v in body["values"].items()}
-        elif kind is Samples:
+        elif kind is EarlierRun:
+            body["registers"] = {int(k): _row(v) for k, v in body["registers"].items()}
+            body["compensated"] = _row(body["compensated"])
+        elif kind in (Samples, EarlierSamples):
             body["block"] = _block(body["block"])
         _check(kind, body)
         return kind(**body)
@@ -148,8 +155,8 @@ def _check(kind: type, body: dict[str, Any]) -> None:
         raise ValueError(f"host_ns of {kind.__name__} is {_short(body['host_ns'])}")
     if not math.isfinite(body.get("wall_s", 0.0)):
         raise ValueError(f"wall_s of {kind.__name__} is {body['wall_s']}")
-    if kind is RegistersKnown:
-        for number, values in body["values"].items():
+    if kind in (RegistersKnown, EarlierRun):
+        for number, values in body.get("values", body.get("registers", {})).items():
             if not 0 <= number <= _MOST_REGISTER or len(values) > _MOST_VALUES:
                 raise ValueError(f"register {_short(number)} of {len(values)} values")
             _check_register(number, values)

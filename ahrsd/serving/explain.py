@@ -68,6 +68,7 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "stream": _stream(status),
         "sensors": list(status["sensors"]),
         "estimator": _estimator(status),
+        "warm_start": str(status.get("warm_start", "")),
         "files": list(status["complaints"]),
         "mismatch": _mismatch(status),
         "gates": shut,
@@ -158,6 +159,8 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
     lines += [f"sensor: {text}" for text in explained["sensors"]]
     if explained["estimator"]:
         lines.append(f"estimator: {explained['estimator']}")
+    if explained["warm_start"]:
+        lines.append(f"warm start: {explained['warm_start']}")
     lines += [f"file: {text}" for text in explained["files"]]
     if explained["mismatch"]:
         lines.append(f"mismatch: {explained['mismatch']}")

@@ -17,6 +17,7 @@ def status_lines(status: Status) -> list[str]:
     lines = [device_line(status), stream_line(status), errors_line(status)]
     lines += [f"sensor: {text}" for text in status["sensors"]]
     lines += [motion_line(status), estimator_line(status), *estimate_lines_of(status)]
+    lines += [f"warm start: {status.get('warm_start', '')}"]
     lines += [mismatch_line(status), write_back_line(status), *candidate_lines(status)]
     lines += [f"file: {text}" for text in status["complaints"]]
     lines += [f"warning: {text}" for text in status["warnings"]]

@@ -70,6 +70,7 @@ class StatusMaker:
             "motion": _motion(core.calibrator.evidence),
             "sensors": list(core.sensors.findings.values()),
             "estimator": _estimator(core, link.estimator_stuck),
+            "warm_start": core.warm.text,
             "estimate": _estimate(core.calibrator.estimate),
             "mismatch": _mismatch(core.calibrator),
             "gates": [_gate(gate, core.at_s) for gate in core.calibrator.gates],
@@ -194,7 +195,7 @@ def _write_back(core: Core) -> dict[str, object]:
     proposal = writeback.proposal
     return {
         "state": writeback.state.value,
-        "holds": writeback.holds(),
+        "holds": [*filter(None, [core.warm.holds]), *writeback.holds()],
         "proposal": None
         if proposal is None
         else {
