@@ -70,13 +70,15 @@ def test_the_scale_is_undone(tmp_path):
         ("ArduCopter V3.6.0", {}, "after"),
         ("", {"COMPASS_PMOT_EN": 0.0}, "after"),
         ("ArduCopter V3.4.6 (e707341b)", {}, "before"),
+        ("ArduPlane V3.8.5", {}, "before"),
+        ("ArduPlane V3.9.0", {"COMPASS_PMOT_EN": 0.0}, "after"),
     ],
 )
 def test_the_motors_are_undone_in_the_order_of_the_version(tmp_path, firmware, parameters, order):
     motor = np.outer(40.0 + 30.0 * np.sin(np.arange(600) / 9.0), [1.0, -2.0, 3.0])
     path, slow, _ = log(tmp_path, {**CALIBRATED, **parameters}, firmware, motor=motor, order=order)
     np.testing.assert_allclose(raw_mg(path), 1e3 * slow["mag"], atol=2 * HALF_STEP_MG)
-    words = {"after": "before D, as", "before": "after D, as in V3.4"}[order]
+    words = {"after": "before D, as", "before": "after D, as in V3."}[order]
     assert any(words in note for note in open_recording(path).notes)
 
 

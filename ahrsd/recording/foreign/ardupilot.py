@@ -198,7 +198,8 @@ def _motor_after(log: Log, parameters: dict[str, float]) -> tuple[bool, str]:
     version = _VERSION.search(_firmware(log))
     if version is None:
         return False, "after D; the log does not name its firmware, so that the order is a guess"
-    if (int(version[1]), int(version[2])) >= (3, 6):
+    since = (3, 6) if "Copter" in _firmware(log) else (4, 0)
+    if (int(version[1]), int(version[2])) >= since:
         return True, f"before D, as in {version[0]}"
     return False, f"after D, as in {version[0]}"
 
