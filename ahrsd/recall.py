@@ -35,7 +35,6 @@ class Recall:
         self._read = read
         self._found: deque[EarlierSamples | EarlierRun] = deque()
         self._until_s = time.monotonic() + LONGEST_S
-        self._closing = False
         self._thread = threading.Thread(target=self._run, name="earlier runs", daemon=True)
         self._thread.start()
 
@@ -57,14 +56,10 @@ class Recall:
         self._found.extend(found or ())
 
     def _go_on(self) -> bool:
-        return not self._closing and time.monotonic() < self._until_s
+        return time.monotonic() < self._until_s
 
     def take(self, host_ns: int) -> EarlierSamples | EarlierRun | None:
         """The next input, as of now; None while there is none."""
         if self._thread.is_alive() or not self._found:
             return None
         return replace(self._found.popleft(), host_ns=host_ns)
-
-    def close(self) -> None:
-        """Read no more."""
-        self._closing = True

@@ -241,10 +241,8 @@ def run_daemon(
     capture = new_capture_path(config.captures) if config.capture.enabled else None
     take_heap(needed_bytes(config.estimator.parameters()))
     shell = open_shell(config, clock, capture)
-    words = _open_words(config)
-    vehicle = VehicleFiles.of(config)
+    words, vehicle = _open_words(config), VehicleFiles.of(config)
     public = open_public(config, shell, notifier)
-    recall = Recall.of(config, capture)
     daemon = Daemon(
         config,
         shell,
@@ -258,7 +256,7 @@ def run_daemon(
         columns=vehicle.columns,
         complaints=complaints(vehicle, words),
         reloader=reloader,
-        recall=recall,
+        recall=Recall.of(config, capture),
     )
     daemon.on_change = lambda change: vehicle.change(change.config, daemon, words)
     gc.freeze()  # what is there now stays: the collector need not look through it again and again
@@ -268,8 +266,6 @@ def run_daemon(
             daemon.run()
     finally:
         vehicle.close()
-        if recall is not None:
-            recall.close()
         if words is not None:
             words.close(_LEAST_S)
         public.close()

@@ -44,6 +44,7 @@ SHELL = (
     "ahrsd.montecarlo",
     "ahrsd.operator_box",
     "ahrsd.recording",
+    "ahrsd.recall",
     "ahrsd.reloading",
     "ahrsd.replay",
     "ahrsd.published",

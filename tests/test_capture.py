@@ -23,6 +23,8 @@ from mcap.reader import make_reader
 from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import (
     Columns,
+    EarlierRun,
+    EarlierSamples,
     Examined,
     Input,
     Interlock,
@@ -63,6 +65,7 @@ EVERY_INPUT: list[Input] = [
     LinkLost(15, "unplugged"),
     JournalOpened(15, 100012345, [{"seq": 1, "old": {"23": [1.0, 1e-7]}}], "line 2 is damaged"),
     Journalled(15, "PREPARED"),
+    EarlierRun(48, "", "a.mcap", "VN-100", 7, "2.0", {44: (0, 1, 5)}, (True, False), "b", 2.0, 1e9),
     Examined(15, 3, "LinAlgError: Singular matrix"),
     LimitsChanged(15, {"max_heading_sigma_deg": 0.5, "min_rate_hz": 10.0}),
     Stop(16, "SIGTERM"),
@@ -110,7 +113,7 @@ def test_side_channels(tmp_path):
 
 
 def test_every_kind_of_input_can_be_recorded():
-    assert {type(item) for item in EVERY_INPUT} | {Samples} == set(get_args(Input))
+    assert {type(item) for item in EVERY_INPUT} | {Samples, EarlierSamples} == set(get_args(Input))
 
 
 def test_samples_survive_json():
