@@ -13,8 +13,9 @@ from types import TracebackType
 
 import click
 
-from ahrsd import __version__, logs
-from ahrsd.commands import LazyGroup
+from ahrsd import __version__
+from ahrsd.cli import LazyGroup
+from ahrsd.daemon import logs
 from ahrsd.errors import EXIT_DONE, EXIT_INTERNAL, AhrsdError
 from ahrsd.printable import LINE, printable
 

@@ -13,11 +13,11 @@ import pytest
 import rerun_cli
 
 from ahrsd import demo
-from ahrsd.config import Config
+from ahrsd.config.loading import Config
 from ahrsd.demo import FILES, demo_config, lines, run_demo
 from ahrsd.errors import DeviceError
-from ahrsd.replay import replay
-from drivers.vn100.emulator_process import EmulatorProcess
+from ahrsd.offline.replay import replay
+from drivers.vn100.emulator.process import EmulatorProcess
 
 SEEDS = range(5)
 # Half a minute where nothing else runs; a busy machine makes it slow, and is no reason to fail.

@@ -21,30 +21,30 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.config import CONFIG_KEY, Config, check_config
-from ahrsd.config_text import print_config
-from ahrsd.core import Core
-from ahrsd.daemon import Daemon, HostClock
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import CONFIG_KEY, Config, check_config
+from ahrsd.config.text import print_config
+from ahrsd.core.core import Core
+from ahrsd.daemon.core_runner import JournalKeeper, Shell
+from ahrsd.daemon.daemon import Daemon, HostClock
+from ahrsd.daemon.journal import Journal
+from ahrsd.daemon.service import close_shell
 from ahrsd.demo.result import LIMIT_DEG, DemoResult, figures, lines, verdict
 from ahrsd.demo.scene import Scene, live_samples
 from ahrsd.errors import EXIT_BUSY, DeviceError
-from ahrsd.headings import tilt_compensated_heading, wrapped
-from ahrsd.journal import Journal
+from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.report import EventCollector, HeadingError, write_report
-from ahrsd.rerun_sink import RerunSink
-from ahrsd.result import calibration_json
+from ahrsd.report.calibration_json import calibration_json
+from ahrsd.report.summary import heading_errors
 from ahrsd.samples import Array
-from ahrsd.service import close_shell
-from ahrsd.settings import core_settings
-from ahrsd.shell import JournalKeeper, Shell
-from ahrsd.summary import heading_errors
+from ahrsd.viewer.sink import RerunSink
 from ahrsd.writeback.states import State
 from drivers.serial_port import PortError, SerialPort
 from drivers.vn100.device import Device
-from drivers.vn100.emulator_physics import Truth
-from drivers.vn100.emulator_process import EmulatorProcess
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import read_registers
 from drivers.vn100.registers import same

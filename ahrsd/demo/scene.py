@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.daemon import Daemon
+from ahrsd.daemon.daemon import Daemon
 from ahrsd.events import (
     Estimated,
     Event,
@@ -25,10 +25,10 @@ from ahrsd.events import (
     StateChanged,
 )
 from ahrsd.gates import Level, for_level, guards_a_write
-from ahrsd.headings import tilt_compensated_heading
+from ahrsd.heading import tilt_compensated_heading
 from ahrsd.report import EventCollector
-from ahrsd.result import UNKNOWN_HEADING_DEG
-from ahrsd.run_time import RunTime
+from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
+from ahrsd.report.run_time import RunTime
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
 

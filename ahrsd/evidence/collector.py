@@ -19,7 +19,7 @@ from ahrsd.evidence.history import History, HistoryParameters, Role
 from ahrsd.evidence.stillness import rest
 from ahrsd.evidence.values import BasisFacts, EstimateFacts, Evidence, HealthFacts
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.worldfield import WorldField
+from ahrsd.world_field import WorldField
 
 _LEAST_TURN_DEG = 60.0  # a held-out segment that turned less cannot show a heading error
 

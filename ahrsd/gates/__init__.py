@@ -1,7 +1,7 @@
 """What must hold before a calibration is written: a table of gates and its judge.
 
 Guards (`Level`): CANDIDATE - it may be shown; RAM - an operator may approve it; FLASH - it may be
-saved; UNATTENDED - RAM without an operator. docs/gates.md explains every row to a field engineer.
+saved; UNATTENDED - RAM without an operator. For a field engineer: docs/reference/gates.md.
 """
 
 from ahrsd.gates.judging import for_level, guards_a_write, holds, judge, limit_of

@@ -20,6 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ahrsd.core.device_record import COMPENSATING
+from ahrsd.core.warm_start import MOST_ROWS, too_old
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.steps import StepAverager, samples_per_step
 from ahrsd.inputs import (
@@ -34,11 +36,9 @@ from ahrsd.inputs import (
 from ahrsd.recording import inputs_json
 from ahrsd.recording.blocks import SEQUENCES, Damage, Entry, read_entries, read_head
 from ahrsd.recording.capture import part_path
-from ahrsd.rollcall import COMPENSATING
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.stream import Stream
-from ahrsd.unmapping import Compensation, RegisterEpochs
-from ahrsd.warm_start import MOST_ROWS, too_old
+from ahrsd.stream.assembler import Stream
+from ahrsd.stream.decompensation import Compensation, RegisterEpochs
 from ahrsd.writeback.clocks import Stamp
 from drivers.vn100.decode import Measurement, Reply, Undecodable, decode
 from drivers.vn100.deframer import Deframer

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.core.device_record import RecordRead
 from ahrsd.inputs import (
     Columns,
     EarlierRun,
@@ -39,7 +40,6 @@ from ahrsd.inputs import (
     Tick,
     WallClock,
 )
-from ahrsd.rollcall import RecordRead
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.reconcile import Kind
 

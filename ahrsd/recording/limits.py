@@ -1,6 +1,6 @@
 """What a recording may be at most.  Sizes are compared with these before anything is allocated.
 
-Beyond them a file ends in one line that names the limit (docs/recordings.md has them, too).
+Beyond them a file ends in one line that names the limit (docs/guide/recordings.md has them, too).
 """
 
 from __future__ import annotations

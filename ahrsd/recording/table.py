@@ -25,9 +25,9 @@ import pyarrow
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
+from ahrsd.recording.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
 from ahrsd.recording.column_names import (
     ACCEL,
     GRAVITY_M_S2,

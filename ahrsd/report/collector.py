@@ -25,7 +25,7 @@ from ahrsd.report.data import (
     RegisterChange,
     ReportData,
 )
-from ahrsd.run_time import RunTime
+from ahrsd.report.run_time import RunTime
 from ahrsd.samples import Array
 
 KEPT = 4000  # samples and estimates; every second one is dropped each time this is reached

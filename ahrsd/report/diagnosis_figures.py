@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ahrsd.mismatch.diagnosis import Contribution, Diagnosis, Drawn, RegimeMap, Validation
-from ahrsd.mismatch.shown import shown
+from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn, RegimeMap, Validation
+from ahrsd.diagnosis.shown import shown
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.samples import Array
 

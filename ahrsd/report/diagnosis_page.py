@@ -6,9 +6,9 @@ from functools import partial
 from html import escape
 from pathlib import Path
 
-from ahrsd.mismatch.diagnosis import Diagnosis, Finding
-from ahrsd.mismatch.shown import shown
-from ahrsd.mismatch.spoken import headline, place, sensitivity, value_text, verdict
+from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.shown import shown
+from ahrsd.diagnosis.spoken import headline, place, sensitivity, value_text, verdict
 from ahrsd.report.page import CSS, number, picture, section, table
 
 _MG = 1e3

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.methods.comparison import Row
+from ahrsd.baselines.comparison import Row
 from ahrsd.printable import drawn
 from ahrsd.report.figures import AFTER, GREY, SERIES, save_png
 

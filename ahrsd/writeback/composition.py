@@ -13,7 +13,7 @@ second run on the written device proposes the same. With a known field (world mo
 
 Where the estimate is of a stream whose registers act on it, C' = C2 C23 and B' = B23 + C23^-1 B2
 (with register 26: C' = R^T C2 R C23, B' = B23 + C23^-1 R^T B2) is the same thing; `Affine.after`
-and tests/test_fixed_point.py show it.
+and tests/core/test_fixed_point.py show it.
 
 Numbers are rounded to the six digits that the device prints: what it stores then equals what it
 shows, and a restart reads back exactly what was written. Six digits are 3e-4 deg of heading.

@@ -18,10 +18,10 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from ahrsd.commands import simulate
-from ahrsd.diagnosing import diagnose_recording
-from ahrsd.mismatch.diagnosis import Diagnosis
-from ahrsd.mismatch.spoken import failed_checks
+from ahrsd.cli import simulate
+from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.spoken import failed_checks
+from ahrsd.offline.diagnose import diagnose_recording
 
 SCENARIOS, MOTIONS = ("wam", "mam", "lam"), ("slow", "rov")
 #: mG and mrad/s per sample: the default, a quiet gyro, the theses' loud sensors, a quiet compass

@@ -7,7 +7,7 @@ from ahrsd.calibration import Affine
 from ahrsd.evidence.history import History
 from ahrsd.evidence.stillness import rest, stretches
 from ahrsd.samples import SampleBlock
-from ahrsd.worldfield import WorldField
+from ahrsd.world_field import WorldField
 
 
 def model(total, dip_deg):

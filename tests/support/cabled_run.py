@@ -11,10 +11,10 @@ from planted_calibrator import PlantedCalibrator
 
 from ahrsd import events, inputs
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.config import Config
-from ahrsd.config_sections import Gates
-from ahrsd.core import Core
-from ahrsd.settings import core_settings
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config
+from ahrsd.config.sections import Gates
+from ahrsd.core.core import Core
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate, Observability
-from ahrsd.calibrator import Calibrator
+from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates.table import GATES
-from ahrsd.mismatch.online import Step
+from ahrsd.monitoring.online import Step
 from ahrsd.samples import Array, SampleBlock
 
 EVERY_S = 1.0

@@ -8,13 +8,13 @@ from typing import Any
 from virtual_run import VirtualRun
 
 from ahrsd import inputs
-from ahrsd.config import check_config
-from ahrsd.config_text import print_config
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import check_config
+from ahrsd.config.text import print_config
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.earlier_run import earlier_inputs
-from ahrsd.settings import core_settings
 from ahrsd.writeback.clocks import Stamp
-from drivers.vn100.emulator import Emulator
+from drivers.vn100.emulator.emulator import Emulator
 
 LIMIT_S = 1800.0
 

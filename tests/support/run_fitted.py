@@ -14,8 +14,8 @@ from pathlib import Path
 
 from fitting_calibrator import FittingCalibrator
 
-from ahrsd import core
 from ahrsd.__main__ import main
+from ahrsd.core import core
 
 
 def wall_clock_of(path: Path) -> None:

@@ -23,12 +23,12 @@ from fitting_calibrator import FittingCalibrator
 from scripted_vn100 import Cable, Unit
 from write_observer import Observer
 
-from ahrsd import core as core_module
 from ahrsd import events, inputs
-from ahrsd.config import Config
-from ahrsd.core import Core
-from ahrsd.settings import core_settings
-from ahrsd.shell import JournalKeeper, Shell, journal_in
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config
+from ahrsd.core import core as core_module
+from ahrsd.core.core import Core
+from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 

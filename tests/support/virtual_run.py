@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Any
 
 from ahrsd import events, inputs
-from ahrsd.core import Core
-from ahrsd.core_settings import CoreSettings
-from drivers.vn100.emulator import Emulator
+from ahrsd.core.core import Core
+from ahrsd.core.settings import CoreSettings
+from drivers.vn100.emulator.emulator import Emulator
 
 WALL_S = 1.8e9
 

@@ -26,8 +26,8 @@ from scripted_world import POLICY, HostClocks, World
 from write_events import EVENTS, ORIGIN_SERIAL, Act, random_iron, users_values
 from write_observer import KINDS
 
-from ahrsd.config import Config
-from ahrsd.config_sections import Location
+from ahrsd.config.loading import Config
+from ahrsd.config.sections import Location
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy
 
 MOTION = Motion(rest_s=2.5, turn_s=3.5)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from quiet_device import Host, bodies, command, device, quiet
 
-from drivers.vn100.emulator import BOOT_S
-from drivers.vn100.emulator_physics import Truth, draw_truth
+from drivers.vn100.emulator.emulator import BOOT_S
+from drivers.vn100.emulator.physics import Truth, draw_truth
 
 WIRE = Path(__file__).parents[2] / "fixtures" / "vn100" / "wire_examples.json"
 

@@ -13,7 +13,7 @@ from quiet_device import Host, bodies, command, crc16, device, quiet
 
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.emulator_physics import Truth
+from drivers.vn100.emulator.physics import Truth
 
 
 @pytest.fixture

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers.vn100.emulator import Emulator
-from drivers.vn100.emulator_motion import make_motion
-from drivers.vn100.emulator_physics import Truth
-from drivers.vn100.emulator_process import EmulatorProcess
-from drivers.vn100.emulator_pty import OVERRUN_BYTES, Line, PtyEmulator
-from drivers.vn100.emulator_scenarios import Setup
+from drivers.vn100.emulator.emulator import Emulator
+from drivers.vn100.emulator.motion import make_motion
+from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import OVERRUN_BYTES, Line, PtyEmulator
+from drivers.vn100.emulator.scenarios import Setup
 
 STREAM = {5: (921600,), 6: (0,), 75: (1, 4, 1, 0x0001)}  # TimeStartup at 200 Hz, 14 bytes
 READ_07, REPLY_07 = b"$VNRRG,07*74\r\n", b"$VNRRG,07,40*5C\r\n"

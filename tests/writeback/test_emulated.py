@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.closing import identify_surely, read_surely
+from ahrsd.core.closing import identify_surely, read_surely
 from ahrsd.writeback.actions import IdentifyAgain, JournalAppend, RunProcedure
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
 from ahrsd.writeback.states import State
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.session import Failed, Finished, Session
 
 STEP_S = 0.01

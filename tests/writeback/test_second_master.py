@@ -151,7 +151,7 @@ def test_the_reads_are_rare_and_the_stream_goes_on():
 @STREAMS
 def test_a_capture_replays_to_the_same_decisions(binary):
     """Every doubt and every look is of the inputs."""
-    from ahrsd.core import Core
+    from ahrsd.core.core import Core
 
     run = CabledRun(two_units(binary=binary), planted=False)
     run.run(40.0)

@@ -10,11 +10,11 @@ import pytest
 from cabled_run import FIRST, IRON, CabledRun, estimate, lenient_gates, two_units
 from planted_calibrator import PlantedCalibrator
 
-from ahrsd.calibrator import Calibrator
-from ahrsd.config import check_config
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import check_config
+from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates.table import GATES
-from ahrsd.settings import core_settings
 
 STEP = np.array([0.06, 0.0, 0.0])
 OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
