@@ -177,7 +177,7 @@ def at_borders(q: chain.Quadratic) -> Array:
     A direction that it does not tell stays: against that a rad of doubt is nothing.
     """
     H, g = q.H[_CHAIN_BORDERS][:, _CHAIN_BORDERS], q.g[_CHAIN_BORDERS]
-    return -np.linalg.solve(H + np.eye(len(g)), g)
+    return np.asarray(-np.linalg.solve(H + np.eye(len(g)), g), dtype=np.float64)
 
 
 def chain_step(z: Array, *, calibrates: bool = True) -> Array:
