@@ -90,11 +90,16 @@ def cramer_rao(
     *,
     field_known: bool = False,
     full_matrix: bool = False,
+    believed: Array | None = None,
+    lag_sigma_s: float | None = None,
 ) -> Bound:
     """The bound for A (3, 3) and the gyro bias, det A = 1 and |h| unknown.
 
     field_known: |h| is given and det A is free; full_matrix: A need not be symmetric, which is the
     misalignment between magnetometer and gyro. `soft_iron` is A in the units of `field_b`.
+    believed: information on [M, b, w_b] that is there without data; with it the bound is that of
+    the mean square error averaged over what is believed. lag_sigma_s: the field is late against the
+    gyro by a time that is known to this much, and is one more nuisance; None: it is not late.
     Raises UnobservableError where the motion determines nothing, ValueError for a noise of zero.
     """
     for name, sigma in (("magnetometer", noise_mag_gauss), ("gyro", noise_gyro_rad_s)):
@@ -104,7 +109,13 @@ def cramer_rao(
     size = float(np.mean(np.linalg.norm(trajectory.field_b, axis=1)))
     M = soft_iron * size
     information = _information(trajectory, M, entries, noise_mag_gauss, noise_gyro_rad_s)
-    covariance = _inverse(information)
+    if believed is not None:
+        information[:-1, :-1] += believed
+    if lag_sigma_s is None:
+        covariance = _inverse(information[:-1, :-1])
+    else:
+        information[-1, -1] += 1 / lag_sigma_s**2
+        covariance = _inverse(information)[:-1, :-1]
     J = np.eye(len(covariance))
     J[:-6, :-6] = _matrix_jacobian(M, entries, size if field_known else None)
     return Bound(J @ covariance @ J.T, entries)
@@ -113,24 +124,31 @@ def cramer_rao(
 def _information(
     trajectory: Trajectory, M: Array, entries: tuple[tuple[int, int], ...], sm: float, sg: float
 ) -> Array:
-    """Schur complement of the directions: (m + 6, m + 6) on [M (m), b, w_b]."""
+    """Schur complement of the directions: (m + 7, m + 7) on [M (m), b, w_b, lag].
+
+    A field that is late by tau is that of the direction u(t - tau), and du/dt = -w x u.
+    """
     u = trajectory.field_b / np.linalg.norm(trajectory.field_b, axis=1, keepdims=True)
     T = so3.tangent_basis(u)
     own = M @ T / sm
     shared = np.concatenate([_matrix_columns(u, entries), _tiled(np.eye(3), len(u))], axis=2) / sm
     here, there, bias = _motion(trajectory, u, T, sg)
+    swept = np.cross(np.nan_to_num(trajectory.rate_b_rad_s), u) @ M.T / sm
     m = shared.shape[2]
+    seen, linked = np.r_[0:m, m + 3], slice(m, m + 3)
+    shared = np.concatenate([shared, swept[:, :, None]], axis=2)
     diag = np.swapaxes(own, 1, 2) @ own
     diag[1:] += np.swapaxes(here, 1, 2) @ here
     diag[:-1] += np.swapaxes(there, 1, 2) @ there
-    border = np.zeros((len(u), 2, m + 3))
-    border[:, :, :m] = np.swapaxes(own, 1, 2) @ shared
-    border[1:, :, m:] += np.swapaxes(here, 1, 2) @ bias
-    border[:-1, :, m:] += np.swapaxes(there, 1, 2) @ bias
-    information = np.zeros((m + 3, m + 3))
-    information[:m, :m] = shared.reshape(-1, m).T @ shared.reshape(-1, m)
-    information[m:, m:] = bias.reshape(-1, 3).T @ bias.reshape(-1, 3)
-    flat = border.reshape(-1, m + 3)
+    border = np.zeros((len(u), 2, m + 4))
+    border[:, :, seen] = np.swapaxes(own, 1, 2) @ shared
+    border[1:, :, linked] += np.swapaxes(here, 1, 2) @ bias
+    border[:-1, :, linked] += np.swapaxes(there, 1, 2) @ bias
+    information = np.zeros((m + 4, m + 4))
+    flat = shared.reshape(-1, m + 1)
+    information[np.ix_(seen, seen)] = flat.T @ flat
+    information[linked, linked] = bias.reshape(-1, 3).T @ bias.reshape(-1, 3)
+    flat = border.reshape(-1, m + 4)
     off = np.swapaxes(here, 1, 2) @ there
     return np.asarray(information - flat.T @ solveh_banded(_banded(diag, off), flat, lower=True))
 

@@ -142,7 +142,9 @@ def test_rise_integrates_the_gradient():
 
 
 def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
-    """Its marginal over the borders at the present c, across the field; a token on the borders."""
+    """Its marginal over the borders at the present c, across the field; a token on the borders,
+    which draws the ones that nothing else moves to where the epoch wants them.
+    """
     rng = np.random.default_rng(0)
     J = rng.normal(size=(40, 16)) * 100
 
@@ -162,6 +164,12 @@ def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
     gradient = across @ marginal @ np.linalg.solve(own, Quadratic.g[9:])[:3]
     np.testing.assert_allclose(factor.g[9:12], gradient, rtol=1e-6)
     assert not np.delete(factor.g, [9, 10, 11]).any()
+    point = Point(np.zeros(9), node, node)
+    drawn = epoch_factor(Quadratic, 0, point, 0.0, rest=node.direction, drawn=(False, True))
+    wanted = -np.linalg.solve(Quadratic.H[12:, 12:] + np.eye(4), Quadratic.g[12:])
+    np.testing.assert_allclose(drawn.g[17:19], -wanted[2:])
+    assert not drawn.g[12:14].any()
+    np.testing.assert_array_equal(drawn.H, factor.H)
 
 
 def test_chain_step_picks_the_numbers_of_an_epoch():

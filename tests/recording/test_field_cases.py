@@ -25,6 +25,7 @@ class Case:
     """A command on a file, and what must be true of its answer.
 
     iron_mg, bias_mrad_s: how near the answer must be to the truth, None: not asked
+    sigma_mg: what must be announced of the hard iron at most
     has, has_not: words of the output
     """
 
@@ -34,6 +35,7 @@ class Case:
     samples: int | None = None
     iron_mg: float | None = None
     bias_mrad_s: float | None = None
+    sigma_mg: float | None = None
     has: tuple[str, ...] = ()
     has_not: tuple[str, ...] = ()
 
@@ -65,6 +67,9 @@ CASES = (
          has_not=("add acceleration", "do not form an ellipsoid")),
     Case("f36_held_10hz_in_100hz.csv.gz", "calibrate", 0, 12000, 0.7, 0.3,
          has=("a new reading only every 10 samples",), has_not=("a magnet came near",)),
+    Case("f37_circles_then_roll.csv.gz", "calibrate", 0, 3200, 0.5, 0.2, sigma_mg=1.0),
+    Case("f37_circles_then_roll.csv.gz", "replay", 0, None, 0.5, 0.2, sigma_mg=1.0,
+         has_not=("observability.",)),
 )  # fmt: skip
 
 
@@ -99,6 +104,8 @@ def test_the_command_line_says_what_is_right(tmp_path, case):
         assert found["converged"]
         off = 1e3 * np.array(found["hard_iron_gauss"]) - HARD_IRON_MG
         assert np.max(np.abs(off)) < case.iron_mg
+    if case.sigma_mg is not None:
+        assert max(found["standard_deviation"]["hard_iron_gauss"]) < case.sigma_mg / 1e3
     if case.bias_mrad_s is not None:
         off = 1e3 * np.array(found["gyro_bias_rad_s"]) - GYRO_BIAS_MRAD_S
         assert np.max(np.abs(off)) < case.bias_mrad_s
