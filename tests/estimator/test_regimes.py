@@ -63,7 +63,7 @@ def test_fast_rows_and_readings_that_are_held_do_no_harm(name, hold):
 
 def test_motions_put_together_from_pieces(monkeypatch):
     """Numbers of the iron: hardly one below 0.9 times its bound, and rarely one above 1.5."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
     bench = importlib.import_module("bench_regimes")
     runs = [bench.run(seed, at_once=32) for seed in range(200, 230)]
     sure = [r for r in runs if r.converged and r.told]

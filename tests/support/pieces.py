@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from ahrsd.accuracy import nees
 
 from ahrsd.calibration import Estimate
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.montecarlo.accuracy import nees
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.simulation.motion import mean_rate, rotation_nb

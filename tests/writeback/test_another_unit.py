@@ -92,7 +92,8 @@ def test_while_the_values_are_on_trial_or_proven(binary, when):
     assert run.cable.units[FIRST].saves == []
     run.cable.swap(FIRST)
     run.run(15.0)
-    assert run.kinds()[-1] in ("LOST", "ROLLED_BACK")  # it restarted: it has its old values
+    # it restarted and has its old values; a stream without the device's time does not prove that
+    assert run.kinds()[-1] in ("LOST", "REVERTED", "ROLLED_BACK")
     assert len(run.cable.units[FIRST].writes) == 2
 
 
