@@ -6,7 +6,7 @@
 
 Each run draws two to five pieces (level circles, roll, pitch, rest, eight headings with stops,
 straight), a rate, a lag of the field and whether readings are held, and compares what the estimator
-says at the end with the bound of the whole data, belief included (`ahrsd/montecarlo/cramer_rao.py`).
+says at the end with the bound of the whole data, belief included (`montecarlo/cramer_rao.py`).
 The bound takes the gyro's bias to be constant and the estimator lets it walk, so iron is judged
 apart.
 """
