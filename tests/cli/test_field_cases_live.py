@@ -21,6 +21,7 @@ import pytest
 
 CASES = Path(__file__).parents[3] / "shared" / "field-cases"
 HARD_IRON_MG, GYRO_BIAS_MRAD_S = (120.0, -80.0, 60.0), (3.5, -4.2, 2.1)
+LISTENED_S = 8.0
 PATIENCE_S = 240.0
 COMMAND = [sys.executable, "-m", "ahrsd"]
 
@@ -143,6 +144,7 @@ def run(scripted: Scripted, folder: Path, until: str, kilobytes: int, config: st
         wait_for(lambda: re.search(until, log.read_text()))
         start = recorded()
         wait_for(lambda: recorded() > start + 1000 * kilobytes)
+        time.sleep(LISTENED_S)  # longer than a rate is watched before it is believed
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0, log.read_text()
     finally:

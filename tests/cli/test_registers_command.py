@@ -267,7 +267,7 @@ def test_a_calibration_is_written_whole_journaled_and_can_be_undone(
     with emulated() as (emulator, port):
         before = {n: emulator.memory.get(n) for n in (23, 84)}
         path = calibration(tmp_path)
-        assert write_from(port, path) == 2  # only said
+        assert write_from(port, path) == 0  # only said
         assert {n: emulator.memory.get(n) for n in (23, 84)} == before
         assert write_from(port, path, "--yes") == 0
         assert ram(emulator) == NEW_VALUES

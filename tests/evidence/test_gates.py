@@ -206,7 +206,7 @@ def test_an_estimator_in_doubt_never_passes(world) -> None:
     assert {"observability.converged", "observability.score", "observability.heading_sigma"} <= set(
         stopped
     )
-    assert "1.4 deg only (limit 1.0)" in stopped["observability.heading_sigma"]
+    assert "not known well enough (limit 1.0 deg)" in stopped["observability.heading_sigma"]
 
 
 def test_before_anything_every_row_says_what_is_missing(world) -> None:

@@ -219,7 +219,7 @@ def _data(record: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("profile", "words"),
     [
-        ("ros2", "is a ROS 2 recording (MCAP); write sensor_msgs/Imu and MagneticField"),
+        ("ros2", "is damaged, cut off or was never closed"),
         ("ros1", "is a ROS 1 recording (MCAP); write"),
         ("x-\x1b[31mred", "is an MCAP file of another program (profile x-\\x1b[31mred)"),
         ("", "is not a capture of ahrsd"),

@@ -153,7 +153,7 @@ def test_an_output_that_cannot_be_written_is_told_first(run, capsys, tmp_path, o
 
 def test_a_report_that_cannot_be_written_is_told_first(run, capsys, tmp_path):
     assert run("calibrate", STREAM, "--report", tmp_path / "no" / "r.html") == 2
-    assert "is no folder; make it first" in capsys.readouterr().err
+    assert "give a folder; the page is report.html in it" in capsys.readouterr().err
 
 
 def test_a_full_disk_leaves_no_half_a_file(run, capsys, small_disk):
