@@ -160,7 +160,7 @@ def test_through_a_whole_write_back_with_approval(tmp_path):
     assert after_stop == before
     live = same_decisions(run, config)
     assert live.writeback.history.open is None
-    journal = next(tmp_path.glob("journal-*")).read_text()
+    journal = next(tmp_path.glob("journal-*.jsonl")).read_text()
     kinds = [json.loads(line)["kind"] for line in journal.splitlines()]
     assert kinds == ["PREPARED", "RAM_VERIFIED", "PROVEN", "ROLLBACK", "ROLLED_BACK"]
 

@@ -359,7 +359,7 @@ def test_convert_keeps_the_samples_and_says_where_they_come_from(tmp_path):
     assert facts["ahrsd.format"] == "a ROS 1 bag"
     assert facts["ahrsd.mag source"] == "/imu/mag"
     assert facts["ahrsd.mag unit"] == "T in the file"
-    assert facts["ahrsd.stream.device_clock"].startswith("the headers' stamps, s since 2025-05-13T")
+    assert facts["ahrsd.clock"].startswith("the headers' stamps, s since 2025-05-13T")
     assert "by gravity" in facts["ahrsd.frame"] or "as the driver" in facts["ahrsd.frame"]
     assert facts["ahrsd.undone"].startswith("nothing")
     assert facts["ahrsd.axes"] == "field and gyro agree"
