@@ -194,6 +194,6 @@ def test_a_configured_model_must_be_one(tmp_path):
 
 
 def test_without_a_model_the_daemon_does_not_load_the_library_of_effects():
-    code = "import sys, ahrsd.service; print([m for m in sys.modules if 'effects' in m])"
+    code = "import sys, ahrsd.daemon.service; print([m for m in sys.modules if 'effects' in m])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "[]\n"
