@@ -24,7 +24,7 @@ def run(text):
         "import json, resource, threading\n"
         "import numpy as np\n"
         "from ahrsd.errors import ConfigError\n"
-        "from ahrsd.heap import take_heap\n"
+        "from ahrsd.daemon.heap import take_heap\n"
         "def rss(): return int(open('/proc/self/statm').read().split()[1]) * 4096 / 2**20\n"
         "def fill(n=700): return [np.ones(4000) for _ in range(n)]  # 32 kB each, 21 MB\n"
     )
@@ -87,7 +87,7 @@ def test_a_larger_window_needs_more():
 def test_a_short_commands_arrays_take_the_pages_of_those_before():
     """Page faults of a hundred arrays of 16 MB, after the first of them: none."""
     faults, kept = run(
-        "from ahrsd.heap import keep_heap\n"
+        "from ahrsd.daemon.heap import keep_heap\n"
         "def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
         "def hundred():\n"
         "    before = faults()\n"

@@ -64,7 +64,7 @@ def test_student_of_variance_one():
 
 def test_a_diagnosis_of_a_table_loads_neither_the_daemon_nor_what_draws():
     heavy = ("gtsam", "rerun", "matplotlib", "pydantic", "scipy.stats", "scipy.signal", "serial")
-    script = f"import sys, ahrsd.diagnosing; print([m for m in {heavy} if m in sys.modules])"
+    script = f"import sys, ahrsd.offline.diagnose; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )

@@ -449,7 +449,7 @@ def test_a_replay_waits_for_a_stopped_process_only_once(tmp_path, monkeypatch):
 
 
 def test_the_daemon_never_loads_rerun(tmp_path):
-    code = "import sys, ahrsd.rerun_sink; print(sorted(m for m in sys.modules if m == 'rerun'))"
+    code = "import sys, ahrsd.viewer.sink; print(sorted(m for m in sys.modules if m == 'rerun'))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"
 
