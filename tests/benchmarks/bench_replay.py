@@ -160,7 +160,8 @@ def start_up_s() -> float:
     import subprocess
 
     code = (
-        "import time; start = time.process_time(); import ahrsd.offline.replay, ahrsd.report.summary; "
+        "import time; start = time.process_time(); "
+        "import ahrsd.offline.replay, ahrsd.report.summary; "
         "print(time.process_time() - start)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
