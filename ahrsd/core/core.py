@@ -213,7 +213,9 @@ class Core:
         """Measurements to the stream, with what was damaged between them; the rest is counted."""
         skipped = deque(self.conversation.session.deframer.take_skipped())
         if any(isinstance(event, Measurement) for event in found):
-            self._doubt(self._watch.heard(self._host_s, self.stream.facts.rate_hz))
+            silence = self._watch.heard(self._host_s, self.stream.facts.rate_hz)
+            if not self.stream.carries_time:  # where it does, a gap shows in its own time
+                self._doubt(silence)
         for event in found:
             if isinstance(event, Measurement):
                 while skipped and skipped[0].offset < event.offset:

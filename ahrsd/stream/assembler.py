@@ -112,6 +112,11 @@ class Stream:
         return self._timeline.restarts
 
     @property
+    def carries_time(self) -> bool:
+        """Whether the messages have the device's own time."""
+        return self._extractor is not None and self._extractor.has_time
+
+    @property
     def compensated_mag(self) -> bool:
         """Whether only the compensated field is in the stream."""
         return self._extractor is not None and self._extractor.mag_compensated
