@@ -1,7 +1,8 @@
 """Every wire example, three ways: whole, byte by byte, cut at random; with noise around it.
 
-The examples are those of fixtures/vn100: manual_examples.toml, and wire_examples.json, whose sources
-are in it. Both have the device's bytes, so a mistake shared by encoder and decoder is caught.
+The examples are those of fixtures/vn100: manual_examples.toml, and wire_examples.json, which
+names its sources. Both have the device's bytes, so a mistake shared by encoder and decoder is
+caught.
 """
 
 from __future__ import annotations
