@@ -35,17 +35,19 @@ class CarriedField:
     def take(self, block: SampleBlock) -> None:
         """Further samples; a step of unknown length begins a new stretch."""
         usable = np.isfinite(block.gyro_b_rad_s).all(axis=1) & np.isfinite(block.dt_s)
+        dt_s = np.where(usable, block.dt_s, 0.0)
+        rate = np.where(usable[:, None], block.gyro_b_rad_s, 0.0)
+        turns = [so3.exp((rate - bias) * dt_s[:, None]) for _, bias in self._pairs]
+        fields = [mag.apply(block.raw_b_gauss) for mag, _ in self._pairs]
         for k in range(len(block)):
             if not usable[k] or self._length_s > STRETCH_S:
                 self._end()
                 self._begin()
                 continue
-            self._length_s += float(block.dt_s[k])
-            for n, (mag, bias) in enumerate(self._pairs):
-                turn = so3.exp((block.gyro_b_rad_s[k] - bias) * block.dt_s[k])
-                self._R[n] = self._R[n] @ turn
-                field = mag.apply(block.raw_b_gauss[k][None])[0]
-                self._carried[n].append(self._R[n] @ field)
+            self._length_s += float(dt_s[k])
+            for n in range(len(self._pairs)):
+                self._R[n] = self._R[n] @ turns[n][k]
+                self._carried[n].append(self._R[n] @ fields[n][k])
 
     @property
     def spreads(self) -> Array:
