@@ -1,6 +1,6 @@
 """Conventions of the whole package: frames, units, signs, names.
 
-Model of the sensor (`docs/architecture.md`; device formula: VN-100 manual, register 23)::
+Model of the sensor (`docs/design/architecture.md`; device formula: VN-100 manual, register 23)::
 
     reading      m = A h + b + noise          h: true field in the sensor frame
     correction   h = C (m - b),  C = A^-1     what register 23 applies

@@ -13,9 +13,11 @@ from types import TracebackType
 
 import click
 
-from ahrsd import __version__, logs
-from ahrsd.commands import LazyGroup
+from ahrsd import __version__
+from ahrsd.cli import LazyGroup
+from ahrsd.daemon import logs
 from ahrsd.errors import EXIT_DONE, EXIT_INTERNAL, AhrsdError
+from ahrsd.printable import LINE, printable
 
 # Before numpy is loaded. The matrices here are small: further threads spin on a busy machine and
 # change the last digits from run to run.
@@ -79,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
             sys.exit(_INTERRUPTED)
         except AhrsdError as error:
             for line in str(error).splitlines():
-                click.echo(f"ahrsd: {line}", err=True)
+                click.echo(f"ahrsd: {printable(line, LINE)}", err=True)
             sys.exit(error.exit_code)
         except BrokenPipeError:
             _detach_stdout()

@@ -14,6 +14,8 @@ Anything else that reaches the command line is a bug: traceback, exit 70.
 
 from __future__ import annotations
 
+from ahrsd.printable import LINE, printable
+
 EXIT_DONE = 0
 EXIT_NO = 1
 EXIT_USAGE = 2
@@ -31,7 +33,7 @@ class RecordingError(AhrsdError):
     """A recording that no command can use."""
 
     def __init__(self, path: object, what: str, remedy: str) -> None:
-        super().__init__(f"{path}: {what}; {remedy}")
+        super().__init__(printable(f"{printable(path, 500)}: {what}; {remedy}", LINE))
         self.path = path
         self.what = what
         self.remedy = remedy

@@ -90,6 +90,15 @@ class Noted:
 
 
 @dataclass(frozen=True, slots=True)
+class Answered:
+    """What became of a person's command, the `word` of `inputs.Operator`; `text` says why."""
+
+    word: str
+    accepted: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class OpenJournal:
     """The device is known: open its journal and answer with `JournalOpened`."""
 
@@ -104,11 +113,19 @@ class JournalAppend:
     facts: dict[str, object]
 
 
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """How work beside the core broke off: in a line, and its traceback."""
+
+    reason: str
+    trace: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Examine:
     """Do this beside the core, each after the one before; then answer with `Examined`."""
 
-    work: Callable[[], None]
+    work: Callable[[], Failure | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +151,7 @@ Event = (
     | StateChanged
     | RegisterWritten
     | Noted
+    | Answered
     | OpenJournal
     | JournalAppend
     | Examine

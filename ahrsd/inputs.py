@@ -29,10 +29,16 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class WallClock:
-    """What the wall clock says: for budgets per day and for labels, never for durations."""
+    """The host's other clocks: the wall clock, and the time since its boot, suspends included.
+
+    The wall clock may forbid (budgets per day) and is a label; boottime gives durations within the
+    boot of this id. Without them (older recordings) nothing is concluded from durations.
+    """
 
     host_ns: int
     wall_s: float
+    boot_id: str = ""
+    boot_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +85,15 @@ class TermsKnown:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason."""
+    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason.
+
+    word: its name, for the answer (`events.Answered`)
+    """
 
     host_ns: int
     verb: str
     argument: str = ""
+    word: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +111,36 @@ class Samples:
 
     host_ns: int
     block: SampleBlock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlierSamples:
+    """Samples of an earlier run, averaged to the estimator's steps; `EarlierRun` ends them."""
+
+    host_ns: int
+    block: SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierRun:
+    """Whose the samples of `EarlierSamples` are and when the newest was taken, or why none come.
+
+    registers:  that their un-mapping depends on, as that capture has them
+    compensated: whether field and rate are only known compensated
+    boot_id, boot_s, wall_s: the host's clocks at the newest sample, as `WallClock`
+    """
+
+    host_ns: int
+    why: str = ""
+    source: str = ""
+    model: str = ""
+    serial: int = 0
+    firmware: str = ""
+    registers: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
+    compensated: tuple[bool, ...] = (False, False)
+    boot_id: str = ""
+    boot_s: float | None = None
+    wall_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,10 +164,22 @@ class Journalled:
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """So many pieces of the work that is done beside the core are done, oldest first."""
+    """So many pieces of the work that is done beside the core are done, oldest first.
+
+    failure: how the last one of them broke off; empty where none did
+    """
 
     host_ns: int
     pieces: int
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LimitsChanged:
+    """A person changed the limits of the gates, by name; what was judged by others is void."""
+
+    host_ns: int
+    limits: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,8 +202,11 @@ Input = (
     | Operator
     | RegistersKnown
     | Samples
+    | EarlierSamples
+    | EarlierRun
     | JournalOpened
     | Journalled
     | Examined
+    | LimitsChanged
     | Stop
 )

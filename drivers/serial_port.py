@@ -10,7 +10,8 @@ Errors::
     PortError                    report it
     +-- PortAbsent               wait for the device, or the path is wrong
     +-- PortBusy                 somebody has it: `holders` says who
-    +-- PortUnusable             no permission, no terminal, a rate it cannot do
+    +-- PortForbidden            no permission: the text names the group to join
+    +-- PortUnusable             no terminal, a rate it cannot do
     +-- LinkLost                 it was open and is gone: close, open again
 """
 
@@ -19,8 +20,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
 import os
+import pwd
 import select
+import stat
 import struct
 import termios
 import time
@@ -35,7 +39,7 @@ import serial
 from drivers.port_holders import Holder, holders, is_pty
 from drivers.vn100.decode import Reply, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.errors import DriverError
+from drivers.vn100.errors import NO_CHECKSUM, DriverError
 from drivers.vn100.sentences import encode
 
 READ_BYTES = 65536
@@ -43,6 +47,7 @@ WRITE_TIMEOUT_S = 2.0
 LISTEN_S = 0.3
 SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
 _TIOCGEXCL = 0x80045440  # Linux asm-generic/ioctls.h; termios does not have it
+_ENOUGH = 2  # messages at a rate, to believe it
 _GARBAGE_TOLERATED = 0.5  # part of the bytes at a right rate that may lie outside of messages
 
 
@@ -61,6 +66,10 @@ class PortBusy(PortError):
         who = ", ".join(map(str, others)) or "a process that cannot be seen from here"
         super().__init__(f"{path} is in use by {who}: stop it first")
         self.holders = others
+
+
+class PortForbidden(PortError):
+    """The user may not open it."""
 
 
 class PortUnusable(PortError):
@@ -165,6 +174,8 @@ class RateHeard:
     baud: int
     received: int
     messages: int
+    unchecked: int = 0  # lines without a checksum
+    answered: bool = False
 
     def __str__(self) -> str:
         what = f"{self.received} bytes, no message" if self.received else "silence"
@@ -192,6 +203,8 @@ class BaudNotFound(PortError):
                 if asked
                 else "the device may be quiet: let it be asked, or give the rate"
             )
+        elif any(heard.unchecked for heard in tried):
+            advice = NO_CHECKSUM
         else:
             advice = "bytes arrive but no message: not a VN-100, or a rate that was not tried"
         super().__init__(f"{path}: {'; '.join(map(str, tried))}. {advice}")
@@ -223,7 +236,7 @@ def detect_baud(
                     continue
                 tried.append(heard)
                 if heard.messages:
-                    how = "heard" if attempt is _listen else "an answer came"
+                    how = "an answer came" if heard.answered else "heard"
                     reason = preferred.get(baud, "found by trying")
                     return BaudFound(baud, f"{how} at {baud} baud, {reason}", tuple(tried))
     raise BaudNotFound(str(path), tuple(tried), may_query)
@@ -238,16 +251,19 @@ def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     def enough(chunk: bytes) -> bool:
         nonlocal messages
         messages += len(deframer.feed(chunk))
-        return messages >= 2
+        return messages >= _ENOUGH
 
     received = _collect(port, listen_s, enough)
     counters = deframer.counters
     believable = messages and counters.skipped_bytes <= _GARBAGE_TOLERATED * received
-    return RateHeard(baud, received, messages if believable else 0)
+    return RateHeard(baud, received, messages if believable else 0, counters.unchecked)
 
 
 def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
-    """Ask for the model; only a reply counts. The line end first clears what the device has."""
+    """Ask for the model. The line end first clears what the device has.
+
+    A reply counts, and so do messages of which there was none while only listened to.
+    """
     port.set_baud(baud)
     port.write(b"\r\n" + encode("VNRRG,01"))
     deframer = Deframer()
@@ -256,11 +272,18 @@ def _query(port: SerialPort, baud: int, listen_s: float) -> RateHeard:
     def enough(chunk: bytes) -> bool:
         nonlocal answers
         replies = [decode(frame) for frame in deframer.feed(chunk)]
-        answers += sum(isinstance(reply, Reply) and reply.register == 1 for reply in replies)
+        # a line that echoes sends the question back, which has no values
+        answers += sum(
+            isinstance(reply, Reply) and reply.register == 1 and bool(reply.tokens)
+            for reply in replies
+        )
         return answers > 0
 
     received = _collect(port, listen_s, enough)
-    return RateHeard(baud, received, answers)
+    counters = deframer.counters
+    others = counters.valid if counters.skipped_bytes <= _GARBAGE_TOLERATED * received else 0
+    messages = answers or (others if others >= _ENOUGH else 0)
+    return RateHeard(baud, received, messages, counters.unchecked, bool(answers))
 
 
 def _collect(port: SerialPort, listen_s: float, enough: Callable[[bytes], bool]) -> int:
@@ -313,5 +336,29 @@ def _why(path: str, error: Exception) -> PortError:
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
     if number in (errno.EACCES, errno.EPERM):
-        return PortUnusable(f"{path}: no permission (is the user in the group of the device?)")
+        return PortForbidden(f"{path}: no permission; {_who_may(path)}")
     return PortUnusable(f"{path} cannot be opened as a serial port: {error}")
+
+
+def _who_may(path: str) -> str:
+    """What a person can do who may not open the port."""
+    try:
+        status = Path(path).stat()
+        group = grp.getgrgid(status.st_gid)
+    except (OSError, KeyError):
+        return "is the user in the group of the device?"
+    both = stat.S_IRGRP | stat.S_IWGRP
+    if not status.st_gid or status.st_mode & both != both:
+        return "no group may open it: give it to one by a udev rule"
+    if status.st_gid in os.getgroups():
+        return f"although this process is in its group {group.gr_name}: is it in a container?"
+    if _user() in group.gr_mem:
+        return f"you are in its group {group.gr_name} since you logged in: log in again"
+    return f"join its group: sudo usermod -aG {group.gr_name} {_user()}, then log in again"
+
+
+def _user() -> str:
+    try:
+        return pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return "$USER"

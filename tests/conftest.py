@@ -129,8 +129,8 @@ def run() -> Iterator[Callable[..., int]]:
 @pytest.fixture
 def emulated() -> Callable[..., AbstractContextManager[tuple[object, str]]]:
     """`with emulated(faults=...) as (emulator, path)`: an emulated VN-100 on a pty."""
-    from drivers.vn100.emulator_pty import PtyEmulator
-    from drivers.vn100.emulator_scenarios import Setup, build
+    from drivers.vn100.emulator.pty import PtyEmulator
+    from drivers.vn100.emulator.scenarios import Setup, build
 
     @contextmanager
     def serve(**setup: object) -> Iterator[tuple[object, str]]:
@@ -148,11 +148,11 @@ class LiveDaemon:
     """
 
     def __init__(self, folder: Path, setup: dict[str, object], tables: dict[str, object]) -> None:
-        from ahrsd.config import check_config
-        from ahrsd.daemon import Daemon, HostClock
-        from ahrsd.service import open_shell
-        from drivers.vn100.emulator_pty import PtyEmulator
-        from drivers.vn100.emulator_scenarios import Setup, build
+        from ahrsd.config.loading import check_config
+        from ahrsd.daemon.daemon import Daemon, HostClock
+        from ahrsd.daemon.service import open_shell
+        from drivers.vn100.emulator.pty import PtyEmulator
+        from drivers.vn100.emulator.scenarios import Setup, build
 
         self.port = folder / "vn100"
         device = {"baud": 115200, "port": str(self.port), **tables.pop("device", {})}
@@ -194,7 +194,7 @@ class LiveDaemon:
         return self
 
     def __exit__(self, *_: object) -> None:
-        from ahrsd.service import close_shell
+        from ahrsd.daemon.service import close_shell
 
         self.stop()
         close_shell(self.shell)

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ahrsd.montecarlo import Plan
-from ahrsd.montecarlo_methods import OURS, STREAM
+from ahrsd.montecarlo.methods import OURS, STREAM
+from ahrsd.montecarlo.runs import Plan
 
 BENCHMARKS = Path(__file__).parent / "benchmarks"
 FAKE = '''

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 
 import bench_diagnose_time
 
-from ahrsd.mismatch import engine
+from ahrsd.diagnosis import engine
 
 
 def test_every_phase_is_a_function_of_the_engine() -> None:

@@ -4,32 +4,33 @@ import json
 import math
 import os
 import signal
+import subprocess
 import threading
-import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun_cli
 
 from ahrsd import demo
-from ahrsd.config import Config
+from ahrsd.config.loading import Config
 from ahrsd.demo import FILES, demo_config, lines, run_demo
 from ahrsd.errors import DeviceError
-from ahrsd.replay import replay
-from drivers.vn100.emulator_process import EmulatorProcess
+from ahrsd.offline.replay import replay
+from drivers.vn100.emulator.process import EmulatorProcess
 
 SEEDS = range(5)
-# Sixty seconds is the promise on a machine that does nothing else; a loaded one gets more.
-LONGEST_S = 60.0 * (1 if os.environ.get("PYTEST_XDIST_WORKER") is None else 3)
+# Half a minute where nothing else runs; a busy machine makes it slow, and is no reason to fail.
+pytestmark = pytest.mark.timeout(1800)
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """One demo for all tests of the short form: (directory, result, what it said, seconds)."""
+    """One demo for all tests of the short form: (directory, result, what it said)."""
     directory = tmp_path_factory.mktemp("demo")
     said: list[str] = []
-    started = time.monotonic()
     result = run_demo(directory, seed=1, say=said.append)
-    return directory, result, said, time.monotonic() - started
+    return directory, result, said
 
 
 def assert_kept(result):
@@ -43,9 +44,8 @@ def assert_kept(result):
 
 
 def test_what_is_promised(done):
-    _, result, said, seconds = done
+    _, result, said = done
     assert_kept(result)
-    assert seconds <= LONGEST_S
     assert sum("operator approves" in line for line in said) == 1
 
 
@@ -60,7 +60,8 @@ def test_before_and_after_on_every_heading_of_unseen_data(done):
 def test_it_leaves_exactly_these_files(done):
     directory = done[0]
     assert sorted(p.name for p in directory.iterdir()) == sorted(FILES)
-    assert all((directory / name).stat().st_size > 1000 for name in FILES)
+    large = set(FILES) - {"journal.receipt"}
+    assert all((directory / name).stat().st_size > 1000 for name in large)
     body = json.loads((directory / "calibration.json").read_text())
     assert body["schema"] == "ahrsd.calibration/1"
     assert body["converged"] is True
@@ -97,13 +98,10 @@ def test_the_truth_stands_beside_the_estimate(done):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_five_seeds_in_a_row(tmp_path, seed):
-    started = time.monotonic()
-    result = run_demo(tmp_path, seed=seed, say=lambda _: None)
-    assert_kept(result)
-    assert time.monotonic() - started <= LONGEST_S
+    assert_kept(run_demo(tmp_path, seed=seed, say=lambda _: None))
 
 
-def test_a_device_that_dies_ends_it_in_seconds(tmp_path, monkeypatch):
+def test_a_device_that_dies_ends_it(tmp_path, monkeypatch):
     processes = []
 
     class Mortal(EmulatorProcess):
@@ -115,19 +113,59 @@ def test_a_device_that_dies_ends_it_in_seconds(tmp_path, monkeypatch):
     said = threading.Event()
 
     def kill():
-        assert said.wait(60.0)
+        assert said.wait(600.0)
         os.kill(processes[0].pid, signal.SIGKILL)
-        killed.append(time.monotonic())
 
-    killed: list[float] = []
     killer = threading.Thread(target=kill)
     killer.start()
     with pytest.raises(DeviceError, match="the emulated device died") as caught:
         run_demo(tmp_path, say=lambda _: said.set())
     killer.join()
-    assert time.monotonic() - killed[0] < 15.0
     assert caught.value.exit_code == 75
     assert "\n" not in str(caught.value)
+
+
+def test_a_world_that_stands_still_ends_it(monkeypatch):
+    """Neither how long it takes nor how busy the machine is ends a demo, but no progress does."""
+
+    class Frozen:
+        alive = True
+
+        def device_s(self):
+            return 12.0
+
+    class Waiting:
+        def __init__(self):
+            self.stopped = threading.Event()
+
+        def run(self):
+            assert self.stopped.wait(600.0)
+
+        def stop(self, _reason):
+            self.stopped.set()
+
+    monkeypatch.setattr(demo, "_STUCK_S", 0.0)
+    monkeypatch.setattr(demo, "_WATCH_S", 0.01)
+    monkeypatch.setattr(demo, "close_shell", lambda *_: None)
+    with pytest.raises(DeviceError, match="the emulated device stood still"):
+        demo._run(Waiting(), None, Frozen(), 100.0)
+    monkeypatch.setattr(demo, "_STUCK_S", 1e9)
+    with pytest.raises(DeviceError, match="no end after 11 s of device time"):
+        demo._run(Waiting(), None, Frozen(), 11.0)
+
+
+def test_the_report_promises_of_a_seed_only_what_it_keeps(done):
+    page = (done[0] / "report.html").read_text()
+    assert "the same seed gives the same hidden truth, motion and noise" in page
+    assert "the same run" not in page
+
+
+def test_the_recording_for_the_viewer_is_whole(done):
+    tool = Path(rerun_cli.__file__).with_name("rerun")
+    checked = subprocess.run(
+        [tool, "rrd", "verify", done[0] / "run.rrd"], check=False, capture_output=True, text=True
+    )
+    assert checked.returncode == 0, checked.stderr
 
 
 def test_no_device_is_one_line(tmp_path, monkeypatch, run, capsys):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.headings import tilt_compensated_heading, wrapped
+from ahrsd.heading import tilt_compensated_heading, wrapped
 
 
 def by_roll_and_pitch(field_b: np.ndarray, accel_b: np.ndarray) -> np.ndarray:

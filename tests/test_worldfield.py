@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ahrsd.worldfield import WorldFieldError, world_field
+from ahrsd.world_field import WorldFieldError, world_field
 
 SEATTLE = (47.6205, -122.3493, 0.0)
 

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from ahrsd.counting import counted
+
 if TYPE_CHECKING:
     from ahrsd.challenge.answers import Finding
     from ahrsd.challenge.judge import Verdict
@@ -39,7 +41,7 @@ def html(head: dict[str, Any], results: Sequence[Result]) -> str:
 
 
 def _title(head: dict[str, Any]) -> str:
-    return f"Sealed trial: {head['cases']} cases, ring {head['ring']}"
+    return f"Sealed trial: {counted(head['cases'], 'case')}, ring {head['ring']}"
 
 
 def _facts(head: dict[str, Any]) -> str:

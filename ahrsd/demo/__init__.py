@@ -21,30 +21,30 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.config import CONFIG_KEY, Config, check_config
-from ahrsd.config_text import print_config
-from ahrsd.core import Core
-from ahrsd.daemon import Daemon, HostClock
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import CONFIG_KEY, Config, check_config
+from ahrsd.config.text import print_config
+from ahrsd.core.core import Core
+from ahrsd.daemon.core_runner import JournalKeeper, Shell
+from ahrsd.daemon.daemon import Daemon, HostClock
+from ahrsd.daemon.journal import Journal
+from ahrsd.daemon.service import close_shell
 from ahrsd.demo.result import LIMIT_DEG, DemoResult, figures, lines, verdict
 from ahrsd.demo.scene import Scene, live_samples
 from ahrsd.errors import EXIT_BUSY, DeviceError
-from ahrsd.headings import tilt_compensated_heading, wrapped
-from ahrsd.journal import Journal
+from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.report import EventCollector, HeadingError, write_report
-from ahrsd.rerun_sink import RerunSink
-from ahrsd.result import calibration_json
+from ahrsd.report.calibration_json import calibration_json
+from ahrsd.report.summary import heading_errors
 from ahrsd.samples import Array
-from ahrsd.service import close_shell
-from ahrsd.settings import core_settings
-from ahrsd.shell import JournalKeeper, Shell
-from ahrsd.summary import heading_errors
+from ahrsd.viewer.sink import RerunSink
 from ahrsd.writeback.states import State
 from drivers.serial_port import PortError, SerialPort
 from drivers.vn100.device import Device
-from drivers.vn100.emulator_physics import Truth
-from drivers.vn100.emulator_process import EmulatorProcess
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import read_registers
 from drivers.vn100.registers import same
@@ -52,7 +52,14 @@ from drivers.vn100.registers import same
 __all__ = ["FILES", "SPEED", "DemoResult", "demo_config", "figures", "lines", "run_demo", "verdict"]
 
 SPEED = 20.0
-FILES = ("report.html", "run.rrd", "capture.mcap", "calibration.json", "journal.jsonl")
+FILES = (
+    "report.html",
+    "run.rrd",
+    "capture.mcap",
+    "calibration.json",
+    "journal.jsonl",
+    "journal.receipt",
+)
 _BAUD = 115200
 _RATE_HZ = 50
 _MAG, _GYRO = 23, 84
@@ -65,6 +72,10 @@ _REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `s
 _REST_S = 10.0  # longer than the stops between pirouettes, which are too short for a save
 _LONGEST_AGE_S = 60.0  # of the vehicle's word, as far as the configuration goes
 _WATCH_S = 0.5
+_CLOSE_S = 60.0  # real time at most for the files to be whole: nobody waits for a demo's end
+_STUCK_S = 120.0  # real time in which the emulated world goes on by nothing
+# Of device time in all. A busy machine makes the demo slow; no such machine makes it longer.
+_LONGEST, _SPARE_S = 2.0, 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +87,10 @@ class WorldClock(HostClock):
     def now_ns(self) -> int:
         """Nanoseconds, never falling."""
         return self.start_ns + int(self.world_s() * 1e9)
+
+    def boot(self) -> tuple[str, float]:
+        """The world's time, whose boot was its beginning."""
+        return self._own_boot()
 
 
 class AlwaysSafe:
@@ -130,7 +145,7 @@ def run_demo(
             shell = _shell(directory, config, clock, scene)
             scene.daemon = Daemon(config, shell, link, clock, AlwaysSafe())
             scene.power_cycle = emulated.power_cycle
-            _run(scene.daemon, shell, emulated, 60.0 + 3.0 * seconds / speed)
+            _run(scene.daemon, shell, emulated, _LONGEST * seconds + _SPARE_S)
             registers = _read_back(link)
     result = _conclude(truth, registers, scene, shell.core)
     _leave(directory, seed, result, scene, shell.core)
@@ -163,17 +178,25 @@ def _emulated(setup: Setup, link: Path, speed: float) -> Iterator[EmulatorProces
 
 
 def _run(daemon: Daemon, shell: Shell, emulated: EmulatorProcess, longest_s: float) -> None:
-    """The daemon until the scene ends it, or the emulated device is gone, or it takes too long."""
+    """The daemon until the scene ends it, or the emulated device is gone or stands still.
+
+    longest_s: of device time, in case no samples come that could end the scene
+    """
     over = threading.Event()
     trouble: list[str] = []
 
     def watch() -> None:
-        until = time.monotonic() + longest_s
+        world_s, moved = emulated.device_s(), time.monotonic()
         while not over.wait(_WATCH_S):
+            now_s = emulated.device_s()
+            if now_s != world_s:
+                world_s, moved = now_s, time.monotonic()
             if not emulated.alive:
                 trouble.append("the emulated device died")
-            elif time.monotonic() > until:
-                trouble.append(f"no end after {longest_s:.0f} s; is this machine very busy?")
+            elif time.monotonic() - moved > _STUCK_S:
+                trouble.append(f"the emulated device stood still for {_STUCK_S:.0f} s")
+            elif world_s > longest_s:
+                trouble.append(f"no end after {longest_s:.0f} s of device time")
             if trouble:
                 daemon.stop(trouble[0])
                 return
@@ -185,7 +208,7 @@ def _run(daemon: Daemon, shell: Shell, emulated: EmulatorProcess, longest_s: flo
     finally:
         over.set()
         watcher.join()
-        close_shell(shell)
+        close_shell(shell, time.monotonic() + _CLOSE_S)
     if trouble:
         raise DeviceError(f"the demo ended early: {trouble[0]}", EXIT_BUSY)
 

@@ -11,7 +11,7 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.report import KeyFigure
 from ahrsd.samples import Array
-from drivers.vn100.emulator_physics import Truth
+from drivers.vn100.emulator.physics import Truth
 
 LIMIT_DEG: Final = 0.5
 LIMIT_BIAS_RAD_S: Final = 3e-4

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.daemon import Daemon
+from ahrsd.daemon.daemon import Daemon
 from ahrsd.events import (
     Estimated,
     Event,
@@ -24,9 +24,11 @@ from ahrsd.events import (
     SamplesSeen,
     StateChanged,
 )
-from ahrsd.gates import Level, for_level
-from ahrsd.headings import tilt_compensated_heading
+from ahrsd.gates import Level, for_level, guards_a_write
+from ahrsd.heading import tilt_compensated_heading
 from ahrsd.report import EventCollector
+from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
+from ahrsd.report.run_time import RunTime
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.states import State
 
@@ -50,6 +52,7 @@ class Scene:
     power_cycle: Callable[[], None] = lambda: None
     daemon: Daemon | None = None
     collector: EventCollector = field(default_factory=EventCollector)
+    clock: RunTime = field(default_factory=RunTime)
     state: str = State.RECONCILING.value
     gates: tuple[GateResult, ...] = ()
     estimate: Estimate | None = None
@@ -74,7 +77,7 @@ class Scene:
             case Estimated(estimate=estimate):
                 self.estimate = estimate
             case Judged(gates=gates):
-                self.gates = tuple(for_level(gates, Level.RAM))
+                self.gates = tuple(gate for gate in gates if guards_a_write(gate.gate))
                 self._progress()
             case RegisterWritten(register=register, outcome=outcome):
                 self._line("", f"register {register} {outcome}")
@@ -92,6 +95,7 @@ class Scene:
     def _samples(self, block: SampleBlock) -> None:
         now_s = float(block.time_s[-1])
         step_s = now_s - self.newest_s
+        self.clock.samples(block.time_s)
         if step_s > 0.0:  # the device's time begins again when its power was away
             self.passed_s += step_s
         self.newest_s = now_s
@@ -142,12 +146,17 @@ class Scene:
             return
         self.said_s = self.passed_s
         shut = [g.gate for g in self.gates if not g.ok]
-        text = f"heading known to {self.estimate.heading_sigma_deg:.2f} deg (1 sigma); "
+        of_write = [g.gate for g in for_level(self.gates, Level.RAM) if not g.ok]
+        sigma_deg = self.estimate.heading_sigma_deg
+        known = sigma_deg < UNKNOWN_HEADING_DEG
+        text = f"heading {f'known to {sigma_deg:.2f} deg (1 sigma)' if known else 'not known'}; "
         text += f"{len(self.gates) - len(shut)} of {len(self.gates)} gates open"
-        self._line("", text + (f", next {shut[0]}" if shut else ""))
+        if shut:
+            text += f", next {of_write[0]}" if of_write else f"; the save waits for {shut[0]}"
+        self._line("", text)
 
     def _line(self, state: str, text: str) -> None:
-        at_s = 0.0 if math.isnan(self.newest_s) else self.newest_s
+        at_s = 0.0 if math.isnan(self.clock.newest_s) else self.clock.newest_s
         self.say(f"{at_s:8.1f} s  {state:15}{text}")
 
     def _end(self, reason: str) -> None:

@@ -15,7 +15,7 @@ system in the d_k, bordered by what is shared: x = [M (6), b (3)], the epoch's g
 two border directions (2 + 2), which the neighbouring epochs see too. The interior is eliminated by
 a banded Cholesky factorisation; what remains is one quadratic in 16 numbers, whatever n is.
 
-Residuals and their derivatives (checked numerically in tests/test_estimator_chain.py):
+Residuals and their derivatives (checked numerically in tests/estimator/test_chain.py):
 
     r_k = (m_k - M u_k - b) / s_m        d/dd_k = -M T_k / s_m,  d/db = -I / s_m
     q_k = T_k^T R_k u_(k-1) / (s_g dt_k) d/dd_k = -I, d/dd_(k-1) = T_k^T R_k T_(k-1),

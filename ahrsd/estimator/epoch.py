@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.estimator import chain, noise
-from ahrsd.estimator.factors import Factor, Node, gap_factor
+from ahrsd.estimator.factors import Factor, Node, at_borders, gap_factor
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.misfit import Score, scores
 from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
-_BORDERS = np.r_[chain.FIRST, chain.LAST]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +32,15 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What an epoch says of iron and instrument (`instrument.py`): H (17, 17), g (17,) at c."""
+
+    H: Array
+    g: Array
+    c: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Place:
     """Where one is to be linearised: directions, noise, weights of the fields (None for 1)."""
 
@@ -46,7 +54,8 @@ class Place:
 class Epoch:
     """One epoch in the window: what it is, directions, noise, and its factor.
 
-    used: the noise that it was linearised with; usual: that of the window then.
+    used: the noise that it was linearised with; usual: that of the window then; told: known once
+    somebody asked.
     """
 
     piece: Piece
@@ -56,6 +65,7 @@ class Epoch:
     quadratic: chain.Quadratic
     factor: Factor
     score: Score | None = None
+    told: Told | None = None
     _residuals: noise.Residuals | None = None
     _cells: Cells | None = None
 
@@ -133,12 +143,10 @@ def place_borders(graph: Graph, begun: Sequence[Epoch]) -> None:
     """Put borders that are at directions of single fields to where their epochs alone want them.
 
     Until then a chain is bent towards the noise of one field and seems that noisy itself; for an
-    epoch at rest, whose borders nothing else moves, for ever. A direction that an epoch does not
-    tell stays: against that a rad of doubt is nothing.
+    epoch at rest, whose borders only a token moves, for long.
     """
     for epoch in begun:
-        H, g = epoch.quadratic.H[_BORDERS][:, _BORDERS], epoch.quadratic.g[_BORDERS]
-        step = -np.linalg.solve(H + np.eye(len(g)), g)
+        step = at_borders(epoch.quadratic)
         own = [(epoch.a + 1, step[2:])]
         if epoch.data.measures_first:
             own.append((epoch.a, step[:2]))

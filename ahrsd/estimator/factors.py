@@ -25,6 +25,7 @@ Y_B = slice(14, 19)
 SIZE = 19
 _BIAS = slice(9, 12)
 _BORDERS = np.r_[12:14, 17:19]
+_CHAIN_BORDERS = np.r_[chain.FIRST, chain.LAST]
 _TOKEN = 1.0  # information on a direction, 1/rad^2
 # where chain.Quadratic's 16 numbers go among the factor's 19
 _FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
@@ -50,6 +51,10 @@ class Node:
     def moved(self, step: Array) -> Node:
         """The node after a step (5,), on the sphere."""
         return moved_all([self], step[None])[0]
+
+    def turned(self, R: Array) -> Node:
+        """The node with its direction and tangents turned by R (3, 3)."""
+        return Node(self.bias, R @ self.direction, R @ self.tangent)
 
 
 def moved_all(nodes: Sequence[Node], steps: Array) -> list[Node]:
@@ -135,14 +140,21 @@ class Stack:
 
 
 def epoch_factor(
-    q: chain.Quadratic, a: int, point: Point, walk: float, *, rest: Array | None = None
+    q: chain.Quadratic,
+    a: int,
+    point: Point,
+    walk: float,
+    *,
+    rest: Array | None = None,
+    drawn: tuple[bool, bool] = (False, False),
 ) -> Factor:
     """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
 
     One at rest does not calibrate, it speaks of the gyro's bias only, and that whatever c is: the
     rate that was read is the bias, across the field's direction `rest` (3,), a mean over the epoch.
     What seems to be said along it comes from the noise of the directions. Its borders keep a token
-    of information, to stay determined.
+    of information, to stay determined. The first and the last, as `drawn` says, are drawn by it to
+    where the epoch wants them; one that an epoch with motion shares is not.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     H[_AMONG] = q.H
@@ -150,12 +162,22 @@ def epoch_factor(
     if rest is not None:
         gain = np.linalg.solve(H[_BORDERS][:, _BORDERS], np.c_[H[_BORDERS][:, _BIAS], g[_BORDERS]])
         cross = H[_BIAS][:, _BORDERS]
+        wanted = at_borders(q) * np.repeat(drawn, 2)
         H_bias, g_bias = H[_BIAS, _BIAS] - cross @ gain[:, :3], g[_BIAS] - cross @ gain[:, 3]
         across = np.eye(3) - np.outer(rest, rest)
         H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
         H[_BIAS, _BIAS], g[_BIAS] = across @ H_bias @ across, across @ g_bias
-        H[_BORDERS, _BORDERS] = _TOKEN
+        H[_BORDERS, _BORDERS], g[_BORDERS] = _TOKEN, -_TOKEN * wanted
     return Factor(a, a + 1, H, g, point, walk)
+
+
+def at_borders(q: chain.Quadratic) -> Array:
+    """Where an epoch alone wants its borders (4,), first and last, from where they are.
+
+    A direction that it does not tell stays: against that a rad of doubt is nothing.
+    """
+    H, g = q.H[_CHAIN_BORDERS][:, _CHAIN_BORDERS], q.g[_CHAIN_BORDERS]
+    return np.asarray(-np.linalg.solve(H + np.eye(len(g)), g), dtype=np.float64)
 
 
 def chain_step(z: Array, *, calibrates: bool = True) -> Array:

@@ -15,6 +15,7 @@ pivots are alike, and what is left on c and the newest node (14 numbers) is solv
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 from operator import is_not
 
 import gtsam
@@ -197,6 +198,13 @@ class Graph:
         self.c = moved(self.c, dc, self.moments)
         steps = np.array([dy[j] for j in self.nodes])
         self.nodes = dict(zip(self.nodes, moved_all(list(self.nodes.values()), steps), strict=True))
+
+    def turn_first(self, R: Array) -> None:
+        """Turn the oldest node's direction by R (3, 3), and with it what was folded about it."""
+        prior = self.prior
+        point = replace(prior.point, a=prior.point.a.turned(R), b=prior.point.b.turned(R))
+        self.prior = replace(prior, point=point)
+        self.nodes[self.first] = self.nodes[self.first].turned(R)
 
     def covariance(self) -> Array:
         """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed.

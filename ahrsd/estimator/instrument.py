@@ -25,7 +25,8 @@ import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.elimination import halfway
-from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.epoch import Epoch, Told
+from ahrsd.estimator.factors import Y_A, C, Stack
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.lag import rates
 from ahrsd.samples import Array
@@ -37,6 +38,7 @@ _FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
 _MOTION = np.ix_(np.r_[9:15, SCALE, _SIZE], np.r_[9:15, SCALE, _SIZE])
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
+_LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
 
 
@@ -88,12 +90,108 @@ class Informations:
         return kept[1]
 
 
-def instrument(said: Said, graph: Graph, sigma_bias: float) -> Instrument:
-    """From what the epochs of a settled window say.  LinAlgError where the motion does not tell."""
-    H, g = believed(graph, sigma_bias)
-    H, g = H + said[0].sum(axis=0), g + said[1].sum(axis=0)
+class Past:
+    """What epochs that left the window said of iron, turn, lag and scale, as one Gaussian.
+
+    The gyro's bias walks, so each epoch had its own, which is eliminated.
+    """
+
+    def __init__(self) -> None:
+        self._H: Array = np.zeros((_SIZE, _SIZE))
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, 0, lag, 0]
+
+    @staticmethod
+    def of_iron(graph: Graph, lag_s: float) -> Past:
+        """What the graph's folded epochs say of the iron; of a lag they were not asked."""
+        H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).here())
+        gain = H[C, Y_A] @ np.linalg.pinv(H[Y_A, Y_A], rcond=1e-12, hermitian=True)
+        own_H, own_g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
+        own_H[C, C], own_g[C] = H[C, C] - gain @ H[Y_A, C], g[C] - gain @ g[Y_A]
+        past = Past()
+        past._add(own_H, own_g, graph.c, lag_s)
+        return past
+
+    @staticmethod
+    def of_lag(lag_s: float, sigma_s: float) -> Past:
+        """A lag is known, and nothing of the iron."""
+        past = Past()
+        past._H[LAG, LAG] = 1.0 / sigma_s**2
+        past._eta[LAG] = lag_s / sigma_s**2
+        return past
+
+    def with_epoch(self, told: Told, lag_s: float, sigma_bias: float) -> Past:
+        """The past with one epoch more, that assumed this lag; sigma_bias in rad/s."""
+        bias = slice(9, 12)
+        own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
+        gain = np.linalg.solve(own, told.H[bias]).T
+        H, g = told.H - gain @ told.H[bias], told.g - gain @ told.g[bias]
+        keep = np.zeros(_SIZE)
+        keep[_LASTING] = 1.0
+        past = Past()
+        past._H, past._eta = self._H.copy(), self._eta.copy()
+        past._add(H * np.outer(keep, keep), g * keep, told.c, lag_s)
+        return past
+
+    def _add(self, H: Array, g: Array, c: Array, lag_s: float) -> None:
+        self._H = self._H + H
+        self._eta = self._eta + H @ _place(c, lag_s) - g
+
+    def at(self, c: Array, lag_s: float) -> tuple[Array, Array]:
+        """H (17, 17) and gradient (17,) there."""
+        return self._H, self._H @ _place(c, lag_s) - self._eta
+
+
+def _place(c: Array, lag_s: float) -> Array:
+    x = np.zeros(_SIZE)
+    x[:9], x[LAG] = c, lag_s
+    return x
+
+
+def tell(epochs: Sequence[Epoch], graph: Graph) -> None:
+    """Let epochs with motion say what they say of the instrument, where they have not yet."""
+    silent = [epoch for epoch in epochs if epoch.turned and epoch.told is None]
+    if silent:
+        _informations(silent, graph)
+
+
+def lag_known(epochs: Sequence[Epoch], graph: Graph, past: Past, sigma_bias: float) -> Lag:
+    """How well all data tell the lag that is taken out of the field.  LinAlgError: not at all.
+
+    The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
+    the lag, so what both make adds up.
+    """
+    tell(epochs, graph)
+    H = believed(graph, sigma_bias)[0] + past.at(graph.c, 0.0)[0]
+    H = H + sum(epoch.told.H for epoch in epochs if epoch.told is not None)
+    sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
+    return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lag:
+    """1-sigma of a lag, and by how much [M, b, w_b] (12,) would be wrong were it one sigma off."""
+
+    sigma_s: float
+    spread: Array
+
+
+def _inverse(H: Array) -> Array:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
-    covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
+    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale))
+
+
+def instrument(
+    said: Said, graph: Graph, sigma_bias: float, before: tuple[Array, Array] | None = None
+) -> Instrument:
+    """From what the epochs of a settled window say, and those before it.
+
+    LinAlgError where the motion does not tell.
+    """
+    H, g = believed(graph, sigma_bias)
+    if before is not None:
+        H, g = H + before[0], g + before[1]
+    H, g = H + said[0].sum(axis=0), g + said[1].sum(axis=0)
+    covariance = _inverse(H)
     step = -covariance @ g
     misfit = max(1.0, disagreement(*said, step))
     return Instrument(step, misfit * covariance, misfit)
@@ -148,6 +246,8 @@ def _informations(epochs: Sequence[Epoch], graph: Graph) -> Said:
         H[k] = -(Y.T @ Y)
         H[k][_FIELD] += chain.squares(J[:, :, a:b])
         H[k][_MOTION] += chain.squares(K[:, :, a:b])
+    for epoch, own in zip(epochs, H, strict=True):
+        epoch.told = Told(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
 
 

@@ -1,7 +1,8 @@
 """From blocks of samples to the data of epochs; any split into blocks gives the same epochs.
 
 The rate is measured on the first _RATE_ROWS samples after a start or a gap, whatever blocks they
-came in; from it follows how many samples make a step. Pieces between short gaps share an epoch:
+came in; from it follows how many samples make a step, and likewise whether the magnetometer's
+readings are held over several samples (`held`). Pieces between short gaps share an epoch:
 nothing links the steps on the two sides of a gap, but the gyro's bias is the same.
 """
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.estimator import chain
+from ahrsd.estimator.held import HeldReadings, rows_per_reading
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.estimator.steps import StepAverager, Steps, join, samples_per_step, split
 from ahrsd.samples import Array, SampleBlock
@@ -53,6 +55,7 @@ class Intake:
         self.averaged = 1
         self.samples = 0
         self._averager: StepAverager | None = None
+        self._held: HeldReadings | None = None
         self._rows: list[Array] = []  # samples of a piece whose rate is not known yet
         self._waiting: list[Array] = []  # samples that are not steps yet
         self._waiting_count = 0
@@ -83,10 +86,13 @@ class Intake:
         if self._averager is None:
             self._rows.append(rows)
             rows = np.vstack(self._rows)
-            if len(rows) < _RATE_ROWS:
+            length = rows_per_reading(rows, _RATE_ROWS)
+            if length is None:
                 return []
             self._rows.clear()
-            closed = self._measure(rows[1:_RATE_ROWS, 1])
+            closed = self._measure(rows[1:_RATE_ROWS, 1], length)
+        if self._held is not None:
+            rows = self._held.thin(rows)
         self._waiting.append(rows)
         self._waiting_count += len(rows)
         enough = self._parameters.epoch_steps + int(self._fresh)
@@ -101,9 +107,13 @@ class Intake:
             self._waiting.clear()
             self._waiting_count = 0
 
-    def _measure(self, dt_s: Array) -> list[chain.Data]:
-        """Measure the rate; steps of another length do not share an epoch."""
-        rate_hz = 1.0 / float(np.median(dt_s))
+    def _measure(self, dt_s: Array, length: int) -> list[chain.Data]:
+        """Measure the rate; steps of another length do not share an epoch.
+
+        length: samples for which a reading is held
+        """
+        self._held = HeldReadings(length) if length > 1 else None
+        rate_hz = 1.0 / (length * float(np.median(dt_s)))
         averaged = samples_per_step(rate_hz, self._parameters.step_rate_hz)
         data = self._closed() if averaged != self.averaged else None
         self.averaged = averaged
@@ -120,13 +130,29 @@ class Intake:
     def gap(self, next_s: float) -> list[chain.Data]:
         """The next sample, at `next_s`, does not follow the last one; epochs that end here."""
         self._work_off()
-        if self._averager is None and self._pending_count and len(self._rows):
-            self._take(np.vstack(self._rows))  # too short to tell its rate: as the one before
-        closed = self._complete()
+        if self._averager is None and self._pending_count and self._too_short:
+            rows = np.vstack(self._rows)  # too short to tell its rate: as the one before
+            self._take(rows if self._held is None else HeldReadings(self._held.length).thin(rows))
+        closed = self._settled() + self._complete()
         if self._pending_count and 0.0 <= next_s - self._to_s <= _LONGEST_GAP_S:
             self._cut()
         elif (data := self.interrupt()) is not None:
             closed.append(data)
+        return closed
+
+    @property
+    def _too_short(self) -> bool:
+        return 0 < sum(map(len, self._rows)) < _RATE_ROWS
+
+    def _settled(self) -> list[chain.Data]:
+        """A piece that ends before it is known how long readings are held: as in the one before."""
+        if self._averager is not None or not self._rows or self._too_short:
+            return []
+        rows = np.vstack(self._rows)
+        self._rows.clear()
+        length = 1 if self._held is None else self._held.length
+        closed = self._measure(rows[1:_RATE_ROWS, 1], length)
+        self._take(rows if self._held is None else self._held.thin(rows))
         return closed
 
     def _cut(self) -> None:
@@ -152,6 +178,7 @@ class Intake:
         other = copy(self)
         other._pending, other._rows = list(self._pending), list(self._rows)
         other._averager, other._waiting = copy(self._averager), []
+        other._held = None if self._held is None else self._held.twin()
         return other
 
     def interrupt(self) -> chain.Data | None:

@@ -10,13 +10,15 @@ from typing import Self
 
 import numpy as np
 
+from ahrsd import so3
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import Epoch, Place, grown, place_borders, scores_of
 from ahrsd.estimator.excitation import turned
 from ahrsd.estimator.factors import Node, Point, Stack, bias_prior, chain_step, epoch_factor
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.grouping import group_size, grouped
-from ahrsd.estimator.lag import delayed
+from ahrsd.estimator.instrument import Past, tell
+from ahrsd.estimator.lag import delayed, rates
 from ahrsd.estimator.misfit import Misfit
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.systematic import Cells
@@ -45,6 +47,7 @@ class Linearised:
         self.misfit = Misfit()
         self.folded = False
         self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
+        self.past = Past()  # of what was folded since there is a lag
         self._folded_cells = Cells()
         self._rest: Array | None = None
         self._work = 0
@@ -121,9 +124,20 @@ class Linearised:
             self.folded |= old.turned
             if old.turned:
                 self._folded_cells += old.cells
+            self._remember_lag(old)
             self.misfit.remember(old.factor, scores_of([old])[0], self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
+
+    def _remember_lag(self, old: Epoch) -> None:
+        """What an epoch that leaves the window said of a lag, if there is one."""
+        if not old.turned or self.lag_s == 0.0:
+            return
+        if old.told is None:  # the others will be asked soon; together it is cheaper
+            tell([old, *self.epochs], self.graph)
+        if old.told is not None:
+            sigma_bias = self.parameters.prior_gyro_bias_rad_s
+            self.past = self.past.with_epoch(old.told, self.lag_s, sigma_bias)
 
     # -- linearisation ---------------------------------------------------------------------------
 
@@ -138,11 +152,14 @@ class Linearised:
             at.u[0], at.u[-1] = first.direction, last.direction
             chains.append(chain.Chain(at.piece.data, at.u, first.bias, at.used, at.weights))
         found = chain.linearise_all(chains, graph.c, outlier_sigma=outlier_sigma)
+        pieces = [e.piece for e in self.epochs] + [at.piece for at in places]
+        moving = {j for piece in pieces if piece.turned for j in (piece.a, piece.a + 1)}
         out = []
         for at, q in zip(places, found, strict=True):
             a, rest = at.piece.a, None if at.piece.turned else self._resting(at.u)
             point = Point(graph.c, graph.nodes[a], graph.nodes[a + 1])
-            factor = epoch_factor(q, a, point, at.piece.walk, rest=rest)
+            drawn = (a not in moving, a + 1 not in moving)
+            factor = epoch_factor(q, a, point, at.piece.walk, rest=rest, drawn=drawn)
             out.append(Epoch(at.piece, at.u, at.used, self.usual, q, factor))
         return out
 
@@ -191,11 +208,23 @@ class Linearised:
         )
 
     def delay(self, lag_s: float) -> None:
-        """Take the field to be `lag_s` late in every epoch of the window, and in those to come."""
-        everyone = range(len(self.epochs))
+        """Take the field to be `lag_s` late in every epoch of the window, and in those to come.
+
+        The directions turn back by as much, so that they fit the fields as well as before.
+        """
+        if self.lag_s == 0.0 and self.folded:
+            self.past = Past.of_iron(self.graph, lag_s)
+        graph, more, everyone = self.graph, lag_s - self.lag_s, range(len(self.epochs))
         places = []
         for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):
-            data = delayed(epoch.data, lag_s - self.lag_s)
+            back = so3.exp(-more * rates(epoch.data))
+            u = (back @ u[:, :, None])[:, :, 0]
+            if epoch.a == graph.first:
+                graph.turn_first(back[0])
+            elif epoch.data.measures_first:
+                graph.nodes[epoch.a] = Node.at(graph.nodes[epoch.a].bias, u[0])
+            graph.nodes[epoch.a + 1] = Node.at(graph.nodes[epoch.a + 1].bias, u[-1])
+            data = delayed(epoch.data, more)
             places.append(Place(replace(epoch.piece, data=data), u, epoch.used, epoch.weights))
         self._replace(everyone, places)
         self.lag_s = lag_s

@@ -8,7 +8,7 @@ has the hat value h = 1 / sqrt(1 + 4 b / a) on its field residual and 1 - h on i
 (inverse of the tridiagonal matrix -b, a + 2 b, -b). So the field residuals of an epoch have
 3 n - sum h degrees of freedom, the motion residuals sum h (1 less in a chain that stands alone:
 half a mode per tangent direction is free at its ends): both noise levels follow from such passes
-(restricted maximum likelihood at fixed calibration; tests/test_estimator_noise.py). The gyro's
+(restricted maximum likelihood at fixed calibration; tests/estimator/test_noise.py). The gyro's
 level found where another was assumed goes the way only in part: over the chain's modes, whose gains
 have the mean h and the mean square h (1 + h^2) / 2, the variance found follows the one assumed with
 the exponent (1 - h^2) / 2. So the step is taken 2 / (1 + h^2) times as far (of logarithms).

@@ -16,7 +16,7 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, change, intake, noise, summary
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
-from ahrsd.estimator.instrument import LAG, Informations, Instrument, instrument
+from ahrsd.estimator.instrument import Informations, Instrument, instrument
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.misalignment import Misalignment, misalignment
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
@@ -79,7 +79,6 @@ class Estimator:
         self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
         self._parted = 1.0  # variance over the expected of what earlier and later data ask for
         self._said = Informations()
-        self._lag_spread: Array = np.zeros(12)  # what a lag that is one sigma off does
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
@@ -256,8 +255,6 @@ class Estimator:
                 break
             self._misscaled = found.misscaled
             more, sigma = found.lag_s
-            if changed:
-                self._lag_spread = found.covariance[:12, LAG] / sigma
             if abs(more) < least * sigma:
                 break
             window.delay(float(np.clip(window.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)))
@@ -269,7 +266,8 @@ class Estimator:
     def _instrument(self, window: Window) -> Instrument | None:
         try:
             said = self._said.of(window.epochs, window.graph)
-            return instrument(said, window.graph, self.parameters.prior_gyro_bias_rad_s)
+            before = window.past.at(window.graph.c, window.lag_s)
+            return instrument(said, window.graph, self.parameters.prior_gyro_bias_rad_s, before)
         except np.linalg.LinAlgError:
             return None
 
@@ -290,6 +288,12 @@ class Estimator:
         if self._new or (self._window and self._intake.pending >= MIN_EPOCH_STEPS):
             return self._twin().finish()
         return self._answer()
+
+    @staticmethod
+    def _by_lag(window: Window) -> Array:
+        """What doubt about the lag, by all data so far, adds to the covariance (12, 12)."""
+        known = window.lag_known() if window.lag_s != 0.0 else None
+        return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -323,7 +327,7 @@ class Estimator:
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         covariance = covariance * (1.0 + doubt**2) * self._parted
-        covariance = covariance + np.outer(self._lag_spread, self._lag_spread)
+        covariance = covariance + self._by_lag(window)
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)

@@ -19,12 +19,13 @@ import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Place, Snapshot, place_borders, scores_of
+from ahrsd.estimator.epoch import Epoch, Place, Snapshot, place_borders, scores_of
 from ahrsd.estimator.factors import Node, Stack
 from ahrsd.estimator.graph import SingularError, sigmas
+from ahrsd.estimator.instrument import Lag, Past, lag_known
 from ahrsd.estimator.linearised import Linearised
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.estimator.staleness import bends, outdated
+from ahrsd.estimator.staleness import bends, drifts, outdated
 from ahrsd.estimator.systematic import excess
 from ahrsd.samples import Array
 
@@ -83,10 +84,20 @@ class Window(Linearised):
         other = Window(self.parameters, mean, belief, node, self.usual)
         other._guesses, other._guess = self._guesses.copy(), self._guess
         other.lag_s = self.lag_s
+        if self.lag_s != 0.0 and (known := self.lag_known(self.epochs[:-count])):
+            other.past = Past.of_lag(self.lag_s, known.sigma_s)
         for epoch in kept:
             other.graph.moments.take(epoch.data.field_b_gauss)
         other.attach([first, *(e.data for e in kept[1:])], [e.turned for e in kept])
         return other
+
+    def lag_known(self, epochs: Sequence[Epoch] | None = None) -> Lag | None:
+        """How well the lag is known by these epochs, all at present, and the past; None: not."""
+        asked = self.epochs if epochs is None else epochs
+        try:
+            return lag_known(asked, self.graph, self.past, self.parameters.prior_gyro_bias_rad_s)
+        except np.linalg.LinAlgError:
+            return None
 
     def restart_at(self, c: Array, bias: Array) -> None:
         """Put the calibration at c, directions from the field alone, noise as first guessed.
@@ -226,7 +237,8 @@ class Window(Linearised):
                 stale = everyone
                 continue
             graph.move(dc, dy)
-            stale = outdated(self.epochs, bent, self.usual, exactly=exactly)
+            drifted = drifts(self.epochs, graph.nodes, self.usual)
+            stale = outdated(self.epochs, bent, drifted, self.usual, exactly=exactly)
             if not stale and self.step_sigmas < (_EXACT if exactly else _SETTLED):
                 return
             stale = everyone if exactly else stale or everyone[-1:]

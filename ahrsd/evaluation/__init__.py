@@ -4,7 +4,7 @@
 compared with, `tilt` which way is up; `heading`, `field` and `dead_reckoning` are the figures,
 `judging` all of them together, `spoken` as JSON and as a table.
 
-Sources: [R] 2.1-2.4 and 4.4, [L]; docs/evaluate.md has the definitions.
+Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """
 
 from ahrsd.evaluation.judging import Evaluation, judge

@@ -16,7 +16,7 @@ import numpy as np
 
 from ahrsd.evaluation.references import Fixes
 from ahrsd.evaluation.track import Track
-from ahrsd.headings import tilt_compensated_heading
+from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array
 
 DOPPLER = ("velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s")

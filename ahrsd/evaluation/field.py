@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ahrsd.baselines.metrics import field_spread
 from ahrsd.evaluation.heading import FOLDS
-from ahrsd.methods.metrics import field_spread
 from ahrsd.samples import Array
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ahrsd.evaluation.references import Reference
 from ahrsd.evaluation.track import EvaluationError
-from ahrsd.headings import tilt_compensated_heading, wrapped
+from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.samples import Array
 
 FOLDS = 5

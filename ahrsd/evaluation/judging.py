@@ -17,7 +17,7 @@ from ahrsd.evaluation.references import Fixes, Reference
 from ahrsd.evaluation.stored import StoredCalibration
 from ahrsd.evaluation.track import EvaluationError, Track
 from ahrsd.samples import Array
-from ahrsd.worldfield import WorldField
+from ahrsd.world_field import WorldField
 
 _LONG_GAP_S = 1.0
 T = TypeVar("T")

@@ -15,7 +15,7 @@ SCHEMA_OF_MANY = "ahrsd.evaluations/1"
 
 
 def evaluation_json(found: Evaluation) -> dict[str, object]:
-    """`ahrsd.evaluation/1`, see docs/evaluate.md."""
+    """`ahrsd.evaluation/1`, see docs/guide/evaluate.md."""
     calibration, world, track = found.calibration, found.world, found.track
     return {
         "schema": SCHEMA,

@@ -7,8 +7,6 @@ under `role(block)`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
@@ -18,20 +16,12 @@ from ahrsd.evidence.coverage import UNKNOWN_MOTION, coverage
 from ahrsd.evidence.field import UNKNOWN_FIELD, field_facts
 from ahrsd.evidence.heading import NO_PROOF, field_0, gyro_heading_rad, prove
 from ahrsd.evidence.history import History, HistoryParameters, Role
-from ahrsd.evidence.stillness import Seconds, rest, seconds
+from ahrsd.evidence.stillness import rest
 from ahrsd.evidence.values import BasisFacts, EstimateFacts, Evidence, HealthFacts
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.worldfield import WorldField
+from ahrsd.world_field import WorldField
 
 _LEAST_TURN_DEG = 60.0  # a held-out segment that turned less cannot show a heading error
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Derived:
-    """What is computed once per segment (the track again when the gyro bias moves far)."""
-
-    track: Track
-    seconds: Seconds
 
 
 class EvidenceCollector:
@@ -39,7 +29,7 @@ class EvidenceCollector:
 
     def __init__(self, parameters: HistoryParameters | None = None) -> None:
         self._history = History(parameters)
-        self._derived: dict[int, _Derived] = {}
+        self._tracks: dict[int, Track] = {}  # again when the gyro bias moves far
 
     def role(self, block: SampleBlock) -> Role:
         """Role of a block that is about to be added (that of its first sample)."""
@@ -88,7 +78,7 @@ class EvidenceCollector:
             field = field_facts(nodes, judged)
             proof = prove(nodes, heading_rad, judged, present, _LEAST_TURN_DEG)
         envelope = comparison.envelope(motion, field, world)
-        still = rest([d.seconds for d in self._derived.values()])
+        still = rest(self._history.segments)
         return Evidence(
             health=health,
             basis=basis,
@@ -106,16 +96,13 @@ class EvidenceCollector:
 
     def _nodes(self, bias_b_rad_s: Array) -> Nodes | None:
         """Bring every segment's attitude up to date with the bias, and join them."""
-        derived = {}
+        tracks = {}
         for segment in self._history.segments:
-            old = self._derived.get(segment.number)
-            if old is not None and old.track.usable_for(bias_b_rad_s):
-                derived[segment.number] = old
-            else:
-                bins = seconds(segment) if old is None else old.seconds
-                derived[segment.number] = _Derived(track(segment, bias_b_rad_s), bins)
-        self._derived = derived
-        return nodes_at([d.track for d in derived.values()], np.asarray(bias_b_rad_s))
+            old = self._tracks.get(segment.number)
+            usable = old is not None and old.usable_for(bias_b_rad_s)
+            tracks[segment.number] = old if old and usable else track(segment, bias_b_rad_s)
+        self._tracks = tracks
+        return nodes_at(list(tracks.values()), np.asarray(bias_b_rad_s))
 
 
 def _facts(estimate: Estimate) -> EstimateFacts:

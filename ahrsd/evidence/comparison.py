@@ -13,7 +13,7 @@ from ahrsd.evidence.refits import gyro_fit, size_fit
 from ahrsd.evidence.stillness import Rest
 from ahrsd.evidence.values import ChangeFacts, GyroFacts, RefitFacts, WorldFacts
 from ahrsd.samples import Array
-from ahrsd.worldfield import WorldField
+from ahrsd.world_field import WorldField
 
 _NAN = float("nan")
 _VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move

@@ -44,6 +44,18 @@ def for_level(results: Iterable[GateResult], level: Level) -> tuple[GateResult, 
     return tuple(r for r in results if guards.get(r.gate, Level.CANDIDATE) in wanted)
 
 
+_UNATTENDED = frozenset(gate.gate for gate in GATES if gate.level is Level.UNATTENDED)
+
+
+def guards_a_write(gate: str) -> bool:
+    """Whether it guards what a person approves: the write or its save.
+
+    These are the gates that are counted, wherever a number of gates is told. The others guard only
+    a write that nobody approves.
+    """
+    return gate not in _UNATTENDED
+
+
 def holds(results: Iterable[GateResult], level: Level) -> bool:
     """Whether every row that guards `level` is there and ok."""
     chosen = {r.gate: r.ok for r in for_level(results, level)}

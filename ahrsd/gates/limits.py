@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True)
 class GateLimits:
-    """One limit per row of the table; docs/gates.md says why each is what it is."""
+    """One limit per row of the table; docs/reference/gates.md says why each is what it is."""
 
     max_error_rate: float = 1e-3  # of messages
     max_drop_rate: float = 5e-3  # of samples

@@ -49,7 +49,7 @@ STREAM = (
         0.0,
         Level.CANDIDATE,
         meaning="times at which the device's clock went backwards",
-        advice="the device's clock went back {v:.0f} times: it was reset; start again",
+        advice="the device's clock went back ({v:.0f} x): it was reset; start again",
     ),
     least(
         "stream_health.rate",
@@ -165,7 +165,7 @@ MOTION = (
         "max_heading_sigma_deg",
         Level.CANDIDATE,
         meaning="expected heading error (1 sigma) at the worst attitude driven",
-        advice=f"heading is known to {{v:.1f}} deg only (limit {{l:.1f}}): {_MOVE}; {_TILT} "
+        advice=f"the heading is not known well enough (limit {{l:.1f}} deg): {_MOVE}; {_TILT} "
         f"{_SEEN}",
         missing="the estimator has no answer yet",
     ),

@@ -1,4 +1,4 @@
-"""All gates, one row per number that is judged.  docs/gates.md is checked against this table."""
+"""All gates, one row per number that is judged; docs/reference/gates.md is checked against it."""
 
 from __future__ import annotations
 

@@ -15,11 +15,13 @@ from __future__ import annotations
 import itertools
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from typing import overload
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
@@ -29,12 +31,16 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from ahrsd import __version__
 from ahrsd.errors import RecordingError
+from ahrsd.printable import printable
+from ahrsd.recording.limits import BLOCK_BYTES
 
 SEQUENCES = 2**32  # `sequence` wraps here
 _MAGIC = b"\x89MCAP0\r\n"
 _PROFILE = "ahrsd"
 _HEAD_BYTES = 64 * 1024
 _PREFIX = struct.Struct("<BQ")  # of every MCAP record: opcode, length
+_TIMES = struct.Struct("<QQ")  # how a chunk begins: of its first and of its last message
+Wanted = Callable[[int, int], bool]
 
 _ENCODINGS = {
     "rx": "application/octet-stream",
@@ -60,9 +66,10 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A part of the file that cannot be read."""
+    """A part of the file that cannot be read; `unclosed`: only its end is missing."""
 
     what: str
+    unclosed: bool = False
 
 
 def is_mcap(start: bytes) -> bool:
@@ -151,7 +158,7 @@ def read_head(path: Path) -> dict[str, str]:
         reader = StreamReader(BytesIO(head), record_size_limit=_HEAD_BYTES)
         for record in itertools.islice(reader.records, 2):
             if isinstance(record, Header) and record.profile != _PROFILE:
-                raise not_ours
+                raise _of_another(path, record.profile, not_ours)
             if isinstance(record, Metadata):
                 return dict(record.metadata)
     except (McapError, struct.error, ValueError) as error:
@@ -159,13 +166,40 @@ def read_head(path: Path) -> dict[str, str]:
     raise not_ours
 
 
-def read_entries(path: Path) -> Iterator[Entry | Damage]:
-    """Everything in a file in recorded order, and what could not be read of it."""
+def _of_another(path: Path, profile: str, not_ours: RecordingError) -> RecordingError:
+    """What an MCAP file of another program is."""
+    from ahrsd.recording.foreign.recognised import ROS
+
+    number = {"ros1": "1", "ros2": "2"}.get(profile)
+    if number is not None:
+        return RecordingError(path, f"is a ROS {number} recording (MCAP)", ROS)
+    if profile:
+        what = f"is an MCAP file of another program (profile {printable(profile, 30)})"
+        return RecordingError(path, what, not_ours.remedy)
+    return not_ours
+
+
+@overload
+def read_entries(path: Path) -> Iterator[Entry | Damage]: ...
+
+
+@overload
+def read_entries(path: Path, wanted: Wanted) -> Iterator[Entry | Damage | None]: ...
+
+
+def read_entries(path: Path, wanted: Wanted | None = None) -> Iterator[Entry | Damage | None]:
+    """Everything in a file in recorded order, and what could not be read of it.
+
+    wanted: asked with the first and the last time of a block, in ns; None comes for each that is
+    left out
+    """
     for data in _read_chunks(path):
         if isinstance(data, Damage):
             yield data
-        else:
+        elif wanted is None or len(data) < _TIMES.size or wanted(*_TIMES.unpack_from(data)):
             yield from _unpack(data)
+        else:
+            yield None
 
 
 def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
@@ -177,19 +211,25 @@ def _read_chunks(path: Path) -> Iterator[bytes | Damage]:
             left -= _PREFIX.size
             if length > left:
                 break
-            data = file.read(length)
             left -= length
-            if opcode == Opcode.CHUNK:
-                yield data
+            if opcode != Opcode.CHUNK or length > BLOCK_BYTES:
+                file.seek(length, 1)
+                if opcode == Opcode.CHUNK:
+                    yield Damage(f"a block of {length} bytes, over the limit, was left out")
+                continue
+            yield file.read(length)
     if opcode != Opcode.FOOTER:
         tail = f"; its last {left} bytes are half a block" if left else ""
-        yield Damage(f"was not closed (killed, or cut short){tail}")
+        yield Damage(f"was not closed (killed, or cut short){tail}", unclosed=True)
 
 
 def _unpack(data: bytes) -> list[Entry | Damage]:
     """The entries of a chunk; of channels that this version does not know, none."""
     try:
-        records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)
+        block = _plain(Chunk.read(ReadDataStream(BytesIO(data))))
+        records = breakup_chunk(block, validate_crc=True)
+    except _BlockTooLargeError as error:
+        return [Damage(f"a block that unpacks to {error} bytes, over the limit, was left out")]
     except (CRCValidationError, McapError, zstandard.ZstdError, struct.error, ValueError):
         return [Damage(f"a damaged block of {len(data)} bytes was left out")]
     return [
@@ -197,3 +237,36 @@ def _unpack(data: bytes) -> list[Entry | Damage]:
         for record in records
         if isinstance(record, Message) and record.channel_id in _TOPICS
     ]
+
+
+class _BlockTooLargeError(Exception):
+    """A block that says that it unpacks to so many bytes, or does."""
+
+
+def _plain(block: Chunk) -> Chunk:
+    """The same block unpacked; looks at every size before anything is allocated.
+
+    ValueError where it is damaged, _BlockTooLargeError where it is beyond the limit.
+    """
+    if block.uncompressed_size > BLOCK_BYTES:
+        raise _BlockTooLargeError(block.uncompressed_size)
+    if block.compression == "zstd":
+        said = zstandard.frame_content_size(block.data)
+        if said > BLOCK_BYTES:
+            raise _BlockTooLargeError(said)
+        content = zstandard.ZstdDecompressor(max_window_size=BLOCK_BYTES).decompress(
+            block.data, max_output_size=max(block.uncompressed_size, 1)
+        )
+    elif block.compression == "lz4":
+        try:
+            decoder = lz4.frame.LZ4FrameDecompressor()
+            content = decoder.decompress(block.data, max_length=block.uncompressed_size + 1)
+        except RuntimeError as error:  # whatever it does not like
+            raise ValueError(str(error)) from error
+    elif block.compression:
+        raise ValueError(f"unknown compression {block.compression!r}")
+    else:
+        content = block.data
+    if len(content) != block.uncompressed_size:
+        raise ValueError("the block is not as long as it says")
+    return replace(block, compression="", data=content)

@@ -1,45 +1,224 @@
-"""Byte streams: what a port sent, in a file, plain or gzipped; no host time in it."""
+"""Byte streams: what a port sent, in a file, plain or gzipped; no host time in it.
+
+`read_chunks` gives a file's bytes as they are, unzipped, never more than a chunk at a time.
+`read_stream` also undoes what terminal programs and loggers do to text on the way into a file:
+UTF-16, lines that end in CR CR LF, lines that Python printed as b'...'.  A file that ends too early
+(a gzip cut off, damaged) is read as far as it goes; `notes` says what is missing.
+"""
 
 from __future__ import annotations
 
-import gzip
+import ast
+import codecs
+import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
+from ahrsd.recording.limits import STREAM_BYTES, refuse_beyond
 
 CHUNK_BYTES = 4096
+_GZIP = b"\x1f\x8b"
+_ANY_HEADER = 31  # zlib's word for gzip with the largest window
+_LOOK_BYTES = 64 * 1024  # from which it is told what was done to a text
+_PIECE_BYTES = 16 * 1024
+_LONGEST_LINE = 64 * 1024
+_FEWEST_NULS = 64  # at the end; less may belong to a packet
+_LITERAL = re.compile(rb"""b'(?:[^'\\]|\\.)*'|b"(?:[^"\\]|\\.)*\"""")
 
 
 def is_gzip(path: Path) -> bool:
     """By its first two bytes, whatever its name."""
     with path.open("rb") as file:
-        return file.read(2) == b"\x1f\x8b"
+        return file.read(2) == _GZIP
 
 
-def read_chunks(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[bytes]:
-    """The file's content, unzipped where it is gzip.  Raises RecordingError where it ends early."""
+def unpacked_size(path: Path) -> int:
+    """Bytes of the content: of a gzip file what its last four bytes say, modulo 4 GiB."""
+    size = path.stat().st_size
+    if size < 4 or not is_gzip(path):
+        return size
+    with path.open("rb") as file:
+        file.seek(-4, 2)
+        return int.from_bytes(file.read(4), "little")
+
+
+def read_chunks(
+    path: Path, chunk_bytes: int = CHUNK_BYTES, notes: list[str] | None = None
+) -> Iterator[bytes]:
+    """The file's content, unzipped where it is gzip, in chunks of this size.
+
+    notes: gets a line where the gzip file ends early. Raises RecordingError where nothing can be
+    read, or more than a stream may hold.
+    """
     position = 0
+    told: list[str] = []
     try:
-        with gzip.open(path) if is_gzip(path) else path.open("rb") as file:
-            while chunk := file.read(chunk_bytes):
+        with path.open("rb") as file:
+            zipped = file.read(2) == _GZIP
+            file.seek(0)
+            for chunk in (
+                _unzipped(file, chunk_bytes, told) if zipped else _plain(file, chunk_bytes)
+            ):
                 position += len(chunk)
+                refuse_beyond(path, position, STREAM_BYTES, "bytes and more", "cut it in parts")
                 yield chunk
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise RecordingError(
-            path,
-            f"the gzip file is truncated or damaged after {position} unpacked bytes",
-            f"save what is there with `gzip -dc {path.name} > {path.stem}` and use that",
-        ) from error
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}", "check the path") from error
+    if position == 0 and told:
+        raise RecordingError(path, f"{told[0]} after 0 unpacked bytes", "copy or record it again")
     if position == 0:
         raise RecordingError(path, "is empty (0 bytes)", "record again")
+    if notes is not None:
+        notes += [f"{words} after {position} unpacked bytes: read up to there" for words in told]
 
 
-def read_received(path: Path) -> Iterator[Received]:
+def _plain(file: BinaryIO, chunk_bytes: int) -> Iterator[bytes]:
+    while chunk := file.read(chunk_bytes):
+        yield chunk
+
+
+def _unzipped(file: BinaryIO, chunk_bytes: int, told: list[str]) -> Iterator[bytes]:
+    """Chunks of all members of a gzip file; what is wrong with it goes into `told`."""
+    ready = bytearray()
+    decoder, packed = zlib.decompressobj(_ANY_HEADER), b""
+    size = max(chunk_bytes, _PIECE_BYTES)  # what a damaged end costs at most
+    while True:
+        if not packed and not (packed := file.read(_LOOK_BYTES)):
+            if not decoder.eof and (held := decoder.decompress(b"", size)):
+                ready += held  # what the last call had no room for
+                continue
+            told += [] if decoder.eof else ["the gzip file is truncated"]
+            break
+        if decoder.eof:  # another member, or padding
+            packed = packed.lstrip(b"\0")
+            if not packed:
+                continue
+            if not packed.startswith(_GZIP):
+                told.append("the gzip file ends, and what follows it is no gzip,")
+                break
+            decoder = zlib.decompressobj(_ANY_HEADER)
+        try:
+            ready += decoder.decompress(packed, size)
+        except zlib.error:
+            told.append("the gzip file is damaged")
+            break
+        packed = decoder.unused_data if decoder.eof else decoder.unconsumed_tail
+        if len(ready) >= chunk_bytes:
+            whole = len(ready) // chunk_bytes * chunk_bytes
+            for at in range(0, whole, chunk_bytes):
+                yield bytes(ready[at : at + chunk_bytes])
+            del ready[:whole]
+    if ready:
+        yield from (bytes(ready[k : k + chunk_bytes]) for k in range(0, len(ready), chunk_bytes))
+
+
+def utf16_of(start: bytes) -> str | None:
+    """The encoding where text begins like UTF-16, by its mark or by every other byte being 0."""
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    sample = start[:400]
+    even, odd = sample[0::2], sample[1::2]
+    if len(sample) < 8 or not (set(sample) <= {0, 9, 10, 13, *range(32, 127)}):
+        return None
+    if odd.count(0) > 0.9 * len(odd) and even.count(0) < 0.1 * len(even):
+        return "utf-16-le"
+    if even.count(0) > 0.9 * len(even) and odd.count(0) < 0.1 * len(odd):
+        return "utf-16-be"
+    return None
+
+
+def read_stream(
+    path: Path, chunk_bytes: int = CHUNK_BYTES, notes: list[str] | None = None
+) -> Iterator[bytes]:
+    """The bytes that the port sent: `read_chunks` without what was done to them in a text file."""
+    told = [] if notes is None else notes
+    chunks = read_chunks(path, chunk_bytes, told)
+    first: list[bytes] = []
+    for chunk in chunks:
+        first.append(chunk)
+        if sum(map(len, first)) >= _LOOK_BYTES:
+            break
+    start = b"".join(first)
+    stream: Iterable[bytes] = _chained(first, chunks)
+    if (encoding := utf16_of(start)) is not None:
+        told.append("the text is UTF-16: read as such")
+        stream = _recoded(stream, encoding)
+        start = start.decode(encoding, "ignore").encode("utf-8")
+    if any(mark in start for mark in (b"b'$VN", b'b"$VN', b"b'\\xfa")):
+        told.append("the lines are bytes as Python prints them (b'...'): taken out of that")
+        stream = _literals(stream)
+    elif b"\r\r\n" in start and start.isascii():
+        told.append("the lines end in CR CR LF: read as CR LF")
+        stream = _single_returns(stream)
+    elif b"\\r\\n" in start and start.isascii():
+        told.append("the lines end in the written characters \\r\\n: read as line ends")
+        stream = _written_ends(stream)
+    yield from _counting_nuls(stream, told)
+
+
+def read_received(path: Path, notes: list[str] | None = None) -> Iterator[Received]:
     """The bytes as inputs; `host_ns` is 0 throughout, the file knows no host time."""
-    for chunk in read_chunks(path):
+    for chunk in read_stream(path, notes=notes):
         yield Received(0, chunk)
+
+
+def _chained(first: list[bytes], rest: Iterator[bytes]) -> Iterator[bytes]:
+    yield from first
+    yield from rest
+
+
+def _recoded(chunks: Iterable[bytes], encoding: str) -> Iterator[bytes]:
+    decoder = codecs.getincrementaldecoder(encoding)("replace")
+    for chunk in chunks:
+        if text := decoder.decode(chunk).encode("utf-8"):
+            yield text
+
+
+def _lines(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    """Whole lines with their ends; a line without an end is cut after a while."""
+    rest = b""
+    for chunk in chunks:
+        *whole, rest = (rest + chunk).split(b"\n")
+        for line in whole:
+            yield line + b"\n"
+        if len(rest) > _LONGEST_LINE:
+            yield rest
+            rest = b""
+    if rest:
+        yield rest
+
+
+def _literals(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    for line in _lines(chunks):
+        parts = []
+        for found in _LITERAL.findall(line):
+            try:
+                parts.append(ast.literal_eval(found.decode("ascii")))
+            except (ValueError, SyntaxError):  # cut or damaged: whatever is whole counts
+                parts.append(b"\n")
+        if data := b"".join(part for part in parts if isinstance(part, bytes)):
+            yield data if data.endswith(b"\n") or b"\xfa" in data else data + b"\r\n"
+
+
+def _single_returns(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    for line in _lines(chunks):
+        yield line.rstrip(b"\r\n") + b"\r\n" if line.endswith(b"\n") else line
+
+
+def _written_ends(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    for line in _lines(chunks):
+        yield line.replace(b"\\r\\n", b"\r\n")
+
+
+def _counting_nuls(chunks: Iterable[bytes], told: list[str]) -> Iterator[bytes]:
+    nuls = 0
+    for chunk in chunks:
+        kept = len(chunk.rstrip(b"\0"))
+        nuls = len(chunk) - kept + (nuls if kept == 0 else 0)
+        yield chunk
+    if nuls >= _FEWEST_NULS:
+        told.append(f"it ends in {nuls} NUL bytes: the recorder lost its power")

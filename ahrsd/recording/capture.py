@@ -69,7 +69,14 @@ def _cost(entry: Entry) -> int:
 
 
 def _create(path: Path) -> FileIO:
-    return FileIO(path, "xb")
+    """For its owner alone, whatever the umask: a capture holds where the vehicle was."""
+    return FileIO(path, "xb", opener=_private)
+
+
+def _private(path: str, flags: int) -> int:
+    descriptor = os.open(path, flags, 0o600)
+    os.fchmod(descriptor, 0o600)
+    return descriptor
 
 
 class _File:
@@ -150,6 +157,10 @@ class CaptureWriter:
             raise CaptureError(f"{path}: cannot be created: {error.strerror}") from error
         self._thread = threading.Thread(target=self._work, name="capture", daemon=True)
         self._thread.start()
+
+    def resize(self, part_bytes: int, keep_bytes: int) -> None:
+        """Other sizes from the next part on."""
+        self._part_bytes, self._keep_bytes = part_bytes, keep_bytes
 
     def write(self, item: Input) -> None:
         """Record an input; call it before the core sees the input."""
@@ -332,13 +343,22 @@ class CaptureReader:
     def facts(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
         """(host_ns, fact) of a JSON channel: "event", "registers" or "covariate"."""
         for entry in self._entries():
-            if entry.topic == topic:
-                yield entry.host_ns, json.loads(entry.data)
+            if entry.topic != topic:
+                continue
+            try:
+                fact = json.loads(entry.data)
+            except (ValueError, RecursionError) as error:
+                raise RecordingError(
+                    self.path, f"a record of {topic} is no JSON: {error}", "record again"
+                ) from error
+            if isinstance(fact, dict):
+                yield entry.host_ns, fact
 
     def _entries(self) -> Iterator[Entry]:
         self.notes = []
         expected: int | None = None
-        for path in _parts(self.path, int(self.header.get("part", "1"))):
+        part = self.header.get("part", "1")
+        for path in _parts(self.path, int(part) if part.isdecimal() and len(part) < 7 else 1):
             for entry in blocks.read_entries(path):
                 if isinstance(entry, Damage):
                     self.notes.append(f"{path.name}: {entry.what}")

@@ -1,22 +1,29 @@
 """One way to open any recording: what kind it is, its inputs in order, and what is to be known.
 
-The name decides the kind; where it says nothing, the content does. Every recording yields what
+The name decides the kind; where it says nothing or the content is another kind beyond doubt, the
+content does. Every recording yields what
 the core takes and ends in `Stop`, so that `replay` is `run` with another source.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples, Stop
-from ahrsd.recording.bytestream import read_chunks, read_received
-from ahrsd.recording.table import Table, read_table
+from ahrsd.printable import printable
+from ahrsd.recording.bytestream import is_gzip, read_chunks, read_received, utf16_of
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.foreign.formats import Format, format_of, ready
+from ahrsd.recording.foreign.recognised import recognised
+from ahrsd.recording.foreign.sensors import NO_CHOICE, Choice, RawBytes, merged
+from ahrsd.recording.table import PARQUET, Table, read_table, table_of
 
 _END = "end of recording"
+_HEAD_BYTES = 4096
 
 
 class Kind(Enum):
@@ -41,6 +48,8 @@ class Recording:
     rate_hz: rate to assume where a byte stream has no device time; None: there is none
     header:  a capture's metadata
     notes:   what is missing or was left out; a capture adds to it while its inputs are read
+    sent:    what the device sent, in a recording of another program that kept it
+    facts:   of a recording of another program: format, source, unit, frame, clock, undone
     """
 
     path: Path
@@ -49,19 +58,23 @@ class Recording:
     header: Mapping[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     table: Table | None = None
+    sent: Sequence[Received] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """The file's name, for reports."""
-        return self.path.name
+        return printable(self.path.name, 200)
 
     def inputs(self) -> Iterator[Input]:
         """Everything that the core takes, in order, ending in `Stop`; RecordingError as found."""
         if self.table is not None:
             return _table_inputs(self.table)
+        if self.sent:
+            return iter((*self.sent, Stop(self.sent[-1].host_ns, _END)))
         if self.kind is Kind.CAPTURE:
             return self._capture_inputs()
-        return _byte_inputs(self.path)
+        return _byte_inputs(self)
 
     def _capture_inputs(self) -> Iterator[Input]:
         from ahrsd.recording.capture import CaptureReader, Sent
@@ -84,8 +97,14 @@ class Recording:
             yield Stop(last.host_ns, _END)
 
 
-def _byte_inputs(path: Path) -> Iterator[Input]:
-    yield from read_received(path)
+def _byte_inputs(recording: Recording) -> Iterator[Input]:
+    told: list[str] = []
+    for item in read_received(recording.path, told):
+        if told:  # as soon as it is known, and once however often the inputs are read
+            recording.notes += [note for note in told if note not in recording.notes]
+            told.clear()
+        yield item
+    recording.notes += [note for note in told if note not in recording.notes]
     yield Stop(0, _END)
 
 
@@ -98,41 +117,114 @@ def _table_inputs(table: Table) -> Iterator[Input]:
 
 
 def open_recording(
-    path: Path, rate_hz: float | None = None, *, check_units: bool = True
+    path: Path,
+    rate_hz: float | None = None,
+    *,
+    check_units: bool = True,
+    columns: ColumnMap = NO_MAP,
+    choice: Choice = NO_CHOICE,
 ) -> Recording:
-    """Open a capture, a byte stream or a table.
+    """Open a capture, a byte stream, a table, or a recording of another program.
 
-    rate_hz is for byte streams without a device clock and is not used otherwise; check_units as
-    in `read_table`.
-    Raises RecordingError, one line, where the file is none of the three.
+    rate_hz is for byte streams without a device clock and is not used otherwise; check_units and
+    columns as in `read_table`, for tables only. choice: what of a recording that holds several.
+    Raises RecordingError, one line, where the file is none of them.
     """
     if rate_hz is not None and not rate_hz > 0.0:
         raise RecordingError(path, f"the rate {rate_hz:g} Hz is not positive", "give --rate in Hz")
+    if path.is_dir() and (other := format_of(path, b"")) is not None:
+        return _of_another(path, other, replace(choice, columns=columns), rate_hz)
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
+        there = "is no regular file" if path.exists() else "does not exist"
+        what = "is a folder" if path.is_dir() else there
         raise RecordingError(path, what, "give the path of a recording")
     suffix = path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
-    kind = _SUFFIXES.get(suffix.lower()) or _by_content(path)
+    start = next(read_chunks(path, _HEAD_BYTES))  # empty or no gzip: say so now
+    if (other := format_of(path, start)) is not None:
+        return _of_another(path, other, replace(choice, columns=columns), rate_hz)
+    if (found := recognised(start)) is not None:
+        raise RecordingError(path, found.what, found.remedy)
+    named = _SUFFIXES.get(suffix.lower())
+    kind = _in_spite_of_its_name(path, start, named) or named or _by_content(path, start)
+    unused = (
+        ["--columns is not used: it is for tables"] if columns and kind is not Kind.TABLE else []
+    )
     if kind is Kind.BYTES:
-        next(read_chunks(path))  # empty or no gzip: say so now, not in the middle of a replay
-        return Recording(path, kind, rate_hz)
-    unused = [] if rate_hz is None else [f"--rate is not used: a {kind.value} has its own time"]
+        return Recording(path, kind, rate_hz, notes=unused)
+    if rate_hz is not None:
+        unused.append(f"--rate is not used: a {kind.value} has its own time")
     if kind is Kind.CAPTURE:
         from ahrsd.recording.capture import CaptureReader  # a table needs no reader of captures
 
         header = CaptureReader(path).header
         return Recording(path, kind, header=header, notes=unused)
-    table = read_table(path, check_units=check_units)
+    table = read_table(path, check_units=check_units, columns=columns)
     return Recording(path, kind, notes=[*unused, *table.notes], table=table)
 
 
-def _by_content(path: Path) -> Kind:
-    start = next(read_chunks(path))
+def _of_another(path: Path, other: Format, choice: Choice, rate_hz: float | None) -> Recording:
+    """A recording of another program: a table of its sensors, or what the device sent."""
+    ready(path, other)
+    for option, given in (("topic", choice.topics), ("compass", choice.compass is not None)):
+        if given and option != other.picks:
+            raise RecordingError(
+                path, f"{other.what}: --{option} is not for it", f"--{other.picks} is"
+            )
+    notes = [] if rate_hz is None else ["--rate is not used: the recording has its own time"]
+    try:
+        found = other.read(path, choice)
+        if isinstance(found, RawBytes):
+            if choice.columns:
+                notes.append("--columns is not used: the recording holds what the device sent")
+            notes += [f"{other.what.removeprefix('is ')}: {note}" for note in found.notes]
+            facts = {"format": other.what.removeprefix("is "), **found.facts}
+            return Recording(path, Kind.CAPTURE, notes=notes, sent=found.received, facts=facts)
+        rows = merged(path, found, choice.columns)
+    except MemoryError as error:
+        raise RecordingError(
+            path, "does not fit into this computer's memory", "cut it in parts"
+        ) from error
+    facts = {"format": other.what.removeprefix("is "), **rows.facts}
+    table = table_of(path, rows.columns, [*rows.notes, _said(facts)])
+    return Recording(path, Kind.TABLE, notes=[*notes, *table.notes], table=table, facts=facts)
+
+
+def _said(facts: Mapping[str, str]) -> str:
+    """The one line about what was taken of a recording of another program."""
+    return (
+        f"{facts['format']}: field of {facts['mag source']} ({facts['mag unit']}), rates of "
+        f"{facts['gyro source']}; frame: {facts['frame']}; undone: {facts['undone']}"
+    )
+
+
+def _in_spite_of_its_name(path: Path, start: bytes, named: Kind | None) -> Kind | None:
+    """What a file is beyond doubt whatever it is called.  RecordingError where it is packed."""
     from ahrsd.recording import blocks
 
-    if blocks.is_mcap(start):
-        return Kind.CAPTURE
-    if b"time_s" in start.split(b"\n", 1)[0]:
+    if blocks.is_mcap(start) or start.startswith(PARQUET):
+        if is_gzip(path):
+            raise RecordingError(path, "is packed with gzip", f"unpack it: gunzip {path.name}")
+        return Kind.CAPTURE if blocks.is_mcap(start) else Kind.TABLE
+    line = _as_utf8(start).lstrip().split(b"\n", 1)[0]
+    if named is Kind.BYTES and _names_columns(line):
+        return Kind.TABLE
+    if named is Kind.TABLE and line.startswith(b"$VN"):
+        return Kind.BYTES
+    return None
+
+
+def _names_columns(line: bytes) -> bool:
+    return b"$VN" not in line and (b"mag_x_gauss" in line or b"TimeStartup," in line)
+
+
+def _as_utf8(start: bytes) -> bytes:
+    encoding = utf16_of(start)
+    return start if encoding is None else start.decode(encoding, "ignore").encode("utf-8")
+
+
+def _by_content(path: Path, start: bytes) -> Kind:
+    line = _as_utf8(start).split(b"\n", 1)[0]
+    if b"time_s" in line or _names_columns(line):
         return Kind.TABLE
     if b"$VN" in start or b"\xfa" in start:
         return Kind.BYTES

@@ -23,6 +23,18 @@ def new_capture_path(directory: Path, now: datetime | None = None) -> Path:
     return path
 
 
+def make_private_folder(folder: Path) -> None:
+    """The folder and what is missing above it, for their owner alone. Raises OSError.
+
+    One that exists stays as it is.
+    """
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    for one in reversed(missing):
+        with contextlib.suppress(FileExistsError):
+            one.mkdir(mode=0o700)
+            one.chmod(0o700)  # whatever the umask
+
+
 def prune(directory: Path, keep_bytes: int, keep: Path) -> list[Path]:
     """Remove the oldest captures until all fit into `keep_bytes`; `keep` always stays.
 

@@ -2,38 +2,62 @@
 
 Columns: time_s, mag_{x,y,z}_gauss, gyro_{x,y,z}_rad_s, optional accel_{x,y,z}_m_s2 (specific
 force); every other numeric column is a covariate and keeps its name, text columns are left out.
+`column_names` says which other names and units are understood, `text_table` which texts.
 
 A gap is a step longer than 1.6 times the 95th percentile of all steps. Host-stamped streams
 alternate between two step lengths, one up to 1.7 times the other, so the median will not do; on
 the real recordings this finds exactly the samples that the damaged sentences cost. The step
-behind a gap is unknown (`dt_s` nan) and a block never spans one.
+behind a gap is unknown (`dt_s` nan) and a block never spans one. Stamps that a host gave to bunches
+of samples are put on the regular clock behind them (`clock_fit`); where the host's clock was set,
+there is a gap.
 """
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pyarrow
-import pyarrow.csv
 from numpy.typing import NDArray
 
+from ahrsd import so3
 from ahrsd.errors import RecordingError
-from ahrsd.recording.bytestream import read_chunks
+from ahrsd.printable import printable
+from ahrsd.recording.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
+from ahrsd.recording.column_names import (
+    ACCEL,
+    GRAVITY_M_S2,
+    GYRO,
+    MAG,
+    NO_MAP,
+    REQUIRED,
+    TIME,
+    ColumnError,
+    ColumnMap,
+    Resolved,
+    Source,
+    resolve,
+)
+from ahrsd.recording.limits import (
+    SPAN_S,
+    TABLE_BYTES,
+    TABLE_CELLS,
+    TABLE_COLUMNS,
+    TABLE_ROWS,
+    refuse_beyond,
+)
 from ahrsd.samples import Array, SampleBlock
 
+PARQUET = b"PAR1"  # how such a file begins
+NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
 BLOCK_ROWS = 1024
 MINIMUM_ROWS = 20
 GAP_FACTOR = 1.6
 GAP_PERCENTILE = 95.0
-
-_MAG = ("mag_x_gauss", "mag_y_gauss", "mag_z_gauss")
-_GYRO = ("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s")
-_ACCEL = ("accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2")
-_REQUIRED = ("time_s", *_MAG, *_GYRO)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +69,26 @@ class _Range:
     maximum: float
     unit: str
     above: tuple[tuple[float, str], ...]  # from this magnitude on it looks like that unit
+    below: tuple[float, float, str] | None = None  # between these it looks like that unit
 
 
 # Above 10 G no VN-100 reads (2.5 G full scale); 20 rad/s is a sustained 1150 deg/s.
 _RANGES = (
-    _Range(_MAG, 0.01, 10.0, "gauss", ((5000.0, "nT"), (200.0, "mG"), (10.0, "uT"))),
-    _Range(_GYRO, 0.0, 20.0, "rad/s", ((20.0, "deg/s"),)),
+    _Range(
+        MAG, 0.01, 10.0, "gauss", ((5000.0, "nT"), (200.0, "mG"), (10.0, "uT")), (1e-5, 1e-3, "T")
+    ),
+    _Range(GYRO, 0.0, 20.0, "rad/s", ((20.0, "deg/s"),)),
 )
 _STEP_S = (1e-4, 2.0)  # 10 kHz ... 0.5 Hz: other units of time end outside
+_TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+_ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
+_GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken for it
+_TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
+_LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
+_SPARSE_SHARE = 0.3  # of the rows without a field: a slower magnetometer, not a fault
+_NOTES = 30  # that are repeated of a converted table
+_HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
+_HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,125 +124,362 @@ class Table:
         )
 
 
-def read_table(path: Path, *, check_units: bool = True) -> Table:
+def read_table(path: Path, *, check_units: bool = True, columns: ColumnMap = NO_MAP) -> Table:
     """Read and check a table.  Raises RecordingError naming the row, the column and a remedy.
 
-    check_units: refuse magnitudes that look like another unit
+    check_units: refuse magnitudes that look like another unit; columns: what the user says of them
     """
-    parquet = path.suffix == ".parquet"
-    table = _read_parquet(path) if parquet else _read_csv(path)
-    _check_length(path, table.num_rows)
-    first_row = 1 if parquet else 2  # a CSV's header is row 1, as editors count
-    columns = {name: _numbers(path, table, name, first_row) for name in _REQUIRED}
-    doubles = _doubles(list(columns.values()))
-    if doubles.any():
-        table = table.filter(pyarrow.array(~doubles))
-        columns = {name: values[~doubles] for name, values in columns.items()}
-        _check_length(path, table.num_rows)
-    covariates, text = _covariates(table)
-    notes = [f"column {name} is text and was left out" for name in text]
-    if doubles.any():
-        words = f"{np.count_nonzero(doubles)} rows repeat the row before them, time and all"
-        notes.append(f"{words}: left out, first row {np.flatnonzero(doubles)[0] + first_row}")
-    accel, missing = _accel(covariates, table.num_rows)
-    if missing and len(missing) < len(_ACCEL):
-        notes.append(f"column {missing[0]} is missing, so the acceleration was left out")
-    time_s = columns["time_s"]
-    _check_time(path, time_s, np.flatnonzero(~doubles) + first_row)
-    mag, gyro = (np.column_stack([columns[name] for name in names]) for names in (_MAG, _GYRO))
-    for vectors, limits in zip((mag, gyro), _RANGES if check_units else (), strict=check_units):
-        _check_units(path, vectors, limits)
-    dt_s, starts = _steps(time_s)
-    rows = SampleBlock(
-        time_s=time_s,
-        dt_s=dt_s,
-        host_s=time_s,
-        raw_b_gauss=mag,
-        gyro_b_rad_s=gyro,
-        accel_b_m_s2=accel,
-        covariates=covariates,
-    )
-    return Table(rows, starts, tuple(notes))
-
-
-def _read_csv(path: Path) -> pyarrow.Table:
-    data = b"".join(read_chunks(path, 1 << 20))
-    _check_text(path, data)
     try:
-        content = pyarrow.BufferReader(data)
-        table = pyarrow.csv.read_csv(content, pyarrow.csv.ReadOptions(use_threads=False))
-        table = table.rename_columns([name.strip() for name in table.column_names])
-        _check_names(path, table.column_names)
-    except (pyarrow.ArrowInvalid, pyarrow.ArrowKeyError, UnicodeDecodeError) as error:
-        words = str(error).splitlines()[0]
-        raise RecordingError(path, f"is no CSV table: {words}", "repair that row") from error
-    return table
-
-
-def _check_text(path: Path, data: bytes) -> None:
-    """Refuse what no reader of comma-separated UTF-8 can read, by what it is."""
-    if "time_s" in data[:2000].decode("utf-16", "ignore"):
-        raise RecordingError(path, "is UTF-16 text", "save it as UTF-8")
-    head = data[: data.find(b"\n") + 1] or data
-    if b"," not in head and (b";" in head or b"\t" in head):
-        word = "semicolons" if b";" in head else "tabs"
+        return _read(path, check_units, columns)
+    except MemoryError as error:
         raise RecordingError(
-            path,
-            f"has its columns separated by {word}",
-            "write it with commas between the columns and points in the numbers",
+            path, "does not fit into this computer's memory", "cut it in parts"
+        ) from error
+
+
+def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
+    if _is_parquet(path):
+        table, first_row = _read_parquet(path, given), 1
+        notes = _noted(table)
+    else:
+        from ahrsd.recording.text_table import read_text_table
+
+        text = read_text_table(path)
+        table, first_row, notes = text.table, text.first_row, list(text.notes)
+    found = _resolved(path, table.column_names, given)
+    _check_length(path, table.num_rows)
+    refuse_beyond(path, table.num_rows, TABLE_ROWS, "rows", "cut it in parts")
+    values = {
+        name: _numbers(path, table, name, found.sources[name], first_row) for name in REQUIRED
+    }
+    covariates, text_names = _covariates(table, found)
+    notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
+    numbers = np.arange(len(table)) + first_row
+    rows = _Rows(path, values, covariates, numbers, notes, sources=found.sources)
+    return _checked(rows, check_units)
+
+
+def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
+    """The same checks for columns, by canonical names, that another reader made of a file."""
+    _check_length(path, len(columns[TIME]))
+    refuse_beyond(path, len(columns[TIME]), TABLE_ROWS, "rows", "cut it in parts")
+    cells = len(columns) * len(columns[TIME])
+    refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
+    values = {name: columns[name] for name in REQUIRED}
+    covariates = {name: column for name, column in columns.items() if name not in REQUIRED}
+    rows = _Rows(path, values, covariates, np.arange(len(columns[TIME])) + 1, list(notes))
+    return _checked(rows, True)
+
+
+def _checked(columns: _Rows, check_units: bool) -> Table:
+    path = columns.path
+    columns.hold_readings()
+    columns.drop_doubles()
+    columns.set_clock()
+    if check_units:
+        for limits in _RANGES:
+            _check_units(path, columns.vectors(limits.columns), limits, columns.sources)
+    accel = columns.acceleration()
+    _check_length(path, len(accel))
+    return columns.table(accel)
+
+
+@dataclass(slots=True)
+class _Rows:
+    """A table's columns on their way to samples: what is dropped here is dropped in all of them.
+
+    numbers (N,): of the rows in the file; sources: the file's columns by canonical name
+    """
+
+    path: Path
+    values: dict[str, Array]
+    covariates: dict[str, Array]
+    numbers: NDArray[np.intp]
+    notes: list[str]
+    starts: tuple[int, ...] = ()
+    sources: Mapping[str, Source] = field(default_factory=dict)
+
+    def vectors(self, names: tuple[str, str, str]) -> Array:
+        """(N, 3) of three columns."""
+        return np.column_stack([self.values[name] for name in names])
+
+    def _keep(self, rows: NDArray[np.bool]) -> None:
+        self.values = {name: values[rows] for name, values in self.values.items()}
+        self.covariates = {name: values[rows] for name, values in self.covariates.items()}
+        self.numbers = self.numbers[rows]
+
+    def hold_readings(self) -> None:
+        """Rows between the readings of a slower magnetometer repeat the last one."""
+        known: NDArray[np.bool] = np.asarray(np.isfinite(self.vectors(MAG)).all(axis=1))
+        if known.all():
+            return
+        count = int(np.count_nonzero(known))
+        _check_length(self.path, count)
+        self.notes.append(
+            f"the magnetometer has a reading in {count} of {len(known)} rows: the rows between "
+            "hold the last one"
         )
+        rows = np.arange(len(known))
+        last = np.maximum.accumulate(np.where(known, rows, 0))
+        self.values |= {name: self.values[name][last] for name in MAG}
+        self._keep(rows >= np.argmax(known))
+
+    def drop_doubles(self) -> None:
+        """Rows that have the same time and readings as the row before."""
+        doubles = _doubles(list(self.values.values()))
+        if doubles.any():
+            words = f"{np.count_nonzero(doubles)} rows repeat the row before them, time and all"
+            first = self.numbers[np.flatnonzero(doubles)[0]]
+            self.notes.append(f"{words}: left out, first row {first}")
+            self._keep(~doubles)
+            _check_length(self.path, len(self.numbers))
+
+    def set_clock(self) -> None:
+        """Clocks that were set, stamps of bunches; refuses a time that is none."""
+        time_s, jumps = clock_jumps(self.values[TIME], _LONGEST_PAUSE_S)
+        if len(jumps):
+            self._refuse_repeated(jumps)
+            row = jumps[0]
+            a, b = self.values[TIME][row - 1], self.values[TIME][row]
+            times = "once, " if len(jumps) == 1 else f"{len(jumps)} times, first "
+            self.notes.append(
+                f"the clock was set {times}at row {self.numbers[row]} "
+                f"({_plain(a)} to {_plain(b)} s): a gap of unknown length, and later times count on"
+            )
+        if not np.any(np.diff(time_s) < 0.0) and is_bunched(time_s):
+            time_s = self._evened(time_s)
+        if ties := np.count_nonzero(np.diff(time_s) == 0.0):
+            spread = ties_spread(time_s)
+            if spread is not None:
+                self.notes.append(f"{ties} rows have the time of the row before: put behind it")
+                time_s = spread
+        _check_time(self.path, time_s, self.numbers)
+        refuse_beyond(
+            self.path, time_s[-1] - time_s[0], SPAN_S, "s from its first to its last row",
+            "cut it in parts",
+        )  # fmt: skip
+        self.starts = tuple(sorted({*self.starts, *jumps.tolist()}))
+        self.values[TIME] = time_s
+
+    def _refuse_repeated(self, jumps: NDArray[np.intp]) -> None:
+        """Time goes back where a file was appended to itself, too: the same rows count once."""
+        rows = np.column_stack([self.values[name] for name in REQUIRED])
+        row = int(jumps[0])
+        back = rows[row, 0] < rows[row - 1, 0]
+        same = np.flatnonzero((rows[:row] == rows[row]).all(axis=1))
+        if back and len(same):
+            raise RecordingError(
+                self.path,
+                f"row {self.numbers[row]} and those behind it repeat row {self.numbers[same[0]]}",
+                "the same rows are in the file twice: leave one copy out",
+            )
+
+    def _evened(self, time_s: Array) -> Array:
+        fitted = regular_clock(time_s)
+        if fitted is None:
+            return time_s
+        self.starts = fitted.starts
+        self.notes.append(
+            f"the time stamps are a host's, they scatter by {1e3 * fitted.scatter_s:.2g} ms about "
+            f"a regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
+        )
+        return fitted.time_s
+
+    def acceleration(self) -> Array:
+        """(N, 3) m/s^2, nan unless all three axes are there; short holes filled."""
+        found = {name: self.covariates.pop(name) for name in ACCEL if name in self.covariates}
+        missing = [name for name in ACCEL if name not in found]
+        if missing:
+            if len(missing) < len(ACCEL):
+                self.notes.append(
+                    f"column {missing[0]} is missing, so the acceleration was left out"
+                )
+            return np.full((len(self.numbers), 3), np.nan)
+        accel = self._without_holes(np.column_stack([found[name] for name in ACCEL]))
+        size = float(np.median(np.linalg.norm(accel, axis=1)))
+        for unit, factor in _ACCEL_UNITS:
+            if _GRAVITY[0] * GRAVITY_M_S2 < size * factor < _GRAVITY[1] * GRAVITY_M_S2:
+                self.notes.append(f"the acceleration was in {unit}: taken as m/s^2")
+                return accel * factor
+        return accel
+
+    def _without_holes(self, accel: Array) -> Array:
+        known: NDArray[np.bool] = np.asarray(np.isfinite(accel).all(axis=1))
+        count = int(np.count_nonzero(~known))
+        if count in (0, len(known)):
+            return accel
+        time_s = self.values[TIME]
+        at = np.flatnonzero(known)
+        right = np.searchsorted(at, np.arange(len(known)))
+        before, behind = at[np.maximum(right - 1, 0)], at[np.minimum(right, len(at) - 1)]
+        far = ~known & (time_s[behind] - time_s[before] > _HOLE_S)
+        if np.count_nonzero(far) > _HOLES_SHARE * len(known):
+            self.notes.append(
+                f"the acceleration was left out: {count} of {len(known)} rows have none"
+            )
+            return np.full_like(accel, np.nan)
+        filled = self._carried(accel, known, far)
+        if filling := count - int(np.count_nonzero(far)):
+            self.notes.append(
+                f"{filling} rows have no acceleration: the gyro carried it over from those beside"
+            )
+        if far.any():
+            self.notes.append(
+                f"{np.count_nonzero(far)} rows without acceleration for more than {_HOLE_S:g} s "
+                "were left out"
+            )
+            kept = ~far
+            place = np.cumsum(kept) - 1
+            ends = np.flatnonzero(np.diff(kept.astype(np.int8)) > 0) + 1
+            begins = [int(place[row]) for row in (*self.starts, *ends.tolist()) if kept[row]]
+            self.starts = tuple(sorted(set(begins)))
+            self._keep(kept)
+            filled = filled[kept]
+        return filled
+
+    def _carried(self, accel: Array, known: NDArray[np.bool], far: NDArray[np.bool]) -> Array:
+        """The force with its holes filled: gravity of the rows beside, turned as the gyro says.
+
+        known, far (N,): rows that have a force, and rows that are too far from any
+        """
+        out = accel.copy()
+        turn = self.vectors(GYRO)[1:] * np.diff(self.values[TIME])[:, None]
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], known, [True]]).astype(np.int8)))
+        for first, end in edges.reshape(-1, 2).tolist():
+            if far[first]:
+                continue
+            before, behind = max(first - 1, 0), min(end, len(known) - 1)
+            R = so3.products(so3.exp(np.vstack([np.zeros((1, 3)), turn[before:behind]])))
+            weight = np.linspace(0.0, 1.0, len(R))[:, None]
+            sides = ((0, before), (-1, behind))
+            force = [np.einsum("nji,j->ni", R, R[k] @ accel[row]) for k, row in sides]
+            weight = np.where(known[before], weight if known[behind] else 0.0, 1.0)
+            mixed = np.where(weight < 1.0, (1.0 - weight) * force[0], 0.0)
+            mixed += np.where(weight > 0.0, weight * force[1], 0.0)
+            out[first:end] = mixed[first - before : end - before]
+        return out
+
+    def table(self, accel: Array) -> Table:
+        """What is left as samples."""
+        time_s = self.values[TIME]
+        dt_s, starts = _steps(time_s, self.starts)
+        rows = SampleBlock(
+            time_s=time_s,
+            dt_s=dt_s,
+            host_s=time_s,
+            raw_b_gauss=self.vectors(MAG),
+            gyro_b_rad_s=self.vectors(GYRO),
+            accel_b_m_s2=accel,
+            covariates=self.covariates,
+        )
+        return Table(rows, starts, tuple(printable(note, 300) for note in self.notes))
 
 
-def _read_parquet(path: Path) -> pyarrow.Table:
+def _is_parquet(path: Path) -> bool:
+    if path.suffix.lower() == ".parquet":
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(len(PARQUET)) == PARQUET
+    except OSError:  # said with its reason by the reader of text
+        return False
+
+
+def _plain(value: float) -> str:
+    return f"{value:.3f}".rstrip("0").rstrip(".")
+
+
+def _resolved(path: Path, names: list[str], given: ColumnMap) -> Resolved:
+    try:
+        return resolve(names, given)
+    except ColumnError as error:
+        raise RecordingError(path, error.what, error.remedy) from None
+
+
+def _read_parquet(path: Path, given: ColumnMap) -> pyarrow.Table:
+    """Numbers and times only, after a look at the sizes."""
     from pyarrow import parquet  # most tables are text, and every import is paid at every start
 
     try:
-        table = parquet.read_table(path)
+        file = parquet.ParquetFile(path)
+        kinds = {field.name: field.type for field in file.schema_arrow}
+        groups = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
+        size = sum(group.total_byte_size for group in groups)
+        for count, limit, what in (
+            (len(file.schema_arrow), TABLE_COLUMNS, "columns"),
+            (file.metadata.num_rows, TABLE_ROWS, "rows"),
+            (size, TABLE_BYTES, "bytes of columns"),
+        ):
+            refuse_beyond(path, count, limit, what, "cut it in parts")
+        needed = {
+            source.column
+            for source in _resolved(path, file.schema_arrow.names, given).sources.values()
+        }
+        wanted = [name for name, kind in kinds.items() if _is_plain(kind) or name in needed]
+        cells = file.metadata.num_rows * len(wanted)
+        refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
+        table = file.read(columns=wanted, use_threads=False)
     except FileNotFoundError as error:
         raise RecordingError(path, "does not exist", "check the path") from error
-    except (pyarrow.ArrowInvalid, OSError) as error:
-        words = str(error).splitlines()[0]
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
+        words = printable(str(error).splitlines()[0] if str(error) else type(error).__name__, 200)
         raise RecordingError(path, f"is no Parquet table: {words}", "write it again") from error
-    _check_names(path, table.column_names)
+    others = [name for name in kinds if name not in wanted]
+    for name in others:  # as empty text, so that it is said that they were left out
+        table = table.append_column(name, pyarrow.nulls(table.num_rows).cast(pyarrow.string()))
     return table
 
 
-def _check_names(path: Path, names: list[str]) -> None:
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise RecordingError(path, f"has the column {double[0]} twice", "rename one of them")
-    missing = [name for name in _REQUIRED if name not in names]
-    if not missing:
-        return
-    others = [name for name in names if name not in _REQUIRED]
-    alike = difflib.get_close_matches(missing[0], others, n=1, cutoff=0.5)
-    hint = f" (is {alike[0]} meant? convert and rename it)" if alike else ""
-    raise RecordingError(
-        path,
-        f"has no column {', '.join(missing)}",
-        f"a table needs {', '.join(_REQUIRED)}{hint}",
-    )
+def _noted(table: pyarrow.Table) -> list[str]:
+    """What was said of the recording that `ahrsd convert` made the table of."""
+    kept = (table.schema.metadata or {}).get(NOTES_KEY.encode(), b"")
+    lines = bytes(kept).decode("utf-8", "replace").splitlines()
+    return [f"converted: {line}" for line in lines[:_NOTES] if line]
 
 
-def _numbers(path: Path, table: pyarrow.Table, name: str, first_row: int) -> Array:
+def _is_plain(kind: pyarrow.DataType) -> bool:
+    types = pyarrow.types
+    return bool(
+        types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+        or types.is_temporal(kind) or types.is_decimal(kind) or types.is_null(kind)
+    )  # fmt: skip
+
+
+def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_row: int) -> Array:
     """A required column.  Raises RecordingError at its first cell that is no finite number."""
-    values = _as_floats(table[name])
+    column = table[source.column]
+    values = _seconds(column) if name == TIME else None
+    factor = 1.0 if values is not None else source.factor
     if values is None:
-        texts = table[name].cast(pyarrow.string()).to_pylist()
-        row = next(k for k, text in enumerate(texts) if text is None or not _is_number(text))
-        cell = "" if texts[row] is None else texts[row]
-        raise RecordingError(
-            path, f"row {row + first_row}, column {name}: {cell!r} is no number", "correct the cell"
-        )
+        values = _as_floats(column, from_first=name == TIME and source.factor != 1.0)
+    if values is None:
+        _refuse_text(path, column, source.column, first_row)
     wrong = np.flatnonzero(~np.isfinite(values))
-    if len(wrong):
+    sparse = name in MAG and _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
+    if len(wrong) and not sparse:
         raise RecordingError(
             path,
-            f"row {wrong[0] + first_row}, column {name}: empty, nan or infinite "
-            f"({len(wrong)} rows in all)",
+            f"row {wrong[0] + first_row}, column {printable(source.column)}: empty, nan or "
+            f"infinite ({len(wrong)} rows in all)",
             "leave such rows out; a missing row is a gap, which is understood",
         )
-    return values
+    return values if factor == 1.0 else values * factor
+
+
+def _refuse_text(path: Path, column: pyarrow.ChunkedArray, name: str, first_row: int) -> NoReturn:
+    try:
+        texts = column.cast(pyarrow.string()).to_pylist()
+    except pyarrow.ArrowException:
+        raise RecordingError(
+            path, f"column {printable(name)} holds {column.type}, no numbers", "write numbers"
+        ) from None
+    row = next((k for k, text in enumerate(texts) if text is None or not _is_number(text)), 0)
+    cell = "" if texts[row] is None else printable(texts[row])
+    raise RecordingError(
+        path,
+        f"row {row + first_row}, column {printable(name)}: {cell!r} is no number",
+        "correct the cell",
+    )
 
 
 def _is_number(text: str) -> bool:
@@ -217,35 +490,84 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _as_floats(column: pyarrow.ChunkedArray) -> Array | None:
+def _seconds(column: pyarrow.ChunkedArray) -> Array | None:
+    """Dates and times as seconds since the first row's day began; None where it holds numbers."""
+    kind = column.type
+    types = pyarrow.types
+    if types.is_string(kind) or types.is_large_string(kind):
+        column = _parsed_times(column)
+        if column is None:
+            return None
+        kind = column.type
+    if types.is_timestamp(kind):
+        unit = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
+        counts = column.cast(pyarrow.int64())
+    elif types.is_time(kind) or types.is_duration(kind):
+        unit = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
+        counts = column.cast(pyarrow.int32() if types.is_time32(kind) else pyarrow.int64())
+    else:
+        return None
+    ticks = counts.to_numpy()
+    if counts.null_count:
+        return np.asarray(ticks, dtype=np.float64) * unit
+    day = round(86400 / unit)
+    first = int(ticks[0]) // day * day if types.is_timestamp(kind) else 0
+    return np.asarray(ticks.astype(np.int64) - first, dtype=np.float64) * unit
+
+
+def _parsed_times(column: pyarrow.ChunkedArray) -> pyarrow.ChunkedArray | None:
+    """ISO 8601 with or without a zone, where all cells are that."""
+    try:
+        texts = np.array(column.to_pylist(), dtype=object)
+        plain = [str(text).strip().replace(",", ".", 1) for text in texts]
+        cut = [text[:-1] if text.endswith(("Z", "z")) else _without_zone(text) for text in plain]
+        if cut and _TIME_OF_DAY.match(cut[0]):
+            cut = [f"1970-01-01T{text.zfill(8)}" for text in cut]
+        times = np.array(cut, dtype="datetime64[ns]")
+    except (ValueError, TypeError):
+        return None
+    return pyarrow.chunked_array([pyarrow.array(times)])
+
+
+def _without_zone(text: str) -> str:
+    """A zone is the same in all rows: times count from the first one."""
+    return text[:-6] if len(text) > 20 and text[-6] in "+-" and text[-3] == ":" else text
+
+
+def _as_floats(column: pyarrow.ChunkedArray, from_first: bool = False) -> Array | None:
+    """Numbers, None where there are none; from_first: the first row is 0, so that no digit of a
+    count of nanoseconds is lost."""
     kind = column.type
     if pyarrow.types.is_null(kind):
         return np.full(len(column), np.nan)
+    if pyarrow.types.is_decimal(kind):
+        column = column.cast(pyarrow.float64())
+        kind = column.type
     if pyarrow.types.is_boolean(kind):
         column = column.cast(pyarrow.int8())
         kind = column.type
     if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
         return None
     # numpy casts: Arrow's own functions take a twentieth of a second to load
-    return np.array(column.to_numpy(), dtype=np.float64)
+    values = column.to_numpy()
+    if from_first and len(values) and not column.null_count:
+        values = values - values[0]
+    return np.array(values, dtype=np.float64)
 
 
-def _covariates(table: pyarrow.Table) -> tuple[dict[str, Array], list[str]]:
+def _covariates(table: pyarrow.Table, found: Resolved) -> tuple[dict[str, Array], list[str]]:
     """All further numeric columns, and the names of those that are text."""
-    columns = {
-        name: _as_floats(table[name]) for name in table.column_names if name not in _REQUIRED
-    }
-    numeric = {name: values for name, values in columns.items() if values is not None}
-    return numeric, [name for name in columns if name not in numeric]
-
-
-def _accel(covariates: dict[str, Array], rows: int) -> tuple[Array, list[str]]:
-    """Take the acceleration out of `covariates`: (N, 3), nan unless all three axes are there."""
-    found = {name: covariates.pop(name) for name in _ACCEL if name in covariates}
-    missing = [name for name in _ACCEL if name not in found]
-    if missing:
-        return np.full((rows, 3), np.nan), missing
-    return np.column_stack([found[name] for name in _ACCEL]), []
+    numeric: dict[str, Array] = {}
+    text = []
+    wanted = {name: Source(column) for name, column in found.covariates.items()}
+    wanted |= {name: one for name, one in found.sources.items() if name not in REQUIRED}
+    for name, source in wanted.items():
+        values = _as_floats(table[source.column])
+        if values is None:
+            text.append(name)
+        else:
+            numeric[name] = values if source.factor == 1.0 else values * source.factor
+    return numeric, text
 
 
 def _check_length(path: Path, rows: int) -> None:
@@ -268,38 +590,72 @@ def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
     wrong = np.flatnonzero(step_s <= 0.0)
     if len(wrong):
         row = int(wrong[0])
+        back = np.count_nonzero(step_s < 0.0)
         word = "stands still" if step_s[row] == 0.0 else "goes back"
+        remedy = (
+            "sort by time, or split the file where the clock was set"
+            if back
+            else "the rows differ, so a host stamped them: give the device's time, or even ones"
+        )
         raise RecordingError(
             path,
             f"row {numbers[row + 1]}, column time_s: time {word} "
             f"({time_s[row]:g} to {time_s[row + 1]:g} s; {len(wrong)} such rows)",
-            "sort by time and remove double rows, or split the file where the clock was reset",
+            remedy,
         )
     median_s = float(np.median(step_s))
     if not _STEP_S[0] <= median_s <= _STEP_S[1]:
+        unit = next(
+            (name for name, s in reversed(_TIME_UNITS) if _STEP_S[0] <= median_s * s <= 0.5), None
+        )
+        hint = f"; if it is in {unit}: --columns time=NAME:{unit}" if unit else ""
         raise RecordingError(
             path,
             f"column time_s: {median_s:g} s from row to row is no sensor's rate",
-            "give the time in seconds",
+            f"give the time in seconds{hint}",
         )
 
 
-def _check_units(path: Path, vectors: Array, limits: _Range) -> None:
+def _check_units(path: Path, vectors: Array, limits: _Range, sources: Mapping[str, Source]) -> None:
     median = float(np.median(np.linalg.norm(vectors, axis=1)))
     if limits.minimum <= median <= limits.maximum:
         return
-    guess = next((unit for level, unit in limits.above if median > level), None)
+    own = [sources.get(name, Source(name)) for name in limits.columns]
+    factor = abs(own[0].factor)
+    native = median / factor  # as the file has it
+    guess = next((unit for level, unit in limits.above if native > level), None)
+    if limits.below is not None and limits.below[0] <= native <= limits.below[1]:
+        guess = limits.below[2]
+    if factor != 1.0 and limits.minimum < native <= limits.maximum and guess is None:
+        guess = limits.unit
     words = f"it looks like {guess}" if guess else "it looks like another unit or a dead sensor"
+    read_as = limits.unit if factor == 1.0 else f"times {factor:g} is {median:.4g} {limits.unit}"
+    name = printable(own[0].column)
     raise RecordingError(
         path,
-        f"columns {limits.columns[0]} ... : median magnitude {median:.4g} {limits.unit}, {words}",
-        f"convert it to {limits.unit}",
+        f"columns {name} ... : median magnitude {native:.4g} {read_as}, {words}",
+        f"convert it to {limits.unit}{_with_option(limits, [one.column for one in own], guess)}",
     )
 
 
-def _steps(time_s: Array) -> tuple[Array, tuple[int, ...]]:
-    """Step lengths (N,), nan where unknown, and the rows where a stretch without gap begins."""
+def _with_option(limits: _Range, columns: list[str], unit: str | None) -> str:
+    if unit is None:
+        return ""
+    short = [name.removesuffix("_gauss").removesuffix("_rad_s") for name in limits.columns]
+    pairs = [
+        f"{a}={printable(b).replace(',', chr(92) + ',')}:{unit}"
+        for a, b in zip(short, columns, strict=True)
+    ]
+    return f", or say so: --columns {','.join(pairs)}"
+
+
+def _steps(time_s: Array, known: tuple[int, ...] = ()) -> tuple[Array, tuple[int, ...]]:
+    """Step lengths (N,), nan where unknown, and the rows where a stretch without gap begins.
+
+    known: rows that begin one whatever their step is
+    """
     step_s = np.diff(time_s)
     gap = step_s > GAP_FACTOR * np.percentile(step_s, GAP_PERCENTILE)
+    gap[[row - 1 for row in known if row > 0]] = True
     dt_s = np.concatenate([[np.nan], np.where(gap, np.nan, step_s)])
     return dt_s, (0, *(np.flatnonzero(gap) + 1).tolist())

@@ -20,12 +20,17 @@ def is_table(path: Path) -> bool:
     return path.name.endswith(TABLE_SUFFIXES)
 
 
-def write_table(path: Path, columns: Mapping[str, Array]) -> None:
+def write_table(
+    path: Path, columns: Mapping[str, Array], facts: Mapping[str, str] | None = None
+) -> None:
     """Write columns of equal length, every digit of them.  Raises OSError.
 
-    The gzip header carries no time, so the same columns give the same bytes.
+    facts: for the metadata of a Parquet file. The gzip header carries no time, so the same columns
+    give the same bytes.
     """
     table = pyarrow.table(dict(columns))
+    if facts:
+        table = table.replace_schema_metadata(dict(facts))
     if path.suffix == ".parquet":
         pyarrow.parquet.write_table(table, path)
         return

@@ -25,6 +25,7 @@ from ahrsd.report.data import (
     RegisterChange,
     ReportData,
 )
+from ahrsd.report.run_time import RunTime
 from ahrsd.samples import Array
 
 KEPT = 4000  # samples and estimates; every second one is dropped each time this is reached
@@ -88,6 +89,7 @@ class EventCollector:
     """Collects events; `report` turns what was seen into a report's data."""
 
     def __init__(self) -> None:
+        self._time = RunTime()
         self._samples = _Thinned()  # time, raw (3), norm before, norm after
         self._estimates = _Thinned()  # time, value (12), sigma (12)
         self._newest: Estimated | None = None
@@ -107,7 +109,8 @@ class EventCollector:
                 self._gates = event.gates
             case StateChanged():
                 if len(self._states) < KEPT_LINES:
-                    self._states.append(event)
+                    at_s = self._time.at(event.at_s)
+                    self._states.append(dataclasses.replace(event, at_s=at_s))
             case RegisterWritten():
                 if len(self._registers) < KEPT_LINES:
                     self._registers.append(
@@ -150,7 +153,8 @@ class EventCollector:
             correction = self._newest.estimate.correction
         if correction is not None:
             after = np.linalg.norm(correction.apply(raw), axis=1)
-        for row in np.column_stack([event.block.time_s, raw, before, after]):
+        time_s = self._time.samples(event.block.time_s)
+        for row in np.column_stack([time_s, raw, before, after]):
             self._samples.add(row)
 
     def _add_estimate(self, event: Estimated) -> None:
@@ -159,7 +163,7 @@ class EventCollector:
         self._estimates.add(
             np.concatenate(
                 [
-                    [event.at_s],
+                    [self._time.at(event.at_s)],
                     estimate.soft_iron[UPPER],
                     estimate.hard_iron_gauss,
                     estimate.gyro_bias_rad_s,

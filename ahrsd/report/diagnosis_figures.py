@@ -7,13 +7,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ahrsd.mismatch.diagnosis import Contribution, Diagnosis, Drawn, RegimeMap, Validation
-from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN
+from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn, RegimeMap, Validation
+from ahrsd.diagnosis.shown import shown
+from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.samples import Array
 
 _BINS = 300  # of time
 _REGIMES = 10  # quantities in the map
 _AXES = "xyz"
+_WORSE = 1.05  # times the mean distance of the spectrum from 1, in logarithms
 
 
 def _figure(height_in: float, rows: int = 1) -> Figure:
@@ -53,7 +55,7 @@ def residual(found: Diagnosis, drawn: Drawn) -> Figure:
             series = _binned(drawn.time_s, values[:, k] * 1e3)
             axes.plot(*series, color=color, lw=1.0, label=name)
         axes.set_ylabel(f"{_AXES[k]}, mG")
-    figure.axes[0].legend(ncols=2, loc="upper right")
+    legend_above(figure)
     figure.axes[-1].set_xlabel("time, s")
     return figure
 
@@ -84,7 +86,7 @@ def contribution(one: Contribution) -> Figure:
         axes.plot(*series, color=SERIES[k], lw=1.0, label=_AXES[k])
     axes.set_xlabel("time, s")
     axes.set_ylabel({"gauss": "mG", "rad/s": "mrad/s"}[one.unit])
-    axes.legend(ncols=3, loc="upper right")
+    legend_above(figure)
     return figure
 
 
@@ -111,19 +113,21 @@ def validation(found: Validation) -> Figure:
 
 def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
     """What is left by condition: a row a quantity, low values left, before and after."""
-    shown = maps[:_REGIMES]
-    highest = max(max(one.before + one.after) for one in shown)
+    rows = maps[:_REGIMES]
+    highest = max(max(one.before + one.after) for one in rows)
     colours = LogNorm(1.0, max(highest, 10.0), clip=True)
-    figure = _figure(1.0 + 0.5 * len(shown), 2)
+    figure = _figure(1.2 + 0.72 * len(rows), 2)
     for axes, side in zip(figure.axes, ("before", "after"), strict=True):
-        for row, one in enumerate(shown):
+        for row, one in enumerate(rows):
             nats = np.array([getattr(one, side)])
             edges = np.linspace(0.0, 1.0, nats.shape[1] + 1)
             drawn = axes.pcolormesh(
                 edges, [row - 0.45, row + 0.45], nats, cmap="YlOrRd", norm=colours, edgecolor="w"
             )
-        labels = [f"{one.quantity}\n{one.edges[0]:.3g} to {one.edges[-1]:.3g}" for one in shown]
-        axes.set_yticks(range(len(shown)), labels, fontsize=7)
+        labels = [
+            f"{_plain(one.quantity)}\n{one.edges[0]:.3g} to {one.edges[-1]:.3g}" for one in rows
+        ]
+        axes.set_yticks(range(len(rows)), labels, fontsize=7)
         axes.set_xticks([])
         axes.invert_yaxis()
         axes.set_title(side)
@@ -131,6 +135,11 @@ def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
         figure.colorbar(drawn, ax=axes, label="nats")
     figure.axes[1].set_xlabel("low to high, as many samples in every bin")
     return figure
+
+
+def _plain(name: str) -> str:
+    """A column's name in a picture: a dollar sign begins no formula."""
+    return shown(name).replace("$", r"\$")
 
 
 def courses(drawn: Drawn) -> Figure:
@@ -148,7 +157,7 @@ def courses(drawn: Drawn) -> Figure:
         axes.set_title(f"{one.frame} frame, evidence {max(one.evidence, 0.0):.0f} nats")
         axes.set_ylabel(unit)
     figure.axes[-1].set_xlabel("time, s")
-    figure.axes[0].legend(ncols=3, loc="upper right")
+    legend_above(figure)
     return figure
 
 
@@ -163,8 +172,38 @@ def spectrum(drawn: Drawn) -> Figure:
     _log_log(axes)
     axes.set_xlabel("frequency, Hz")
     axes.set_ylabel("power, 1 = as expected")
-    axes.legend(ncols=2, loc="upper right")
+    if spectrum_is_worse(drawn):
+        axes.set_title("Farther from 1 after than before")
+    legend_above(figure)
     return figure
+
+
+def spectrum_is_worse(drawn: Drawn) -> bool:
+    """Whether the innovations after the named effects are farther from 1 than those before."""
+    if np.array_equal(drawn.before, drawn.after):
+        return False
+    before, after = (
+        float(np.mean(np.abs(np.log(np.maximum(_power(drawn.time_s, values)[1], 1e-12)))))
+        for values in (drawn.before, drawn.after)
+    )
+    return after > _WORSE * before
+
+
+def stands_out(drawn: Drawn) -> bool:
+    """Whether the freely drawn course of any frame leaves its own band of two deviations."""
+    return any(
+        bool(np.any(np.abs(one.course) > 2.0 * np.reshape(one.deviation, (-1, 1))))
+        for one in drawn.courses
+        if len(one.course)
+    )
+
+
+def grey_ones_are_longer(found: Diagnosis, drawn: Drawn) -> bool:
+    """Whether an effect that was not named explains more alone than one that was."""
+    named = {finding.effect for finding in found.findings}
+    blue = [nats for name, nats in drawn.evidence.items() if name in named]
+    grey = [nats for name, nats in drawn.evidence.items() if name not in named]
+    return bool(blue) and bool(grey) and max(grey) > min(blue)
 
 
 def _power(time_s: Array, values: Array) -> tuple[Array, Array]:

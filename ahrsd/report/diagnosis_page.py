@@ -6,8 +6,9 @@ from functools import partial
 from html import escape
 from pathlib import Path
 
-from ahrsd.mismatch.diagnosis import Diagnosis, Finding
-from ahrsd.mismatch.spoken import headline, place, sensitivity, value_text, verdict
+from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.shown import shown
+from ahrsd.diagnosis.spoken import headline, place, sensitivity, value_text, verdict
 from ahrsd.report.page import CSS, number, picture, section, table
 
 _MG = 1e3
@@ -25,6 +26,30 @@ _BY_NAME = (
     "evidence of every effect",
     "How much every effect alone would explain; named ones in blue. The line is what a name needs.",
 )
+#: said below the spectrum where the blue curve is the worse one
+_WORSE_SPECTRUM = (
+    "Here it is farther from 1 after than before: the named effects explain the readings where "
+    "they are located, not how the innovations spread over the frequencies."
+)
+#: said below the bars where an effect that was not named has the longer bar
+_LOST = (
+    "A longer grey bar is no contradiction: each bar is of one effect without any other. What a "
+    "grey one explains, the named ones explain as well; beside them it adds less than a name "
+    "needs, or it fails on parts of the recording that were not fitted."
+)
+#: the statistics of the checks, in words
+_STATISTICS = {
+    "normalised_innovation": "mean square of the innovations, 1: as the noise says",
+    "autocorrelation": "how much innovations remember of those before them",
+    "shift_sensor": "longest shift of their mean, axes of the sensor",
+    "shift_world": "longest shift of their mean, axes of the world",
+    "shift_turn": "longest shift of their mean, across the field",
+    "field_size": "shift or trend of the field's strength",
+    "heading": "dependence on the heading",
+    "tail": "largest innovations (the highest in a thousand)",
+    "line": "highest line of the spectrum over its mean",
+    "covariates": "correlation with a logged column or its rate",
+}
 _BY_CONDITION = (
     "what is left by condition",
     "Under which conditions readings and model differ, before and after: a row a quantity, low "
@@ -118,17 +143,28 @@ def _unexplained(found: Diagnosis) -> str:
     rows += [
         (
             "moves with",
-            escape(f"{s.channel}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}"),
+            escape(f"{shown(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}"),
         )
         for s in left.follows
     ]
     words = (
-        "<p>Nothing in the library explains this. It is real: it has a place and a size. "
-        "A name would be a guess.</p>"
+        f"<p>Nothing in the library explains this. {_how_real(found)} A name would be a guess.</p>"
     )
     return section(
         "Unknown, here", words, table(("", ""), [[escape(name), text] for name, text in rows])
     )
+
+
+def _how_real(found: Diagnosis) -> str:
+    """Only what the pictures below show."""
+    from ahrsd.report.diagnosis_figures import stands_out
+
+    if found.drawn is not None and found.drawn.courses and not stands_out(found.drawn):
+        return (
+            "All of it together is more than chance, but at no moment does it leave the band that "
+            "its own uncertainty draws: that it is there is known, its course is not."
+        )
+    return "It is real: it has a place and a size."
 
 
 def _sensitivity(found: Diagnosis) -> str:
@@ -166,12 +202,14 @@ def _pictures(found: Diagnosis) -> str:
         return ""
     from ahrsd.report import diagnosis_figures as figures
 
+    worse = figures.spectrum_is_worse(drawn)
     shots = [
         (partial(figures.residual, found, drawn), *_OVER_TIME),
-        (partial(figures.spectrum, drawn), *_BY_FREQUENCY),
+        (partial(figures.spectrum, drawn), *_longer(_BY_FREQUENCY, worse, _WORSE_SPECTRUM)),
     ]
     if drawn.evidence:
-        shots.append((partial(figures.evidence, found, drawn), *_BY_NAME))
+        longer = figures.grey_ones_are_longer(found, drawn)
+        shots.append((partial(figures.evidence, found, drawn), *_longer(_BY_NAME, longer, _LOST)))
     if found.regime_map:
         shots.append((partial(figures.regime_map, found.regime_map), *_BY_CONDITION))
     if found.validation is not None and found.findings:
@@ -179,6 +217,11 @@ def _pictures(found: Diagnosis) -> str:
     if drawn.courses:
         shots.append((partial(figures.courses, drawn), *_BY_FRAME))
     return section("Before and after", *(picture(*shot) for shot in shots))
+
+
+def _longer(texts: tuple[str, str], wanted: bool, more: str) -> tuple[str, str]:
+    """A picture's name and caption, with a further sentence where it is wanted."""
+    return (texts[0], f"{texts[1]} {more}") if wanted else texts
 
 
 def _checks(found: Diagnosis) -> str:
@@ -190,7 +233,7 @@ def _checks(found: Diagnosis) -> str:
 
     rows = [
         [
-            escape(name.replace("_", " ")),
+            escape(_STATISTICS.get(name, name.replace("_", " "))),
             f"{number(check.value)} ({number(check.band[0])} to {number(check.band[1])})",
             mark(check.inside_before),
             mark(check.inside_after),

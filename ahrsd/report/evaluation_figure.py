@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ahrsd.evaluation.judging import Evaluation, HeadingJudged, Reckoned
+from ahrsd.printable import drawn
 from ahrsd.report.figures import AFTER, BEFORE, GREY, MAX_POINTS, TRUTH, save_png
 
 _PANEL_PX, _ROW_PX = 560, 360
@@ -47,7 +48,7 @@ def _over_heading(axes: Axes, judged: HeadingJudged) -> None:
     axes.set_xticks(np.arange(0, 361, 90))
     axes.set_xlabel("heading [deg]")
     axes.set_ylabel("error [deg]")
-    axes.set_title(f"Heading against {judged.reference}")
+    axes.set_title(f"Heading against {drawn(judged.reference)}")
 
 
 def _over_time(axes: Axes, judged: HeadingJudged) -> None:
@@ -78,14 +79,16 @@ def _field(axes: Axes, found: Evaluation) -> None:
 
 def _way(axes: Axes, reckoned: Reckoned) -> None:
     fixes, pair = reckoned.fixes, reckoned.figures
-    axes.plot(fixes.east_m, fixes.north_m, color=TRUTH, linewidth=3, label=reckoned.reference)
+    axes.plot(
+        fixes.east_m, fixes.north_m, color=TRUTH, linewidth=3, label=drawn(reckoned.reference)
+    )
     for figures, colour in ((pair.before, BEFORE), (pair.after, AFTER)):
         axes.plot(figures.east_m, figures.north_m, color=colour, linewidth=1.2)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("east [m]")
     axes.set_ylabel("north [m]")
     axes.set_title(
-        f"Way, grey {reckoned.reference}: RMS error {pair.before.rms_percent:.1f} %, "
+        f"Way, grey {drawn(reckoned.reference)}: RMS error {pair.before.rms_percent:.1f} %, "
         f"{pair.after.rms_percent:.1f} %"
     )
 

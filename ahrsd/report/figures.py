@@ -99,7 +99,7 @@ def heading(data: HeadingError, title: str) -> Figure:
             enlarged.axhline(sign * data.limit_deg, color=TRUTH, linewidth=1.2, linestyle="--")
     reach = max(float(np.max(np.abs(data.after_deg))), data.limit_deg or 0.0, 1e-3)
     enlarged.set_ylim(-1.25 * reach, 1.25 * reach)
-    both.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2)
+    legend_above(figure, both)
     both.set_title(title)
     limit = "" if data.limit_deg is None else f" (dashed: limit {data.limit_deg:g} deg)"
     enlarged.set_title(f"After, enlarged{limit}")
@@ -129,10 +129,10 @@ def norm(data: FieldNorm) -> Figure:
         (data.after_gauss, AFTER, "with the newest estimate"),
     ):
         axes.plot(data.time_s[shown], values[shown], color=colour, linewidth=1.2, label=label)
-    axes.set_xlabel("device time [s]")
+    axes.set_xlabel("time [s]")
     axes.set_ylabel("field strength [gauss]")
     axes.set_ylim(bottom=0.0)
-    axes.legend(loc="lower right")
+    legend_above(figure)
     return figure
 
 
@@ -183,30 +183,44 @@ def history(data: EstimateHistory) -> Figure:
         if data.truth is not None:
             axes.axhline(data.truth[k], color=colour, linewidth=1.0, linestyle=":")
     axes.set_ylim(*_settled_range(data))
-    axes.set_xlabel("device time [s]")
+    axes.set_xlabel("time [s]")
     axes.set_ylabel(f"{data.name.lower()} [{data.unit}]" if data.unit else data.name.lower())
     handles = axes.get_legend_handles_labels()[0]
     if data.truth is not None:
         handles.append(Line2D([], [], color=TRUTH, linestyle=":", label="truth"))
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=len(handles),
-        columnspacing=1.0,
-        handlelength=1.2,
-    )
+    legend_above(figure, handles=handles)
     return figure
 
 
+def legend_above(
+    figure: Figure, axes: Axes | None = None, handles: list[Any] | None = None
+) -> None:
+    """One legend above the picture, where no curve runs; of these axes or of the first."""
+    shown = handles or (axes or figure.axes[0]).get_legend_handles_labels()[0]
+    figure.legend(
+        handles=shown,
+        loc="outside upper center",
+        ncols=len(shown),
+        columnspacing=1.0,
+        handlelength=1.2,
+    )
+
+
+_BANDS = 4.0  # standard deviations at the end that are seen on both sides
+
+
 def _settled_range(data: EstimateHistory) -> tuple[float, float]:
-    """Show what the estimate settled to; its first wild guesses may leave the picture."""
-    late = data.value[len(data.value) // 4 :]
-    band = data.sigma[len(data.sigma) // 4 :]
+    """What the estimate settled to, as wide as its uncertainty at the end lets one see.
+
+    First guesses and their standard deviations leave the picture.
+    """
+    late = data.value[len(data.value) // 2 :]
+    band = _BANDS * np.nanmin(data.sigma[len(data.sigma) // 2 :], axis=0)
     values = [late - band, late + band]
     if data.truth is not None:
         values.append(np.broadcast_to(data.truth, late.shape))
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    margin = max(0.15 * (high - low), 1e-9)
+    margin = max(0.05 * (high - low), 1e-9)
     return low - margin, high + margin
 
 

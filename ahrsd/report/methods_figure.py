@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.methods.comparison import Row
+from ahrsd.baselines.comparison import Row
+from ahrsd.printable import drawn
 from ahrsd.report.figures import AFTER, GREY, SERIES, save_png
 
 _WIDTH_PX, _ROW_PX = 1500, 52
@@ -31,7 +32,7 @@ def _draw(title: str, rows: Sequence[Row]) -> Figure:
     _spread(right, rows)
     left.set_yticks(np.arange(len(rows)), [row.method for row in rows])
     left.invert_yaxis()
-    figure.suptitle(title)
+    figure.suptitle(drawn(title, 120))
     return figure
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.montecarlo_summary import BOUNDED, Row
+from ahrsd.montecarlo.summary import BOUNDED, Row
 from ahrsd.report.figures import GREY, SERIES, TRUTH, save_png
 
 _TITLES = {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ahrsd.events import GateResult
+from ahrsd.gates import guards_a_write
 from ahrsd.report.data import EstimateHistory, HeadingError, KeyFigure, RegisterChange, ReportData
 from ahrsd.writeback.composition import register_lines
 
@@ -238,15 +239,16 @@ def _one_history(item: EstimateHistory) -> str:
 def _gates(data: ReportData) -> str:
     if not data.gates:
         return ""
-    failing = [gate for gate in data.gates if not gate.ok]
-    passing = [gate for gate in data.gates if gate.ok]
+    counted = [gate for gate in data.gates if guards_a_write(gate.gate)]
+    failing = [gate for gate in counted if not gate.ok]
+    passing = [gate for gate in counted if gate.ok]
     parts = []
     if failing:
         rows = [[*_gate_cells(gate), escape(gate.advice)] for gate in failing]
         parts.append(table(["", "gate", "value", "limit", "what to do"], rows, numeric=(2, 3)))
     if passing:
         passed = table(["", "gate", "value", "limit"], map(_gate_cells, passing), numeric=(2, 3))
-        count = f"{len(passing)} of {len(data.gates)} checks are ok"
+        count = f"{len(passing)} of {len(counted)} gates are ok"
         opened = "" if failing else " open"
         parts.append(f"<details{opened}><summary>{count}</summary>{passed}</details>")
     return section("Gates: may it be written?", *parts)
@@ -268,7 +270,7 @@ def _states(data: ReportData) -> str:
         [f"{s.at_s:.1f} s", f"{escape(s.old)} → <b>{escape(s.new)}</b>", escape(s.reason)]
         for s in data.states
     ]
-    return section("What happened", table(["device time", "state", "why"], rows, numeric=(0,)))
+    return section("What happened", table(["time", "state", "why"], rows, numeric=(0,)))
 
 
 def _registers(data: ReportData) -> str:
@@ -303,5 +305,9 @@ def _made(data: ReportData) -> str:
     if data.command:
         lines.append(f"<pre>{escape(data.command)}</pre>")
     if data.seed is not None:
-        lines.append(f'<p class="soft">Seed {data.seed}: the same seed gives the same run.</p>')
+        lines.append(
+            f'<p class="soft">Seed {data.seed}: the same seed gives the same hidden truth, motion '
+            "and noise. When the daemon reads them is up to the machine, so the last digits and "
+            "the moment of a step differ from run to run.</p>"
+        )
     return section("How this report was made", *lines) if lines else ""

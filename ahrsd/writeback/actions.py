@@ -15,6 +15,7 @@ from ahrsd.events import Event
 from ahrsd.writeback.permissions import Purpose
 from ahrsd.writeback.reconcile import Kind
 from drivers.vn100.commands import Command, Procedure
+from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import Values
 
 
@@ -70,6 +71,29 @@ class IdentifyAgain:
     """Identify the device, read its registers and tell `on_device`."""
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Ask who answers and what it holds, when nothing else runs, and tell `on_looked`."""
+
+    unit: Unit
+    expected: Mapping[int, Values]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateAnew:
+    """What was un-mapped until now may have been so through registers that were not in force."""
+
+    reason: str
+
+
 Action = (
-    RunProcedure | CancelProcedure | JournalAppend | Emit | InForce | SetUpStream | IdentifyAgain
+    RunProcedure
+    | CancelProcedure
+    | JournalAppend
+    | Emit
+    | InForce
+    | SetUpStream
+    | IdentifyAgain
+    | Look
+    | CalibrateAnew
 )

@@ -13,7 +13,7 @@ second run on the written device proposes the same. With a known field (world mo
 
 Where the estimate is of a stream whose registers act on it, C' = C2 C23 and B' = B23 + C23^-1 B2
 (with register 26: C' = R^T C2 R C23, B' = B23 + C23^-1 R^T B2) is the same thing; `Affine.after`
-and tests/test_fixed_point.py show it.
+and tests/core/test_fixed_point.py show it.
 
 Numbers are rounded to the six digits that the device prints: what it stores then equals what it
 shows, and a restart reads back exactly what was written. Six digits are 3e-4 deg of heading.
@@ -102,7 +102,7 @@ def compose(
 def register_lines(values: Mapping[int, Values]) -> tuple[str, ...]:
     """`$VNWRG,23,...*XX`: what is sent, and what a person may type into a terminal."""
     return tuple(
-        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]))}")
+        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]), held=True)}")
         .decode()
         .strip()
         for number in sorted(values)
@@ -210,6 +210,12 @@ def _named(soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array) -> 
     upper = soft_iron[np.triu_indices(3)]
     numbers = np.concatenate([upper, hard_iron_gauss, gyro_bias_rad_s])
     return dict(zip(_NAMES, numbers.tolist(), strict=True))
+
+
+def refuse_unsafe(values: Mapping[int, Values]) -> None:
+    """Raise UnwritableError where registers 23 and 84 hold what is refused whoever asks for it."""
+    mag, gyro = (_affine(values, number) for number in (MAG, GYRO))
+    _refuse_out_of_bounds(mag, gyro.offset)
 
 
 def _refuse_out_of_bounds(written: Affine, gyro_bias_rad_s: Array) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from ahrsd.events import Noted, RegisterWritten, StateChanged
 from ahrsd.writeback.actions import (
@@ -13,40 +16,91 @@ from ahrsd.writeback.actions import (
     JournalAppend,
     RunProcedure,
 )
+from ahrsd.writeback.clocks import Now, Stamp, plausible
 from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Purpose
 from ahrsd.writeback.reconcile import Kind
 from drivers.vn100.commands import Command, Procedure
 from drivers.vn100.registers import Values
 
+JOURNAL_AGAIN_S = 30.0
+_ANNOUNCED = (Kind.PREPARED, Kind.RAM_VERIFIED, Kind.FLASH_SENT)  # not on the disk: not done
+
 
 class Desk:
-    """Outgoing actions in order, each stamped with the newest time; the history beside them."""
+    """Outgoing actions in order, each stamped with the newest time; the history beside them.
+
+    A record that says what was done (a rollback) and that the disk did not take is kept and asked
+    for again until it does: otherwise the next start would have to guess.
+    """
 
     def __init__(self, allow: Callable[[Command, Purpose, float], bool]) -> None:
         self.host_s = self.at_s = 0.0
+        self.device_s: float | None = None  # the device's time since its start-up, as last heard
         self.history = History()
         self.running = ""
         self._allow = allow
-        self._wall_offset_s = 0.0
+        self._wall_offset_s: float | None = None
+        self._least_offset_s: float | None = None  # of every wall clock that may have been right
+        self._boot: tuple[str, float | None] = ("", None)  # and what to add to `host_s`
+        self._serial: int | None = None
+        self._bound_s = 0.0
+        self._asked: deque[tuple[Kind, dict[str, Any], History]] = deque()
+        self._unjournaled: list[tuple[Kind, dict[str, Any]]] = []
+        self._journal_again_s = 0.0
         self._runs = 0
         self._out: list[Action] = []
         self._said = ""
 
     @property
     def wall_s(self) -> float:
-        """The wall clock now, as it ran when the device was bound: steps since do not count."""
-        return self.host_s + self._wall_offset_s
+        """The wall clock now, a label; the monotonic one where nobody told it."""
+        return self.host_s + (self._wall_offset_s or 0.0)
 
-    def bind(self, serial: int, journal: Sequence[JournalRecord] | None, wall_s: float) -> None:
+    @property
+    def stamp(self) -> Stamp:
+        """The present by every clock, for a record."""
+        boot_id, offset_s = self._boot
+        return Stamp(
+            wall_s=None if self._wall_offset_s is None else self.wall_s,
+            boot_id=boot_id,
+            boot_s=None if offset_s is None else self.host_s + offset_s,
+            device_s=self.device_s,
+        )
+
+    @property
+    def now(self) -> Now:
+        """The present for a budget: by the earliest wall clock that this run was told."""
+        stamp, least_s = self.stamp, None
+        if self._least_offset_s is not None:
+            since_s = self.host_s if stamp.boot_s is None else stamp.boot_s
+            least_s = since_s + self._least_offset_s
+        return Now(replace(stamp, wall_s=least_s), self.host_s - self._bound_s)
+
+    def set_clocks(self, wall_s: float, boot_id: str = "", boot_s: float | None = None) -> None:
+        """The host's other clocks at this moment; the wall clock may have been set since."""
+        self._wall_offset_s = wall_s - self.host_s
+        if plausible(wall_s):
+            offset_s = wall_s - (self.host_s if boot_s is None else boot_s)
+            least_s = offset_s if self._least_offset_s is None else self._least_offset_s
+            self._least_offset_s = min(offset_s, least_s)
+        self._boot = (boot_id, None if boot_s is None else boot_s - self.host_s)
+
+    def bind(self, serial: int, journal: Sequence[JournalRecord] | None) -> None:
         """Another device, or the same one again: its journal is what counts.
 
-        Where it cannot be read, what is remembered of an open transaction is better than nothing.
+        Where it cannot be read, what is remembered of an open transaction is better than nothing;
+        and what the disk has not taken yet comes behind what it has.
         """
-        self._wall_offset_s = wall_s - self.host_s
+        if serial != self._serial and self._unjournaled:
+            self.note("error", f"{len(self._unjournaled)} records of {self._serial} are lost")
+            self._unjournaled.clear()
+        self._serial, self._bound_s, self.device_s = serial, self.host_s, None
         remembered = self.history.open
         if journal is not None or remembered is None or remembered.serial != serial:
             self.history = History.of(journal or ())
+            for kind, facts in self._unjournaled:
+                self.history = self.history.with_record(kind, facts)
 
     def take(self) -> list[Action]:
         """The actions so far."""
@@ -58,15 +112,61 @@ class Desk:
         self._out.append(action)
 
     def record(self, kind: Kind, **facts: object) -> None:
-        """Append to the journal; the history takes it as given."""
+        """Append to the journal, behind what it lacks; the history takes it as given."""
+        self.journal_again()
         transaction = self.history.open
         complete = {
             **({} if transaction is None else {"txn": transaction.id}),
             **facts,
-            "wall_s": self.wall_s,
+            **self.stamp.facts(),
         }
-        self.history = self.history.with_record(kind, complete)
-        self.ask(JournalAppend(kind, complete))
+        before, self.history = self.history, self.history.with_record(kind, complete)
+        self._append(kind, complete, before)
+
+    def journaled(self, kind: Kind) -> bool:
+        """A record of this kind is on the disk; whether nothing is left that is not."""
+        self._answered(kind)
+        self.journal_again()
+        return not self._unjournaled and not self._asked
+
+    def not_journaled(self, kind: Kind) -> None:
+        """A record of this kind is not on the disk: what it announced does not happen."""
+        asked = self._answered(kind)
+        if asked is None:
+            return
+        _, facts, before = asked
+        if kind not in _ANNOUNCED:
+            self._unjournaled.append((kind, facts))
+            self._journal_again_s = self.host_s + JOURNAL_AGAIN_S
+        elif kind is Kind.PREPARED:  # nothing was opened
+            self.history = replace(
+                self.history,
+                open=before.open,
+                last=before.last,
+                last_at=before.last_at,
+                holds=before.holds,
+            )
+
+    @property
+    def journal_again_s(self) -> float | None:
+        """When the records that the disk did not take are asked for again."""
+        return self._journal_again_s if self._unjournaled else None
+
+    def journal_again(self) -> None:
+        """Ask for them now, in their order."""
+        waiting, self._unjournaled = self._unjournaled, []
+        for kind, facts in waiting:
+            self._append(kind, facts, self.history)
+
+    def _append(self, kind: Kind, facts: dict[str, Any], before: History) -> None:
+        self._asked.append((kind, facts, before))
+        self.ask(JournalAppend(kind, facts))
+
+    def _answered(self, kind: Kind) -> tuple[Kind, dict[str, Any], History] | None:
+        asked = next((one for one in self._asked if one[0] is kind), None)
+        if asked is not None:
+            self._asked.remove(asked)
+        return asked
 
     def note(self, level: str, text: str) -> None:
         """One line for the log; not the same one twice in a row."""

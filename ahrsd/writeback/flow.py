@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
-from ahrsd.calibration import Estimate
-from ahrsd.writeback.actions import IdentifyAgain, SetUpStream
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.writeback.actions import CalibrateAnew, IdentifyAgain, SetUpStream
 from ahrsd.writeback.composition import (
+    GYRO,
+    MAG,
     Proposal,
     UnwritableError,
     apart_deg,
@@ -19,17 +21,26 @@ from ahrsd.writeback.composition import (
 )
 from ahrsd.writeback.desk import Desk
 from ahrsd.writeback.permissions import Mode, Purpose
-from ahrsd.writeback.policy import WriteBackPolicy, worth_writing
+from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
 from ahrsd.writeback.reconcile import Kind, found
 from ahrsd.writeback.safeguards import Safeguards
-from ahrsd.writeback.states import ON_TIMEOUT, TABLE, Signal, State
+from ahrsd.writeback.states import (
+    LIVED_WITH,
+    ON_TIMEOUT,
+    TABLE,
+    WITHOUT_TRANSACTION,
+    Signal,
+    State,
+)
 from ahrsd.writeback.transaction import Outcome, Transaction, check, roll_back, save, stage
+from ahrsd.writeback.trial import Finding as Verdict
 from ahrsd.writeback.trial import Trial
-from drivers.vn100.procedures import Identity
+from drivers.vn100.procedures import Identity, Unit
 from drivers.vn100.registers import Values, same
 
 RETRY_SAVE_S = 600.0  # after a save that was not sent
+Answer = tuple[bool, str]  # to a person: whether it is accepted, and what follows or why not
 COUNTED = frozenset({"trial", "interlock", "operator"})  # rollbacks that speak against the values
 
 
@@ -48,7 +59,10 @@ class Flow:
         self.proposal: Proposal | None = None
         self.approver = ""
         self.trial = Trial(policy.trial, 0.0)
+        self.passed = ""  # why the trial is passed, until the device was asked again
         self._cause = "device"
+        self._from_fault = self._resumed = False
+        self._against_since_s: float | None = None
         self._since_s = 0.0
         self._save_from_s = float("-inf")
         self._on_entry: dict[State, Callable[[str], None]] = {
@@ -85,6 +99,7 @@ class Flow:
         """Arrive in a state. A conversation of the old one ends."""
         self.desk.stop_running()
         old, self.state = self.state, state
+        self._from_fault, self._resumed = old is State.FAULT, old is State.RECONCILING
         self._since_s = self.desk.host_s
         wait = ON_TIMEOUT.get(state)
         self.deadline_s = None if wait is None else self.desk.host_s + wait[0]
@@ -94,9 +109,11 @@ class Flow:
 
     def watch(self) -> None:
         """Take the step that waits for nothing but a condition, if it holds now."""
-        now = (self.desk.history, self.desk.host_s, self.desk.wall_s)
+        now = (self.desk.history, self.desk.host_s, self.desk.now)
         if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
             self.signal(Signal.APPROVED, f"approved: {self.approver}")
+        elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
+            self.roll_back("void", self.safe.void)
         elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
             if not self.safe.save_holds(*now):
                 self.signal(Signal.SAVE_DUE, "proven, safe and still")
@@ -128,12 +145,16 @@ class Flow:
         if Signal.ROLL_BACK in TABLE[self.state] and (by_hand or self.state is not State.FAULT):
             self._cause = cause
             self.signal(Signal.TRIAL_FAILED if cause == "trial" else Signal.ROLL_BACK, reason)
-        elif by_hand:
-            self.desk.note(
-                "warning",
+
+    def roll_back_by_hand(self) -> Answer:
+        """An operator wants the old values back."""
+        if Signal.ROLL_BACK not in TABLE[self.state]:
+            return False, (
                 f"nothing to roll back in {self.state.value}; for values that are in flash use "
-                "the registers rollback command",
+                "the registers rollback command"
             )
+        self.roll_back("operator", "an operator asked for it")
+        return True, "the old values are being put back"
 
     # -- the candidate -----------------------------------------------------------------------------
 
@@ -165,15 +186,25 @@ class Flow:
         if signal in TABLE[self.state]:
             self.signal(signal, reason)
 
-    def approve(self, text: str) -> None:
+    def approve(self, text: str) -> Answer:
         """An operator's yes to the candidate with this id; holds as long as it stays qualified."""
         if self.state is not State.QUALIFIED or self.proposal is None:
-            self.desk.note("warning", f"no candidate to approve in {self.state.value}")
-        elif text.strip().lower() != self.proposal.id:
-            self.desk.note("warning", f"{text!r} is not the candidate, it is {self.proposal.id}")
-        else:
-            self.approver, self.safe.armed = "operator", True
-            self.desk.note("info", f"{self.proposal.id} approved")
+            return False, f"no candidate to approve in {self.state.value}"
+        if text.strip().lower() != self.proposal.id:
+            return False, f"{text!r} is not the candidate, it is {self.proposal.id}"
+        if self.policy.mode < Mode.STAGE:
+            return False, self.mode_forbids
+        self.approver, self.safe.armed = "operator", True
+        said = f"{self.proposal.id} approved"
+        self.desk.note("info", said)
+        held = self.safe.write_holds(self.desk.history, self.desk.host_s, self.desk.now)
+        waits = f"; it is written once this is over: {'; '.join(held)}" if held else ""
+        return True, f"{said}{waits}"
+
+    @property
+    def mode_forbids(self) -> str:
+        """Why nothing can be written in this run at all."""
+        return f"the mode is {self.policy.mode.name.lower()}: nothing is written in this run"
 
     def _compose(self, estimate: Estimate, gyro_is_raw: bool) -> Proposal | None:
         if not estimate.converged:
@@ -184,21 +215,72 @@ class Flow:
             self.desk.note("warning", f"this estimate cannot be written: {error}")
             return None
 
+    # -- what is in force, judged by what comes in ------------------------------------------------
+
+    def compare(self, estimate: Estimate, gyro_is_raw: bool) -> None:
+        """Does the present estimate still ask for what was written, and do its gates pass?
+
+        The smallest disagreement holds the pass of a trial and a save; one that is clear and lasts
+        as long as a bad figure may ends them.
+        """
+        reason = clear = ""
+        if red := [gate.gate for gate in self.safe.gates if not gate.ok]:
+            reason = clear = f"gates not met: {', '.join(red)}"
+        elif (fresh := self._compose(estimate, gyro_is_raw)) is None:
+            reason = "there is no present estimate to compare with what was written"
+        elif worth_writing(self.policy, self.desk.history, fresh):
+            reason = (
+                f"the present estimate asks for another {fresh.heading_change_deg:.1f} deg and "
+                f"{fresh.gyro_change_rad_s:.4f} rad/s"
+            )
+            clear = reason if contradicts(self.policy, fresh, estimate) else ""
+        self.safe.disagrees = reason
+        if not clear:
+            self._against_since_s = None
+        elif self._against_since_s is None:
+            self._against_since_s = self.desk.host_s
+        elif self.desk.host_s - self._against_since_s >= self.policy.trial.worse_for_s:
+            self.void(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
+
+    def void(self, reason: str) -> None:
+        """What was calibrated before holds no more: what is not in flash yet never gets there."""
+        if self.state in WITHOUT_TRANSACTION:
+            self.signal_if(Signal.GATES_FAILED, reason)
+            return
+        self.safe.void = reason
+        self.roll_back("void", reason)
+
+    def prove_again(self, reason: str) -> None:
+        """What was proven was so before a doubt."""
+        if self.state in LIVED_WITH:
+            self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
+            self.passed = ""
+            self.safe.proof_waits = f"{reason}: what is in force is on trial again"
+
+    def judge_proof(self, finding: Verdict, reason: str) -> None:
+        """What is proven goes on being judged until it is saved."""
+        if finding is Verdict.FAILED:
+            self.roll_back("trial", reason)
+        elif finding is Verdict.PASSED:
+            self.safe.proof_waits = ""
+
     # -- locks -------------------------------------------------------------------------------------
 
-    def lock(self, reason: str) -> None:
+    def lock(self, reason: str) -> Answer:
         """No writes from now on; what is only in RAM is undone first."""
         self.desk.record(Kind.LOCKED, reason=reason)
         if Signal.ROLL_BACK in TABLE[self.state] and self.state is not State.FAULT:
             self.roll_back("operator", reason)
         self.signal_if(Signal.LOCK, reason)
+        return True, f"locked: {reason}"
 
-    def unlock(self, reason: str) -> None:
+    def unlock(self, reason: str) -> Answer:
         """A person looked and found it right. In FAULT: look again."""
         self.desk.record(Kind.UNLOCKED, reason=reason)
         if self.state is State.FAULT:
             self.desk.ask(IdentifyAgain())
         self.signal_if(Signal.UNLOCK, reason)
+        return True, f"unlocked: {reason}"
 
     # -- arriving ----------------------------------------------------------------------------------
 
@@ -229,6 +311,8 @@ class Flow:
         )
 
     def _enter_preparing(self, reason: str) -> None:
+        self.safe.void = self.safe.disagrees = self.safe.proof_waits = ""
+        self._against_since_s = None
         proposal, identity = self._the_proposal(), self._the_identity()
         transaction = Transaction(
             id=f"{proposal.id}-{self.desk.wall_s:.0f}",
@@ -239,6 +323,7 @@ class Flow:
             snapshot=self.registers,
             heading_change_deg=proposal.heading_change_deg,
             approver=self.approver,
+            model=identity.model,
         )
         gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
         self.desk.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
@@ -255,13 +340,20 @@ class Flow:
         transaction = self.transaction()
         self._now_in_force(transaction.new)
         self.desk.written(transaction.old, transaction.new, "verified")
-        self.desk.record(Kind.RAM_VERIFIED)
+        self.desk.record(Kind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
+        self.passed = ""
         self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
 
     def _enter_proven(self, reason: str) -> None:
-        """Also the way back from a save that was not sent: it does not count and waits a while."""
+        """Also the way back from a save that was not sent: it does not count and waits a while.
+
+        What an earlier run, or one before an interruption, has proven is proven again before it is
+        saved: nobody knows what happened to the vehicle meanwhile.
+        """
+        if self._resumed:
+            self.prove_again(reason)
         if self.desk.history.last is Kind.FLASH_SENT:
             self._save_from_s = self.desk.host_s + RETRY_SAVE_S
             self.desk.record(Kind.PROVEN, reason=reason, unsent=True)
@@ -271,12 +363,17 @@ class Flow:
         self.desk.run("save", Purpose.SAVE, make)
 
     def _enter_rolling_back(self, reason: str) -> None:
-        if self.desk.history.last is not Kind.ROLLBACK:
+        # what was read back as ours and holds something else by now is somebody else's; out of a
+        # FAULT a person has looked, and after a write that failed it is what that write left
+        last = self.desk.history.last
+        only_ours = last is not Kind.RAM_FAILED and not self._from_fault
+        if last is not Kind.ROLLBACK:
             self.desk.record(
                 Kind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
             )
         self.desk.in_force(None)
-        self.desk.run("roll back", Purpose.ROLL_BACK, partial(roll_back, self.transaction()))
+        make = partial(roll_back, self.transaction(), only_ours=only_ours)
+        self.desk.run("roll back", Purpose.ROLL_BACK, make)
 
     def _enter_fault(self, reason: str) -> None:
         transaction = self.desk.history.open
@@ -287,6 +384,9 @@ class Flow:
 
     def on_outcome(self, outcome: Outcome) -> None:
         """A conversation came to its end and says how it found the device."""
+        if outcome.other is not None:
+            self._another(outcome.other, outcome.written)
+            return
         endings: dict[State, Callable[[Outcome], None]] = {
             State.CHECKING: self._checked,
             State.STAGING: self._written,
@@ -294,6 +394,39 @@ class Flow:
             State.ROLLING_BACK: self._rolled_back,
         }
         endings[self.state](outcome)
+
+    def another(self, unit: Unit) -> None:
+        """Another device has the cable: nothing that was judged here is for it."""
+        wanted = "nobody knew" if self.identity is None else str(self.identity.unit)
+        self.desk.note("error", f"another device answers: {unit}, not {wanted}; nothing is written")
+        self.look_closer(f"another device answers: {unit}")
+
+    def look_closer(self, reason: str) -> None:
+        """What the device is or holds is not what it ought to: identify it, read it, compare."""
+        self.desk.in_force(None)
+        self.desk.ask(IdentifyAgain())
+        self.signal(Signal.IN_DOUBT, reason)
+
+    def expected(self, read: Mapping[int, Values]) -> dict[int, Values]:
+        """What these registers hold, as far as is known."""
+        return {n: self.registers[n] for n in read if n in self.registers}
+
+    def changed(self, numbers: tuple[int, ...]) -> None:
+        """The device holds something else than it was left with, nobody knows since when."""
+        which = f"register{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
+        reason = f"{which} changed: the device restarted unseen, or somebody else wrote"
+        self.desk.note("warning", reason)
+        self.desk.ask(CalibrateAnew(reason))
+        self.look_closer(reason)
+
+    def _another(self, unit: Unit, written: bool) -> None:
+        """In the middle of a conversation; the journal that is open is still the first device's."""
+        reason = f"another device answers: {unit}"
+        if self.state is State.SAVING:
+            self.desk.record(Kind.PROVEN, reason=reason, unsent=True)
+        elif self.state in (State.CHECKING, State.STAGING) and not written:
+            self.desk.record(Kind.ABORTED, reason=reason)
+        self.another(unit)
 
     def _checked(self, outcome: Outcome) -> None:
         if outcome.as_expected:
@@ -304,12 +437,16 @@ class Flow:
         self.signal(Signal.DIFFERS, f"somebody else changed the device: {outcome}")
 
     def _written(self, outcome: Outcome) -> None:
-        signal = Signal.DONE if outcome.as_expected else Signal.DIFFERS
-        self.signal(signal, f"read back: {outcome}")
+        if outcome.as_expected:
+            self.signal(Signal.DONE, "both registers and the device's identity were read back")
+        elif outcome.written:  # a restart, or somebody else, between the writes
+            self.look_closer(f"after the writes {outcome}")
+        else:
+            self.signal(Signal.DIFFERS, f"read back: {outcome}")
 
     def _saved(self, outcome: Outcome) -> None:
         if outcome.as_expected:
-            self.desk.record(Kind.FLASH_ACKED)
+            self.desk.record(Kind.FLASH_ACKED, serial=self.transaction().serial)
             self.signal(Signal.DONE, "the device acknowledged the save")
         else:
             self.desk.note("warning", f"not saved: {outcome}")
@@ -336,9 +473,12 @@ class Flow:
 
     def _rolled_back(self, outcome: Outcome) -> None:
         transaction = self.transaction()
+        if not outcome.as_expected:
+            self.look_closer(f"not rolled back: {outcome}")
+            return
         self._now_in_force(transaction.old)
         self.desk.written(transaction.new, transaction.old, "undone")
-        self.desk.record(Kind.ROLLED_BACK)
+        self.desk.record(Kind.ROLLED_BACK, serial=transaction.serial)
         history = self.desk.history
         if history.rollbacks >= self.policy.rollbacks_to_lock and history.locked is None:
             self.desk.record(Kind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
@@ -377,6 +517,22 @@ class Flow:
                 "error",
                 f"register {', '.join(map(str, changed))} changed since the journal's last record: "
                 "somebody else wrote or saved it",
+            )
+        factory, history = Affine.identity().to_register(), self.desk.history
+        strange = [
+            number
+            for number in (MAG, GYRO)
+            if (values := self.registers.get(number)) is not None
+            and not held
+            and not same(number, factory, values)
+            and not history.knows(number, values)
+        ]
+        if strange and self.safe.journal_ok:
+            self.desk.note(
+                "warning",
+                f"register {', '.join(map(str, strange))} holds values that are neither the "
+                "factory's nor in the journal: somebody calibrated the device before, or a journal "
+                "was lost in a trial; then switch the device off and on",
             )
 
     def transaction(self) -> Transaction:

@@ -10,15 +10,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
+from ahrsd.writeback.clocks import UNKNOWN, Stamp
 from ahrsd.writeback.reconcile import OF_OUTPUTS, OPEN, Kind
 from ahrsd.writeback.transaction import Transaction
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
 
 TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
+BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
 
 _TOUCHED_RAM: Final = (Kind.RAM_VERIFIED, Kind.RAM_FAILED, Kind.ROLLBACK)
 _HOLDS_NEW: Final = (Kind.FLASH_ACKED, Kind.CONFIRMED)
-_HOLDS_OLD: Final = (Kind.ABORTED, Kind.ROLLED_BACK, Kind.LOST, Kind.NOT_SAVED)
+_HOLDS_OLD: Final = (Kind.ABORTED, Kind.ROLLED_BACK, Kind.REVERTED, Kind.LOST, Kind.NOT_SAVED)
 
 
 class JournalRecord(Protocol):
@@ -30,30 +32,34 @@ class JournalRecord(Protocol):
 
     @property
     def facts(self) -> Mapping[str, Any]:
-        """What was recorded; `wall_s` is the wall clock in seconds."""
+        """What was recorded; `clocks.Stamp` reads the time from it."""
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """A journal, summed up. Times are wall-clock seconds.
+    """A journal, summed up.
 
-    open:      the transaction that no record ended yet, and its newest record's kind
+    open:      the transaction that no record ended yet, the kind and time of its newest record
+    newest_at: the time of the newest record of any kind
     rollbacks: since the last proven write or unlock; each says that a calibration was bad
     holds:     what the device must hold after the newest transaction, where that is known
+    values:    registers and values that a write found or meant, also one by hand
     broken:    the kind of a record that could not be understood; then nothing may be written
     """
 
     open: Transaction | None = None
     last: Kind | None = None
-    last_wall_s: float = 0.0
-    ram_writes_wall_s: tuple[float, ...] = ()
-    flashes_wall_s: tuple[float, ...] = ()
+    last_at: Stamp = UNKNOWN
+    newest_at: Stamp = UNKNOWN
+    ram_writes_at: tuple[Stamp, ...] = ()
+    flashes_at: tuple[Stamp, ...] = ()
     flashes: int = 0
     rollbacks: int = 0
-    last_rollback_wall_s: float | None = None
+    rollback_at: Stamp | None = None
     locked: str | None = None
     torn: bool = False
     holds: dict[int, Values] | None = None
+    values: tuple[tuple[int, Values], ...] = ()
     broken: str | None = None
 
     @staticmethod
@@ -63,52 +69,84 @@ class History:
         for record in records:
             if record.kind in Kind.__members__:
                 history = history.with_record(Kind(record.kind), record.facts)
+            elif record.kind == BY_HAND:
+                history = history._with_values(record.facts)
         return history
 
     def with_record(self, kind: Kind, facts: Mapping[str, Any]) -> History:
         """The history after one more record."""
         if kind in OF_OUTPUTS:
             return self
-        wall_s = float(facts.get("wall_s", 0.0))
+        at = Stamp.of(facts)
+        now = replace(self, newest_at=at)
         if kind is Kind.LOCKED:
-            return replace(self, locked=str(facts.get("reason", "no reason given")))
+            return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is Kind.UNLOCKED:
-            return replace(self, locked=None, torn=False, rollbacks=0)
+            return replace(now, locked=None, torn=False, rollbacks=0)
         if kind is Kind.PREPARED:
             try:
                 transaction = Transaction.from_facts(facts)
             except (KeyError, TypeError, ValueError):
-                return replace(self, broken=kind.value)
-            return replace(self, open=transaction, last=kind, last_wall_s=wall_s, holds=None)
-        return self._counted(kind, facts, wall_s)._moved(kind, wall_s)
+                return replace(now, broken=kind.value)
+            begun = replace(now, open=transaction, last=kind, last_at=at, holds=None)
+            return begun._with_values(facts)
+        return now._counted(kind, facts, at)._moved(kind, facts, at)
 
-    def _counted(self, kind: Kind, facts: Mapping[str, Any], wall_s: float) -> History:
+    def knows(self, number: int, values: Values) -> bool:
+        """Whether a record has these values of this register, as found or as meant."""
+        return any(n == number and same(n, known, values) for n, known in self.values)
+
+    def _with_values(self, facts: Mapping[str, Any]) -> History:
+        try:
+            found = [
+                (int(number), tuple(row))
+                for which in ("old", "new")
+                for number, row in facts[which].items()
+            ]
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return self
+        return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
+
+    def _counted(self, kind: Kind, facts: Mapping[str, Any], at: Stamp) -> History:
         """Budgets and rollbacks."""
         changes: dict[str, Any] = {}
         if kind in _TOUCHED_RAM and self.last is Kind.PREPARED:
-            changes["ram_writes_wall_s"] = (*self.ram_writes_wall_s, wall_s)[-TIMES_KEPT:]
+            changes["ram_writes_at"] = (*self.ram_writes_at, at)[-TIMES_KEPT:]
         if kind is Kind.FLASH_SENT:
-            changes["flashes_wall_s"] = (*self.flashes_wall_s, wall_s)[-TIMES_KEPT:]
+            changes["flashes_at"] = (*self.flashes_at, at)[-TIMES_KEPT:]
             changes["flashes"] = self.flashes + 1
         if kind is Kind.PROVEN:
             changes["rollbacks"] = 0
         if kind is Kind.PROVEN and self.last is Kind.FLASH_SENT:  # it was not sent after all
-            changes["flashes_wall_s"] = self.flashes_wall_s[:-1]
+            changes["flashes_at"] = self.flashes_at[:-1]
             changes["flashes"] = self.flashes - 1
         if kind is Kind.ROLLBACK and facts.get("counts"):
             changes["rollbacks"] = self.rollbacks + 1
-            changes["last_rollback_wall_s"] = wall_s
+            changes["rollback_at"] = at
         return replace(self, **changes)
 
-    def _moved(self, kind: Kind, wall_s: float) -> History:
-        """Where the open transaction stands."""
-        if self.open is None:
+    def _moved(self, kind: Kind, facts: Mapping[str, Any], at: Stamp) -> History:
+        """Where the open transaction stands; a record of another one says nothing about it."""
+        if self.open is None or facts.get("txn", self.open.id) != self.open.id:
             return self
         holds = self.holds
         if kind in _HOLDS_NEW:
             holds = self.open.new
         elif kind in _HOLDS_OLD:
-            holds = self.open.old
+            saved = kind is Kind.REVERTED and self.last in (Kind.FLASH_SENT, Kind.FLASH_ACKED)
+            holds = None if saved else self.open.old  # the next start may bring either
         torn = self.torn or kind is Kind.FLASH_TORN
         still_open = self.open if kind in OPEN else None
-        return replace(self, open=still_open, last=kind, last_wall_s=wall_s, holds=holds, torn=torn)
+        return replace(self, open=still_open, last=kind, last_at=at, holds=holds, torn=torn)
+
+
+def of_another_device(records: Iterable[JournalRecord], serial: int) -> str:
+    """Which record is of a device with another serial number; empty where none is."""
+    for number, record in enumerate(records, start=1):
+        device = record.facts.get("device")
+        theirs = record.facts.get(
+            "serial", device.get("serial") if isinstance(device, dict) else None
+        )
+        if theirs is not None and str(theirs) != str(serial):
+            return f"record {number} is of the device {theirs}, and this is {serial}"
+    return ""

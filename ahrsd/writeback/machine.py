@@ -21,16 +21,19 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.actions import Action, IdentifyAgain
+from ahrsd.writeback.actions import Action, IdentifyAgain, Look
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
-from ahrsd.writeback.flow import Flow
+from ahrsd.writeback.flow import Answer, Flow
 from ahrsd.writeback.journal_history import History, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
+from ahrsd.writeback.recheck import Recheck
 from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.restarts import RestartWatch
 from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
+    LIVED_WITH,
     ON_TIMEOUT,
     WITHOUT_TRANSACTION,
     Signal,
@@ -38,16 +41,28 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import Outcome
 from ahrsd.writeback.trial import Finding, TrialMetrics
-from drivers.vn100.procedures import Identity
+from drivers.vn100.procedures import Identity, Seen, differences
 from drivers.vn100.registers import Values
 
-UPTIME_MARGIN_S = 0.5  # what a message may take to get here
+RESTS = frozenset(  # states in which a proven restart since the newest record has it read again
+    {
+        State.CANDIDATE,
+        State.QUALIFIED,
+        State.TRIAL,
+        State.PROVEN,
+        State.COMMITTED,
+        State.FAULT,
+        State.LOCKED,
+    }
+)
+RECHECKED = (23, 25, 26, 44, 84)  # what a sample went through depends on them
 
 _AWAITED = {
     State.PREPARING: Kind.PREPARED,
     State.STAGED: Kind.RAM_VERIFIED,
     State.SAVE_PREPARING: Kind.FLASH_SENT,
 }
+_NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
 
 class WriteBack:
@@ -59,8 +74,9 @@ class WriteBack:
         self._desk = self._flow.desk
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
-        self._saw_reset = False
-        self._read_from_s = float("inf")  # since when the registers were being read; inf: told
+        self._restarts = RestartWatch()
+        self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
+        self._recheck = Recheck(policy.recheck_s)
 
     # -- what others ask ---------------------------------------------------------------------------
 
@@ -92,7 +108,7 @@ class WriteBack:
     @property
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
-        deadlines = [self._flow.deadline_s]
+        deadlines = [self._flow.deadline_s, self._desk.journal_again_s, self._recheck.due_s]
         if self._flow.watches_interlock:
             deadlines.append(self._desk.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
@@ -104,7 +120,7 @@ class WriteBack:
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
-        now = (self.history, self._desk.host_s, self._desk.wall_s)
+        now = (self.history, self._desk.host_s, self._desk.now)
         if self.state is State.PROVEN:
             return self._safe.save_holds(*now)
         reasons = self._safe.write_holds(*now)
@@ -119,6 +135,18 @@ class WriteBack:
         self._desk.host_s = host_s
         if self._flow.deadline_s is not None and host_s >= self._flow.deadline_s:
             self._flow.on_timeout()
+        if (again_s := self._desk.journal_again_s) is not None and host_s >= again_s:
+            self._desk.journal_again()
+        if self._recheck.is_due(host_s):
+            self._ask_again()
+        return self._answer()
+
+    def on_clock(
+        self, wall_s: float, boot_id: str, boot_s: float | None, host_s: float
+    ) -> list[Action]:
+        """The host's other clocks; the wall clock may have been set."""
+        self._desk.host_s = host_s
+        self._desk.set_clocks(wall_s, boot_id, boot_s)
         return self._answer()
 
     def on_device(
@@ -127,9 +155,7 @@ class WriteBack:
         registers: Mapping[int, Values],
         journal: Sequence[JournalRecord] | None,
         host_s: float,
-        wall_s: float,
         *,
-        uptime_s: float | None = None,
         session_keys: frozenset[int] = frozenset(),
         read_from_s: float = float("inf"),
     ) -> list[Action]:
@@ -139,18 +165,14 @@ class WriteBack:
                       with the values that the user had
         read_from_s:  when the reading of them began; see `on_uptime`
         journal:      this device's records, oldest first; None where they cannot be trusted
-        wall_s:       the wall clock at `host_s`; only for budgets that span restarts
-        uptime_s:     the device's own time since its start-up, where its stream says it
         """
         flow, self._desk.host_s = self._flow, host_s
-        self._desk.bind(identity.serial, journal, wall_s)
+        self._recheck.begin(host_s)
+        self._desk.bind(identity.serial, journal)
+        restarted = self._restarts.bind(identity.serial, read_from_s)
         self._safe.bind(identity, registers, journal is not None)
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
         self._desk.in_force(registers)
-        age_s = wall_s - self.history.last_wall_s
-        restarted = self._saw_reset or (uptime_s is not None and 0.0 <= uptime_s < age_s)
-        self._read_from_s = float("inf") if self._saw_reset else read_from_s
-        self._saw_reset = False
         if self.state is not State.RECONCILING:
             flow.enter(State.RECONCILING, "the device was read again")
         unfinished = self.history.open
@@ -161,6 +183,8 @@ class WriteBack:
     def on_no_device(self, registers: Mapping[int, Values] | None, host_s: float) -> list[Action]:
         """There is nobody to ask: mode passive, or a recording. Registers where they are known."""
         self._desk.host_s = host_s
+        self._restarts.lost()
+        self._recheck.off()
         identity = Affine.identity().to_register()
         self._flow.registers = {MAG: identity, GYRO: identity, **(registers or {})}
         self._safe.no_device("there is no device to write to")
@@ -170,38 +194,82 @@ class WriteBack:
     def on_link_lost(self, host_s: float) -> list[Action]:
         """The port went away."""
         self._desk.host_s = host_s
+        self._restarts.lost()
         self._flow.signal(Signal.LINK_LOST, "the link was lost")
         return self._answer()
 
-    def on_reset(self, host_s: float) -> list[Action]:
-        """The device restarted: its RAM is what its flash holds. `on_device` must follow."""
-        self._desk.host_s, self._saw_reset = host_s, True
+    def on_reset(self, host_s: float, uptime_s: float | None = None) -> list[Action]:
+        """The device restarted: its RAM is what its flash holds. `on_device` must follow.
+
+        uptime_s: its time since then, where that is what tells; then it must agree with the journal
+        """
+        self._desk.host_s = host_s
+        self._restarts.seen(self.history.last_at, self._desk.stamp, host_s, uptime_s)
         self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
     def on_uptime(self, uptime_s: float, host_s: float) -> list[Action]:
-        """The device's time since its start-up, once its stream tells: a restart nobody saw.
+        """The device's time since its start-up, as its stream tells: a restart that nobody saw.
 
-        One since the registers were read (the output of before had no device time) makes that
-        reading void. And only a restart shows what a save left in flash, so it is asked again then.
+        One since the registers were read makes that reading void. And only a restart shows what a
+        save left in flash, so it is asked again then.
+        """
+        desk, record = self._desk, self.history.last_at
+        desk.host_s = host_s
+        reason = self._restarts.heard(uptime_s, host_s)
+        if reason:
+            self._restarts.seen(record, desk.stamp, host_s, uptime_s)
+        elif (
+            self.history.open is not None
+            and self.state in RESTS
+            and self._restarts.proven(record, desk.stamp, host_s)
+        ):
+            self._restarts.concluded()
+            reason = "the device restarted since the journal's newest record"
+        else:
+            desk.device_s = uptime_s
+        if reason:
+            self._flow.signal(Signal.DEVICE_RESET, reason)
+            desk.ask(IdentifyAgain())
+        return self._answer()
+
+    def on_looked(self, seen: Seen | None, error: str, host_s: float) -> list[Action]:
+        """Who answered and what it holds, or why nobody did."""
+        self._desk.host_s, flow = host_s, self._flow
+        if flow.identity is None or self.state is State.RECONCILING or self._desk.running:
+            return self._answer()  # overtaken
+        if seen is None:
+            self._desk.note(
+                "warning", f"the device does not say who it is and what it holds: {error}"
+            )
+            self._recheck.soon(host_s)
+        elif seen.unit != flow.identity.unit:
+            flow.another(seen.unit)
+        elif changed := differences(flow.expected(seen.values), seen.values):
+            flow.changed(tuple(changed))
+        elif self.state is State.TRIAL and self._flow.passed and not self._safe.disagrees:
+            self._safe.proof_waits = ""
+            self._desk.record(Kind.PROVEN, reason=self._flow.passed)
+            flow.signal(Signal.TRIAL_PASSED, self._flow.passed)
+        return self._answer()
+
+    def on_doubt(self, reason: str, host_s: float, *, jumped: bool = False) -> list[Action]:
+        """The stream makes it doubtful whether this is still the device that was read.
+
+        jumped: its readings did, so what was proven before must be proven again.
         """
         self._desk.host_s = host_s
-        if uptime_s < host_s - self._read_from_s - UPTIME_MARGIN_S:
-            self._saw_reset = True
-            self._flow.signal(Signal.DEVICE_RESET, "the device restarted since it was read")
-            self._desk.ask(IdentifyAgain())
-            return self._answer()
-        age_s = self._desk.wall_s - self.history.last_wall_s
-        open_save = self.history.last in (Kind.FLASH_SENT, Kind.FLASH_ACKED)
-        resting = self.state in (State.FAULT, State.COMMITTED)
-        if open_save and resting and 0.0 <= uptime_s < age_s:
-            self._saw_reset = True
-            self._flow.signal(Signal.DEVICE_RESET, "the device restarted since the save")
-            self._desk.ask(IdentifyAgain())
+        self._desk.note("debug", f"{reason}: the device is asked again who it is")
+        self._safe.doubt(host_s)
+        if jumped:
+            self._flow.prove_again(reason)
+        self._recheck.soon(host_s)
         return self._answer()
 
     def on_samples(self, block: SampleBlock) -> list[Action]:
         """Raw samples: for the proof that the vehicle stands still."""
+        if len(block):
+            self._safe.sampled_s = float(block.host_s[-1])
         self._safe.stillness.update(block, self._gyro_bias_rad_s)
         return self._answer()
 
@@ -220,60 +288,101 @@ class WriteBack:
         *,
         flash_gates: tuple[GateResult, ...] = (),
         gyro_is_raw: bool = True,
+        sampled_s: float | None = None,
     ) -> list[Action]:
         """A new estimate and what the gates say: for RAM (none at all is no pass), and for flash.
 
         gyro_is_raw: see `composition.compose`.
+        sampled_s:   host time of the newest sample that was judged; None: now
         """
         self._desk.host_s, self._desk.at_s = host_s, at_s
-        self._safe.gates, self._safe.flash_gates = gates, flash_gates
+        self._safe.judged_s = host_s if sampled_s is None else sampled_s
+        fresh = sampled_s is None or sampled_s > self._safe.doubt_s
+        self._safe.gates, self._safe.flash_gates = gates, flash_gates if fresh else ()
         if np.isfinite(estimate.gyro_bias_rad_s).all():
             self._gyro_bias_rad_s = estimate.gyro_bias_rad_s
         if self.state in WITHOUT_TRANSACTION:
             self._flow.consider(estimate, gyro_is_raw)
+        elif self.state in LIVED_WITH:
+            self._flow.compare(estimate, gyro_is_raw)
+        return self._answer()
+
+    def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
+        """What was calibrated until now holds no more: something on the vehicle changed."""
+        self._desk.host_s, self._desk.at_s = host_s, at_s
+        self._safe.doubt(host_s)
+        self._flow.void(reason)
+        return self._answer()
+
+    def on_examined(self, sampled_s: float, host_s: float) -> list[Action]:
+        """The estimate has taken the samples up to this host time into account."""
+        self._desk.host_s, self._safe.examined_s = host_s, sampled_s
+        return self._answer()
+
+    def on_estimator_failed(self, host_s: float) -> list[Action]:
+        """There is no estimate, nor what the gates said of it: what rests on it ends."""
+        self._desk.host_s = host_s
+        self._safe.gates = self._safe.flash_gates = ()
+        self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the estimator failed")
+        self._flow.roll_back("estimator", "the estimator failed: nobody judges the new values")
+        return self._answer()
+
+    def on_limits_changed(self, host_s: float) -> list[Action]:
+        """The gates have other limits: what they said before allows nothing."""
+        self._desk.host_s = host_s
+        self._safe.gates = self._safe.flash_gates = ()
+        self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the limits of the gates were changed")
         return self._answer()
 
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
         """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
         self._desk.host_s = host_s
         reason = argument or "no reason given"
-        verbs: dict[str, Callable[[], None]] = {
+        verbs: dict[str, Callable[[], Answer]] = {
             "arm": partial(self._arm, True),
             "disarm": partial(self._arm, False),
             "approve": partial(self._flow.approve, argument),
             "lock": partial(self._flow.lock, reason),
             "unlock": partial(self._flow.unlock, reason),
-            "rollback": partial(self._flow.roll_back, "operator", "an operator asked for it"),
+            "rollback": self._flow.roll_back_by_hand,
         }
         if verb in verbs:
-            verbs[verb]()
+            self.operator_answer = verbs[verb]()
         else:
-            self._desk.note("warning", f"{verb!r} is no command; possible: {', '.join(verbs)}")
+            self.operator_answer = False, f"{verb!r} is no command; possible: {', '.join(verbs)}"
+        if not self.operator_answer[0]:
+            self._desk.note("warning", f"operator: {verb} refused: {self.operator_answer[1]}")
         return self._answer()
 
     def on_trial_metrics(self, metrics: TrialMetrics, host_s: float) -> list[Action]:
         """The new registers against the old ones on live samples."""
         self._desk.host_s = host_s
-        if self.state is State.TRIAL and metrics.finite:
-            self._flow.deadline_s = host_s + ON_TIMEOUT[State.TRIAL][0]
+        if self.state in (State.TRIAL, State.PROVEN) and metrics.finite:
+            self._flow.deadline_s = host_s + ON_TIMEOUT[self.state][0]
             finding, reason = self._flow.trial.judge(metrics)
-            if finding is Finding.FAILED:
+            if self.state is State.PROVEN:
+                self._flow.judge_proof(finding, reason)
+            elif finding is Finding.FAILED:
                 self._flow.roll_back("trial", reason)
-            elif finding is Finding.PASSED:
-                self._desk.record(Kind.PROVEN, reason=reason)
-                self._flow.signal(Signal.TRIAL_PASSED, reason)
+            elif finding is Finding.PASSED and not self._flow.passed:
+                self._recheck.now(host_s)  # proven is what the device still holds
+                self._ask_again()
+            if self.state is State.TRIAL:
+                self._flow.passed = reason if finding is Finding.PASSED else ""
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:
         """The daemon ends: what is only in RAM is undone, unless it is proven and to be kept."""
         self._desk.host_s, self._safe.stopping = host_s, True
+        self._desk.journal_again()
         if not (self.policy.keep_on_stop and self.state is State.PROVEN):
             self._flow.roll_back("stop", "the daemon stops")
         return self._answer()
 
     def on_journal_ok(self, kind: Kind, host_s: float) -> list[Action]:
         """The record is on the disk."""
-        self._desk.host_s, self._safe.journal_ok = host_s, True
+        self._desk.host_s = host_s
+        self._safe.journal_ok = self._desk.journaled(kind)
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNALLED, f"{kind.value} is in the journal")
         return self._answer()
@@ -281,6 +390,7 @@ class WriteBack:
     def on_journal_failed(self, kind: Kind, error: str, host_s: float) -> list[Action]:
         """The record is not on the disk. What waited for it does not happen."""
         self._desk.host_s, self._safe.journal_ok = host_s, False
+        self._desk.not_journaled(kind)
         self._desk.note("error", f"{kind.value} could not be journalled: {error}")
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNAL_FAILED, error)
@@ -292,6 +402,8 @@ class WriteBack:
         if name == self._desk.running and isinstance(result, Outcome):
             self._desk.running = ""
             self._flow.on_outcome(result)
+            if not result.as_expected:
+                self._recheck.now(host_s)
         return self._answer()
 
     def on_procedure_failed(self, name: str, error: Exception, host_s: float) -> list[Action]:
@@ -300,12 +412,27 @@ class WriteBack:
         if name == self._desk.running:
             self._desk.running = ""
             self._flow.on_failure(str(error))
+            self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()
 
-    def _arm(self, armed: bool) -> None:
+    def _ask_again(self) -> None:
+        """Have the device say who it is and what it holds, unless something else runs."""
+        flow, now_s = self._flow, self._desk.host_s
+        self._recheck.begin(now_s)
+        if flow.identity is None or self._desk.running or self.state in _NOT_ASKED:
+            self._recheck.soon(now_s)
+            return
+        expected = {n: flow.registers[n] for n in RECHECKED if n in flow.registers}
+        self._desk.ask(Look(flow.identity.unit, expected))
+
+    def _arm(self, armed: bool) -> Answer:
         """Whether this run may begin a write or a save; what is under way is not undone."""
         self._safe.armed = armed
-        self._desk.note("info", "armed: this run may write" if armed else NOT_ARMED)
+        text = "armed: this run may write" if armed else NOT_ARMED
+        self._desk.note("info", text)
+        if armed and self.policy.mode < Mode.STAGE:
+            return False, f"{self._flow.mode_forbids}"
+        return True, text if armed else "disarmed: this run writes nothing by itself"
 
     def _answer(self) -> list[Action]:
         """Take the steps that are due now, then hand over everything that was asked for."""

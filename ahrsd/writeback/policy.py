@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from ahrsd.calibration import Estimate
+from ahrsd.writeback.clocks import Now, passed_s
 from ahrsd.writeback.composition import Proposal
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.permissions import Mode
 
 DAY_S: Final = 86400.0
+CLEAR_SIGMAS: Final = 4.0
+VERDICT_AGE_S: Final = 600.0  # a save must be of what is true now, as an approval must
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +23,10 @@ class TrialPolicy:
     duration_s, turns: whichever comes first ends the trial; longer proves more [600 s, 2 turns]
     worse_percent, worse_for_s: undo where the live figure is worse than the old registers' on the
                        same samples by this, for this long [10 %, 60 s]
-    max_spread_percent: undo where std/mean of the corrected field exceeds this [2 %]
+    max_wrong_percent, wrong_sigmas: undo where an error of the calibration explains more of the
+                       corrected field than this, by so many of the figure's own sigmas [0.5 %, 2.5]
+    max_spread_percent: undo where std/mean of the corrected field exceeds this, whatever explains
+                       it [10 %]
     max_jump_deg:      undo where the heading jumped by this much more than predicted [5 deg]
     interlock:         undo where the vehicle withdraws its word; false lets the trial live through
                        driving, for vehicles whose word is only about the moment of writing [true]
@@ -29,7 +36,9 @@ class TrialPolicy:
     turns: float = 2.0
     worse_percent: float = 10.0
     worse_for_s: float = 60.0
-    max_spread_percent: float = 2.0
+    max_wrong_percent: float = 0.5
+    wrong_sigmas: float = 2.5
+    max_spread_percent: float = 10.0
     max_jump_deg: float = 5.0
     interlock: bool = True
 
@@ -69,6 +78,8 @@ class WriteBackPolicy:
     margin_after_rollback: and then only for changes so many times as large [2]
     rollbacks_to_lock: so many in a row lock the write-back [2]
     interlock_max_age_s: an older word of the vehicle counts as no [1]
+    recheck_s:         who answers and what it holds is read again so often, beside the running
+                       output, in every mode but passive [30 s]
     """
 
     mode: Mode = Mode.OBSERVE
@@ -89,6 +100,7 @@ class WriteBackPolicy:
     margin_after_rollback: float = 2.0
     rollbacks_to_lock: int = 2
     interlock_max_age_s: float = 1.0
+    recheck_s: float = 30.0
     trial: TrialPolicy = field(default_factory=TrialPolicy)
     still: StillPolicy = field(default_factory=StillPolicy)
 
@@ -107,35 +119,50 @@ def worth_writing(policy: WriteBackPolicy, history: History, proposal: Proposal)
     )
 
 
-def ram_budget(policy: WriteBackPolicy, history: History, wall_s: float) -> list[str]:
-    """Why RAM must not be written now; empty where it may. A clock set back does not help."""
+def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate) -> bool:
+    """Whether an estimate clearly speaks against the values that are in force.
+
+    By twice what is worth a write, and beyond its own uncertainty.
+    """
+    heading_deg = max(2.0 * policy.min_change_deg, CLEAR_SIGMAS * estimate.heading_sigma_deg)
+    gyro_rad_s = max(
+        2.0 * policy.min_gyro_change_rad_s, CLEAR_SIGMAS * float(estimate.sigma[9:].max())
+    )
+    return proposal.heading_change_deg > heading_deg or proposal.gyro_change_rad_s > gyro_rad_s
+
+
+def ram_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:
+    """Why RAM must not be written now; empty where it may. Times as `clocks.passed_s` reads them:
+    no clock that was wrong, or was set, makes one longer.
+    """
     reasons: list[str] = []
     if history.locked is not None:
         reasons.append(f"locked: {history.locked}; unlock to go on")
     if history.broken is not None:
         reasons.append(f"the journal's {history.broken} record cannot be understood")
-    writes = history.ram_writes_wall_s
-    if writes and wall_s - writes[-1] < policy.min_interval_s:
+    *writes_s, _ = passed_s((*history.ram_writes_at, history.newest_at), now)
+    if writes_s and writes_s[-1] < policy.min_interval_s:
         reasons.append(
-            f"the last write was {max(wall_s - writes[-1], 0.0):.0f} s ago, wait for "
-            f"{policy.min_interval_s:.0f} s"
+            f"the last write was {writes_s[-1]:.0f} s ago, wait for {policy.min_interval_s:.0f} s"
         )
-    today = sum(wall_s - at < DAY_S for at in writes)
+    today = sum(passed < DAY_S for passed in writes_s)
     if today >= policy.ram_writes_per_day:
         reasons.append(f"{today} RAM writes in a day, limit {policy.ram_writes_per_day}")
-    last = history.last_rollback_wall_s
-    if last is not None and wall_s - last < policy.cooldown_s:
-        reasons.append(
-            f"a rollback was {max(wall_s - last, 0.0) / 3600.0:.1f} h ago, wait for "
-            f"{policy.cooldown_s / 3600.0:.1f} h"
-        )
+    if history.rollback_at is not None:
+        since_s, _ = passed_s((history.rollback_at, history.newest_at), now)
+        if since_s < policy.cooldown_s:
+            reasons.append(
+                f"a rollback was {since_s / 3600.0:.1f} h ago, wait for "
+                f"{policy.cooldown_s / 3600.0:.1f} h"
+            )
     return reasons
 
 
-def flash_budget(policy: WriteBackPolicy, history: History, wall_s: float) -> list[str]:
+def flash_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:
     """Why flash must not be written now; empty where it may."""
     reasons: list[str] = []
-    today = sum(wall_s - at < DAY_S for at in history.flashes_wall_s)
+    *flashes_s, _ = passed_s((*history.flashes_at, history.newest_at), now)
+    today = sum(passed < DAY_S for passed in flashes_s)
     if today >= policy.flash_writes_per_day:
         reasons.append(f"{today} flash writes in a day, limit {policy.flash_writes_per_day}")
     if history.flashes >= policy.flash_writes_lifetime:

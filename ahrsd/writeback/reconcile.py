@@ -5,8 +5,10 @@ and not saved is lost with the device's power and keeps living with the program'
 holds the old values" is always a safe end. The one dangerous stretch is VNWNV itself, between
 FLASH_SENT and the next reading after a reset.
 
-The table is total over (last record, what the device holds). Where they contradict each other it
-raises an alarm; it never writes flash.
+The table is total over (last record, what the device holds, whether it is proven that the device
+restarted since that record). Where they contradict each other it raises an alarm; it never writes
+flash. After a restart that is proven the device holds what is in its flash, so what is neither the
+old values nor saved from here was saved by somebody: it is never written over without a person.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ class Kind(StrEnum):
 
     ABORTED = "ABORTED"  # nothing was changed
     ROLLED_BACK = "ROLLED_BACK"  # the old values were read back
+    REVERTED = "REVERTED"  # the old values are back, by whom is not known
     LOST = "LOST"  # the device restarted with the old values
     NOT_SAVED = "NOT_SAVED"  # VNWNV was sent, a restart brought the old values
     CONFIRMED = "CONFIRMED"  # J7: a restart brought the new values
@@ -58,12 +61,14 @@ OF_OUTPUTS: Final = (Kind.OUTPUTS_KEPT, Kind.OUTPUTS_BACK)
 
 
 class Found(Enum):
-    """What the device holds in the registers of a transaction."""
+    """What the device holds in the registers of a transaction; a restart counts if it is proven."""
 
     OLD = "the old values"
+    OLD_AFTER_RESTART = "the old values after a restart"
     NEW = "the new values"
     NEW_AFTER_RESTART = "the new values after a restart"
     MIXED = "some old and some new values"
+    MIXED_AFTER_RESTART = "some old and some new values after a restart"
     NEITHER = "neither the old nor the new values"
 
 
@@ -87,11 +92,11 @@ def found(
     is_old = {n: n in device and same(n, old[n], device[n]) for n in new}
     is_new = {n: n in device and same(n, new[n], device[n]) for n in new}
     if all(is_old.values()):
-        return Found.OLD
+        return Found.OLD_AFTER_RESTART if restarted else Found.OLD
     if all(is_new.values()):
         return Found.NEW_AFTER_RESTART if restarted else Found.NEW
     if all(is_old[n] or is_new[n] for n in new):
-        return Found.MIXED
+        return Found.MIXED_AFTER_RESTART if restarted else Found.MIXED
     return Found.NEITHER
 
 
@@ -109,6 +114,20 @@ def _undo(level: str, text: str) -> Resolution:
     return Resolution(Signal.UNDO, Kind.ROLLBACK, level, text)
 
 
+def _closed(record: Kind, level: str, text: str) -> Resolution:
+    return Resolution(Signal.NOTHING_OPEN, record, level, text)
+
+
+def _saved_by_others(what: str) -> Resolution:
+    return Resolution(
+        Signal.FOREIGN,
+        Kind.FOREIGN,
+        "error",
+        f"{what}, and somebody else saved registers: the device holds new values after a restart; "
+        "compare it with the journal, then unlock",
+    )
+
+
 _TORN: Final = Resolution(
     Signal.TORN,
     Kind.FLASH_TORN,
@@ -116,12 +135,19 @@ _TORN: Final = Resolution(
     "FLASH TORN: saving was interrupted and the device holds neither the old nor the new values; "
     "write the journal's old values by hand, check the heading, then unlock",
 )
-_SAVED_BY_OTHERS: Final = "somebody else saved the device's registers: they survived a restart"
+_CONFIRMED: Final = Resolution(
+    Signal.READ_CONFIRMED, Kind.CONFIRMED, "info", "the new values survived a restart"
+)
+_BACK: Final = (
+    "the device has its old values, and nobody knows why: a rollback that could not be journaled, "
+    "a restart that nobody saw, or a person"
+)
 
 TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
     Kind.PREPARED: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN, Kind.ABORTED, "info", "a write was prepared and never made"
+        Found.OLD: _closed(Kind.ABORTED, "info", "a write was prepared and never made"),
+        Found.OLD_AFTER_RESTART: _closed(
+            Kind.ABORTED, "info", "a write was prepared; the device restarted with its old values"
         ),
         Found.NEW: Resolution(
             Signal.RESUME_TRIAL,
@@ -129,22 +155,23 @@ TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
             "warning",
             "the device holds the new values of an interrupted write; the trial begins",
         ),
-        Found.NEW_AFTER_RESTART: _undo("error", f"{_SAVED_BY_OTHERS}, and were never tried"),
+        Found.NEW_AFTER_RESTART: _saved_by_others("a write was prepared"),
         Found.MIXED: _undo("warning", "a write was interrupted between its registers"),
+        Found.MIXED_AFTER_RESTART: _saved_by_others("a write was prepared"),
         Found.NEITHER: _foreign("a write was prepared"),
     },
     Kind.RAM_FAILED: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN, Kind.ROLLED_BACK, "info", "a failed write is undone"
-        ),
+        Found.OLD: _closed(Kind.ROLLED_BACK, "info", "a failed write is undone"),
+        Found.OLD_AFTER_RESTART: _closed(Kind.ROLLED_BACK, "info", "a failed write is undone"),
         Found.NEW: _undo("warning", "a failed write was not undone"),
-        Found.NEW_AFTER_RESTART: _undo("error", _SAVED_BY_OTHERS),
+        Found.NEW_AFTER_RESTART: _saved_by_others("a write failed"),
         Found.MIXED: _undo("warning", "a failed write was not undone"),
-        Found.NEITHER: _undo("warning", "a failed write left values that were never meant"),
+        Found.MIXED_AFTER_RESTART: _saved_by_others("a write failed"),
+        Found.NEITHER: _foreign("a write failed"),
     },
     Kind.RAM_VERIFIED: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN,
+        Found.OLD: _closed(Kind.REVERTED, "warning", f"a trial was under way; {_BACK}"),
+        Found.OLD_AFTER_RESTART: _closed(
             Kind.LOST,
             "warning",
             "the device restarted during the trial and has its old values: safe",
@@ -152,13 +179,14 @@ TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
         Found.NEW: Resolution(
             Signal.RESUME_TRIAL, None, "info", "the device kept the new values; the trial restarts"
         ),
-        Found.NEW_AFTER_RESTART: _undo("error", f"{_SAVED_BY_OTHERS}, and were not proven yet"),
+        Found.NEW_AFTER_RESTART: _saved_by_others("a trial was under way"),
         Found.MIXED: _undo("warning", "one of two registers went back by itself"),
+        Found.MIXED_AFTER_RESTART: _saved_by_others("a trial was under way"),
         Found.NEITHER: _foreign("a trial was under way"),
     },
     Kind.PROVEN: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN,
+        Found.OLD: _closed(Kind.REVERTED, "warning", f"proven values waited to be saved; {_BACK}"),
+        Found.OLD_AFTER_RESTART: _closed(
             Kind.LOST,
             "warning",
             "the device restarted before the proven values were saved and has its old ones: safe",
@@ -167,23 +195,31 @@ TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
             Signal.RESUME_PROVEN, None, "info", "the device kept the proven values"
         ),
         Found.NEW_AFTER_RESTART: Resolution(
-            Signal.READ_CONFIRMED, Kind.CONFIRMED, "warning", _SAVED_BY_OTHERS
+            Signal.READ_CONFIRMED,
+            Kind.CONFIRMED,
+            "warning",
+            "somebody else saved the device's registers: the proven values survived a restart",
         ),
         Found.MIXED: _undo("warning", "one of two registers went back by itself"),
+        Found.MIXED_AFTER_RESTART: _saved_by_others("proven values waited to be saved"),
         Found.NEITHER: _foreign("proven values waited to be saved"),
     },
     Kind.ROLLBACK: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN, Kind.ROLLED_BACK, "info", "a rollback is complete"
-        ),
+        Found.OLD: _closed(Kind.ROLLED_BACK, "info", "a rollback is complete"),
+        Found.OLD_AFTER_RESTART: _closed(Kind.ROLLED_BACK, "info", "a rollback is complete"),
         Found.NEW: _undo("warning", "a rollback was interrupted"),
-        Found.NEW_AFTER_RESTART: _undo("error", f"a rollback was interrupted; {_SAVED_BY_OTHERS}"),
+        Found.NEW_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
         Found.MIXED: _undo("warning", "a rollback was interrupted"),
+        Found.MIXED_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
         Found.NEITHER: _foreign("a rollback was interrupted"),
     },
     Kind.FLASH_SENT: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN,
+        Found.OLD: _closed(
+            Kind.REVERTED,
+            "warning",
+            f"saving was interrupted; {_BACK}; its flash may hold either, the next restart tells",
+        ),
+        Found.OLD_AFTER_RESTART: _closed(
             Kind.NOT_SAVED,
             "warning",
             "saving was interrupted and the device has its old values: not saved, safe",
@@ -192,18 +228,21 @@ TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
             Signal.UNRESOLVED,
             None,
             "error",
-            "nobody knows whether the registers were saved: switch the device off and on, then "
-            "they are read again",
+            "nobody knows whether the registers were saved: switch the device off and on while "
+            "this runs, then they are read again",
         ),
-        Found.NEW_AFTER_RESTART: Resolution(
-            Signal.READ_CONFIRMED, Kind.CONFIRMED, "info", "the new values survived a restart"
-        ),
+        Found.NEW_AFTER_RESTART: _CONFIRMED,
         Found.MIXED: _TORN,
+        Found.MIXED_AFTER_RESTART: _TORN,
         Found.NEITHER: _TORN,
     },
     Kind.FLASH_ACKED: {
-        Found.OLD: Resolution(
-            Signal.NOTHING_OPEN,
+        Found.OLD: _closed(
+            Kind.REVERTED,
+            "warning",
+            f"the new values were saved; {_BACK}; the next restart tells what its flash holds",
+        ),
+        Found.OLD_AFTER_RESTART: _closed(
             Kind.NOT_SAVED,
             "error",
             "the device acknowledged the save and still has its old values",
@@ -211,10 +250,9 @@ TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
         Found.NEW: Resolution(
             Signal.RESUME_COMMITTED, None, "info", "saved; the next restart confirms it"
         ),
-        Found.NEW_AFTER_RESTART: Resolution(
-            Signal.READ_CONFIRMED, Kind.CONFIRMED, "info", "the new values survived a restart"
-        ),
+        Found.NEW_AFTER_RESTART: _CONFIRMED,
         Found.MIXED: _TORN,
+        Found.MIXED_AFTER_RESTART: _TORN,
         Found.NEITHER: _TORN,
     },
 }

@@ -8,16 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ahrsd.events import GateResult
+from ahrsd.writeback.clocks import Now
 from ahrsd.writeback.composition import GYRO, MAG
 from ahrsd.writeback.journal_history import History
 from ahrsd.writeback.permissions import Mode, Purpose, permitted
-from ahrsd.writeback.policy import WriteBackPolicy, flash_budget, ram_budget
+from ahrsd.writeback.policy import VERDICT_AGE_S, WriteBackPolicy, flash_budget, ram_budget
 from ahrsd.writeback.stillness import Stillness
 from drivers.vn100.commands import Command, Word, Write
 from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
+UNEXAMINED_S = 2.0  # samples that the estimate has not seen yet may hold a step
 NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
 
 
@@ -32,6 +34,13 @@ class Safeguards:
         self.armed = policy.armed_at_start
         self.gates: tuple[GateResult, ...] = ()
         self.flash_gates: tuple[GateResult, ...] = ()
+        self.doubt_s = float("-inf")  # host time of the last doubt about what is in force
+        self.judged_s = float("-inf")  # host time of the newest verdict's samples
+        self.void = ""  # why the transaction's values hold no more
+        self.disagrees = ""  # how the newest estimate differs from them, or a gate does
+        self.proof_waits = ""  # why they must be proven again
+        self.sampled_s: float | None = None  # host time of the newest sample
+        self.examined_s: float | None = None  # and of the newest one in the estimate
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
         self._is_ours = False
@@ -63,11 +72,18 @@ class Safeguards:
                 f"this is the device {identity.serial}, writes are for {self._serial} only"
             )
         if not identity.profile.writable:
-            self._limits.append(f"firmware {identity.firmware!r} is unknown: observe only")
+            self._limits.append(f"observe only: {identity.profile.observed_for}")
         if missing := [n for n in (MAG, GYRO, HSI_CONTROL) if n not in registers]:
             self._limits.append(f"registers {missing} could not be read")
         if not journal_readable:
             self._limits.append("the journal cannot be read; see its error")
+
+    def doubt(self, host_s: float) -> None:
+        """What was judged of samples until now is of before a doubt: nothing is saved by it."""
+        if self.examined_s is not None:
+            self.examined_s = min(self.examined_s, host_s)
+        self.flash_gates, self.doubt_s = (), host_s
+        self.stillness.reset()
 
     def hear_interlock(self, safe: bool, host_s: float) -> None:
         """The vehicle's word."""
@@ -94,7 +110,7 @@ class Safeguards:
             return ""
         return self.interlock_holds(host_s)
 
-    def write_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
+    def write_holds(self, history: History, host_s: float, now: Now) -> list[str]:
         """Why no write may begin now, but for the approval."""
         reasons = list(self._limits)
         if self.policy.mode < Mode.STAGE:
@@ -108,10 +124,10 @@ class Safeguards:
             reasons.append("no gate has judged yet")
         if self._hsi_applied:
             reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
-        reasons += ram_budget(self.policy, history, wall_s)
+        reasons += ram_budget(self.policy, history, now)
         return reasons + self._always(host_s)
 
-    def save_holds(self, history: History, host_s: float, wall_s: float) -> list[str]:
+    def save_holds(self, history: History, host_s: float, now: Now) -> list[str]:
         """Why the flash may not be written now."""
         reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
         if not self.armed:
@@ -122,10 +138,22 @@ class Safeguards:
         reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.flash_gates if not gate.ok]
         if not self.flash_gates:
             reasons.append("no gate has judged for flash yet")
-        reasons += flash_budget(self.policy, history, wall_s)
+        reasons += flash_budget(self.policy, history, now)
+        reasons += self._not_as_judged(host_s)
         if still := self.stillness.why_not(host_s):
             reasons.append(still)
         return reasons + self._always(host_s)
+
+    def _not_as_judged(self, host_s: float) -> list[str]:
+        """Why what is in force may not be what was judged, or not be right any more."""
+        reasons = [word for word in (self.void, self.disagrees, self.proof_waits) if word]
+        if host_s - self.judged_s > VERDICT_AGE_S:
+            reasons.append(f"the newest verdict is {host_s - self.judged_s:.0f} s old")
+        if self.sampled_s is not None and self.examined_s is not None:
+            late_s = self.sampled_s - self.examined_s
+            if late_s > UNEXAMINED_S:
+                reasons.append(f"the newest {late_s:.0f} s of samples are not judged yet")
+        return reasons
 
     def allow(self, command: Command, purpose: Purpose, host_s: float) -> bool:
         """The gate in front of every command of the write-back.
@@ -143,6 +171,7 @@ class Safeguards:
             return (
                 self.armed
                 and self.journal_ok
+                and not (self.void or self.disagrees or self.proof_waits)
                 and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
             )
         return True

@@ -11,15 +11,17 @@ before the device does: nothing is sent until the record of what the device held
     STAGING       23 and 84 written and read back; from here on only ROLLING_BACK leads out
     STAGED        the device holds the new values in RAM; waits for the journal to say so too
     TRIAL         lives with them, is judged against the old ones on the same samples
-    PROVEN        was better, or not worse, for long enough; in mode `stage` it rests here
+    PROVEN        was better, or not worse, for long enough, and goes on being judged; what voids a
+                  trial ends it too; in mode `stage` it rests here
     SAVE_PREPARING waits for the journal to say that the flash is about to be written
     SAVING        session settings put back, every register compared, then VNWNV: one conversation
     COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
 
 "verified", "proven", "committed" and "confirmed" are different words on purpose.
 
-RECONCILING is entered at the start and whenever the link or the device went away: the registers are
-read and compared with the journal (`reconcile`), which says where to go on. FAULT is a device in a
+RECONCILING is entered at the start, whenever the link or the device went away, and whenever another
+device answers or this one holds what it should not: the registers are read and compared with the
+journal (`reconcile`), which says where to go on. FAULT is a device in a
 state that this program cannot mend alone; FLASH_TORN one whose flash holds neither the old nor the
 new values. Neither ends by itself. LOCKED: no writes until a person unlocks. In FAULT "unlock"
 means: look again.
@@ -79,6 +81,7 @@ class Signal(StrEnum):
     TIMEOUT = "timeout"
     LINK_LOST = "link lost"
     DEVICE_RESET = "device reset"
+    IN_DOUBT = "device in doubt"
     LOCK = "lock"
     UNLOCK = "unlock"
     NOTHING_OPEN = "nothing open"
@@ -94,7 +97,11 @@ class Signal(StrEnum):
 
 S, E = State, Signal
 
-_AWAY: Final = {E.LINK_LOST: S.RECONCILING, E.DEVICE_RESET: S.RECONCILING}
+_AWAY: Final = {
+    E.LINK_LOST: S.RECONCILING,
+    E.DEVICE_RESET: S.RECONCILING,
+    E.IN_DOUBT: S.RECONCILING,  # another device answers, or it holds what it should not
+}
 _WATCHING: Final = {**_AWAY, E.LOCK: S.LOCKED, E.WORTH_WRITING: S.CANDIDATE}
 
 TABLE: Final[dict[State, dict[Signal, State]]] = {
@@ -163,7 +170,13 @@ TABLE: Final[dict[State, dict[Signal, State]]] = {
         E.ROLL_BACK: S.ROLLING_BACK,
         E.TIMEOUT: S.ROLLING_BACK,
     },
-    S.PROVEN: {**_AWAY, E.SAVE_DUE: S.SAVE_PREPARING, E.ROLL_BACK: S.ROLLING_BACK},
+    S.PROVEN: {
+        **_AWAY,
+        E.SAVE_DUE: S.SAVE_PREPARING,
+        E.TRIAL_FAILED: S.ROLLING_BACK,
+        E.ROLL_BACK: S.ROLLING_BACK,
+        E.TIMEOUT: S.ROLLING_BACK,
+    },
     S.SAVE_PREPARING: {
         **_AWAY,
         E.JOURNALLED: S.SAVING,
@@ -202,6 +215,7 @@ ON_TIMEOUT: Final[dict[State, tuple[float, State]]] = {
     S.STAGING: (30.0, S.ROLLING_BACK),  # it may have been changed
     S.STAGED: (5.0, S.ROLLING_BACK),
     S.TRIAL: (60.0, S.ROLLING_BACK),  # since the last finite metric: unjudged is not proven
+    S.PROVEN: (600.0, S.ROLLING_BACK),  # since the last finite metric: a proof ages
     S.SAVE_PREPARING: (5.0, S.PROVEN),  # VNWNV was not sent
     S.SAVING: (30.0, S.FAULT),  # it may have been carried out: only a reset tells
     S.ROLLING_BACK: (30.0, S.FAULT),
@@ -219,6 +233,8 @@ CHANGED_IN_RAM: Final = frozenset(
         S.ROLLING_BACK,
     }
 )
+# The vehicle lives with new values that may still be undone: whatever voids them ends it.
+LIVED_WITH: Final = frozenset({S.TRIAL, S.PROVEN, S.SAVE_PREPARING, S.SAVING})
 WITHOUT_TRANSACTION: Final = frozenset(
     {S.OBSERVING, S.CANDIDATE, S.QUALIFIED, S.COMMITTED, S.CONFIRMED, S.ROLLED_BACK}
 )

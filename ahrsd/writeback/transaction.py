@@ -3,30 +3,40 @@
 Each conversation keeps the device's output paused while it lasts and returns whether the device
 was as expected; everything else is an error that the session reports. None of them undoes what it
 did: that is a conversation of its own, so that the gate knows a rollback from a write.
+
+A cable can be moved to another device between any two commands. So each conversation asks who
+answers before it compares, before every attempt to write a register, and before the save; what is
+judged of one device is never written into another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from ahrsd.writeback.composition import register_lines
-from drivers.vn100.commands import NoReply, NotPermitted, Procedure
+from drivers.vn100.commands import QUIET, NoReply, NotPermitted, Procedure, Write
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.firmware import Profile, profile_of
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
+    WRITE_TRIES,
     RestoreFailed,
+    Unit,
+    VerifyFailed,
     differences,
     quiet,
+    read,
     read_configuration,
     read_registers,
+    read_unit,
     restore,
+    resume,
     save_settings,
-    write_verified,
 )
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
 
 HSI_RESULT = 47  # changes by itself while the on-board estimator runs; nobody's setting
 
@@ -37,6 +47,7 @@ class Transaction:
 
     snapshot: every configuration register as the user has it, before the daemon touched anything
     approver: who said yes: "operator" or "auto"
+    model:    of the device; empty in records from before it was kept
     """
 
     id: str
@@ -47,6 +58,11 @@ class Transaction:
     snapshot: dict[int, Values]
     heading_change_deg: float
     approver: str
+    model: str = ""
+
+    def is_of(self, unit: Unit) -> bool:
+        """Whether this is the device that was judged."""
+        return unit == Unit(self.model or unit.model, self.serial, self.firmware)
 
     @property
     def profile(self) -> Profile:
@@ -58,6 +74,7 @@ class Transaction:
         return {
             "txn": self.id,
             "serial": self.serial,
+            "model": self.model,
             "firmware": self.firmware,
             "old": _to_json(self.old),
             "new": _to_json(self.new),
@@ -80,6 +97,7 @@ class Transaction:
             snapshot=_from_json(facts["snapshot"]),
             heading_change_deg=float(facts["heading_change_deg"]),
             approver=str(facts["approver"]),
+            model=str(facts.get("model", "")),
         )
 
 
@@ -93,15 +111,23 @@ def _from_json(registers: Mapping[str, list[float | int | str]]) -> dict[int, Va
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a conversation ended: as expected, or which registers were not, or what was refused."""
+    """How a conversation ended: as expected, or which registers were not, or what was refused.
+
+    other:   who answered, where it was not the transaction's device
+    written: whether a write may have gone out
+    """
 
     as_expected: bool
     differing: tuple[int, ...] = ()
     why: str = ""
+    other: Unit | None = None
+    written: bool = False
 
     def __str__(self) -> str:
         if self.as_expected:
             return "as expected"
+        if self.other is not None:
+            return f"another device answers: {self.other}"
         return self.why or f"registers {', '.join(map(str, self.differing))} differ"
 
 
@@ -110,17 +136,27 @@ def check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[O
 
     session_keys: settings that the daemon itself changed for the session; they may differ.
     """
-    return quiet(_compare(transaction, transaction.old, session_keys))
+    return quiet(_check(transaction, session_keys))
 
 
 def stage(transaction: Transaction) -> Procedure[Outcome]:
-    """Write the new values, each read back; nothing is written where the old ones are gone."""
+    """Write the new values, each read back, then all of them together with who answers.
+
+    Nothing is written where the old values are gone.
+    """
     return quiet(_stage(transaction))
 
 
-def roll_back(transaction: Transaction) -> Procedure[Outcome]:
-    """The old values again, read back; a register that has them is not written."""
-    return quiet(_roll_back(transaction))
+def roll_back(transaction: Transaction, *, only_ours: bool) -> Procedure[Outcome]:
+    """The old values again, read back; a register that has them is not written.
+
+    Every register is tried before a failure is reported, and all of them also where the device does
+    not let its output be paused: that makes replies slower, and is no reason to leave values in it.
+
+    only_ours: nothing is written where a register holds neither the old nor the new value, for
+    then somebody else wrote it
+    """
+    return _roll_back(transaction, only_ours)
 
 
 def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
@@ -133,6 +169,36 @@ def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Ou
     return quiet(_save(transaction, session_keys))
 
 
+def _other(transaction: Transaction) -> Procedure[Unit | None]:
+    """Who answers, where it is another device; asked twice, for a reply may be altered."""
+    unit = yield from read_unit()
+    if transaction.is_of(unit):
+        return None
+    unit = yield from read_unit()
+    return None if transaction.is_of(unit) else unit
+
+
+def _stranger(transaction: Transaction) -> Procedure[Unit | None]:
+    """The same within a conversation that has asked already: the serial number is enough."""
+    if int((yield from read(3))[0]) == transaction.serial:
+        return None
+    return (yield from _other(transaction))
+
+
+def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
+    """Registers that do not hold what is expected, in two readings."""
+    changed = differences(expected, (yield from read_registers(expected)))
+    if changed:
+        changed = differences(expected, (yield from read_registers(expected)))
+    return tuple(changed)
+
+
+def _check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
+    if (other := (yield from _other(transaction))) is not None:
+        return Outcome(False, other=other)
+    return (yield from _compare(transaction, transaction.old, session_keys))
+
+
 def _compare(
     transaction: Transaction, expected: Mapping[int, Values], ignored: frozenset[int]
 ) -> Procedure[Outcome]:
@@ -143,24 +209,106 @@ def _compare(
 
 
 def _stage(transaction: Transaction) -> Procedure[Outcome]:
-    now = yield from read_registers(transaction.new)
-    if changed := differences(transaction.old, now):
-        return Outcome(False, tuple(changed))
+    if (other := (yield from _other(transaction))) is not None:
+        return Outcome(False, other=other)
+    if changed := (yield from _changed(transaction.old)):
+        return Outcome(False, changed)
+    written = False
     for number, values in transaction.new.items():
-        yield from write_verified(number, values)
-    return Outcome(True)
+        refused = yield from _write(transaction, number, values, written)
+        if refused is not None:
+            return refused
+        written = True
+    return (yield from _together(transaction, transaction.new))
 
 
-def _roll_back(transaction: Transaction) -> Procedure[Outcome]:
-    yield from restore(transaction.old, transaction.old)
-    return Outcome(True)
+def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
+    abandoned = False
+    try:
+        with suppress(NoReply, DeviceRefused):
+            yield QUIET
+        return (yield from _put_back(transaction, only_ours))
+    except GeneratorExit:  # dropped without an end: nobody is there to carry out a command
+        abandoned = True
+        raise
+    finally:
+        if not abandoned:
+            with suppress(NoReply, DeviceRefused):  # the registers are what the outcome is about
+                yield from resume()
+
+
+def _together(transaction: Transaction, expected: Mapping[int, Values]) -> Procedure[Outcome]:
+    """Both registers in one reading, and whose they are: a restart between two writes shows."""
+    if (other := (yield from _stranger(transaction))) is not None:
+        return Outcome(False, other=other, written=True)
+    changed = yield from _changed(expected)
+    return Outcome(not changed, changed, written=True)
+
+
+def _write(
+    transaction: Transaction, number: int, values: Values, written: bool
+) -> Procedure[Outcome | None]:
+    """Write a register of the transaction's device; the outcome where another one answers.
+
+    written: whether something was before
+
+    Each attempt is one command, and who answers is asked right before it: what takes over the cable
+    in the silence behind an attempt is not written. Raises VerifyFailed.
+    """
+    back: Values = ()
+    for _ in range(WRITE_TRIES):
+        if (other := (yield from _stranger(transaction))) is not None:
+            return Outcome(False, other=other, written=written)
+        written = True
+        with suppress(NoReply):  # carried out or not: the read says which
+            yield Write(number, values, once=True)
+        back = yield from read(number)
+        if same(number, values, back[: len(values)]):
+            return None
+    raise VerifyFailed(number, values, back)
+
+
+def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
+    if (other := (yield from _stranger(transaction))) is not None:
+        return Outcome(False, other=other)
+    if only_ours and (strange := (yield from _strange(transaction))):
+        return Outcome(False, strange)
+    errors: dict[int, Exception] = {}
+    for number, values in transaction.old.items():
+        refused: Outcome | None = None
+        try:
+            if not same(number, values, (yield from read(number))):
+                refused = yield from _write(transaction, number, values, True)
+        except (DeviceRefused, NoReply, VerifyFailed) as error:
+            errors[number] = error
+        if refused is not None:
+            return refused
+    if errors:
+        raise RestoreFailed(errors)
+    return (yield from _together(transaction, transaction.old))
+
+
+def _strange(transaction: Transaction) -> Procedure[tuple[int, ...]]:
+    """Registers that hold neither the old nor the new value, in two readings."""
+    found: tuple[int, ...] = ()
+    for _ in range(2):
+        now = yield from read_registers(transaction.old)
+        old, new = differences(transaction.old, now), differences(transaction.new, now)
+        found = tuple(sorted(old.keys() & new.keys()))
+        if not found:
+            return ()
+    return found
 
 
 def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
     keys = [number for number in SESSION_SETTINGS if number in session_keys]
     try:
+        if (other := (yield from _other(transaction))) is not None:
+            return Outcome(False, other=other)
         yield from restore(transaction.snapshot, keys)
         outcome = yield from _compare(transaction, transaction.new, frozenset())
+        if outcome.as_expected:
+            outcome = yield from _together(transaction, transaction.new)
     except (NotPermitted, RestoreFailed, NoReply, DeviceRefused) as error:
         return Outcome(False, why=str(error))
     if outcome.as_expected:

@@ -24,6 +24,9 @@ class TrialMetrics:
                        into one frame, in parts of the field; `old`: the least with either or both
                        of the registers put back; 0 while nothing is known
     heading_jump_deg:  how far the heading moved when the registers changed; None: not seen yet
+    wrong, old_wrong:  how much of the corrected field an error of the calibration still explains,
+                       in parts of the field; nan while nothing is known
+    wrong_sigmas:      by how many of its own sigmas that is beyond the limit; negative: within
     """
 
     duration_s: float
@@ -34,6 +37,9 @@ class TrialMetrics:
     heading_jump_deg: float | None = None
     new_swing: float = 0.0
     old_swing: float = 0.0
+    wrong: float = float("nan")
+    old_wrong: float = float("nan")
+    wrong_sigmas: float = float("nan")
 
     @property
     def finite(self) -> bool:
@@ -70,7 +76,9 @@ class Trial:
         policy = self._policy
         if self._worse_since_s is not None:
             return Finding.GOES_ON, "worse than the old registers for the moment"
-        if metrics.duration_s >= policy.duration_s or metrics.turns >= policy.turns:
+        # turns end a trial only once they have been judged
+        turned = metrics.turns >= policy.turns and np.isfinite(metrics.wrong_sigmas)
+        if metrics.duration_s >= policy.duration_s or turned:
             return Finding.PASSED, (
                 f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
                 f"{metrics.old_figure:.2%} ({metrics.duration_s:.0f} s, {metrics.turns:.1f} turns)"
@@ -84,6 +92,12 @@ class Trial:
             return (
                 f"the corrected field varies by {spread_percent:.1f} %, "
                 f"limit {policy.max_spread_percent} %"
+            )
+        if metrics.wrong_sigmas > policy.wrong_sigmas:
+            return (
+                f"an error of the calibration explains {metrics.wrong:.2%} of the corrected field "
+                f"(with the old registers {metrics.old_wrong:.2%}), clearly more than "
+                f"{policy.max_wrong_percent} %"
             )
         if (jump := metrics.heading_jump_deg) is not None and self._unexpected(jump):
             return f"the heading jumped by {jump:.1f} deg, predicted {self._predicted_deg:.1f} deg"

@@ -8,7 +8,8 @@ to 77 name the port, so first the own port is found: register 6 without a port p
 port in use; after writing 0 to it, the port whose register 6 reads 0 is ours (where both do, 1 is
 written for a moment). Where firmware does not tell the ports apart, the usual way remains: try
 port 1, and if 300 ms are silent, port 2. Outputs that also or only go to the other port keep going
-there, unchanged.
+there, unchanged. Where the packet does not come from the register that is free, it gets that of an
+output that goes to both ports, which goes on to the other port from the free one.
 """
 
 from __future__ import annotations
@@ -63,6 +64,9 @@ class CalibrationStream:
     values: Values
     rate_hz: float
 
+    def __str__(self) -> str:
+        return f"register {self.output}, {self.layout} at {self.rate_hz:g} Hz"
+
     @property
     def layout(self) -> str:
         """Name of the layout of its packets."""
@@ -108,8 +112,11 @@ def configure_stream(
         if differences({n: saved[n] for n in present}, present):
             yield from quiet(restore(saved, SESSION_SETTINGS))
         port = yield from quiet(_silence_and_find_port())
-        for candidate in (port,) if port else (1, 2):
-            stream = yield from quiet(_set_up(saved, candidate, divisor))
+        ports = (port,) if port else (1, 2)
+        tries = [(candidate, False) for candidate in ports]
+        tries += [(candidate, True) for candidate in ports if _shared(saved)]
+        for candidate, move in tries:
+            stream = yield from quiet(_set_up(saved, candidate, divisor, move))
             heard = yield Pause(max(LISTEN_S, 3 * divisor / SAMPLE_RATE_HZ))
             if stream.layout in heard.tokens:
                 return stream
@@ -122,11 +129,12 @@ def configure_stream(
     raise nothing
 
 
-def left_by_session(register: int, users: Values, present: Values) -> bool:
-    """Whether `present` is what `configure_stream` leaves in a register of a user with `users`.
+def left_by_session(register: int, outputs: Mapping[int, Values], present: Values) -> bool:
+    """Whether `present` is what `configure_stream` leaves in a register of a user with `outputs`.
 
     At its end, or where it was broken off half way. The user's own value is none of its.
     """
+    users = outputs[register]
     if same(register, users, present):
         return False
     if register == 6:
@@ -138,6 +146,9 @@ def left_by_session(register: int, users: Values, present: Values) -> bool:
     mode, other = int(present[0]), int(users[0]) & ~int(present[0])
     if mode in _OTHER_PORT and other and same(register, (mode, *users[1:]), present):
         return True  # taken off one port, kept on the other
+    for number in _shared(outputs):
+        if mode in _OTHER_PORT and same(register, (mode, *outputs[number][1:]), present):
+            return True  # moved here, kept on the other port
     words = tuple(int(value) for value in present[2:])
     packets = [(GROUPS, TIME_WORD, word) for word in (IMU_WORD, IMU_WORD_WITHOUT_SATURATION)]
     return mode in _OTHER_PORT and words in packets
@@ -178,8 +189,18 @@ def _only_port_with_type(output_type: int) -> Procedure[int | None]:
     return found[0] if len(found) == 1 else None
 
 
-def _set_up(saved: dict[int, Values], port: int, divisor: int) -> Procedure[CalibrationStream]:
-    """The packet on `port` in the first output register that the other port does not use."""
+def _shared(outputs: Mapping[int, Values]) -> list[int]:
+    """Registers of binary outputs that go to both ports."""
+    return [n for n in BINARY_OUTPUTS if n in outputs and int(outputs[n][0]) == 3]
+
+
+def _set_up(
+    saved: dict[int, Values], port: int, divisor: int, move: bool
+) -> Procedure[CalibrationStream]:
+    """The packet on `port` in the first output register that the other port does not use.
+
+    move: in the first one that both ports use, whose output moves to that register
+    """
     other = _OTHER_PORT[port]
     free = [number for number in BINARY_OUTPUTS if not int(saved[number][0]) & other]
     if not free:
@@ -188,14 +209,18 @@ def _set_up(saved: dict[int, Values], port: int, divisor: int) -> Procedure[Cali
         mode = int(saved[number][0])
         if mode & port:
             rest = BINARY_OUTPUT_OFF if mode == port else (other, *saved[number][1:])
-            yield from write_verified(number, rest)
+            yield from write_verified(number, rest, held=True)
+    own = free[0]
+    if move:
+        own = _shared(saved)[0]
+        yield from write_verified(free[0], (other, *saved[own][1:]), held=True)
     for word in (IMU_WORD, IMU_WORD_WITHOUT_SATURATION):
         values = (port, divisor, GROUPS, TIME_WORD, word)
         try:
-            yield from write_verified(free[0], values)
+            yield from write_verified(own, values)
         except DeviceRefused as error:
             if error.code != INVALID_PARAMETER or word == IMU_WORD_WITHOUT_SATURATION:
                 raise
         else:
             break
-    return CalibrationStream(free[0], values, SAMPLE_RATE_HZ / divisor)
+    return CalibrationStream(own, values, SAMPLE_RATE_HZ / divisor)

@@ -9,7 +9,7 @@ Codes".
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from drivers.vn100.decode import Reply
@@ -92,6 +92,8 @@ class Read:
 
     def answered_by(self, reply: Reply) -> bool:
         """Whether `reply` is one to this: the word, the register, and values that it can have."""
+        if not reply.tokens and self.register != USER_TAG:  # a command's echo, not an answer
+            return False
         values = _values(self.register, "VNRRG", reply)
         return values is not None and (self.port is None or values[1:] == (self.port,))
 
@@ -101,18 +103,24 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Write a register in RAM. RegisterValueError where the device would refuse the values."""
+    """Write a register in RAM. RegisterValueError where the device would refuse the values.
+
+    held: the device itself held these values, so they may go back whatever the manual says of them
+    once: not repeated after a silence, in which another device may have taken over the cable
+    """
 
     register: int
     values: Values
+    held: bool = field(default=False, compare=False)
+    once: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
-        format_command(self.register, self.values)
+        format_command(self.register, self.values, held=self.held)
 
     @property
     def body(self) -> str:
         """What goes between $ and *."""
-        return f"VNWRG,{format_command(self.register, self.values)}"
+        return f"VNWRG,{format_command(self.register, self.values, held=self.held)}"
 
     def answered_by(self, reply: Reply) -> bool:
         """Whether `reply` echoes these values; an echo of others is another program's."""
@@ -165,6 +173,7 @@ class Pause:
 
 Command = Read | Write | Word | Pause
 Speech = Read | Write | Word
+USER_TAG = 0
 RESUME = Word("VNASY", (1,))
 QUIET = Word("VNASY", (0,))
 
@@ -174,23 +183,30 @@ Procedure = Generator[Command, Reply, T]
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """How long one reply may take (None: the session's own figure) and how often to ask."""
+    """How long one reply may take (None: the session's own figure) and how often to ask.
+
+    tries:   where no reply comes
+    damaged: where a VNERR says at once that the command arrived damaged
+    """
 
     reply_s: float | None = None
     tries: int = 3
+    damaged: int = 3
 
 
 # Never repeated without an answer: a second VNWNV costs flash, a second reset restarts the filter
 # again. Whoever gets NoReply reads registers to see what happened.
 _PATIENCE = {
-    "VNWNV": Patience(2.0, 1),
-    "VNRST": Patience(3.0, 1),
-    "VNRFS": Patience(3.0, 1),
+    "VNWNV": Patience(2.0, 1, 1),
+    "VNRST": Patience(3.0, 1, 1),
+    "VNRFS": Patience(3.0, 1, 1),
 }
 
 
 def patience(command: Speech) -> Patience:
     """Timing of a command: UM001 gives none, these are what works in the field."""
+    if isinstance(command, Write) and command.once:
+        return Patience(tries=1)
     return _PATIENCE.get(command.word, Patience()) if isinstance(command, Word) else Patience()
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.vn100.binary import BinaryLayout
 from drivers.vn100.deframer import Packet, Sentence
+from drivers.vn100.errors import code_of
 from drivers.vn100.fields import Layout
 from drivers.vn100.sentences import (
     COMMAND_WORDS,
@@ -26,10 +27,10 @@ from drivers.vn100.sentences import (
     sentence_layout,
 )
 
-_ERROR_CODE = re.compile(r"[0-9A-Fa-f]{1,2}")
 _REGISTER = re.compile(r"[0-9]{1,3}")
-_COUNT = re.compile(r"T[0-9]{1,10}")
+_COUNT = re.compile(r"T[0-9]{1,20}")  # a time in ns has more digits than a count
 _STATUS = re.compile(r"S[0-9A-Fa-f]{1,4}")
+_OTHER = re.compile(r"VN[A-Z0-9]{3}")
 _LAYOUTS = {name: sentence_layout(name) for name in MESSAGES}
 
 
@@ -69,7 +70,18 @@ class Undecodable:
     offset: int
 
 
-Decoded = Measurement | Reply | ErrorReply | Undecodable
+@dataclass(frozen=True, slots=True)
+class Unused:
+    """A whole message of which nothing is used: another model's, or fields that no VN-100 has.
+
+    name: "VNINS", or header bytes and field words of a packet
+    """
+
+    name: str
+    offset: int
+
+
+Decoded = Measurement | Reply | ErrorReply | Undecodable | Unused
 
 
 def decode(frame: Sentence | Packet) -> Decoded:
@@ -85,7 +97,7 @@ def decode(frame: Sentence | Packet) -> Decoded:
 
 def _decode_reply(
     word: str, tokens: list[str], frame: Sentence
-) -> Reply | ErrorReply | Undecodable:
+) -> Reply | ErrorReply | Undecodable | Unused:
     if word in REGISTER_WORDS:
         if not tokens or not _REGISTER.fullmatch(tokens[0]):
             return Undecodable(f"{word} without a register number", frame.offset)
@@ -93,9 +105,12 @@ def _decode_reply(
     if word in COMMAND_WORDS:
         return Reply(word, None, tuple(tokens))
     if word == "VNERR":
-        if len(tokens) != 1 or not _ERROR_CODE.fullmatch(tokens[0]):
+        code = code_of(tokens)
+        if code is None:
             return Undecodable("VNERR without an error code", frame.offset)
-        return ErrorReply(int(tokens[0], 16))
+        return ErrorReply(code)
+    if _OTHER.fullmatch(word):
+        return Unused(word, frame.offset)
     return Undecodable(f"{word} is not a message of a VN-100", frame.offset)
 
 
@@ -109,6 +124,10 @@ def decode_batch(packets: Sequence[Packet]) -> NDArray[np.float64]:
     if len(layouts) != 1:
         raise ValueError(f"a batch is packets of one layout, not of {len(layouts)}")
     (layout,) = layouts
+    if layout.repeats:
+        rows = [decode(packet) for packet in packets]
+        nothing = (np.nan,) * len(layout.columns)
+        return np.array([r.values if isinstance(r, Measurement) else nothing for r in rows])
     wire = np.frombuffer(b"".join([packet.data for packet in packets]), _wire_type(layout))
     values = np.empty((len(packets), len(layout.columns)))
     for place, per_si in enumerate(layout.per_si):
@@ -133,11 +152,11 @@ def _wire_type(layout: BinaryLayout) -> np.dtype[np.void]:
 _NUMPY_CODES = {"f": "f4", "Q": "u8", "I": "u4", "H": "u2"}
 
 
-def _decode_packet(packet: Packet) -> Measurement | Undecodable:
+def _decode_packet(packet: Packet) -> Measurement | Undecodable | Unused:
     layout = packet.layout
     values = tuple(map(truediv, layout.unpack(packet.data), layout.per_si))
     if not values:
-        return Undecodable(f"{layout.name} has nothing that a VN-100 measures", packet.offset)
+        return Unused(layout.name, packet.offset)
     if not all(map(math.isfinite, values)):
         bad = next(c.name for c, v in zip(layout.columns, values) if not math.isfinite(v))
         return Undecodable(f"{layout.name}: {bad} is not finite", packet.offset)

@@ -3,13 +3,14 @@
 Theory of operation (vn100-protocol 1.4)
 ========================================
 
-**Starts.** ``$VN`` starts a line. ``FA`` starts a packet if its header is one that a VN-100 can
-send (`generic`: any model of known layout). Whatever else is between messages is noise, NMEA
-sentences of other devices included.
+**Starts.** ``$VN`` starts a line. ``FA`` starts a packet if its header is one of known layout, of
+whichever model. Whatever else is between messages is noise, NMEA sentences of other devices
+included.
 
-**Candidates.** A line ends at ``\\n`` and dies at ``$``, at a byte that is not printable and at the
-length limit. A packet ends where its header says. A candidate that fails is left by one byte: the
-next start inside of it is tried.
+**Candidates.** A line ends at ``\\n``, with up to two ``\\r`` before it (a port in text mode adds
+one), or at ``\\r`` alone where the next message begins there. It dies at ``$``, at a byte that is
+not printable and at the length limit. A packet ends where its header says. A candidate that fails
+is left by one byte: the next start inside of it is tried.
 
 **Which message wins.** Behind a valid message a packet of a layout that was seen before is believed
 and waited for. Anywhere else all starts are followed in parallel and the message that ends first
@@ -18,9 +19,11 @@ the stream only, so how the stream is cut into chunks changes nothing.
 
 **Damage** is counted by cause and never raised; the bytes are kept until `take_skipped`. A message
 is *rejected* when its start was recognised and then its checksum, CRC or content refused it; each
-such start counts once. Two lines that became one because the bytes between were lost are one. Where
-a new ``$`` breaks a line off, that is one for the first, and the second is judged by itself. A
-start that silence cut (`Cause.CUT`) was refused by nobody: it is damage, but not rejected.
+such start counts once. A header with fields that no VN-100 has is recognised only behind a whole
+packet with it: most of them are bytes of something else. Two lines that became one because the
+bytes between were lost are one. Where a new ``$`` breaks a line off, that is one for the first, and
+the second is judged by itself. A start that silence cut (`Cause.CUT`) was refused by nobody: it is
+damage, but not rejected.
 
     fed bytes = bytes of valid messages + skipped bytes + pending        always
 """
@@ -32,9 +35,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 
-from drivers.vn100.binary import SYNC, BinaryLayout, layout_of, packet_size, read_header
+from drivers.vn100.binary import SYNC, BinaryLayout, is_of_vn100, layout_of, read_header, size_in
 from drivers.vn100.checksum import packet_intact
-from drivers.vn100.sentences import COMMAND_LINE, LINE, line_intact
+from drivers.vn100.sentences import COMMAND_LINE, LINE, LINE_AT_THE_END, line_intact
 
 LONGEST_LINE = 320
 LONGEST_COMMAND = 256  # receive buffer of the device
@@ -42,11 +45,12 @@ KEPT_SKIPPED_BYTES = 65536  # of what nobody took; a feed's own skipped bytes ar
 _TRUSTED_LAYOUTS = 8
 
 _LINE_END = re.compile(rb"[^ -#%-~]")  # not printable, or $
+_UNCHECKED = re.compile(rb"\$VN[A-Z]{3},[^*\r\n]*(?:\*XX)?\r*\n")
 _CR, _LF = 0x0D, 0x0A
 _LINE_START = rb"\$(?:\Z|V(?:\Z|N))"
 _COMMAND_STARTS = re.compile(_LINE_START)
-_STARTS = re.compile(_LINE_START + rb"|\xfa(?:\Z|[\x01-\x07\x10-\x17])")
-_GENERIC_STARTS = re.compile(_LINE_START + rb"|\xfa(?:\Z|[\x01-\x7f])")
+# a second group byte can only announce GNSS3
+_STARTS = re.compile(_LINE_START + rb"|\xfa(?=\Z|[\x01-\x7f]|[\x80-\xff](?:\Z|\x20))")
 
 
 class Cause(Enum):
@@ -101,13 +105,17 @@ class Skipped:
 
 @dataclass(slots=True)
 class Counters:
-    """Running totals. `damage`: recognised starts of messages that came to nothing, by cause."""
+    """Running totals. `damage`: recognised starts of messages that came to nothing, by cause.
+
+    unchecked: lines that carry no checksum, or XX in place of one; they are among the damage
+    """
 
     fed_bytes: int = 0
     valid_bytes: int = 0
     skipped_bytes: int = 0
     sentences: int = 0
     packets: int = 0
+    unchecked: int = 0
     damage: dict[Cause, int] = field(default_factory=dict)
 
     @property
@@ -147,15 +155,13 @@ class Deframer:
     """Bytes in, messages with a right checksum out; see the module.
 
     host_side: read what a host sends: lines only, ``*XX`` accepted as checksum (the emulator).
-    generic:   accept the packets of other VectorNav models too, as far as lengths are known.
     """
 
-    def __init__(self, *, host_side: bool = False, generic: bool = False) -> None:
+    def __init__(self, *, host_side: bool = False) -> None:
         self.counters = Counters()
         self._line = COMMAND_LINE if host_side else LINE
         self._longest = LONGEST_COMMAND if host_side else LONGEST_LINE
-        self._starts = _COMMAND_STARTS if host_side else _GENERIC_STARTS if generic else _STARTS
-        self._generic = generic
+        self._starts = _COMMAND_STARTS if host_side else _STARTS
         self._buffer = b""
         self._base = 0  # offset of the buffer's first byte in the stream
         self._synced = False  # the buffer begins right behind a valid message
@@ -243,7 +249,7 @@ class Deframer:
                     layout = self._trusted_at(buffer, position)
                     if layout is None:
                         break
-                stop = position + layout.size
+                stop = position + layout.size_in(buffer, position)
                 data = buffer[position:stop]
                 if stop > available or not packet_intact(data):
                     decided = stop
@@ -280,7 +286,7 @@ class Deframer:
             start = match.start()
             if winner is not None and start >= winner.stop:
                 break
-            candidate = self._examine(buffer, start)
+            candidate = self._examine(buffer, start, final)
             if candidate is None:
                 continue
             candidates.append(candidate)
@@ -295,37 +301,39 @@ class Deframer:
         self._skip(buffer, position, until, _causes(before, now, otherwise))
         return (None if winner is None else winner.frame), until
 
-    def _examine(self, buffer: bytes, start: int) -> _Candidate | None:
+    def _examine(self, buffer: bytes, start: int, final: bool) -> _Candidate | None:
         """What the start at `start` leads to; None where it turns out not to be one."""
         if buffer[start] != SYNC:
-            return self._examine_line(buffer, start)
+            return self._examine_line(buffer, start, final)
         header = read_header(buffer, start)
         if not header:
             return _Candidate(start, recognised=False)
-        size = packet_size(header, self._generic)
+        size = size_in(header, buffer, start)
         if not size:
             return None
+        likely = is_of_vn100(header) or any(header == layout.header for layout in self._trusted)
         stop = start + size
         if stop > len(buffer):
-            return _Candidate(start)
+            return _Candidate(start, recognised=likely)
         data = buffer[start:stop]
         if not packet_intact(data):
-            return _Candidate(start, stop, stop, Cause.CRC)
+            return _Candidate(start, stop, stop, Cause.CRC) if likely else None
         frame = Packet(layout_of(header), data, self._base + start)
         return _Candidate(start, stop, stop, None, frame)
 
-    def _examine_line(self, buffer: bytes, start: int) -> _Candidate:
+    def _examine_line(self, buffer: bytes, start: int, final: bool) -> _Candidate:
         if len(buffer) < start + 3:
             return _Candidate(start, recognised=False)
         limit = start + self._longest
-        match = self._line.match(buffer, start, limit)
+        ends = final and self._line is LINE and len(buffer) < limit
+        match = (LINE_AT_THE_END if ends else self._line).match(buffer, start, limit)
         if match is not None and line_intact(match):
             stop = match.end()
             frame = Sentence(match[1].decode(), self._base + start, stop - start)
             return _Candidate(start, stop, stop, None, frame)
         end = _LINE_END.search(buffer, start + 1, limit)
-        stop = end.start() if end is not None else limit
-        if stop < limit and buffer[stop] == _CR:
+        stop = printed = end.start() if end is not None else limit
+        while stop < min(limit, len(buffer), printed + 2) and buffer[stop] == _CR:
             stop += 1
         if stop >= limit:
             waits = len(buffer) < limit
@@ -359,6 +367,10 @@ class Deframer:
                 stop = min(stop, candidate.stop)
             self._keep(buffer, candidate.start, stop, cause)
             self.counters.damage[cause] = self.counters.damage.get(cause, 0) + 1
+            if cause is Cause.CHECKSUM and _UNCHECKED.fullmatch(
+                buffer, candidate.start, candidate.stop
+            ):
+                self.counters.unchecked += 1
             position = stop
         self._keep(buffer, position, until, Cause.NOISE)
 

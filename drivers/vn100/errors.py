@@ -9,6 +9,8 @@ Codes are hexadecimal on the wire (vn100-protocol 3.1).
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -31,6 +33,12 @@ class DeviceError:
     outcome: Outcome
     advice: str
 
+
+# For a person who meets lines that end without one (register 30, as firmware 1 and others had it).
+NO_CHECKSUM = (
+    "lines arrive without a checksum, and what nothing protects is not used: switch it on with "
+    "$VNWRG,30,0,0,0,0,1,0,1*69"
+)
 
 _ROWS = (
     DeviceError(
@@ -56,6 +64,22 @@ _ROWS = (
     DeviceError(0xFF, "error buffer overflow", Outcome.STOP, "errors came faster than it reports"),
 )
 ERRORS: dict[int, DeviceError] = {row.code: row for row in _ROWS}
+_CODE = re.compile(r"[0-9A-Fa-f]{1,2}")
+_BY_NAME = {row.name.replace(" ", ""): row.code for row in _ROWS}
+_BY_NAME["serialbufferoverflow"] = 0x02  # the manual's name
+
+
+def code_of(tokens: Sequence[str]) -> int | None:
+    """The code of what follows VNERR: in hexadecimal, or the error's name as a text; else None."""
+    if not tokens:
+        return None
+    if _CODE.fullmatch(tokens[0]):
+        return int(tokens[0], 16)
+    return _BY_NAME.get(_letters("".join(tokens)))
+
+
+def _letters(text: str) -> str:
+    return "".join(character for character in text.lower() if character.isalpha())
 
 
 def device_error(code: int) -> DeviceError:
@@ -69,11 +93,12 @@ class DriverError(Exception):
 
 
 class DeviceRefused(DriverError):
-    """The device answered ``$VNERR,code``; `error` is the table's row."""
+    """The device answered ``$VNERR,code``; `error` is the table's row, `to` the command."""
 
-    def __init__(self, code: int) -> None:
+    def __init__(self, code: int, to: object = None) -> None:
         self.code = code
         self.error = device_error(code)
+        where = "" if to is None else f"{to}: "
         super().__init__(
-            f"the device answered error {code:02X} ({self.error.name}): {self.error.advice}"
+            f"{where}the device answered error {code:02X} ({self.error.name}): {self.error.advice}"
         )

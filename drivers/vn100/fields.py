@@ -78,6 +78,7 @@ def _angles(names: str, printed: str, frame: Frame = "") -> Columns:
 
 
 _MAG, _ACCEL, _GYRO, _ANGLE = "%+08.4f", "%+07.3f", "%+010.6f", "%+08.3f"
+_EXPONENT = "%+.6E"  # of $VNCMV
 
 TIME_STARTUP = (Column("time_startup_s", "s", per_si=_NS),)
 TIME_SYNC_IN = (Column("time_sync_in_s", "s", per_si=_NS),)
@@ -99,12 +100,16 @@ GYRO = _vector("gyro", "rad/s", "b", "compensated", _GYRO)
 UNCOMP_MAG = _vector("uncomp_mag", "gauss", "b", "uncompensated", _MAG)
 UNCOMP_ACCEL = _vector("uncomp_accel", "m/s^2", "b", "uncompensated", _ACCEL)
 UNCOMP_GYRO = _vector("uncomp_gyro", "rad/s", "b", "uncompensated", _GYRO)
+UNCOMP_MAG_E = _vector("uncomp_mag", "gauss", "b", "uncompensated", _EXPONENT)
+UNCOMP_ACCEL_E = _vector("uncomp_accel", "m/s^2", "b", "uncompensated", _EXPONENT)
+UNCOMP_GYRO_E = _vector("uncomp_gyro", "rad/s", "b", "uncompensated", _EXPONENT)
 MAG_NED = _vector("mag", "gauss", "n", "compensated")
 ACCEL_NED = _vector("accel", "m/s^2", "n", "compensated")
 LINEAR_ACCEL_BODY = _vector("linear_accel_b", "m/s^2", "b", "compensated", _ACCEL)
 LINEAR_ACCEL_NED = _vector("linear_accel", "m/s^2", "n", "compensated", _ACCEL)
 
 TEMPERATURE = (Column("temperature_c", "degC", printed="%+05.1f"),)
+TEMPERATURE_E = (Column("temperature_c", "degC", printed=_EXPONENT),)
 PRESSURE = (Column("pressure_kpa", "kPa", printed="%+08.3f"),)
 DELTA_TIME = (Column("delta_time_s", "s", printed="%+09.6f"),)
 DELTA_THETA = _angles("delta_theta_x_rad delta_theta_y_rad delta_theta_z_rad", "%+08.3f", "b")

@@ -7,7 +7,9 @@
 | VNTAR | yes | no (error 04) |
 | register numbers in replies | 8 or 08 | 08 |
 
-Any other firmware is unknown: `Profile.writable` is false and nothing may be changed on it.
+Any other firmware is unknown, and so is any other model: `Profile.writable` is false,
+`observed_for` says why, and nothing may be changed on the device. The same holds for a device that
+lacks a register which a VN-100 of its firmware has.
 
 **The gyro bias goes to register 84, on both generations, and to no other.** Register 84 is
 ``out = C (in - B)`` at the sensor, acts at once, on every output, and can be read back and taken
@@ -19,11 +21,12 @@ VNSGB copies the filter's estimate, not ours.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.vn100.registers import REGISTERS, Values
 
 GYRO_BIAS_REGISTER = 84
+_VN100 = re.compile(r"VN-?100(?![0-9])", re.IGNORECASE)
 _VERSION = re.compile(r"([0-9]{1,3})(?:\.([0-9]{1,5}))?(?:\.([0-9]{1,5}))?(?:\.([0-9]{1,5}))?")
 
 
@@ -33,11 +36,12 @@ class Profile:
 
     generation:     2 or 3; 0 where the firmware is unknown
     version:        as register 4 says it
-    writable:       false for unknown firmware: observe only
+    writable:       false for unknown firmware and other models: observe only
     startup_bias:   register that VNSGB fills, None where unknown
     tare:           whether VNTAR exists
     padded_replies: true where replies print register numbers with two digits; false where both
                     forms were seen
+    observed_for:   why nothing may be changed, for a person; empty where it may
     """
 
     generation: int
@@ -46,6 +50,12 @@ class Profile:
     startup_bias: int | None
     tare: bool
     padded_replies: bool
+    observed_for: str = ""
+
+    def observed(self, why: str) -> Profile:
+        """The same where nothing may be changed, for one reason more."""
+        reasons = f"{self.observed_for}; {why}" if self.observed_for else why
+        return replace(self, writable=False, observed_for=reasons)
 
     def has(self, register_id: int) -> bool:
         """Whether this firmware has the register; for unknown firmware, whether any has it."""
@@ -64,12 +74,17 @@ class Profile:
         return REGISTERS[register_id].defaults.get(self.generation)
 
 
-def profile_of(version: str) -> Profile:
-    """The profile of a firmware from what register 4 says, such as ``3.1.0.0``."""
+def profile_of(version: str, model: str = "VN-100") -> Profile:
+    """The profile of a device from what registers 4 and 1 say: ``3.1.0.0``, ``VN-100S-CR``."""
     match = _VERSION.fullmatch(version.strip())
     generation = int(match[1]) if match else 0
     if generation == 2:
-        return Profile(2, version, True, 74, True, False)
-    if generation == 3:
-        return Profile(3, version, True, 43, False, True)
-    return Profile(0, version, False, None, False, False)
+        profile = Profile(2, version, True, 74, True, False)
+    elif generation == 3:
+        profile = Profile(3, version, True, 43, False, True)
+    else:
+        why = f"firmware {version} is unknown (known are 2.x and 3.x)"
+        profile = Profile(0, version, False, None, False, False, why)
+    if _VN100.match(model.strip()):
+        return profile
+    return profile.observed(f"the model is {model or 'not said'}, and only a VN-100 is written")

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from drivers.vn100.commands import (
@@ -36,8 +36,8 @@ ERROR_WINDOW_S = 1.5  # after VNWNV: the device may still report an error
 INVALID_REGISTER = 0x08
 SESSION_SETTINGS = (*BINARY_OUTPUTS, 7, 6)  # in the order in which `restore` puts them back
 
-# Without one of these nothing can be said about the samples or put back later, so its absence is an
-# error. The others may be missing on some firmware.
+# Without one of these not everything can be said about the samples or put back later, so a device
+# that lacks one is only observed. The others may be missing on some firmware.
 _ESSENTIAL = (5, 6, 7, 23, 26, 30, 44, 47, 75, 76, 77, 84, 85)
 _OPTIONAL = (21, 25, 32, 35, 36, 38, 43, 74, 82, 83)
 CONFIGURATION = tuple(sorted(_ESSENTIAL + _OPTIONAL))
@@ -64,6 +64,26 @@ class RestoreFailed(SessionError):
 
 
 @dataclass(frozen=True, slots=True)
+class Unit:
+    """One device and no other, from registers 1, 3 and 4."""
+
+    model: str
+    serial: int
+    firmware: str
+
+    def __str__(self) -> str:
+        return f"{self.model} serial {self.serial} firmware {self.firmware}"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Who answers, and some registers read in the same breath."""
+
+    unit: Unit
+    values: dict[int, Values]
+
+
+@dataclass(frozen=True, slots=True)
 class Identity:
     """Who the device is, from registers 1 to 4; `hardware` is None where it cannot be read."""
 
@@ -72,6 +92,21 @@ class Identity:
     serial: int
     firmware: str
     profile: Profile
+
+    @property
+    def unit(self) -> Unit:
+        """What tells it from every other device."""
+        return Unit(self.model, self.serial, self.firmware)
+
+    def observed_without(self, values: Mapping[int, Values]) -> Identity:
+        """The same, not to be written where an essential register is not among `values`."""
+        absent = [n for n in _ESSENTIAL if self.profile.has(n) and n not in values]
+        if not absent:
+            return self
+        numbers = ", ".join(map(str, absent))
+        many = "s" if len(absent) > 1 else ""
+        why = f"firmware {self.firmware} has no register{many} {numbers}"
+        return replace(self, profile=self.profile.observed(why))
 
 
 def identify() -> Procedure[Identity]:
@@ -85,13 +120,33 @@ def identify() -> Procedure[Identity]:
         hardware = int((yield from read(2))[0])
     serial = yield from read(3)
     firmware = str((yield from read(4))[0])
-    return Identity(str(first[0]), hardware, int(serial[0]), firmware, profile_of(firmware))
+    model = str(first[0])
+    return Identity(model, hardware, int(serial[0]), firmware, profile_of(firmware, model))
 
 
 def read(register: int, port: int | None = None) -> Procedure[Values]:
     """One register's values."""
     reply = yield Read(register, port)
     return parse(register, reply.tokens)
+
+
+def read_unit() -> Procedure[Unit]:
+    """Who answers now. The serial number is the last that is read: only that of whoever has the
+    cable by then counts, whatever was heard of another unit before.
+    """
+    values = yield from read_registers((1, 4, 3))
+    return Unit(str(values[1][0]), int(values[3][0]), str(values[4][0]))
+
+
+def look(unit: Unit, expected: Mapping[int, Values]) -> Procedure[Seen]:
+    """Who answers, and the registers of `expected`; needs no pause of the output.
+
+    What is not as expected is read once more, for a reply may be altered on its way.
+    """
+    seen = Seen((yield from read_unit()), (yield from read_registers(expected)))
+    if seen.unit == unit and not differences(expected, seen.values):
+        return seen
+    return Seen((yield from read_unit()), (yield from read_registers(expected)))
 
 
 def read_registers(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
@@ -105,8 +160,8 @@ def read_registers(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
 def read_configuration(profile: Profile) -> Procedure[dict[int, Values]]:
     """Every configuration register of this firmware: what must be put back and what un-maps data.
 
-    A register that is not essential and that the device does not have (VNERR 08) is left out, so
-    `missing` can name it.
+    A register that the device does not have (VNERR 08) is left out, so `missing` can name it. So is
+    one of another model whose answer does not read like a VN-100's.
     """
     values: dict[int, Values] = {}
     for number in CONFIGURATION:
@@ -115,7 +170,22 @@ def read_configuration(profile: Profile) -> Procedure[dict[int, Values]]:
         try:
             values[number] = yield from read(number)
         except DeviceRefused as error:
-            if error.code != INVALID_REGISTER or number in _ESSENTIAL:
+            if error.code != INVALID_REGISTER:
+                raise
+        except NoReply:
+            if profile.writable or not values:
+                raise
+    return values
+
+
+def read_present(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Several registers, without those that the device does not have (VNERR 08)."""
+    values: dict[int, Values] = {}
+    for number in ids:
+        try:
+            values[number] = yield from read(number)
+        except DeviceRefused as error:
+            if error.code != INVALID_REGISTER:
                 raise
     return values
 
@@ -125,13 +195,14 @@ def missing(profile: Profile, values: Mapping[int, Values]) -> tuple[int, ...]:
     return tuple(n for n in CONFIGURATION if profile.has(n) and n not in values)
 
 
-def write_verified(register: int, values: Values) -> Procedure[Values]:
+def write_verified(register: int, values: Values, *, held: bool = False) -> Procedure[Values]:
     """Write, see the echo, read afresh, compare; up to three times. Returns what was read.
 
+    held: the device itself held the values (`commands.Write`)
     An echo that never came is no failure as long as the fresh read shows the values. Raises
     VerifyFailed; ValueError before anything is sent where the device would refuse the values.
     """
-    command = Write(register, values)
+    command = Write(register, values, held)
     back: Values = ()
     for _ in range(WRITE_TRIES):
         with suppress(NoReply):  # carried out or not: the read says which
@@ -218,7 +289,7 @@ def _put_back(number: int, values: Values) -> Procedure[bool]:
     present = yield from read(number)
     if same(number, values, present):
         return False
-    yield from write_verified(number, values)
+    yield from write_verified(number, values, held=True)
     return True
 
 

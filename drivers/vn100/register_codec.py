@@ -34,7 +34,7 @@ _LARGEST: dict[str, int] = {
     "u8": 0xFF,
     "u16": 0xFFFF,
     "u32": 0xFFFF_FFFF,
-    "hex8": 0xFF,
+    "hex8": 0xFFFF,  # two digits at least; other models announce a second group byte
     "hex16": 0xFFFF,
 }
 
@@ -76,6 +76,7 @@ class Register:
     repeated:    the last field repeats, as often as the values in front of it say (75 to 77)
     opaque:      the manual does not print the fields: read as text, never written
     keep_off:    why this must not be written although the device would accept it
+    unconfirmed: what of the row rests on one source; empty where two agree
     check:       what the values must fulfil together; raises RegisterValueError
     """
 
@@ -89,6 +90,7 @@ class Register:
     repeated: bool = False
     opaque: bool = False
     keep_off: str = ""
+    unconfirmed: str = ""
     check: Callable[[Values], None] | None = None
 
     @property
@@ -113,6 +115,8 @@ def parse_values(register: Register, tokens: Sequence[str]) -> Values:
 
 def check_values(register: Register, values: Values) -> None:
     """Raises RegisterValueError where the device would refuse `values`, with its error code."""
+    if register.opaque:
+        return
     fields = _fields_for(register, len(values))
     for f, value in zip(fields, values, strict=True):
         _check_field(register, f, value)
@@ -120,9 +124,10 @@ def check_values(register: Register, values: Values) -> None:
         register.check(values)
 
 
-def command_text(register: Register, values: Values) -> str:
+def command_text(register: Register, values: Values, *, held: bool = False) -> str:
     """``NN,value,...`` as a write sends it: fixed point, shortest digits that give the same f32.
 
+    held: the device itself held the values, so ranges are not checked.
     Raises RegisterValueError where the register may not be written, where the values do not fit it
     or where the line would overrun the device's receive buffer (see `as_stored_values`).
     """
@@ -131,8 +136,12 @@ def command_text(register: Register, values: Values) -> str:
             "its fields are not documented" if register.opaque else "it is read only"
         )
         raise RegisterValueError(f"register {register.id} is never written: {reason}", 0x09)
-    check_values(register, values)
     fields = _fields_for(register, len(values))
+    if not held:
+        check_values(register, values)
+    for f, value in zip(fields, values, strict=True):
+        if f.kind != "string":
+            _number(f"register {register.id}, {f.name}", f, value)
     texts = [_command_value(f, value) for f, value in zip(fields, values, strict=True)]
     text = ",".join([f"{register.id:02d}", *texts])
     length = len(f"$VNWRG,{text}*XX\r\n")

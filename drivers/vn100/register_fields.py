@@ -60,8 +60,22 @@ def always(*values: float | int | str) -> dict[int, Values]:
     return {2: values, 3: values}
 
 
-def opaque(number: int, name: str, generations: tuple[int, ...], why: str) -> Register:
-    """A register of which the manual prints no fields: read as text, never written."""
+def opaque(
+    number: int, name: str, generations: tuple[int, ...], why: str, values: Values = ()
+) -> Register:
+    """A register of which the manual prints no fields: read as text, never written.
+
+    values: what the emulator answers where the number of values is known
+    """
     return Register(
-        number, name, "RW", (), "not printed", generations=generations, opaque=True, keep_off=why
+        number,
+        name,
+        "RW",
+        (),
+        "not printed",
+        dict.fromkeys(generations, values) if values else {},
+        generations=generations,
+        opaque=True,
+        keep_off=why,
+        unconfirmed="fields and values",
     )

@@ -40,6 +40,7 @@ from drivers.vn100.register_fields import (
     xyz,
 )
 from drivers.vn100.registers_system import (
+    ASYNC_OUTPUT_RATES_HZ,
     BINARY_OUTPUT_OFF,
     BINARY_OUTPUTS,
     MEASUREMENT_ROWS,
@@ -49,6 +50,7 @@ from drivers.vn100.registers_system import (
 )
 
 __all__ = [
+    "ASYNC_OUTPUT_RATES_HZ",
     "BINARY_OUTPUTS",
     "BINARY_OUTPUT_OFF",
     "REGISTERS",
@@ -102,6 +104,7 @@ CONFIGURATION_ROWS = (
         + f32s("gravity_ref_n gravity_ref_e gravity_ref_d", "m/s^2"),
         "Attitude Subsystem",
         {2: (1.0, 0.0, 1.8, 0.0, 0.0, -9.79375), 3: (0.234, 0.0, 0.4212, 0.0, 0.0, -9.79375)},
+        unconfirmed="factory values: one sensor of each generation",
     ),
     *(
         opaque(number, "Filter internals", (2,), FILTER_INTERNALS)
@@ -139,6 +142,7 @@ CONFIGURATION_ROWS = (
         (u8("enable", 1), u8("heading_mode", 2), u8("filtering_mode", 1), u8("tuning_mode", 1)),
         "Attitude Subsystem",
         always(1, 1, 1, 1),
+        unconfirmed="factory values: the manual's examples",
     ),
     Register(
         36,
@@ -147,6 +151,7 @@ CONFIGURATION_ROWS = (
         VPE_TUNING,
         "Attitude Subsystem",
         always(4.0, 4.0, 4.0, 5.0, 5.0, 5.0, 5.5, 5.5, 5.5),
+        unconfirmed="factory values: the manual's examples",
     ),
     Register(
         38,
@@ -155,6 +160,7 @@ CONFIGURATION_ROWS = (
         VPE_TUNING,
         "Attitude Subsystem",
         always(6.0, 6.0, 6.0, 3.0, 3.0, 3.0, 5.0, 5.0, 5.0),
+        unconfirmed="factory values: one sensor's",
     ),
     Register(
         43,
@@ -189,6 +195,7 @@ CONFIGURATION_ROWS = (
         (*f32s("max_rate_error", ""), u8("reserved")),
         "Attitude Subsystem",
         always(0.5, 0),
+        unconfirmed="factory values",
     ),
     Register(
         50,
@@ -271,8 +278,9 @@ CONFIGURATION_ROWS = (
         ),
         "IMU Subsystem",
         always(0, 4, 4, 4, 0, 0, 3, 3, 3, 0),
+        unconfirmed="factory values: one sensor's",
     ),
-    opaque(116, "Heave Control", (3,), "not documented for the VN-100"),
+    opaque(116, "Heave Control", (3,), "not documented for the VN-100", ("0",) * 7),
 )
 
 REGISTERS: dict[int, Register] = {
@@ -294,12 +302,13 @@ def check(register_id: int, values: Values) -> None:
     check_values(_row(register_id), values)
 
 
-def format_command(register_id: int, values: Values) -> str:
+def format_command(register_id: int, values: Values, *, held: bool = False) -> str:
     """``NN,value,...`` to write behind ``VNWRG,``: fixed point, no exponent, f32 round-trip.
 
+    held: the device itself held the values; then what the manual allows is not asked.
     Raises RegisterValueError for values, registers or lengths that the device would refuse.
     """
-    return command_text(_row(register_id), values)
+    return command_text(_row(register_id), values, held=held)
 
 
 def format_reply(register_id: int, values: Values) -> str:

@@ -5,6 +5,9 @@ Source: VN-100 user manual UM001, "System Module" and the measurement pages of e
 
 from __future__ import annotations
 
+import struct
+
+from drivers.vn100.binary import SYNC, packet_size
 from drivers.vn100.register_codec import (
     OUT_OF_RANGE,
     TOO_FEW,
@@ -42,26 +45,30 @@ ASYNC_OUTPUT_TYPES = (0, 1, 2, 8, 10, 11, 12, 13, 14, 16, 17, 19, 30, 34)  # 34:
 ASYNC_OUTPUT_RATES_HZ = (0, 1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
 BINARY_OUTPUTS = (75, 76, 77)
 BINARY_OUTPUT_OFF: Values = (0, 1, 0)
-BINARY_FIELD_MASKS = {0: 0x3F3D, 1: 0x0191, 2: 0x1FFF, 4: 0x11FF}  # group bit: fields it can send
 
 
 def check_binary_output(values: Values) -> None:
-    """Registers 75 to 77: one field word per set group bit, only fields that a VN-100 sends."""
+    """Registers 75 to 77: one field word per set group bit, and only fields of known length.
+
+    A VN-100 takes fields of other models too and sends zeros for them: drivers ask it for these.
+    """
     groups, words = int(values[2]), [int(w) for w in values[3:]]
-    bits = [bit for bit in range(8) if groups >> bit & 1]
-    if len(words) != len(bits):
+    needed, extended = groups.bit_count(), sum(word >> 15 for word in words)
+    if len(words) - extended != needed:
         raise RegisterValueError(
-            f"binary output: groups {groups:02X} need {len(bits)} field words, not {len(words)}",
-            TOO_FEW if len(words) < len(bits) else TOO_MANY,
+            f"binary output: groups {groups:02X} need {needed} field words, not "
+            f"{len(words) - extended}",
+            TOO_FEW if len(words) - extended < needed else TOO_MANY,
         )
-    for bit, word in zip(bits, words, strict=True):
-        mask = BINARY_FIELD_MASKS.get(bit, 0)
-        if word == 0 or word & ~mask:
-            raise RegisterValueError(
-                f"binary output: field word {word:04X} of group {bit + 1}, a VN-100 has only "
-                f"fields in {mask:04X}",
-                OUT_OF_RANGE,
-            )
+    if not words:
+        return
+    header = struct.pack(f"<BB{len(words)}H", SYNC, groups & 0xFF, *words)
+    if groups > 0x7F or not packet_size(header):
+        raise RegisterValueError(
+            f"binary output: groups {groups:02X}, fields {' '.join(f'{w:04X}' for w in words)}: "
+            "a field of unknown length, or a group without fields",
+            OUT_OF_RANGE,
+        )
 
 
 def _binary_output(number: int) -> Register:
@@ -105,6 +112,7 @@ SYSTEM_ROWS = (
         "R",
         (RegisterField("revision", "u32"), RegisterField("minor", "u32", optional=True)),
         "System Module",
+        unconfirmed="the minor revision of firmware 3",
     ),
     Register(
         3, "Serial Number", "R", (RegisterField("serial", "u32", printed="%010d"),), "System Module"
@@ -174,6 +182,7 @@ SYSTEM_ROWS = (
         ),
         "System Module",
         always(3, 0, 0, 0, 3, 0, 0, 500000, 0),
+        unconfirmed="factory values: one sensor's",
     ),
     Register(
         33,
@@ -186,11 +195,18 @@ SYSTEM_ROWS = (
         ),
         "System Module",
         always(0, 0, 0),
+        unconfirmed="the unit of sync_in_time",
     ),
     _binary_output(1),
     _binary_output(2),
     _binary_output(3),
-    opaque(206, "Legacy Compatibility Settings", (3,), "not documented for the VN-100"),
+    opaque(
+        206,
+        "Legacy Compatibility Settings",
+        (3,),
+        "not documented for the VN-100",
+        ("0", "0", "0", "0"),
+    ),
     Register(
         227,
         "IMU Rate Configuration",
@@ -203,6 +219,7 @@ SYSTEM_ROWS = (
         "IMU Subsystem",
         always(800, 2, 200.0, 100.0),
         keep_off="it changes the sampling of the filter that steers",
+        unconfirmed="fields and values: one sensor's",
     ),
 )
 
@@ -249,7 +266,15 @@ MEASUREMENT_ROWS = (
         + xyz("delta_velocity", "m/s", ANGLE),
         "IMU Subsystem",
     ),
-    Register(115, "Heave", "R", f32s("heave rate delayed", ""), "not printed", generations=(3,)),
+    Register(
+        115,
+        "Heave",
+        "R",
+        f32s("heave rate delayed", ""),
+        "not printed",
+        generations=(3,),
+        unconfirmed="on a VN-100",
+    ),
     Register(
         239,
         "Yaw, Pitch, Roll, True Body Acceleration, and Angular Rates",

@@ -25,7 +25,7 @@ class Message:
     """A row of the table of asynchronous messages.
 
     output_type: ADOR, the value of register 6 that selects it
-    register:    the register that holds the same values
+    register:    the register that holds the same values, 0 where none does
     """
 
     name: str
@@ -57,12 +57,22 @@ _ROWS = (
     ),
     Message("VNDTV", 30, 80, fields.DELTA_TIME + fields.DELTA_THETA + fields.DELTA_VELOCITY),
     Message("VNHVE", 34, 115, fields.HEAVE),
+    # of firmware 1; the vendor's old library names its values uncompensated
+    Message(
+        "VNCMV",
+        253,
+        0,
+        fields.UNCOMP_MAG_E + fields.UNCOMP_ACCEL_E + fields.UNCOMP_GYRO_E + fields.TEMPERATURE_E,
+    ),
 )
 MESSAGES: dict[str, Message] = {row.name: row for row in _ROWS}
 
 REGISTER_WORDS = frozenset({"VNRRG", "VNWRG"})
 COMMAND_WORDS = frozenset(
-    {"VNWNV", "VNRFS", "VNRST", "VNASY", "VNKMD", "VNKAD", "VNSGB", "VNTAR", "VNBOM"}
+    {
+        *("VNWNV", "VNRFS", "VNRST", "VNASY", "VNKMD", "VNKAD"),
+        *("VNSGB", "VNTAR", "VNBOM", "VNSFB", "VNSIH"),
+    }
 )
 
 
@@ -86,7 +96,10 @@ def sentence_layout(name: str, count: bool = False, status: bool = False) -> Lay
 
 
 _TEXT = rb"[ -#%-)+-~]"  # printable, neither $ nor *
-LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})\r?\n" % _TEXT)
+_CHECKED = rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})" % _TEXT
+# A port in text mode makes CR CR LF of CR LF; one that edits lines may leave CR alone.
+LINE = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]))")
+LINE_AT_THE_END = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]|\Z))")
 COMMAND_LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2}|XX)\r?\n" % _TEXT)
 
 

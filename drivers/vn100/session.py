@@ -11,6 +11,8 @@ not say which command it answers. Everything else on the wire passes through, in
 and a read's values must be ones that the register can have. Names of measurements differ from
 ``VNRRG``, so none can be taken for a reply. All other replies come out as `Stray`.
 
+**Echoes.** A line that sends commands back is recognised (`echo`); an echo answers nothing.
+
 **Late replies.** The device carries out commands in the order of arrival and the wire keeps the
 order of its replies. So what can go wrong is only this: an attempt timed out (or was ended by a
 VNERR that was not its own), its reply is still under way (a *ghost*), and it would answer a later
@@ -48,8 +50,16 @@ from drivers.vn100.commands import (
     confusable,
     patience,
 )
-from drivers.vn100.decode import ErrorReply, Measurement, Reply, Undecodable, decode
-from drivers.vn100.deframer import Deframer
+from drivers.vn100.decode import (
+    ErrorReply,
+    Measurement,
+    Reply,
+    Undecodable,
+    Unused,
+    decode,
+)
+from drivers.vn100.deframer import Deframer, Frame, Sentence
+from drivers.vn100.echo import Echo
 from drivers.vn100.errors import DeviceRefused, DriverError
 from drivers.vn100.sentences import encode
 
@@ -88,7 +98,12 @@ class Failed:
     error: Exception
 
 
-Event = Measurement | Undecodable | DeviceFault | Stray | Finished | Failed
+@dataclass(frozen=True, slots=True)
+class LineEchoes:
+    """What is sent comes back before the answer; told once per link."""
+
+
+Event = Measurement | Unused | Undecodable | DeviceFault | Stray | LineEchoes | Finished | Failed
 
 
 @dataclass(slots=True)
@@ -127,6 +142,7 @@ class Session:
         self._cancelling = False
         self._output = bytearray()
         self._silent_from_s: float | None = None
+        self._echo = Echo()
 
     @property
     def busy(self) -> bool:
@@ -178,6 +194,7 @@ class Session:
         else:
             raise RuntimeError("a command sequence goes on although its link is gone")
         self._output.clear()
+        self._echo.forget()
         self.deframer.drop_pending()
         self._silent_from_s = None
         return events
@@ -206,10 +223,25 @@ class Session:
     def last_word(self, command: Speech) -> None:
         """Send a command whose reply nobody waits for, where the gate lets it out."""
         if self._allow(command):
-            self._output += encode(command.body)
+            self._say(command)
+
+    def _say(self, command: Speech) -> None:
+        self._echo.sent(command.body)
+        self._output += encode(command.body)
+
+    def _is_echo(self, frame: Frame, events: list[Event]) -> bool:
+        """Whether the wire sent back a command of ours, which answers nothing."""
+        known = self._echo.echoes
+        if not isinstance(frame, Sentence) or not self._echo.is_echo(frame.body):
+            return False
+        if not known:
+            events.append(LineEchoes())
+        return True
 
     def _take(self, chunk: bytes, now_s: float, events: list[Event]) -> None:
         for frame in self.deframer.feed(chunk):
+            if self._is_echo(frame, events):
+                continue
             event = decode(frame)
             if isinstance(event, Measurement):
                 events.append(event)
@@ -250,10 +282,10 @@ class Session:
             events.append(DeviceFault(code))
         else:  # VNERR names no command, so it may be another one's and the reply may still come
             self._abandon_flight(now_s)
-            if code in RETRIED_ERRORS and flight.attempts < patience(flight.command).tries:
+            if code in RETRIED_ERRORS and flight.attempts < patience(flight.command).damaged:
                 self._repeat(flight, now_s, events)
             else:
-                self._advance(DeviceRefused(code), now_s, events)
+                self._advance(DeviceRefused(code, flight.command), now_s, events)
 
     def _unanswered(self, flight: _Flight, now_s: float, events: list[Event]) -> None:
         self._abandon_flight(now_s)
@@ -332,7 +364,7 @@ class Session:
         flight.attempts += 1
         flight.due_s = now_s + (patience(flight.command).reply_s or self._reply_timeout_s)
         self._flight = flight
-        self._output += encode(flight.command.body)
+        self._say(flight.command)
         return True
 
     def _abandon_flight(self, now_s: float) -> None:

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 
 from mismatch_trials import Trial, made
 
-from ahrsd.mismatch.engine import diagnose
+from ahrsd.diagnosis.engine import diagnose
 
 NOISES = ("white", "red", "heavy", "walk", "bursts")
 SCENARIOS = ("wam", "mam", "lam")

@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosing import load_track
-from ahrsd.mismatch.diagnosis import Diagnosis, Finding
-from ahrsd.mismatch.engine import diagnose
-from ahrsd.mismatch.locate import Located
-from ahrsd.mismatch.track import Track
+from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.locate import Located
+from ahrsd.diagnosis.track import Track
+from ahrsd.offline.diagnose import load_track
 
 RECORDINGS = Path(__file__).parents[2] / ".." / "shared" / "recordings"
 FOLDERS = ("arducopter", "broad", "repoimu", "vn100", "vn100_distorters")

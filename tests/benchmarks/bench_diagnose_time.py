@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosing import diagnose_recording
-from ahrsd.mismatch import engine
-from ahrsd.mismatch.track import Track
+from ahrsd.diagnosis import engine
+from ahrsd.diagnosis.track import Track
+from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.recording.table_writer import write_table
 
 ROWS, RATE_HZ = 16_000, 40.0

@@ -1,7 +1,8 @@
 """Ours beside the authors' package magyc 1.0.0, on the same samples in the same run.
 
     python tests/benchmarks/bench_peers.py --cache DIR --runs 10
-    python tests/benchmarks/bench_peers.py --cache DIR --runs 100,30,10 --time --output docs/peers
+    python tests/benchmarks/bench_peers.py --cache DIR --runs 100,30,10 --time \\
+        --output docs/validation/peers
 
 The package runs in an environment of its own (made in the cache folder; its numpy and ours cannot
 share one), as released and with its one wrong Jacobian column corrected, each with and without the
@@ -27,12 +28,12 @@ from pathlib import Path
 import numpy as np
 from peers_table import best_peers, set_lines, time_lines, verdict_lines
 
-from ahrsd.accuracy import Answer
+from ahrsd.baselines import MethodError
 from ahrsd.estimator.online import WHOLE, Estimator
-from ahrsd.methods import MethodError
-from ahrsd.montecarlo import Plan, Record, run_many, scored
-from ahrsd.montecarlo_methods import OURS, STREAM
-from ahrsd.montecarlo_summary import Row, summarise
+from ahrsd.montecarlo.accuracy import Answer
+from ahrsd.montecarlo.methods import OURS, STREAM
+from ahrsd.montecarlo.runs import Plan, Record, run_many, scored
+from ahrsd.montecarlo.summary import Row, summarise
 from ahrsd.report.peers_figure import write_peers_figure
 from ahrsd.simulation import Experiment, Settings, simulate
 
@@ -313,7 +314,7 @@ class Comparison:
         return records, rows
 
     def ours(self, plan: Plan) -> list[Record]:
-        """Batch and stream at the end, kept by the plans of docs/montecarlo.md's full form."""
+        """Batch and stream at the end, kept by the plans of the full form."""
         kept = self.cache / f"ours-{estimator_source()}"
         times_s = (*(t for t in EARLIER_S if t < AT_S), AT_S)
         batch, stream = (

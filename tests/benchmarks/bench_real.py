@@ -27,17 +27,17 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from ahrsd.batch import BatchResult, calibrate
+from ahrsd.baselines import METHODS
+from ahrsd.baselines.comparison import Row
 from ahrsd.calibration import Affine
-from ahrsd.commands.evaluate_sources import gps_beside, read_fixes, read_track
-from ahrsd.config import Config
-from ahrsd.config_sections import Location
+from ahrsd.cli.evaluate_sources import gps_beside, read_fixes, read_track
+from ahrsd.config.loading import Config
+from ahrsd.config.sections import Location
 from ahrsd.evaluation import Evaluation, StoredCalibration, Track, judge
 from ahrsd.evaluation.references import QUATERNION, course, optical
-from ahrsd.headings import wrapped
-from ahrsd.methods import METHODS
-from ahrsd.methods.comparison import Row
-from ahrsd.published import our_row, row_of, run_published
+from ahrsd.heading import wrapped
+from ahrsd.offline.calibrate import BatchResult, calibrate
+from ahrsd.offline.compare_methods import our_row, row_of, run_published
 from ahrsd.samples import Array
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "recordings"

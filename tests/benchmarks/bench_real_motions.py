@@ -22,15 +22,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from mismatch_trials import covariates
 
-from ahrsd.diagnosing import load_track
-from ahrsd.mismatch.coarse import noise_of
-from ahrsd.mismatch.diagnosis import Diagnosis
-from ahrsd.mismatch.effects.base import Readings
-from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.engine import diagnose
-from ahrsd.mismatch.limits import LIMITS
-from ahrsd.mismatch.problem import problem_of
-from ahrsd.mismatch.track import Spec, Track
+from ahrsd.diagnosis.coarse import noise_of
+from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.problem import problem_of
+from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.offline.diagnose import load_track
 from ahrsd.samples import Array
 
 RECORDINGS = Path(__file__).parents[2] / ".." / "shared" / "recordings"

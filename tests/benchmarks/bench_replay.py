@@ -23,13 +23,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ahrsd.calibrator import Calibrator
-from ahrsd.config import Config
+from ahrsd.config.loading import Config
+from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.estimator.online import Estimator
 from ahrsd.evidence.collector import EvidenceCollector
+from ahrsd.offline.replay import replay
 from ahrsd.recording.bytestream import read_chunks
-from ahrsd.replay import replay
-from ahrsd.stream import Stream
+from ahrsd.stream.assembler import Stream
 from drivers.vn100.decode import decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.session import Session
@@ -160,7 +160,8 @@ def start_up_s() -> float:
     import subprocess
 
     code = (
-        "import time; start = time.process_time(); import ahrsd.replay, ahrsd.summary; "
+        "import time; start = time.process_time(); "
+        "import ahrsd.offline.replay, ahrsd.report.summary; "
         "print(time.process_time() - start)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

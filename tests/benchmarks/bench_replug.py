@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from ahrsd.config import check_config
-from ahrsd.daemon import Daemon, HostClock
+from ahrsd.config.loading import check_config
+from ahrsd.daemon.daemon import Daemon, HostClock
+from ahrsd.daemon.service import close_shell, open_shell
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.service import close_shell, open_shell
-from drivers.vn100.emulator_pty import PtyEmulator
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.pty import PtyEmulator
+from drivers.vn100.emulator.scenarios import Setup, build
 
 BAUD, RATE_HZ = 921600, 100
 WARM_UP = 10  # cycles before the first count

@@ -26,8 +26,8 @@ from ahrsd.inputs import Received
 from ahrsd.recording.capture import CaptureReader
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.emulator_process import EmulatorProcess
-from drivers.vn100.emulator_scenarios import Setup
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.scenarios import Setup
 
 BAUD = 921600
 SETTLE_S = 3.0

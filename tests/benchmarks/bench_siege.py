@@ -27,10 +27,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from ahrsd.serving.client import Asked
-from ahrsd.serving.protocol import line_of
-from drivers.vn100.emulator_process import EmulatorProcess
-from drivers.vn100.emulator_scenarios import Setup
+from ahrsd.telemetry.client import Asked
+from ahrsd.telemetry.protocol import line_of
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.scenarios import Setup
 
 BAUD, READERS = 921600, 8
 PATIENCE_S = 60.0

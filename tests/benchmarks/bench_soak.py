@@ -1,7 +1,7 @@
 """Device-days in hours: what grows, and whether an update takes longer the longer it runs.
 
-    python tests/benchmarks/bench_soak.py --days 7 --out docs/soak        # an hour or two
-    python tests/benchmarks/bench_soak.py --days 7 --wall 15 --out docs/soak   # as far as it gets
+    python tests/benchmarks/bench_soak.py --days 7 --out docs/validation/soak   # an hour or two
+    python tests/benchmarks/bench_soak.py --days 7 --wall 15 --out DIR    # as far as it gets
 
 The daemon's shell and core, with capture, journal and log, on the byte stream of an emulated
 device, as fast as one core goes. `--loop` minutes of the stream are emulated once and then played
@@ -36,17 +36,17 @@ import numpy as np
 import psutil
 
 from ahrsd import inputs
-from ahrsd.config import Config, check_config
-from ahrsd.core import Core
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config, check_config
+from ahrsd.core.core import Core
+from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
+from ahrsd.daemon.heap import needed_bytes, take_heap
+from ahrsd.daemon.service import DAEMON_KEEPS
 from ahrsd.estimator.online import Estimator
 from ahrsd.events import Estimated, Event
-from ahrsd.heap import needed_bytes, take_heap
 from ahrsd.recording.capture import CaptureWriter
-from ahrsd.service import DAEMON_KEEPS
-from ahrsd.settings import core_settings
-from ahrsd.shell import JournalKeeper, Shell, journal_in
 from drivers.vn100.checksum import crc16
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.scenarios import Setup, build
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 from live_heap import heap_bytes
@@ -274,7 +274,7 @@ class Soak:
 
     def _inputs(self) -> Iterator[None]:
         """Round after round, for ever; yields after every chunk."""
-        self._feed(inputs.WallClock(0, 1.7e9))
+        self._feed(inputs.WallClock(0, 1.7e9, "soak", 0.0))
         number, device_s = 0, 10.0
         while True:
             began_s = self._now_s

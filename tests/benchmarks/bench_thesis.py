@@ -1,6 +1,6 @@
 """The figures that [R] prints, beside the same methods here, ours and the bound.
 
-    python tests/benchmarks/bench_thesis.py --cache DIR --runs 100 --output docs/thesis
+    python tests/benchmarks/bench_thesis.py --cache DIR --runs 100 --output docs/validation/thesis
 
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023. Its experiment is simulated as its tables were made:
 b = m_b, 1 mG and 5 mrad/s while calibrating, 10 mG while headings are judged. It does not print the
@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.accuracy import heading_rms_deg
-from ahrsd.montecarlo import Plan, Record, run_many
-from ahrsd.montecarlo_summary import accuracy_lines, bound_lines, parameter_lines, summarise
+from ahrsd.montecarlo.accuracy import heading_rms_deg
+from ahrsd.montecarlo.runs import Plan, Record, run_many
+from ahrsd.montecarlo.summary import accuracy_lines, bound_lines, parameter_lines, summarise
 from ahrsd.samples import Array
 from ahrsd.simulation import simulate
 

@@ -4,7 +4,7 @@
 
 Each part is done in chunks; the file is written after each, and a later call with the same seed and
 file goes on where this one ended (or with `--seconds`, was ended). What a run of a part is, and
-what counts as wrong, is said in tests/support/campaign_*.py; figures are in docs/campaign.md.
+what counts as wrong, is said in tests/support/campaign_*.py; figures: docs/validation/campaign.md.
 """
 
 from __future__ import annotations

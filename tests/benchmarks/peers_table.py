@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.montecarlo_summary import BOUNDED, Row
+from ahrsd.montecarlo.summary import BOUNDED, Row
 
 Found = Mapping[str, Any]
 _ENOUGH = 10  # runs, to be the best of the peers

@@ -41,7 +41,7 @@ def test_generator_and_tool_import_nothing_of_each_other():
             }, path.name  # fmt: skip
     graph = grimp.build_graph("ahrsd", "drivers", include_external_packages=True, cache_dir=None)
     assert not [name for name in graph.modules if "blindworld" in name]
-    assert "ahrsd.mismatch" not in {
+    assert "ahrsd.diagnosis" not in {
         ".".join(up.split(".")[:2])
         for module in graph.find_descendants("ahrsd.challenge")
         for up in graph.find_modules_directly_imported_by(module)

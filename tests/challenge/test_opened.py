@@ -9,7 +9,7 @@ import pytest
 from blindworld.__main__ import case_ids, make_one
 from blindworld.rings import orders
 
-from ahrsd.diagnosing import diagnose_recording
+from ahrsd.offline.diagnose import diagnose_recording
 
 #: ring -> cases, seed
 RINGS = {

@@ -12,7 +12,7 @@ from ahrsd.challenge import making, sealing
 from ahrsd.challenge.running import command_of, run
 from ahrsd.challenge.scoring import score
 from ahrsd.challenge.sealing import open_round
-from ahrsd.commands.challenge import command
+from ahrsd.cli.challenge import command
 from ahrsd.errors import AhrsdError
 
 FAKE = """
@@ -289,6 +289,6 @@ def test_the_command_makes_runs_and_scores(tmp_path):
 def test_the_rings_are_the_generators():
     from blindworld.rings import RINGS
 
-    from ahrsd.commands.challenge import _RINGS
+    from ahrsd.cli.challenge import _RINGS
 
     assert tuple(RINGS) == _RINGS[:-1]

@@ -138,7 +138,7 @@ def test_a_gps_file_that_is_none(files, run, capsys, tmp_path):
         assert words in capsys.readouterr().err
     (tmp_path / "g.csv.gz").write_bytes(b"\x1f\x8b no gzip")
     assert run(*base, "--reference", tmp_path / "g.csv.gz") == 2
-    assert "cannot be read" in capsys.readouterr().err
+    assert "the gzip file is damaged" in capsys.readouterr().err
 
 
 BAD = [

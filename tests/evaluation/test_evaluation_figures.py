@@ -22,8 +22,8 @@ from ahrsd.evaluation.references import (
 )
 from ahrsd.evaluation.spoken import evaluation_json, evaluation_lines
 from ahrsd.evaluation.tilt import up_b
-from ahrsd.headings import wrapped
-from ahrsd.worldfield import world_field
+from ahrsd.heading import wrapped
+from ahrsd.world_field import world_field
 
 
 def with_columns(vehicle, **columns):

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
-from ahrsd.worldfield import WorldField
+from ahrsd.evidence.history import History
+from ahrsd.evidence.stillness import rest, stretches
+from ahrsd.samples import SampleBlock
+from ahrsd.world_field import WorldField
 
 
 def model(total, dip_deg):
@@ -99,3 +102,55 @@ def test_without_rest_there_is_no_agreement(world) -> None:
     assert seen.rest_s == 0.0
     assert np.isnan(seen.disagreement)
     assert np.isnan(seen.sigma_share)
+
+
+def rests(seconds_of_rest: float, every_s: float, phase_s: float, minutes: float = 10.0):
+    """Segments of a vehicle that drives, and rests now and then; its bias is BIAS."""
+    rate_hz, random = 25.0, np.random.default_rng(7)
+    time_s = np.arange(round(60.0 * minutes * rate_hz)) / rate_hz
+    still = (time_s - phase_s) % every_s < seconds_of_rest
+    heading = np.cumsum(np.where(still, 0.0, 0.3)) / rate_hz
+    rate = BIAS + 5e-4 * random.standard_normal((len(time_s), 3))
+    rate[:, 2] += np.where(still, 0.0, 0.3)
+    force = 0.005 * random.standard_normal((len(time_s), 3)) - [0.0, 0.0, 9.81]
+    force += np.where(still, 0.0, 0.5)[:, None] * random.standard_normal((len(time_s), 3))
+    field = np.column_stack([0.25 * np.cos(heading), -0.25 * np.sin(heading), 0 * heading + 0.4])
+    field += 5e-4 * random.standard_normal((len(time_s), 3))
+    dt_s = np.full(len(time_s), 1 / rate_hz)
+    dt_s[0] = np.nan
+    block = SampleBlock(time_s, dt_s, time_s, field, rate, force, gap_before=True)
+    history = History()
+    for _, part in history.parts(block):
+        history.add(part)
+    history.interrupt()
+    return history.segments
+
+
+BIAS = np.array([0.004, -0.005, 0.002])
+
+
+@pytest.mark.parametrize("phase_s", np.arange(0.0, 60.0, 1.3))
+def test_rest_counts_however_it_falls(phase_s: float) -> None:
+    """Also where the cut between two segments lies in the middle of it."""
+    found = rest(rests(6.0, 60.0, phase_s))
+    assert found.duration_s >= 3.0 * 8  # 6 s a minute: five whole bins less the two outer ones
+    assert found.duration_s <= 6.0 * 10
+    assert np.linalg.norm(found.rate_b_rad_s - BIAS) < 4e-4
+
+
+def test_one_long_rest_is_not_longer_than_it_was() -> None:
+    found = rest(rests(300.0, 600.0, 100.0))
+    assert found.duration_s == pytest.approx(300.0, abs=4.0)
+
+
+def test_rest_from_before_the_devices_clock_began_anew_is_of_before() -> None:
+    segments = rests(6.0, 60.0, 10.0, minutes=4.0)
+    before = rest(segments).duration_s
+    assert rest([*segments, *segments]).duration_s == before
+
+
+def test_a_hole_in_the_stream_is_no_rest() -> None:
+    segments = rests(300.0, 600.0, 100.0)
+    pieces = stretches(segments)
+    assert [len(piece) for piece in pieces] == [len(segments)]
+    assert len(stretches(segments[:5] + segments[6:])) == 2

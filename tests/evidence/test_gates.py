@@ -14,10 +14,10 @@ from ahrsd.calibration import Affine, Observability
 from ahrsd.evidence import BasisFacts
 from ahrsd.evidence.values import Evidence, numbers
 from ahrsd.gates import GATES, GateLimits, Level, for_level, holds, judge, limit_of
-from ahrsd.worldfield import WorldField
+from ahrsd.world_field import WorldField
 
 LIMITS = GateLimits()
-DOC = Path(__file__).parents[2] / "docs" / "gates.md"
+DOC = Path(__file__).parents[2] / "docs" / "reference" / "gates.md"
 DIP = np.radians(60.0)
 MODEL = WorldField(
     0.5 * np.array([np.cos(DIP), 0, np.sin(DIP)]),
@@ -206,7 +206,7 @@ def test_an_estimator_in_doubt_never_passes(world) -> None:
     assert {"observability.converged", "observability.score", "observability.heading_sigma"} <= set(
         stopped
     )
-    assert "1.4 deg only (limit 1.0)" in stopped["observability.heading_sigma"]
+    assert "not known well enough (limit 1.0 deg)" in stopped["observability.heading_sigma"]
 
 
 def test_before_anything_every_row_says_what_is_missing(world) -> None:

@@ -12,10 +12,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ahrsd.config import Config
-from ahrsd.config_text import print_config
+from ahrsd.config.loading import Config
+from ahrsd.config.text import print_config
+from ahrsd.daemon.journal import Journal
 from ahrsd.inputs import Received, Stop, Tick
-from ahrsd.journal import Journal
 from ahrsd.recording.capture import CaptureWriter
 
 PROJECT = Path(__file__).parents[2]

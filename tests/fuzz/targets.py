@@ -12,18 +12,18 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
-from ahrsd.columns_file import columns_of
-from ahrsd.config import Config, check_config
-from ahrsd.config_text import print_config
-from ahrsd.core import Core
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config, check_config
+from ahrsd.config.text import print_config
+from ahrsd.core.core import Core
+from ahrsd.daemon.columns_file import columns_of
+from ahrsd.daemon.core_runner import Shell
+from ahrsd.daemon.journal import Journal, wrg_lines
 from ahrsd.errors import CaptureError, ConfigError, JournalError, RecordingError
 from ahrsd.inputs import Received, Stop
-from ahrsd.journal import Journal, wrg_lines
 from ahrsd.recording.capture import CaptureReader, Sent
-from ahrsd.serving.protocol import BadRequest, parse_request
-from ahrsd.settings import core_settings
-from ahrsd.shell import Shell
-from ahrsd.summary import summary_json
+from ahrsd.report.summary import summary_json
+from ahrsd.telemetry.protocol import BadRequest, parse_request
 from ahrsd.writeback.journal_history import History
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer

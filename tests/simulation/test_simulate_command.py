@@ -70,7 +70,7 @@ def test_disturbances_reach_the_file(run, tmp_path):
     ("arguments", "said"),
     [
         (("wam", "-o", "x.txt"), "x.txt: unknown kind of file"),
-        (("wam", "-o", "no/such/folder/x.csv"), "cannot be written"),
+        (("wam", "-o", "no/such/folder/x.csv"), "is no folder; make it first"),
         (("wam", "-o", "x.csv", "--seconds", "0"), "--seconds times --rate must be positive"),
         (("wam", "-o", "x.csv", "--noise-mag", "-1"), "noise_mag_gauss is -0.001"),
         (("wam", "-o", "x.csv", "--outliers", "2"), "outlier_fraction is 2"),

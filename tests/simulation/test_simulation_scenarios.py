@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.headings import tilt_compensated_heading
+from ahrsd.heading import tilt_compensated_heading
 from ahrsd.simulation import Iron, Settings, simulate
 from ahrsd.simulation.experiment import predicted_directions
 from ahrsd.simulation.motion import MOTIONS, SCENARIOS, SUBSTEPS, mean_rate, rotation_nb, sinusoids

@@ -30,13 +30,13 @@ from virtual_run import VirtualRun
 from writeback_rig import estimate
 
 from ahrsd.calibration import Estimate
-from ahrsd.config import Config
-from ahrsd.settings import core_settings
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
-from drivers.vn100.emulator_faults import FAULTS
-from drivers.vn100.emulator_physics import draw_truth
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.faults import FAULTS
+from drivers.vn100.emulator.physics import draw_truth
+from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.registers import Values
 
 PER_SCHEDULE = 40

@@ -173,7 +173,7 @@ class History:
             ram = flash = reddened(draw, ram)
         elif self.family == "flash gate red":
             flash = (*ram, *reddened_one(draw, only_flash))
-        found, rig = found_with(int(draw.integers(4))), self.rig
+        found, rig = found_with(int(draw.random() < 0.1)), self.rig  # another iron now and then
         rig.do(rig.wb.on_verdict(found, ram, 50.0, rig.now_s, flash_gates=flash))
 
     def act(self) -> None:

@@ -4,10 +4,11 @@
     python tests/support/golden.py --streams   every stream anew, too
 
 A stream is made once, in virtual time; `STREAMS` says how. `fixtures/replays/golden.toml` has, for
-each, counts, the gates that are red at the end, the estimate, and the hash of all decisions. Hashes
-are of one arithmetic: libraries and processors differ in the last digit, and a decision that was
-near a limit may fall to the other side. `arithmetic()` names the one on which they were made; on
-another the hash is not compared, everything else is (tests/test_golden.py).
+each, counts, the gates that are red at the end, the estimate, and the hash of all decisions, which
+are the same on every processor (`ahrsd.core.decision_log`). The bytes of a stream are of one
+arithmetic: libraries and processors differ in the last digit of a sine. `arithmetic()` names the
+one on which
+they were made; on another they are not compared byte by byte (tests/offline/test_golden.py).
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ import numpy as np
 import scipy.linalg
 from streams import emitted
 
-from ahrsd.config import Config
-from ahrsd.core import Core
-from ahrsd.replay import replay
-from drivers.vn100.emulator_scenarios import Setup, build
+from ahrsd.config.loading import Config
+from ahrsd.core.core import Core
+from ahrsd.offline.replay import replay
+from drivers.vn100.emulator.scenarios import Setup, build
 
 FOLDER = Path(__file__).parents[2] / "fixtures" / "replays"
 TABLE = FOLDER / "golden.toml"

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ahrsd.mismatch.effects.base import Readings
-from ahrsd.mismatch.effects.library import EFFECTS
-from ahrsd.mismatch.track import Track
+from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.track import Track
 from ahrsd.simulation import Settings, simulate
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.calibrator import Calibrator
+from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates.table import GATES
 from ahrsd.samples import Array, SampleBlock

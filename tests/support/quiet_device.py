@@ -8,9 +8,9 @@ import re
 from functools import reduce
 from operator import xor
 
-from drivers.vn100.emulator import Emulator
-from drivers.vn100.emulator_motion import make_motion
-from drivers.vn100.emulator_physics import Truth
+from drivers.vn100.emulator.emulator import Emulator
+from drivers.vn100.emulator.motion import make_motion
+from drivers.vn100.emulator.physics import Truth
 
 
 def xor8(body: bytes) -> bytes:

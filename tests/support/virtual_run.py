@@ -12,11 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 from ahrsd import events, inputs
-from ahrsd.core import Core
-from ahrsd.core_settings import CoreSettings
-from drivers.vn100.emulator import Emulator
+from ahrsd.core.core import Core
+from ahrsd.core.settings import CoreSettings
+from drivers.vn100.emulator.emulator import Emulator
 
-WALL_S = 8e8
+WALL_S = 1.8e9
 
 
 class VirtualRun:
@@ -39,12 +39,18 @@ class VirtualRun:
         self.states: list[str] = []
         self.samples = 0
         self.finished = False
-        self.now_s = 1.0
+        self.now_s, self.wall_s = 1.0, WALL_S
+        self.boot_id, self.boot_began_s = "virtual boot", 0.0
         self._plugged = False
         self._serial = 0
         self._interlock_s = 0.0
         emulator.advance(self.now_s)
-        self.feed(inputs.WallClock(self.now_ns, WALL_S + self.now_s))
+        self.tell_clocks()
+
+    def tell_clocks(self) -> None:
+        """The computer's other clocks, as they are now."""
+        boot_s = self.now_s - self.boot_began_s
+        self.feed(inputs.WallClock(self.now_ns, self.wall_s + self.now_s, self.boot_id, boot_s))
 
     @property
     def now_ns(self) -> int:
@@ -128,7 +134,7 @@ class VirtualRun:
         """The program was killed and is started again: only the journal is remembered."""
         self.core = Core(self.core.settings)
         self._plugged = False
-        self.feed(inputs.WallClock(self.now_ns, WALL_S + self.now_s))
+        self.tell_clocks()
 
     def operate(self, verb: str, argument: str = "") -> None:
         """A person's word."""

@@ -22,6 +22,7 @@ from ahrsd.writeback.actions import (
     IdentifyAgain,
     InForce,
     JournalAppend,
+    Look,
     RunProcedure,
     SetUpStream,
 )
@@ -33,10 +34,10 @@ from drivers.vn100.commands import Command, NoReply, NotPermitted, Pause, Read, 
 from drivers.vn100.decode import Reply
 from drivers.vn100.errors import DeviceRefused, DriverError
 from drivers.vn100.firmware import profile_of
-from drivers.vn100.procedures import CONFIGURATION, Identity
+from drivers.vn100.procedures import CONFIGURATION, Identity, Seen, Unit
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_reply, parse
 
-FIRMWARE, SERIAL = "3.1.0.0", 100130608
+MODEL, FIRMWARE, SERIAL = "VN-100T-CR", "3.1.0.0", 100130608
 PROFILE = profile_of(FIRMWARE)
 GREEN = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
 RED = (GateResult("observability", 0.3, 1.0, False, 0.0, "", "turn more"),)
@@ -91,7 +92,9 @@ class Device:
             raise NoReply(command)
         if isinstance(command, Read | Write):
             word = "VNRRG" if isinstance(command, Read) else "VNWRG"
-            text = format_reply(command.register, self.ram[command.register])
+            who = {1: (MODEL,), 3: (self.serial,), 4: (FIRMWARE,)}
+            values = who.get(command.register) or self.ram[command.register]
+            text = format_reply(command.register, values)
             return Reply(word, command.register, tuple(text.split(",")[1:]))
         return Reply("", None, ())
 
@@ -134,6 +137,7 @@ def metrics(**changes: Any) -> TrialMetrics:
         "new_figure": 0.5,
         "old_figure": 10.0,
         "field_spread": 0.005,
+        "wrong_sigmas": -10.0,
     }
     return TrialMetrics(**{**values, **changes})
 
@@ -149,7 +153,9 @@ class Rig:
         self.journal: list[Record] = []
         self.disk_full = False
         self.safe = True
-        self.now_s, self.wall_s = 1000.0, 5e8
+        self.now_s, self.wall_s = 1000.0, 1.8e9
+        self.boots, self.boot_began_s = 1, 0.0  # of the computer
+        self.tells_time, self.started_s = True, 0.0  # the device: in its stream; its start-up
         self.cut_at: int | None = None
         self.points = 0
         self.events: list[Any] = []
@@ -161,19 +167,24 @@ class Rig:
     def start(self) -> None:
         """A new process: nothing is remembered but the journal."""
         self.wb = WriteBack(self.policy)
+        self.tell_clocks()
+
+    def tell_clocks(self) -> None:
+        """The computer's other clocks, as they are now."""
+        boot_s = self.now_s - self.boot_began_s
+        wall_s = self.wall_s + self.now_s
+        self.do(self.wb.on_clock(wall_s, f"boot {self.boots}", boot_s, self.now_s))
 
     # -- what the core does ------------------------------------------------------------------------
 
-    def connect(self, uptime_s: float | None = None, **changes: Any) -> None:
+    def connect(self, **changes: Any) -> None:
         registers = {n: printed(n, v) for n, v in self.device.ram.items()}
-        identity = Identity("VN-100T-CR", 7, self.device.serial, FIRMWARE, PROFILE)
+        identity = Identity(MODEL, 7, self.device.serial, FIRMWARE, PROFILE)
         arguments: dict[str, Any] = {
             "identity": identity,
             "registers": registers,
             "journal": list(self.journal),
             "host_s": self.now_s,
-            "wall_s": self.wall_s + self.now_s,
-            "uptime_s": uptime_s,
             **changes,
         }
         self.do(self.wb.on_device(**arguments))
@@ -186,6 +197,8 @@ class Rig:
                 queue = self._append(action) + queue
             elif isinstance(action, RunProcedure):
                 queue += self._carry_out(action)
+            elif isinstance(action, Look):
+                queue += self._look(action)
             elif isinstance(action, Emit):
                 self.events.append(action.event)
             elif isinstance(action, InForce):
@@ -233,6 +246,12 @@ class Rig:
         self._point()
         return reply
 
+    def _look(self, action: Look) -> list[Action]:
+        """Who answers and what it holds, without a word in the log."""
+        unit = Unit(MODEL, self.device.serial, FIRMWARE)
+        held = {n: printed(n, self.device.ram[n]) for n in action.expected}
+        return self.wb.on_looked(Seen(unit, held), "", self.now_s)
+
     def _point(self) -> None:
         """A place where the power may go."""
         self.points += 1
@@ -243,6 +262,12 @@ class Rig:
         self.now_s += seconds
         self.do(self.wb.on_interlock(self.safe, self.now_s))
         self.do(self.wb.tick(self.now_s))
+        self.hear_time()
+
+    def hear_time(self) -> None:
+        """The device's own time, where its stream has it."""
+        if self.tells_time and self.device.asynchronous:
+            self.do(self.wb.on_uptime(self.now_s - self.started_s, self.now_s))
 
     # -- what the world does -----------------------------------------------------------------------
 
@@ -266,6 +291,7 @@ class Rig:
         dt_s = np.full(count, 0.1)
         block = SampleBlock(time_s, dt_s, time_s, np.zeros((count, 3)), gyro, accel)
         self.do(self.wb.on_interlock(self.safe, self.now_s))
+        self.hear_time()
         self.do(self.wb.on_samples(block))
 
     def whole_way(self) -> None:
@@ -295,13 +321,20 @@ class Rig:
         self.now_s += 60.0
         if lost != "program":
             self.device.restart()
+            self.started_s = self.now_s - 5.0
         if lost == "device":
             self.do(self.wb.on_link_lost(self.now_s))
             self.do(self.wb.on_reset(self.now_s))
-            self.connect()
-        else:
+        if lost == "all":
+            self.boots, self.boot_began_s = self.boots + 1, self.now_s - 5.0
+        if lost != "device":
             self.start()
-            self.connect(uptime_s=5.0 if lost == "all" else 10_000.0)
+        self.connect()
+        asked = self.asked_again
+        for _ in range(3 if self.tells_time else 0):  # a second of messages
+            self.pass_time(0.6)
+        if self.asked_again > asked:
+            self.connect()
 
     # -- what a test asks --------------------------------------------------------------------------
 

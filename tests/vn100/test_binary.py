@@ -19,6 +19,7 @@ from drivers.vn100.binary import (
     encode_packet,
     layout_of,
     packet_size,
+    read_header,
 )
 from drivers.vn100.checksum import packet_intact
 from drivers.vn100.decode import Measurement, decode
@@ -38,9 +39,11 @@ SIZES = {
 
 @pytest.mark.parametrize("group", SIZES)
 def test_sizes_are_the_manuals(group: int) -> None:
-    ours = [struct.calcsize("<" + row.format) for bit, row in GROUPS[group].items() if bit < 16]
-    assert list(map(str, ours)) == SIZES[group].split()
-    assert list(GROUPS[group])[: len(ours)] == list(range(len(ours)))
+    ours = [struct.calcsize("<" + row.format) for row in GROUPS[group].values() if not row.each]
+    sizes = SIZES[group].split() + (["2", "8"] if group in (3, 6) else [])  # of the second word
+    assert list(map(str, ours)) == sizes
+    fields = len(SIZES[group].split())
+    assert list(GROUPS[group])[:fields] == list(range(fields))
 
 
 def test_masks_are_the_manuals() -> None:
@@ -72,25 +75,29 @@ def test_all_that_a_vn100_can_send_fits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("header", "generic", "size"),
+    ("header", "size"),
     [
-        ("FA 00 00 00", True, 0),  # no group
-        ("FA 01 00 00", True, 0),  # no field
-        ("FA 01 02 00", False, 0),  # TimeGps: not on a VN-100
-        ("FA 01 02 00", True, 14),
-        ("FA 04 00 20", True, 0),  # reserved bit: length unknown
-        ("FA 08 01 80 02 00", False, 0),
-        ("FA 08 01 80 02 00", True, 18),
-        ("FA 08 00 40", True, 0),  # SatInfo: length depends on its content
-        ("FA 01 08 80 01 00", False, 0),  # no extension words on a VN-100
-        ("FA 81 08 00", True, 0),  # groups 8 to 14: unknown
-        ("FA 60 B9 00 61 79", True, 0),  # found in a payload
-        ("FA 49 FF 7F FF 3F FF 3F", True, 198 + 142 + 142 + 10),
-        ("FA 69 FF 7F FF 3F FF 1F FF 3F", True, 0),  # 756 bytes: longer than any packet
+        ("FA 00 00 00", 0),  # no group
+        ("FA 01 00 00", 0),  # no field
+        ("FA 01 02 00", 14),  # TimeGps: not on a VN-100, and asked of it all the same
+        ("FA 04 00 20", 0),  # reserved bit: length unknown
+        ("FA 08 01 80 02 00", 18),  # a second field word
+        ("FA 08 00 40", 8),  # SatInfo: 8 more for each satellite
+        ("FA 08 00 80 01 00", 20),  # RawMeas, of the second word: 28 more for each
+        ("FA 01 08 80 01 00", 0),  # the common group has no second word
+        ("FA 81 08 01 00 01 00", 0),  # group 11
+        ("FA 80 20 20 00", 31),  # GNSS3, behind a second group byte
+        ("FA 81 20 01 00 20 00", 41),
+        ("FA 60 B9 00 61 79", 310),  # found in a payload
+        ("FA 49 FF 7F FF 3F FF 3F", 198 + 142 + 142 + 10),
+        ("FA 69 FF 7F FF 3F FF 1F FF 3F", 198 + 142 + 262 + 142 + 12),
+        ("FA 29 FF 7F 10 02 0C 00", 8 + 198 + 13 + 36 + 2),
     ],
 )
-def test_headers(header: str, generic: bool, size: int) -> None:
-    assert packet_size(bytes.fromhex(header), generic) == size
+def test_headers(header: str, size: int) -> None:
+    header_bytes = bytes.fromhex(header)
+    assert packet_size(header_bytes) == size
+    assert read_header(header_bytes, 0) == header_bytes or not size
 
 
 def test_layouts_that_do_not_exist() -> None:

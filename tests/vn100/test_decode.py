@@ -20,6 +20,7 @@ from drivers.vn100.decode import (
     Measurement,
     Reply,
     Undecodable,
+    Unused,
     decode,
     decode_batch,
 )
@@ -93,10 +94,14 @@ def test_bad_values_are_undecodable(values: str) -> None:
         ("VNERR,0C", ErrorReply(12)),
         ("VNERR,ff", ErrorReply(255)),
         ("VNERR", Undecodable("VNERR without an error code", 0)),
+        ("VNERR,08,Invalid Register", ErrorReply(8)),
+        ("VNERR,Invalid Parameter", ErrorReply(7)),
+        ("VNERR,INSUFFICIENT_BAUD_RATE", ErrorReply(0x0C)),
+        ("VNERR,SerialBufferOverflow", ErrorReply(2)),
         ("VNERR,XY", Undecodable("VNERR without an error code", 0)),
         ("VNRRG", Undecodable("VNRRG without a register number", 0)),
         ("VNRRG,-1", Undecodable("VNRRG without a register number", 0)),
-        ("VNGPS,1", Undecodable("VNGPS is not a message of a VN-100", 0)),
+        ("VNGPS,1", Unused("VNGPS", 0)),
     ],
 )
 def test_replies_and_errors(body: str, result: Decoded) -> None:
@@ -111,7 +116,7 @@ words = st.sampled_from(["VNYPR", "VNIMU", "VNRRG", "VNWRG", "VNERR", "VNASY", "
 @given(words, text)
 def test_no_text_raises(word: str, rest: str) -> None:
     result = decode(Sentence(f"{word},{rest}", 3, 0))
-    assert isinstance(result, Measurement | Reply | ErrorReply | Undecodable)
+    assert isinstance(result, Measurement | Reply | ErrorReply | Undecodable | Unused)
     if isinstance(result, Measurement):
         assert all(map(math.isfinite, result.values))
 

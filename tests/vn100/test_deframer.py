@@ -184,15 +184,14 @@ def test_damage_costs_one_message_at_most(
 
 
 @settings(deadline=None)
-@given(st.binary(max_size=3000), st.booleans(), st.booleans())
-@example(b"\xfa" * 1000, False, True)
-@example(b"$VN" + b"0" * 2000, False, False)
-@example(b"$VN" + b"0" * 2000, True, False)
-@example(b"\xfa\x17\x3d\x3f\x91\x01\xff\x1f\xff\x11" * 200, False, False)
-def test_garbage_is_harmless_and_the_buffer_bounded(
-    data: bytes, host_side: bool, generic: bool
-) -> None:
-    deframer = Deframer(host_side=host_side, generic=generic)
+@given(st.binary(max_size=3000), st.booleans())
+@example(b"\xfa" * 1000, False)
+@example(b"$VN" + b"0" * 2000, False)
+@example(b"$VN" + b"0" * 2000, True)
+@example(b"\xfa\x17\x3d\x3f\x91\x01\xff\x1f\xff\x11" * 200, False)
+@example(b"\xfa\x88\x20\x00\x40\x00\x40\xff" * 200, False)
+def test_garbage_is_harmless_and_the_buffer_bounded(data: bytes, host_side: bool) -> None:
+    deframer = Deframer(host_side=host_side)
     for at in range(0, len(data), 7):
         deframer.feed(data[at : at + 7])
         check_sums(deframer)

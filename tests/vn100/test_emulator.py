@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from quiet_device import Host, bodies, command, device, quiet
 
-from drivers.vn100.emulator import BOOT_S
-from drivers.vn100.emulator_physics import Truth, draw_truth
+from drivers.vn100.emulator.emulator import BOOT_S
+from drivers.vn100.emulator.physics import Truth, draw_truth
 
 WIRE = Path(__file__).parents[2] / "fixtures" / "vn100" / "wire_examples.json"
 
@@ -72,7 +72,7 @@ EXCHANGES = [  # vn100-protocol 1.1, 3, 9 and 13.1, as found in public documents
     (b"$VNWRG,26,1,0.1,0,0,1,0,0,0,1*XX", b"$VNERR,07*76"),
     (b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,nan*XX", b"$VNERR,07*76"),
     (b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,1E-3*XX", b"$VNERR,07*76"),
-    (b"$VNWRG,75,1,16,08,0001*XX", b"$VNERR,07*76"),
+    (b"$VNWRG,75,1,16,04,2000*XX", b"$VNERR,07*76"),
     (b"$VNBOM,1*45", b"$VNERR,07*76"),
     (b"$VNRRG,99*XX", b"$VNERR,08*79"),
     (b"$VNRRG,74*XX", b"$VNERR,08*79"),
@@ -330,3 +330,53 @@ def test_known_magnetic_disturbance_stops_the_on_board_compensation():
     host.ask("VNKMD,0")
     host.wait(30.0)
     assert host.ask("VNRRG,47") != "VNRRG,47,1,0,0,0,1,0,0,0,1,0,0,0"
+
+
+@pytest.mark.parametrize("firmware", ["2.1.0.0", "3.1.0.0"])
+def test_fields_of_other_models_may_be_asked_for_and_are_zero(firmware):
+    """As the ROS 2 driver does; the VN-100 of public reports takes it and sends zeros."""
+    host = Host(quiet(firmware=firmware, presets={5: (921600,)}))
+    asked = "75,3,40,29,7FFF,0210,000C"
+    line, _, stream = host.send(command(f"VNWRG,{asked}")).partition(b"\r\n")
+    assert bodies(line + b"\r\n") == [f"VNWRG,{asked}"]
+    stream += host.wait(1.0)
+    header = bytes.fromhex("FA29FF7F10020C00")
+    size = len(header) + 198 + 13 + 36 + 2
+    packets = [stream[at : at + size] for at in range(0, len(stream), size)]
+    assert 20 <= len(packets) <= 24
+    assert all(packet.startswith(header) for packet in packets)
+    position = slice(8 + 24 + 12 + 16 + 12, 8 + 24 + 12 + 16 + 12 + 24)  # PosLla
+    assert all(packet[position] == bytes(24) for packet in packets)
+
+
+@pytest.mark.parametrize(
+    ("sent", "on_3", "on_2"),
+    [
+        ("VNSIH,+090.000", "VNSIH,+090.000", "VNERR,04"),
+        ("VNSIH", "VNERR,05", "VNERR,04"),
+        ("VNSIH,north", "VNERR,07", "VNERR,04"),
+        ("VNSFB", "VNSFB", "VNERR,04"),
+        ("VNRRG,206", "VNRRG,206,0,0,0,0", "VNERR,08"),
+        ("VNRRG,116", "VNRRG,116,0,0,0,0,0,0,0", "VNERR,08"),
+    ],
+)
+def test_what_the_vendors_present_library_asks(sent, on_3, on_2):
+    assert Host(quiet(firmware="3.1.0.0")).ask(sent) == on_3
+    assert Host(quiet(firmware="2.1.0.0")).ask(sent) == on_2
+
+
+def test_an_initial_heading_turns_the_attitude_about_the_vertical():
+    host = Host(quiet())
+    before = [float(value) for value in host.ask("VNRRG,08").split(",")[2:]]
+    host.ask("VNSIH,+090.000")
+    yaw, pitch, roll = (float(value) for value in host.ask("VNRRG,08").split(",")[2:])
+    assert abs(yaw - 90.0) < 2.0
+    np.testing.assert_allclose((pitch, roll), before[1:], atol=0.5)
+
+
+def test_a_poll_is_answered_by_a_line_and_a_packet():
+    host = Host(quiet())
+    host.ask("VNWRG,75,0,16,01,0009")
+    answer = host.send(b"$VNBOM,1*XX\r\n")
+    assert answer.startswith(b"$VNBOM,1*45\r\n" + bytes.fromhex("FA010900"))
+    assert len(answer) == 13 + 26

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.vn100.emulator_chain import BIAS_S, FilterState, Outputs, Settings
-from drivers.vn100.emulator_hsi import OnBoardHsi
-from drivers.vn100.emulator_motion import make_motion
-from drivers.vn100.emulator_physics import BLOCK_TICKS, Block, Truth, World
+from drivers.vn100.emulator.chain import BIAS_S, FilterState, Outputs, Settings
+from drivers.vn100.emulator.hsi import OnBoardHsi
+from drivers.vn100.emulator.motion import make_motion
+from drivers.vn100.emulator.physics import BLOCK_TICKS, Block, Truth, World
 
 EYE = (np.eye(3), np.zeros(3))
 PLAIN = Settings(EYE, EYE, EYE, np.eye(3), None, np.array([0.245, 0, 0.424]))

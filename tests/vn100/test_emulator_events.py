@@ -5,10 +5,10 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.vn100.emulator import Emulator
-from drivers.vn100.emulator_motion import make_motion
-from drivers.vn100.emulator_physics import Truth
-from drivers.vn100.emulator_scenarios import SCENARIOS, Setup, build
+from drivers.vn100.emulator.emulator import Emulator
+from drivers.vn100.emulator.motion import make_motion
+from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.scenarios import SCENARIOS, Setup, build
 
 QUIET = {6: (0,)}
 TIMES = {6: (0,), 75: (1, 8, 1, 0x0001)}  # TimeStartup at 100 Hz, 14 bytes

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from drivers.vn100.emulator_faults import FALSE_HEADERS, FAULTS, Fault, FaultPlan, parse_fault
+from drivers.vn100.emulator.faults import FALSE_HEADERS, FAULTS, Fault, FaultPlan, parse_fault
 
 MESSAGE = bytes(range(32, 127))
 

@@ -13,7 +13,7 @@ from quiet_device import Host, bodies, command, crc16, device, quiet
 
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.emulator_physics import Truth
+from drivers.vn100.emulator.physics import Truth
 
 
 @pytest.fixture
@@ -207,7 +207,9 @@ def test_compensated_set_agrees_with_the_codec_and_with_the_truth():
 def test_vnbom_polls_one_packet(host):
     host.ask("VNWRG,75,0,0,01,0009")
     assert host.wait(1.0) == b""
-    (packet,) = packets(host.send(b"$VNBOM,1*45\r\n"), bytes.fromhex("FA010900"), 26)
+    answer = host.send(b"$VNBOM,1*45\r\n")
+    assert answer.startswith(b"$VNBOM,1*45\r\n\xfa")  # the vendor's library waits for the line
+    (packet,) = packets(answer.partition(b"\n")[2], bytes.fromhex("FA010900"), 26)
     nanoseconds, yaw, pitch, roll = struct.unpack("<Q3f", packet[4:-2])
     assert nanoseconds == pytest.approx((host.now_s - 0.1) * 1e9, abs=10e6)
     assert abs(pitch) < 4 and abs(roll) < 4 and abs(yaw) <= 180

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivers.vn100.emulator_motion import (
+from drivers.vn100.emulator.motion import (
     MOTIONS,
     TRANSITION_S,
     YAW,
@@ -16,7 +16,7 @@ from drivers.vn100.emulator_motion import (
     quaternion_of,
     quaternions,
 )
-from drivers.vn100.emulator_physics import (
+from drivers.vn100.emulator.physics import (
     BLOCK_TICKS,
     HISTORY_TICKS,
     TICK_HZ,

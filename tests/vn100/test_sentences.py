@@ -28,6 +28,7 @@ TABLE = [
     ("VNIMU", 19, 54, 11, 110),
     ("VNDTV", 30, 80, 7, 75),
     ("VNHVE", 34, 115, 3, None),  # no source prints a line of it
+    ("VNCMV", 253, 0, 10, None),  # firmware 1
 ]
 
 
@@ -67,6 +68,9 @@ def messages(draw: st.DrawFn) -> tuple[str, list[float], int | None, int | None,
     name = draw(st.sampled_from(sorted(MESSAGES)))
     values = []
     for column in MESSAGES[name].columns:
+        if column.printed.endswith("E"):
+            values.append(float(f"{draw(st.floats(-100, 100)):.6E}"))
+            continue
         decimals = int(column.printed[-2])
         most = min(180, 10 ** (int(re.findall(r"\d+", column.printed)[0]) - decimals - 2) - 1)
         number = draw(st.integers(-most * 10**decimals, most * 10**decimals)) / 10**decimals

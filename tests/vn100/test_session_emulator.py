@@ -13,8 +13,8 @@ from drivers.vn100.commands import SessionError
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.device import Device
-from drivers.vn100.emulator_pty import PtyEmulator
-from drivers.vn100.emulator_scenarios import Setup, build
+from drivers.vn100.emulator.pty import PtyEmulator
+from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,

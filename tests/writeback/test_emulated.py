@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ahrsd.core.closing import identify_surely, read_surely
 from ahrsd.writeback.actions import IdentifyAgain, JournalAppend, RunProcedure
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
 from ahrsd.writeback.states import State
-from drivers.vn100.emulator_scenarios import Setup, build
-from drivers.vn100.procedures import identify, read_configuration
+from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.session import Failed, Finished, Session
 
 STEP_S = 0.01
@@ -42,8 +42,8 @@ class Bench:
 
     def identify(self):
         def everything():
-            who = yield from identify()
-            return who, (yield from read_configuration(who.profile))
+            who = yield from identify_surely()
+            return who, (yield from read_surely(who, (23, 84)))
 
         self.waiting.append(RunProcedure("identify", Purpose.READ, everything, lambda _: True))
 
@@ -89,8 +89,9 @@ class Bench:
                 self.identify()
             elif name == "identify":
                 who, held = event.result
-                wall_s = 5e8 + self.now_s
-                self.do(self.wb.on_device(who, held, self.journal, self.now_s, wall_s))
+                wall_s, boot_s = 1.8e9 + self.now_s, self.now_s
+                self.do(self.wb.on_clock(wall_s, "boot", boot_s, self.now_s))
+                self.do(self.wb.on_device(who, held, self.journal, self.now_s))
                 self.identified = who
             elif isinstance(event, Finished):
                 self.do(self.wb.on_procedure_finished(name, event.result, self.now_s))

@@ -362,7 +362,8 @@ def in_trial(make_rig, **policy):
 @pytest.mark.parametrize(
     "bad",
     [
-        {"field_spread": 0.021},
+        {"field_spread": 0.11},
+        {"wrong": 0.01, "wrong_sigmas": 3.1},
         {"heading_jump_deg": 60.0},
         {"heading_jump_deg": float("nan")},
     ],

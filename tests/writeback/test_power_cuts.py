@@ -242,7 +242,18 @@ def test_contradictions_are_alarms_and_old_values_never_are_before_a_save():
     for last, row in TABLE.items():
         assert row[Found.NEITHER].level in ("error", "warning")
         assert row[Found.NEITHER].signal not in (Signal.NOTHING_OPEN, Signal.READ_CONFIRMED)
-        assert row[Found.OLD].signal is Signal.NOTHING_OPEN
+        for held in (Found.OLD, Found.OLD_AFTER_RESTART):
+            assert row[held].signal is Signal.NOTHING_OPEN
+        assert {Kind.LOST, Kind.NOT_SAVED}.isdisjoint(
+            row[held].record for held in Found if held is not Found.OLD_AFTER_RESTART
+        )
+        if last not in (Kind.FLASH_SENT, Kind.FLASH_ACKED):
+            assert row[Found.NEITHER].record is Kind.FOREIGN
+            assert row[Found.MIXED_AFTER_RESTART].record is Kind.FOREIGN
+            if last is not Kind.PROVEN:
+                assert row[Found.NEW_AFTER_RESTART].record is Kind.FOREIGN
+        confirming = {held for held in Found if row[held].record is Kind.CONFIRMED}
+        assert confirming <= {Found.NEW_AFTER_RESTART}
         if last is not Kind.FLASH_ACKED:
             assert row[Found.OLD].level != "error"
 
@@ -255,10 +266,11 @@ OTHER = (2.0,) * 12
     ("device", "restarted", "expected"),
     [
         ({23: OLD, 84: OLD}, False, Found.OLD),
-        ({23: OLD, 84: OLD}, True, Found.OLD),
+        ({23: OLD, 84: OLD}, True, Found.OLD_AFTER_RESTART),
         ({23: NEW, 84: NEW}, False, Found.NEW),
         ({23: NEW, 84: NEW}, True, Found.NEW_AFTER_RESTART),
-        ({23: NEW, 84: OLD}, True, Found.MIXED),
+        ({23: NEW, 84: OLD}, False, Found.MIXED),
+        ({23: NEW, 84: OLD}, True, Found.MIXED_AFTER_RESTART),
         ({23: NEW, 84: OTHER}, True, Found.NEITHER),
         ({23: NEW}, True, Found.NEITHER),
         ({23: (float("nan"),) * 12, 84: NEW}, False, Found.NEITHER),

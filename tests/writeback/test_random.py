@@ -51,7 +51,7 @@ def act(rig, watchman, rng):
     what = rng.integers(14)
     if what <= 3:
         watchman.green = rng.random() < 0.7
-        shift = np.array([0.03 * rng.integers(4), 0.04, -0.02])
+        shift = np.array([0.03 * (1 + (rng.random() < 0.1)), 0.04, -0.02])
         rig.verdict(gates=rig.GREEN if watchman.green else rig.RED, hard_iron_gauss=shift)
     elif what <= 5 and rig.wb.proposal is not None:
         rig.approve()

@@ -1,0 +1,107 @@
+"""The two ways in which MAGICAL and MAGYC optimise their factor graph, on GTSAM.
+
+Batch: all windows in one vectorised factor, which is the same sum as one factor each, by dogleg.
+Incremental: a factor of every Gamma windows as they come, into iSAM2 with dogleg (RISE); the answer
+is the mean of the last fifth of the estimates. With one set of variables each update of iSAM2
+evaluates every factor again, so the whole is quadratic in time, as published.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from ahrsd.baselines.data import Fit, MethodError, Settings
+from ahrsd.baselines.factors import custom_factor, values_of, variable, vector_of
+from ahrsd.baselines.kinematic import Model
+from ahrsd.baselines.windows import Kinematics
+from ahrsd.samples import Array
+
+SIGMA = 1e-6  # the seeds', of every row
+TOLERANCE = 1e-7
+_MAX_ITERATIONS = 1000
+_FIRST_RADIUS = 0.5
+_AVERAGED = 0.2  # part of the estimates, from the end
+
+
+def factors(model: Model, kin: Kinematics) -> list[gtsam.CustomFactor]:
+    """The residual factor of these windows, and their norm factors as one."""
+    found = [custom_factor(lambda x: model.residual(kin, x), 3 * len(kin), model.nodes, SIGMA)]
+    if model.norm:
+        each = SIGMA / float(np.sqrt(len(kin)))  # n equal factors are one of n times the weight
+        found.append(custom_factor(model.norm_residual, 1, model.nodes, each))
+    return found
+
+
+def batch(model: Model, kin: Kinematics) -> Fit:
+    """All windows at once.  MethodError where it is singular, diverges or does not end."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors(model, kin):
+        graph.add(factor)
+    parameters = gtsam.DoglegParams()
+    parameters.setRelativeErrorTol(TOLERANCE)
+    parameters.setAbsoluteErrorTol(TOLERANCE)
+    parameters.setMaxIterations(_MAX_ITERATIONS)
+    parameters.setDeltaInitial(_FIRST_RADIUS)
+    try:
+        optimizer = gtsam.DoglegOptimizer(graph, values_of(model.start, model.nodes), parameters)
+        found = optimizer.optimize()
+    except RuntimeError as error:
+        raise _singular(error) from error
+    if optimizer.iterations() >= _MAX_ITERATIONS:
+        raise MethodError(f"no end after {_MAX_ITERATIONS} iterations")
+    return model.fit(vector_of(found, len(model.nodes)), int(optimizer.iterations()))
+
+
+def incremental(model: Model, kin: Kinematics, settings: Settings, threshold: float) -> Fit:
+    """Window after window; `threshold` of iSAM2's relinearisation, 0 for never.
+
+    MethodError where an update is singular, or the data do not fill one update.
+    """
+    isam = gtsam.ISAM2(_isam_parameters(threshold))
+    every = settings.update_every
+    history: list[Array] = []
+    for end in range(every, len(kin) + 1, every):
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors(model, kin[end - every : end]):
+            graph.add(factor)
+        initial = values_of(model.start, model.nodes) if not history else gtsam.Values()
+        try:
+            isam.update(graph, initial)
+            current = isam.calculateEstimate()
+        except RuntimeError as error:
+            raise _singular(error) from error
+        history.append(np.concatenate([current.atVector(variable(i)) for i in _nodes(model)]))
+    if not history:
+        raise MethodError(f"{len(kin)} windows: the first update needs {every}")
+    return _mean(model, history)
+
+
+def _nodes(model: Model) -> range:
+    return range(len(model.nodes))
+
+
+def _isam_parameters(threshold: float) -> gtsam.ISAM2Params:
+    dogleg = gtsam.ISAM2DoglegParams()
+    dogleg.setInitialDelta(_FIRST_RADIUS)
+    dogleg.setAdaptationMode("ONE_STEP_PER_ITERATION")
+    parameters = gtsam.ISAM2Params()
+    parameters.setOptimizationParams(dogleg)
+    parameters.enableRelinearization = threshold > 0
+    if threshold > 0:
+        parameters.setRelinearizeThreshold(threshold)
+    return parameters
+
+
+def _mean(model: Model, history: list[Array]) -> Fit:
+    last = max(1, int(_AVERAGED * len(history)))
+    fits = [model.fit(x, len(history)) for x in history[-last:]]
+    A = np.mean([fit.soft_iron for fit in fits if fit.soft_iron is not None], axis=0)
+    b = np.mean([fit.hard_iron_gauss for fit in fits], axis=0)
+    bias = np.mean([x[-3:] for x in history[-last:]], axis=0)
+    return Fit(A, b, bias, len(history), f"mean of the last {last} of {len(history)} estimates")
+
+
+def _singular(error: RuntimeError) -> MethodError:
+    first = str(error).strip().split("\n", maxsplit=1)[0]
+    return MethodError(f"the motion does not determine the answer (GTSAM: {first})")

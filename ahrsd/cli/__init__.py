@@ -1,0 +1,56 @@
+"""The command line, one module per command, imported only when that command runs.
+
+Every module here has `command: click.Command`. A command that answers "no" ends with
+`raise SystemExit(EXIT_NO)`; whatever a person can put right is raised as an `AhrsdError`.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+#: name -> what `ahrsd --help` says about it, so that the help imports none of them
+COMMANDS: dict[str, str] = {
+    "demo": "The whole job on an emulated VN-100, no hardware needed.",
+    "run": "The daemon: estimate from the stream, judge, and write back as far as the mode allows.",
+    "emulate": "An emulated VN-100 on a pseudo-terminal.",
+    "capture": "Record what a device sends.",
+    "convert": "A recording of another program as a Parquet table that says where it comes from.",
+    "replay": "The pipeline of `run` over a recording.",
+    "calibrate": "Batch calibration of a recording.",
+    "evaluate": "What a calibration is worth: heading, field and dead reckoning, before and after.",
+    "simulate": "A recording of a scenario, with the truth beside it.",
+    "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
+    "diagnose": "Where a simulation and a recording differ, and which physics was left out.",
+    "challenge": "Sealed blind trials of `diagnose`: make cases, run tools, score.",
+    "operator": "A person's word to the running daemon: approve, lock, unlock, rollback.",
+    "status": "How the running daemon stands.",
+    "watch": "The running daemon, live on a terminal.",
+    "explain": "Which gate holds a write back, since when, and what would open it.",
+    "bundle": "A support archive: journal, newest capture, status, versions.",
+    "registers": "Read, compare, write and roll back the device's registers.",
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports `ahrsd.cli.NAME` when NAME is called, and not before."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of a first visit."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command's module."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"ahrsd.cli.{cmd_name}")
+        command = module.command
+        if not isinstance(command, click.Command):
+            raise TypeError(f"ahrsd.cli.{cmd_name}.command is not a click command")
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The command list out of the table above."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))

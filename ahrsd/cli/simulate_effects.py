@@ -1,0 +1,57 @@
+"""What `ahrsd simulate` does beyond its scenarios: effects in them, and repaired models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ahrsd.diagnosis import forward, roles
+from ahrsd.diagnosis.effects import profiles, request
+from ahrsd.diagnosis.injection import injected, readings_of, terms_json
+from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.errors import AhrsdError
+from ahrsd.offline.diagnose import load_track
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.samples import Array
+from ahrsd.simulation import Experiment
+
+
+def with_effects(
+    experiment: Experiment, wanted: Sequence[str], seed: int
+) -> tuple[Experiment, list[dict[str, object]]]:
+    """The experiment with the wanted effects and the covariates they need, and the terms for the
+    truth.  AhrsdError in one line for a request that cannot be."""
+    try:
+        requests = [request.parse(text) for text in wanted]
+        effects = [one.effect for one in requests]
+        columns = profiles.columns_for(effects, experiment.samples.time_s, seed)
+        readings = readings_of(experiment, columns)
+        terms = [one.term(readings) for one in requests]
+    except ValueError as error:
+        raise AhrsdError(f"--effect: {error}") from None
+    return injected(experiment, readings, terms), terms_json(terms)
+
+
+def along(
+    model: RepairedModel, recording: Path, seed: int, columns: ColumnMap = NO_MAP
+) -> tuple[dict[str, Array], list[str]]:
+    """A table's columns: what the repaired model reads along the motion of a recording.
+
+    RecordingError as `diagnose`; AhrsdError where a term needs a column that there is not.
+    """
+    read, notes = load_track(recording, columns=columns)
+    track, refused = roles.prepared(read)
+    try:
+        context = forward.context_along(track, model.calibration, model.terms)
+        truth = forward.truth_along(context)
+        made = forward.simulated(truth, model.terms, model.noise, seed)
+    except ValueError as error:
+        raise AhrsdError(f"{recording}: {error}") from None
+    done = forward.track_of(made, track)
+    written = {"time_s": done.time_s}
+    sensors = [("mag", "gauss", done.mag_b_gauss), ("gyro", "rad_s", done.gyro_b_rad_s)]
+    if done.accel_b_m_s2 is not None:
+        sensors.append(("accel", "m_s2", done.accel_b_m_s2))
+    for name, unit, values in sensors:
+        written |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
+    return written | done.covariates, [*notes, *refused]

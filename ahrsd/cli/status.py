@@ -1,0 +1,20 @@
+"""`ahrsd status`: how the running daemon stands."""
+
+from __future__ import annotations
+
+import click
+
+from ahrsd.cli.running import Place, place_options, tell
+
+
+@click.command()
+@place_options
+@click.option("--json", "json_path", help="As JSON into this file, - for stdout.")
+def command(place: Place, json_path: str | None) -> None:
+    """Show device, stream, motion, estimate and write-back of the running daemon.
+
+    Exit 75 where no daemon answers.
+    """
+    from ahrsd.telemetry.lines import status_lines
+
+    tell(place, "status", json_path, status_lines)

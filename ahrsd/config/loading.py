@@ -1,0 +1,163 @@
+"""The configuration: TOML, frozen, every wrong key named with its value and what is allowed.
+
+    config = load_config(Path("ahrsd.toml"))        # ConfigError: one line per wrong key
+
+An unknown key is an error, because a misspelt limit must not silently be the default.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from ahrsd.config.sections import (
+    Budget,
+    Capture,
+    Device,
+    Estimator,
+    Gates,
+    Interlock,
+    Location,
+    Metrics,
+    Rerun,
+    Section,
+    Socket,
+    Still,
+    Terms,
+    Trial,
+    WriteBack,
+)
+from ahrsd.errors import ConfigError
+from ahrsd.foreign_file import ForeignFileError, text_within
+from ahrsd.writeback.permissions import Mode as Ceiling
+from ahrsd.writeback.policy import WriteBackPolicy
+
+Mode = Literal["passive", "observe", "stage", "commit"]
+
+_LARGEST_BYTES = 1 << 20
+_NAMES = 12  # more keys than this do not fit into one line
+_WORDS = {  # where pydantic speaks of Python's types and not of TOML's
+    "is_instance_of": "must be text, a path",
+    "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "float_type": "must be a number",
+    "date_type": "must be a date such as 2026-11-03, without quotes",
+}
+
+
+class Config(Section):
+    """Everything that a person can set."""
+
+    mode: Mode = "observe"
+    """passive sends no byte; observe only reads registers and says what it would write; stage may
+    write RAM; commit may write flash."""
+    state_directory: Path | None = None
+    """Journals and captures; default: $STATE_DIRECTORY (systemd), else ~/.local/state/ahrsd."""
+    device: Device = Device()
+    capture: Capture = Capture()
+    rerun: Rerun = Rerun()
+    socket: Socket = Socket()
+    metrics: Metrics = Metrics()
+    estimator: Estimator = Estimator()
+    gates: Gates = Gates()
+    interlock: Interlock = Interlock()
+    terms: Terms = Terms()
+    location: Location = Location()
+    write_back: WriteBack = WriteBack()
+    trial: Trial = Trial()
+    still: Still = Still()
+    budget: Budget = Budget()
+
+    @property
+    def state(self) -> Path:
+        """The state directory in force."""
+        return self.state_directory or default_state_directory()
+
+    @property
+    def captures(self) -> Path:
+        """The folder of the captures in force."""
+        return self.capture.directory or self.state / "captures"
+
+    def write_back_policy(self) -> WriteBackPolicy:
+        """What the write-back takes, collected from the tables that a person sees."""
+        return WriteBackPolicy(
+            mode=Ceiling[self.mode.upper()],
+            configure_stream=self.device.configure_stream,
+            serial=self.device.serial_number,
+            interlock_max_age_s=self.interlock.max_age_s,
+            max_change_auto_deg=self.gates.max_step_auto_deg,
+            trial=self.trial.policy(),
+            still=self.still.policy(),
+            **self.write_back.model_dump(),
+            **self.budget.model_dump(),
+        )
+
+
+CONFIG_KEY = "config"  # where a capture's header keeps the configuration it was made with
+
+
+def recorded_config(text: str) -> Config:
+    """The configuration in a capture's header, TOML.  Raises ConfigError where it is not one."""
+    source = "the capture's configuration"
+    try:
+        return check_config(tomllib.loads(text), source)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError([f"{source}: is not TOML: {error}"]) from error
+
+
+def default_state_directory() -> Path:
+    """$STATE_DIRECTORY as systemd sets it, else the user's own (XDG base directories)."""
+    if given := os.environ.get("STATE_DIRECTORY"):
+        return Path(given.split(":")[0])
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "ahrsd"
+
+
+def load_config(path: Path) -> Config:
+    """Read and check a file.  Raises ConfigError with one line per wrong key."""
+    try:
+        body = tomllib.loads(text_within(path, _LARGEST_BYTES))
+    except ForeignFileError as error:
+        raise ConfigError([f"{path}: {error}"]) from error
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError([f"{path}: is not TOML: {error}"]) from error
+    return check_config(body, str(path))
+
+
+def check_config(body: dict[str, Any], source: str) -> Config:
+    """A configuration from keys and values; `source` is how the errors call it."""
+    try:
+        return Config.model_validate(body)
+    except ValidationError as error:
+        # a choice such as "auto or a rate" reports once per alternative: one line is enough
+        lines = dict.fromkeys(f"{source}: {_explain(detail)}" for detail in error.errors())
+        raise ConfigError(list(lines)) from error
+
+
+def section_of(location: tuple[int | str, ...]) -> type[BaseModel]:
+    """The table that holds the key at `location`."""
+    annotation = Config.model_fields[str(location[0])].annotation if len(location) > 1 else Config
+    return annotation if isinstance(annotation, type) else Config
+
+
+def _explain(detail: ErrorDetails) -> str:
+    location = detail["loc"]
+    key = ".".join(str(part) for part in location)
+    if detail["type"] == "extra_forbidden":
+        known = list(section_of(location).model_fields)
+        alike = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
+        names = ", ".join(known) if len(known) <= _NAMES else "those of `ahrsd run --print-config`"
+        hint = f"did you mean {alike[0]}?" if alike else f"known are {names}"
+        return f"{key} = {detail['input']!r}: unknown key; {hint}"
+    if not location or detail["type"] == "value_error":
+        return f"{key}: {detail['msg'].removeprefix('Value error, ')}"
+    if detail["type"] == "model_type":
+        return f"{key} = {detail['input']!r}: this is a table, write [{key}]"
+    words = _WORDS.get(detail["type"], detail["msg"].replace("Input should be", "must be"))
+    return f"{key} = {detail['input']!r}: {words}"

@@ -1,0 +1,159 @@
+"""The write-back's actions, carried out one after the other.
+
+A journal record stops the line until it is on the disk: what waits behind it may be a byte to the
+device. A procedure waits until the session is idle.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol
+
+from ahrsd import events
+from ahrsd.core.device_session import Conversation
+from ahrsd.inputs import Journalled
+from ahrsd.writeback.actions import (
+    Action,
+    CalibrateAnew,
+    CancelProcedure,
+    Emit,
+    IdentifyAgain,
+    InForce,
+    JournalAppend,
+    Look,
+    RunProcedure,
+    SetUpStream,
+)
+from ahrsd.writeback.machine import WriteBack
+from ahrsd.writeback.reconcile import OF_OUTPUTS, Kind
+from drivers.vn100.registers import Values
+from drivers.vn100.session import Event as SessionEvent
+
+
+class Office(Protocol):
+    """The core, as far as errands concern it."""
+
+    def emit(self, event: events.Event) -> None:
+        """Let the event out."""
+
+    def take(self, found: list[SessionEvent]) -> None:
+        """Take in what the session heard."""
+
+    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+        """These registers act from now on."""
+
+    def calibrate_anew(self, reason: str) -> None:
+        """What was estimated until now rests on samples that prove nothing."""
+
+
+class Errands:
+    """A line of actions. `pausing` is called before a procedure that may pause the output."""
+
+    def __init__(
+        self, conversation: Conversation, writeback: WriteBack, pausing: Callable[[], None]
+    ) -> None:
+        self._conversation, self._writeback = conversation, writeback
+        self._pausing = pausing
+        self._todo: deque[Action] = deque()
+        self._procedure: RunProcedure | None = None
+        self._look: Look | None = None
+        self._awaiting_journal = False
+        self._now_s = 0.0
+
+    @property
+    def at_rest(self) -> bool:
+        """Nothing is under way, so the port may be given back."""
+        return (
+            not self._todo
+            and self._procedure is None
+            and not self._awaiting_journal
+            and self._writeback.idle
+            and self._conversation.may_close
+        ) or not self._conversation.limit.patient(self._now_s)
+
+    @property
+    def awaiting_journal(self) -> bool:
+        """Whether the line waits for a record to be on the disk."""
+        return self._awaiting_journal
+
+    def add(self, actions: Iterable[Action]) -> None:
+        """To the end of the line."""
+        self._todo.extend(actions)
+
+    def stop(self, host_s: float) -> None:
+        """The run is to end: what is only in RAM is undone, within a limit."""
+        self._conversation.limit.begin(host_s)
+        self.add(self._writeback.on_stop(host_s))
+
+    def forget_procedure(self) -> None:
+        """The link or the device went away before it could start; the write-back knows."""
+        self._procedure = self._look = None
+
+    def journalled(self, item: Journalled, host_s: float) -> None:
+        """The record that the line waits for is on the disk, or is not."""
+        self._awaiting_journal = False
+        kind = Kind(item.kind)
+        if kind in OF_OUTPUTS:
+            self._conversation.journalled(kind, item.error, host_s)
+        if item.error:
+            first = self._writeback.on_journal_failed(kind, item.error, host_s)
+        else:
+            first = self._writeback.on_journal_ok(kind, host_s)
+        self._todo.extendleft(reversed(first))
+
+    def let_out(self, office: Office) -> None:
+        """Facts at the head of the line, at once: when they are told must not depend on chunks."""
+        while self._todo and not self._awaiting_journal:
+            action = self._todo[0]
+            if not isinstance(action, Emit):
+                return
+            self._todo.popleft()
+            office.emit(action.event)
+
+    def work(self, office: Office, host_s: float) -> bool:
+        """As far as it goes now; whether anything was done."""
+        done, self._now_s = False, host_s
+        self._todo.extend(self._conversation.outputs.take_actions())
+        while self._todo and not self._awaiting_journal:
+            self._act(self._todo.popleft(), office, host_s)
+            done = True
+        if self._procedure is not None:  # goes before a look, which only wants to know
+            self._look = None
+            office.take(self._conversation.stop_looking(host_s))
+        if self._procedure is not None and self._conversation.idle:
+            run, self._procedure = self._procedure, None
+            self._pausing()
+            office.take(self._conversation.run(run.name, run.make(), run.purpose, host_s, run.gate))
+            done = True
+        if self._look is not None and self._conversation.idle:
+            wanted, self._look = self._look, None
+            office.take(self._conversation.look(wanted.unit, wanted.expected, host_s))
+            done = True
+        return done
+
+    def _act(self, action: Action, office: Office, host_s: float) -> None:
+        match action:
+            case Emit(event):
+                office.emit(event)
+            case JournalAppend(kind, facts):
+                self._awaiting_journal = True
+                office.emit(events.JournalAppend(kind.value, dict(facts)))
+            case RunProcedure():
+                self._procedure = action
+            case CancelProcedure(name):
+                if self._procedure is not None and self._procedure.name == name:
+                    self._procedure = None
+                office.take(self._conversation.cancel(name, host_s))
+            case InForce(registers):
+                office.in_force(registers)
+            case Look():
+                self._look = action
+            case CalibrateAnew(reason):
+                office.calibrate_anew(reason)
+            case SetUpStream():
+                self._pausing()
+                office.take(self._conversation.set_up_again(host_s))
+            case IdentifyAgain():
+                self._look = None
+                office.take(self._conversation.identify_again(host_s))

@@ -1,0 +1,547 @@
+"""The pure core: inputs in, events out. `run` and `replay` feed it the same way.
+
+It joins the parts and decides nothing itself: `conversation` talks to the device, `stream` makes
+samples, `calibrator` estimates and judges, `writeback` says what may be written. Its time is that
+of the inputs. Whatever it answers depends on the list of inputs alone, which is why a replay takes
+the same decisions; `decisions` holds them and their hash.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd import events, inputs
+from ahrsd.calibration import Affine, Estimate
+from ahrsd.core.action_queue import Errands
+from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.column_compensation import VehicleTerms
+from ahrsd.core.decision_log import DecisionLog
+from ahrsd.core.device_record import Rollcall
+from ahrsd.core.device_session import ECHOES, Conversation
+from ahrsd.core.estimation_queue import Broken, Circumstances, Desk, EstimatorState, Finding, Piece
+from ahrsd.core.sensor_checks import SensorChecks
+from ahrsd.core.session_events import (
+    Closed,
+    Completed,
+    ConfigurationRead,
+    Identified,
+    Looked,
+    Said,
+    StreamChanged,
+    Unanswered,
+)
+from ahrsd.core.settings import CoreSettings
+from ahrsd.core.stream_watch import StreamWatch
+from ahrsd.core.warm_start import Present, WarmStart
+from ahrsd.evidence.values import BasisFacts
+from ahrsd.gates import GateLimits, Level, for_level
+from ahrsd.samples import Array, SampleBlock
+from ahrsd.stream.assembler import Stream
+from ahrsd.stream.decompensation import Compensation, RegisterEpochs, user_compensation
+from ahrsd.writeback.machine import WriteBack
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.states import LIVED_WITH, State
+from ahrsd.writeback.trial_metrics import LiveTrial
+from drivers.vn100.decode import Measurement, Undecodable, Unused
+from drivers.vn100.procedures import Unit
+from drivers.vn100.registers import Values
+from drivers.vn100.session import DeviceFault, LineEchoes, Stray
+from drivers.vn100.session import Event as SessionEvent
+
+_WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01  # VNERR codes
+
+
+class Core:
+    """See the module. Not thread-safe."""
+
+    def __init__(self, settings: CoreSettings) -> None:
+        self.settings = settings
+        self.decisions = DecisionLog(settings.keep)
+        self.epochs = RegisterEpochs()
+        rate, source = settings.stream_rate_hz, settings.stream_rate_source
+        self.stream = Stream(self.epochs, rate, source, keep_gaps=settings.keep)
+        self.vehicle = VehicleTerms(self.stream.warnings.setdefault, settings.columns_max_age_s)
+        self.conversation = Conversation(
+            settings.policy.mode,
+            change_stream=settings.policy.configure_stream,
+            rate_hz=settings.output_rate_hz,
+            reply_timeout_s=settings.reply_timeout_s,
+        )
+        self.writeback = WriteBack(settings.policy)
+        self.registers: dict[int, Values] = {}
+        self._compared: tuple[Affine, Array] = (Affine.identity(), np.zeros(3))
+        self._from_scratch = (settings.calibrator, *self._compared)
+        self.calibrator = Calibrator(*self._from_scratch)
+        self._desk = Desk()
+        self.estimator, self.sensors = EstimatorState(), SensorChecks()
+        self._proposed: Affine | None = None
+        passive = settings.policy.mode is Mode.PASSIVE
+        self.warm = WarmStart(settings.warm_start_s, passive=passive)
+        self.at_s = self._host_s = 0.0
+        self.first_s = float("nan")
+        self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
+        self._stopping, self._judged_anew = "", 0
+        self._closing = self._unread = False
+        self._unit: Unit | None = None
+        self._watch = StreamWatch()
+        self._rollcall = Rollcall()
+        self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
+        self._trial: LiveTrial | None = None
+        self._out: list[events.Event] = []
+        self._answers: list[events.Answered] = []  # due once nothing waits for the journal
+        if settings.policy.mode is Mode.PASSIVE:
+            self._no_device()
+        talk, back, add = self.conversation, self.writeback, self._errands.add
+        self._handlers: dict[type, Callable[..., None]] = {
+            inputs.Received: lambda it: self.take(talk.received(it.data, self._host_s)),
+            inputs.Tick: lambda _: self.take(talk.tick(self._host_s)),
+            inputs.WallClock: self._wall_clock,
+            inputs.LinkOpened: self._link_opened,
+            inputs.LinkLost: self._link_lost,
+            inputs.Interlock: lambda it: add(back.on_interlock(it.safe, self._host_s)),
+            inputs.Operator: self._operator,
+            **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.hear),
+            inputs.RegistersKnown: self._registers_known,
+            inputs.Samples: self._samples_given,
+            inputs.EarlierSamples: self.warm.sampled,
+            inputs.EarlierRun: lambda it: self._say_warm(self.warm.ended(it)),
+            inputs.JournalOpened: self._journal_opened,
+            inputs.Journalled: self._journalled,
+            inputs.Examined: lambda it: self._take_findings(it.pieces, it.failure),
+            inputs.LimitsChanged: self._limits_changed,
+            inputs.Stop: self._stop,
+        }
+
+    # -- the two calls of a shell ------------------------------------------------------------------
+
+    def handle(self, item: inputs.Input) -> list[events.Event]:
+        """Take one input; everything that follows from it, in order."""
+        self._host_s = max(self._host_s, item.host_ns * 1e-9)
+        self._errands.let_out(self)
+        # first of all: what is sent next is judged by how old the vehicle's word is *now*
+        self._errands.add(self.writeback.tick(self._host_s))
+        self._handlers[type(item)](item)
+        self._drive()
+        if self._answers and not self._errands.awaiting_journal:
+            self._out += self._answers
+            self._answers = []
+        out, self._out = self._out, []
+        return out
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When a `Tick` is wanted if nothing else arrives before, on the host's clock."""
+        due = [self.conversation.deadline_s, self.writeback.deadline_s]
+        known = [d for d in due if d is not None]
+        return int(min(known) * 1e9) + 1 if known else None
+
+    # -- inputs ------------------------------------------------------------------------------------
+
+    def _wall_clock(self, item: inputs.WallClock) -> None:
+        add, back = self._errands.add, self.writeback
+        self.warm.clock(item)
+        add(back.on_clock(item.wall_s, item.boot_id, item.boot_s, self._host_s))
+
+    def _link_opened(self, item: inputs.LinkOpened) -> None:
+        latency = "" if item.latency_ms is None else f", USB latency {item.latency_ms} ms"
+        self._note("info", f"{item.port} open at {item.baud} baud{latency}")
+        self.stream.forget()
+        if self.conversation.mode is Mode.PASSIVE:
+            self._no_device()
+        else:
+            self.epochs.begin_anew()  # nothing is un-mapped before it is known how, late or not
+        self.take(self.conversation.opened(item.baud, self._host_s))
+
+    def _link_lost(self, item: inputs.LinkLost) -> None:
+        self._flush()
+        self._breaks += 1
+        self._note("warning", f"link lost: {item.reason}")
+        self.take(self.conversation.lost(self._host_s))
+        self.stream.forget()
+        self._errands.forget_procedure()
+        self._errands.add(self.writeback.on_link_lost(self._host_s))
+
+    def _operator(self, item: inputs.Operator) -> None:
+        self._note("info", f"operator: {item.verb} {item.argument}".strip())
+        back = self.writeback
+        self._errands.add(back.on_operator(item.verb, item.argument, self._host_s))
+        self._answers.append(events.Answered(item.word, *back.operator_answer))
+
+    def _journalled(self, item: inputs.Journalled) -> None:
+        self._errands.journalled(item, self._host_s)
+        if item.error and item.kind in (Kind.LOCKED, Kind.UNLOCKED):
+            text = f"not in the journal: {item.error}; it holds for this run only"
+            self._answers = [replace(a, accepted=False, text=text) for a in self._answers]
+
+    def _registers_known(self, item: inputs.RegistersKnown) -> None:
+        self._flush()
+        self._note("info", f"registers taken from {item.source}")
+        self._in_force(dict(item.values))
+        self._no_device()
+
+    def _samples_given(self, item: inputs.Samples) -> None:
+        self.stream.given(item.block)
+        self._block(item.block)
+
+    def _journal_opened(self, item: inputs.JournalOpened) -> None:
+        if error := self._rollcall.journal(item):
+            self._note("error", f"journal: {error}; nothing can be written")
+        self._device_known()
+
+    def _limits_changed(self, item: inputs.LimitsChanged) -> None:
+        calibrator = replace(self.settings.calibrator, limits=GateLimits(**item.limits))
+        self.settings = replace(self.settings, calibrator=calibrator)
+        self._from_scratch = (calibrator, *self._from_scratch[1:])
+        self._judged_anew += 1
+        self._note("info", "the limits of the gates were changed")
+        self._begin(self._desk.adopt(self.calibrator, calibrator))
+        self._errands.add(self.writeback.on_limits_changed(self._host_s))
+
+    def _stop(self, item: inputs.Stop) -> None:
+        self._flush()
+        self._stopping = item.reason
+        self._errands.stop(self._host_s)
+
+    # -- the device --------------------------------------------------------------------------------
+
+    def take(self, found: list[SessionEvent]) -> None:
+        """Measurements to the stream, with what was damaged between them; the rest is counted."""
+        skipped = deque(self.conversation.session.deframer.take_skipped())
+        if any(isinstance(event, Measurement) for event in found):
+            silence = self._watch.heard(self._host_s, self.stream.facts.rate_hz)
+            if not self.stream.carries_time:  # where it does, a gap shows in its own time
+                self._doubt(silence)
+        for event in found:
+            if isinstance(event, Measurement):
+                while skipped and skipped[0].offset < event.offset:
+                    self.stream.damaged(skipped.popleft())
+                for block in self.stream.take(event, self._host_s):
+                    self._block(block)
+            elif isinstance(event, Undecodable):
+                self.undecodable += 1
+                self.stream.undecodable()
+            elif isinstance(event, Unused):
+                self.stream.unused(event.name)
+            elif isinstance(event, LineEchoes):
+                self._note("warning", ECHOES)
+            elif isinstance(event, DeviceFault):
+                self._fault(event.code)
+            elif isinstance(event, Stray):
+                self.strays += 1
+        for piece in skipped:
+            self.stream.damaged(piece)
+        facts = self.stream.facts
+        for text in self.sensors.count(facts.unusable + self.undecodable, facts.samples):
+            self._note("warning", text)
+        if self.stream.restarts > self._restarts:
+            self._restarts = self.stream.restarts
+            self._device_reset("its time fell", self.at_s)
+
+    def _doubt(self, reason: str, *, jumped: bool = False) -> None:
+        """Whose samples these are is not sure any more; empty: it is."""
+        if reason and self.conversation.listening and self.conversation.identity is not None:
+            self.warm.doubt()
+            more = self.writeback.on_doubt(reason, self._host_s, jumped=jumped)
+            self._errands.add(more)
+            if jumped and self._trial is not None:
+                self._begin_trial()  # it is judged by what comes after the jump
+
+    def _fault(self, code: int) -> None:
+        self.faults += 1
+        self._note("warning", f"the device reports VNERR {code:02X}")
+        if code in (_WATCHDOG_RESET, _HARD_FAULT):
+            self._device_reset(f"VNERR {code:02X}")
+
+    def _device_reset(self, why: str, uptime_s: float | None = None) -> None:
+        self._note("warning", f"the device restarted ({why})")
+        self._breaks += 1
+        if self.conversation.identity is None:
+            return
+        self.epochs.begin(self._host_s, None)
+        self._errands.add(self.writeback.on_reset(self._host_s, uptime_s))
+        self._errands.forget_procedure()
+        self.take(self.conversation.identify_again(self._host_s))
+
+    def _no_device(self) -> None:
+        """Passive, or a recording without a conversation: the stream is taken as it is."""
+        self._errands.add(self.writeback.on_no_device(self.registers or None, self._host_s))
+
+    def _device_known(self) -> None:
+        """Identity, registers and journal may all be there now."""
+        self._errands.add(self._rollcall.told(self.conversation, self.writeback, self._host_s))
+
+    def _in_force(self, values: dict[int, Values]) -> None:
+        """These registers act on what follows; the first ones are the estimator's prior."""
+        self.registers = values
+        compensation = Compensation.from_registers(values)
+        self.epochs.begin(self._host_s, compensation)
+        self.stream.warnings.update(dict.fromkeys(compensation.warnings))
+        self.stream.registers = values
+        # on trial, a candidate is still compared with what the user had before it
+        trial = self.writeback.history.open
+        users = values if trial is None else {**values, **trial.old}
+        self._compared = user_compensation(users)
+        self._begin(self._desk.compare(self.calibrator, *self._compared))
+
+    def _identified(self, unit: Unit) -> None:
+        """A device said who it is; what was estimated of another one is not for it."""
+        self._note("info", str(unit))
+        self._rollcall.identified()
+        if self._unit not in (None, unit):
+            self._flush()
+            self.stream.forget()
+            self._watch.resumed(self._host_s)
+            text = f"{self._unit} was here before: the calibration begins anew for this one"
+            self._note("warning", f"another device, {unit}; {text}")
+            self.calibrator = Calibrator(*self._from_scratch)
+            self.warm.over("another device was here")
+        self._unit = unit
+        self._out.append(events.OpenJournal(unit.serial))
+
+    def _digest(self, said: Said) -> None:
+        match said:
+            case Identified(identity):
+                self._identified(identity.unit)
+            case ConfigurationRead(values):
+                self._flush()
+                believed = {} if self.writeback.history.open else self.registers
+                if others := self._rollcall.registers(values, believed, self._breaks):
+                    self._note("warning", f"somebody changed registers {others}: calibrated anew")
+                if self._unread or others:  # as it came does not mix with what is un-mapped
+                    self.calibrator, self._unread = Calibrator(*self._from_scratch), False
+                    self.warm.over("calibrated anew")
+                self._in_force(values)
+                self._out.append(events.RegistersRead(self._host_s, values))
+                self._device_known()
+            case Looked(seen, error):
+                more = self.writeback.on_looked(seen, str(error or ""), self._host_s)
+                self._errands.add(more)
+            case StreamChanged(text, level):
+                self._flush()
+                self._watch.resumed(self._host_s)
+                self.stream.forget()
+                if text:
+                    self._note(level, text)
+            case Unanswered(text):
+                self._unread = True
+                self._note("warning", f"{text}; listening only, nothing can be written")
+                self.epochs.begin(self._host_s, Compensation.unknown())
+                self._no_device()
+            case Completed(name, result, error):
+                self._flush()
+                self._watch.resumed(self._host_s)
+                self.stream.forget()
+                if error is None:
+                    more = self.writeback.on_procedure_finished(name, result, self._host_s)
+                else:
+                    more = self.writeback.on_procedure_failed(name, error, self._host_s)
+                self._errands.add(more)
+            case Closed(error):
+                if error is not None:
+                    self._note("error", f"not everything was put back: {error}")
+                self._out.append(events.Finished(self._stopping))
+
+    # -- what the write-back wants -----------------------------------------------------------------
+
+    def _drive(self) -> None:
+        """Let conversation and write-back answer each other until neither has more to say."""
+        while True:
+            said = self.conversation.take_said()
+            for one in said:
+                self._digest(one)
+            acted = self._errands.work(self, self._host_s)
+            if self._stopping and not self._closing and self._errands.at_rest:
+                self._closing = acted = True
+                self.take(self.conversation.restore_and_close(self._host_s))
+            if not said and not acted:
+                break
+        if output := self.conversation.session.take_output():
+            self._out.append(events.Send(output))
+
+    def emit(self, event: events.Event) -> None:
+        """A fact of the write-back."""
+        self._out.append(event)
+        if isinstance(event, events.StateChanged):
+            self._on_state(event)
+
+    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+        """The write-back says what the device applies from now on; None: nobody knows."""
+        self._flush()
+        if registers is None:
+            self.epochs.begin(self._host_s, None)
+        else:
+            self._in_force(dict(registers))
+
+    def calibrate_anew(self, reason: str) -> None:
+        """Nobody knows since when the registers that un-map the samples are not in force."""
+        self._flush()
+        self._unread = True  # from scratch as soon as they are read
+        self._breaks += 1
+        self._note("warning", f"calibrated anew: {reason}")
+
+    def _on_state(self, change: events.StateChanged) -> None:
+        self.decisions.add(self.at_s, change.new, reason=change.reason)
+        if change.new == State.TRIAL or (change.new, change.old) == (
+            State.PROVEN,
+            State.RECONCILING,
+        ):
+            self._begin_trial()
+        elif change.new not in LIVED_WITH:
+            self._trial = None
+
+    def _begin_trial(self) -> None:
+        """From here on the registers in force are compared with those before them."""
+        transaction = self.writeback.history.open
+        old = {} if transaction is None else transaction.old
+        mag, bias = user_compensation(self.registers)
+        old_mag, old_bias = user_compensation({**self.registers, **old})
+        limit = 0.01 * self.settings.policy.trial.max_wrong_percent
+        self._trial = LiveTrial(mag, old_mag, bias, old_bias, wrong_limit=limit)
+
+    # -- samples -----------------------------------------------------------------------------------
+
+    def _flush(self) -> None:
+        for block in self.stream.flush():
+            self._block(block)
+
+    def _block(self, block: SampleBlock) -> None:
+        self.at_s = float(block.time_s[-1])
+        self.first_s = float(block.time_s[0]) if np.isnan(self.first_s) else self.first_s
+        if (
+            self.stream.facts.rate_source == "device time"
+            and self.stream.restarts == self._restarts
+        ):
+            self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
+        if self.stream.take_replaced():
+            self.calibrator = self.calibrator.anew()
+            self._begin(self._desk.compare(self.calibrator, *self._compared))
+            self.warm.again()
+        reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
+        self._doubt(reason, jumped=jumped)
+        block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
+        self._out.append(events.SamplesSeen(block, present, self._proposed))
+        self._errands.add(self.writeback.on_samples(block))
+        for text in self.sensors.take(block):
+            self._note("warning", text)
+        if (free := self.vehicle.without(block)) is not None:
+            if self._trial is not None:
+                metrics = self._trial.take(free)
+                self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
+            if self.estimator.takes(free):
+                free = self._recall(free)
+                self.warm.live(free)
+                how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+                now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
+                self._begin(self._desk.examine(self.calibrator, free, now))
+        self._errands.let_out(self)
+
+    def _recall(self, block: SampleBlock) -> SampleBlock:
+        """The block, after the calibrator was given the samples of an earlier run, if any."""
+        if not self.warm.pending or self.writeback.state is State.RECONCILING:
+            return block
+        identity, read = self.conversation.identity, self.epochs.now.compensation is not None
+        present = Present(
+            identity.unit if identity is not None and read else None,
+            self.registers,
+            (self.stream.compensated_mag, self.stream.compensated_gyro),
+            self.at_s,
+            self._host_s,
+            open=self.writeback.history.open is not None,
+            candidate=self.writeback.proposal is not None,
+            terms=bool(self.vehicle.terms),
+        )
+        blocks, text = self.warm.due(present, float(block.time_s[0]))
+        self._say_warm(text)
+        if not blocks:
+            return block
+        self.calibrator = Calibrator(*self._from_scratch)
+        self._begin(self._desk.compare(self.calibrator, *self._compared))
+        how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+        now = Circumstances(self.at_s, self._host_s, *how)
+        for old in blocks:
+            old = replace(old, epoch=self.epochs.now.number)
+            self._begin(self._desk.recall(self.calibrator, old, now))
+        self._errands.add(self.writeback.on_doubt("samples of an earlier run", self._host_s))
+        unknown = np.concatenate([[np.nan], block.dt_s[1:]])
+        return replace(block, dt_s=unknown, gap_before=True)
+
+    def _say_warm(self, text: str) -> None:
+        if text:
+            self._note("info", text)
+
+    def _begin(self, piece: Piece) -> None:
+        """Have it done beside the core, or do it now."""
+        if self.settings.beside:
+            self._out.append(events.Examine(piece.work))
+        else:
+            self._take_findings(1)
+
+    def _take_findings(self, pieces: int, failure: str = "") -> None:
+        for found in self._desk.take(pieces, failure):
+            if found.calibrator is not self.calibrator:
+                continue  # another device or other quantities since
+            if isinstance(found, Broken):
+                self._estimator_failed(found.reason)
+                continue
+            self._proposed = found.proposed
+            self._out += found.notes
+            back, when = self.writeback, found.when
+            self._errands.add(back.on_examined(when.host_s, self._host_s))
+            if found.void:
+                self.warm.doubt()
+                self._errands.add(back.on_void(found.void, when.at_s, self._host_s))
+            if found.estimate is not None:
+                self._judged(found, found.estimate)
+
+    def _estimator_failed(self, reason: str) -> None:
+        """Nothing is written from what it made, and it begins anew after a pause."""
+        self.estimator.broke_off(reason)
+        self.calibrator = Calibrator(self.settings.calibrator, *self._compared)
+        self._proposed = None
+        self.warm.over("the estimator failed")
+        left_s = self.estimator.left_s
+        self._note("error", f"ESTIMATOR FAILED: {reason}; it begins anew in {left_s:.0f} s")
+        self.decisions.add(self.at_s, "ESTIMATOR FAILED")
+        self._errands.add(self.writeback.on_estimator_failed(self._host_s))
+
+    def _judged(self, found: Finding, estimate: Estimate) -> None:
+        at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates
+        self._out += [events.Estimated(at_s, host_s, estimate), events.Judged(at_s, host_s, gates)]
+        self.decisions.judged(at_s, self.writeback.state.value, gates, estimate)
+        if found.when.era != self._era():
+            return  # it judged what is in force no more; nothing may be written by it
+        if not self.warm.confirms(estimate):
+            return  # it rests on an earlier run: nothing is written before this one agrees
+        self._errands.add(
+            self.writeback.on_verdict(
+                estimate,
+                for_level(gates, self.settings.level),
+                at_s,
+                self._host_s,
+                gyro_is_raw=not self.stream.compensated_gyro,
+                flash_gates=for_level(gates, Level.FLASH),
+                sampled_s=host_s,
+            )
+        )
+
+    def _era(self) -> tuple[int, int]:
+        return self.epochs.now.number, self._breaks + self._judged_anew
+
+    def _basis(self) -> BasisFacts:
+        """What is known of where the samples come from."""
+        identity, applied = self.conversation.identity, self.epochs.now.compensation
+        return BasisFacts(
+            registers_read=bool(self.registers),
+            changed=applied is None,
+            hsi_applied=applied is not None and applied.hsi is not None,
+            compensated_only=self.stream.compensated_mag,
+            firmware_known=identity is not None and identity.profile.writable,
+        )
+
+    def _note(self, level: str, text: str) -> None:
+        self._out.append(events.Noted(self.at_s, self._host_s, level, text))

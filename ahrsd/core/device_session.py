@@ -1,0 +1,445 @@
+"""What the core says to the device, and when: identify, read, set up the stream, put it back.
+
+```
+ CLOSED -> IDENTIFYING -> READING -> [KEEPING -> SETTING_UP] -> READY -> RESTORING -> DONE
+                                                                READY <-> RUNNING (the write-back)
+                                                                READY <-> LOOKING (who answers?)
+```
+Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_outputs`).
+A device that falls silent though it may be told to talk is asked for its output (`silence`), and
+a stop ends within `STOP_S`, whatever the device does.
+
+In mode `passive` the port goes from CLOSED to READY at once and no byte is ever sent. A device that
+answers nothing is listened to and asked again now and then: it stays IDENTIFYING, without an
+identity, so nothing can be written to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from ahrsd.core import closing
+from ahrsd.core.closing import OutOfTime, StopLimit, WrongDevice
+from ahrsd.core.kept_outputs import KeptOutputs
+from ahrsd.core.session_events import (
+    Closed,
+    Completed,
+    ConfigurationRead,
+    Identified,
+    Looked,
+    Phase,
+    Said,
+    StreamChanged,
+    Unanswered,
+)
+from ahrsd.core.silence import Silence
+from ahrsd.writeback.journal_history import JournalRecord
+from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
+from ahrsd.writeback.reconcile import Kind
+from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
+from drivers.vn100.commands import RESUME, Command, LinkGone, Procedure
+from drivers.vn100.decode import Measurement
+from drivers.vn100.procedures import (
+    SESSION_SETTINGS,
+    Identity,
+    Seen,
+    Unit,
+    look,
+    quiet,
+    restore,
+    resume,
+)
+from drivers.vn100.registers import Values
+from drivers.vn100.session import Event, Failed, Finished, Session
+
+ECHOES = (
+    "the line sends back what is sent (an adapter or terminal that echoes): echoes are told from "
+    "answers and left out"
+)
+ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
+RESTORE_AGAIN_S = 0.1
+_FOREIGN = 20  # messages without one of the session's own output: it is gone
+_ENDING = (Phase.RESTORING, Phase.CLOSING, Phase.DONE)
+
+
+class Conversation:
+    """Owns the session. `said` collects what the core must know; measurements come back at once."""
+
+    def __init__(
+        self,
+        mode: Mode,
+        *,
+        change_stream: bool = False,
+        rate_hz: float = 100.0,
+        reply_timeout_s: float = closing.USUAL_REPLY_S,
+    ) -> None:
+        self.mode = mode
+        self.change_stream = change_stream and mode is not Mode.PASSIVE
+        self.rate_hz = rate_hz
+        self._may_ask = self.change_stream or mode >= Mode.STAGE  # may send VNASY,1, as what:
+        self._asking = Purpose.STREAM if self.change_stream else Purpose.ROLL_BACK
+        self.phase = Phase.CLOSED
+        self.identity: Identity | None = None
+        self.outputs = KeptOutputs()
+        scale = max(1.0, reply_timeout_s / closing.USUAL_REPLY_S)
+        self.silence, self.limit = Silence(scale), StopLimit(scale)
+        self.session = Session(self._allowed, reply_timeout_s=reply_timeout_s)
+        self._purpose = Purpose.READ
+        self._extra_gate: Callable[[Command], bool] | None = None
+        self._serial: int | None = None
+        self._name = ""
+        self._baud = 115200
+        self._touched = self._unanswered = self._unkept = False
+        self._failure = "no answer in time"  # why something was not put back
+        self._ask_again_s = ASK_AGAIN_S[0]
+        self._own, self._foreign = "", 0  # layout of the session's output; others without it
+        self._said: list[Said] = []
+
+    def _allowed(self, command: Command) -> bool:
+        if not permitted(command, self.mode, self.change_stream, self._purpose):
+            return False
+        return self._extra_gate is None or self._extra_gate(command)
+
+    @property
+    def idle(self) -> bool:
+        """Whether a procedure may be started now."""
+        return self.phase is Phase.READY and not self.session.busy
+
+    @property
+    def listening(self) -> bool:
+        """Whether the device's output runs as it is, undisturbed by a procedure."""
+        return self.phase in (Phase.READY, Phase.LOOKING)
+
+    @property
+    def may_close(self) -> bool:
+        """Nothing is under way that must end before the port may be given back."""
+        return self.phase not in (Phase.RUNNING, Phase.RESTORING)
+
+    @property
+    def deadline_s(self) -> float | None:
+        """When `tick` wants to be called if nothing arrives before."""
+        due = [self.session.deadline_s, self.limit.due_s]
+        if self.idle and self._may_ask and self._writable:
+            due.append(self.silence.due_s)
+        return min((d for d in due if d is not None), default=None)
+
+    @property
+    def session_keys(self) -> frozenset[int]:
+        """Registers that this session, or one before it that was killed, changed."""
+        theirs = bool(self.outputs.left)
+        return frozenset(SESSION_SETTINGS) if self.change_stream or theirs else frozenset()
+
+    def take_said(self) -> list[Said]:
+        """What happened since the last call."""
+        said, self._said = self._said, []
+        return said
+
+    def opened(self, baud: int, now_s: float) -> list[Event]:
+        """The port is open."""
+        self._baud, self._ask_again_s = baud, ASK_AGAIN_S[0]
+        if self.mode is Mode.PASSIVE:
+            self.phase = Phase.READY
+            return []
+        return self.identify_again(now_s)
+
+    def known(
+        self, registers: Mapping[int, Values], journal: Sequence[JournalRecord] | None
+    ) -> dict[int, Values]:
+        """Registers and journal of the device are there; returns them as the user has them.
+
+        With `change_stream`, the session's outputs follow as soon as the journal has the user's.
+        """
+        if self._serial is None or self.mode is Mode.PASSIVE:
+            return dict(registers)
+        self.outputs.read(self._serial, registers, journal)
+        if self.outputs.left and not self._touched:
+            self._warn(self.outputs.describe_left(put_back=self.change_stream))
+        if self.phase is Phase.KEEPING:
+            self.outputs.keep()
+        return {**registers, **self.outputs.users}
+
+    def journalled(self, kind: Kind, error: str, now_s: float) -> None:
+        """A record of the user's outputs is on the disk, or is not."""
+        kept = self.outputs.journalled(kind, error)
+        if self.phase is Phase.CLOSING and kind is Kind.OUTPUTS_BACK:
+            self._done(None)
+        elif self.phase is Phase.KEEPING and not kept:
+            if not self._unkept:
+                self._warn("the user's outputs cannot be journalled, so no others are set up")
+            self.phase, self._unkept = Phase.READY, True
+            self.silence.owe(now_s, *closing.KEEP_AGAIN_S)
+
+    def identify_again(self, now_s: float) -> list[Event]:
+        """The device may be another one, or itself after a reset: ask it everything again."""
+        if self.mode is Mode.PASSIVE or self.phase in _ENDING:
+            return []
+        events = self._abandon(now_s)
+        self.phase = Phase.IDENTIFYING
+        return events + self._digest(
+            self._start(closing.identify_surely(), Purpose.READ, now_s), now_s
+        )
+
+    def received(self, data: bytes, now_s: float) -> list[Event]:
+        """Bytes came; returns measurements, faults and strays, in order."""
+        events = self._digest(self.session.receive(data, now_s), now_s)
+        if self._own and self._own_is_gone(events) and self.idle:
+            self._warn("the session's output is gone: the device restarted, or somebody changed it")
+            events += self.identify_again(now_s)
+        if any(isinstance(event, Measurement) for event in events):
+            self.silence.heard(now_s)
+        return events + self._on_time(now_s)
+
+    def tick(self, now_s: float) -> list[Event]:
+        """Time passed."""
+        return self._digest(self.session.tick(now_s), now_s) + self._on_time(now_s)
+
+    def lost(self, now_s: float) -> list[Event]:
+        """The port went away."""
+        events = self._abandon(now_s)
+        if self.phase is not Phase.DONE:
+            self.phase = Phase.CLOSED
+        self.identity = None
+        return events
+
+    def _abandon(self, now_s: float) -> list[Event]:
+        """End what runs without another byte; only the write-back is told how its own ended."""
+        self._own = ""
+        if self.phase not in (Phase.RUNNING, Phase.RESTORING):
+            self.phase = Phase.CLOSED
+        return self._digest(self.session.link_lost(now_s), now_s)
+
+    def run(
+        self,
+        name: str,
+        procedure: Procedure[object],
+        purpose: Purpose,
+        now_s: float,
+        gate: Callable[[Command], bool] | None = None,
+    ) -> list[Event]:
+        """Start a procedure of the write-back; only while `idle`. `gate` is asked per command."""
+        self.phase, self._name, self._extra_gate = Phase.RUNNING, name, gate
+        return self._digest(self._start(procedure, purpose, now_s), now_s)
+
+    def look(self, unit: Unit, expected: Mapping[int, Values], now_s: float) -> list[Event]:
+        """Ask who answers and what it holds, beside the running output; only while `idle`."""
+        self.phase = Phase.LOOKING
+        return self._digest(self._start(look(unit, expected), Purpose.READ, now_s), now_s)
+
+    def stop_looking(self, now_s: float) -> list[Event]:
+        """Something more urgent waits."""
+        if self.phase is not Phase.LOOKING:
+            return []
+        return self._digest(self.session.cancel(now_s), now_s)
+
+    def cancel(self, name: str, now_s: float) -> list[Event]:
+        """End the procedure of this name, if it runs; it may still send what puts things back."""
+        if self.phase is not Phase.RUNNING or self._name != name:
+            return []
+        return self._digest(self.session.cancel(now_s), now_s)
+
+    def set_up_again(self, now_s: float) -> list[Event]:
+        """The user's own outputs are back for a save, or kept: set the session's up (again)."""
+        may = self.change_stream and self._writable
+        if not (may and (self.idle or self.phase is Phase.KEEPING)):
+            return []
+        if not self.outputs.kept:  # the disk was full until now: the journal first
+            self.phase = Phase.KEEPING
+            self.outputs.keep()
+            return []
+        self.phase = Phase.SETTING_UP
+        self._unkept = False
+        self._touched = True  # from the first byte on, also where it breaks off half way
+        procedure = configure_stream(self.rate_hz, self._baud, self.outputs.users)
+        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
+
+    def restore_and_close(self, now_s: float) -> list[Event]:
+        """Put back what was changed for the session, then say Closed. Ends what is under way."""
+        linked, self.limit.closing = self.phase is not Phase.CLOSED, True
+        if self.phase is Phase.RUNNING and not self._must_restore:
+            return self._give_up(now_s)
+        events = [] if self.idle else self._abandon(now_s)
+        if not (self._must_restore and linked):
+            self._done(LinkGone() if self._must_restore else None)
+            return events
+        return events + self._restore(0.0, now_s)
+
+    def amends(self) -> Procedure[object] | None:
+        """What puts the device's output back after this program broke down; None: nothing need be.
+
+        Not for `run`: whoever calls this trusts no state of the conversation but what was saved.
+        """
+        if self._must_restore and self.identity is not None:
+            return quiet(restore(self.outputs.users, SESSION_SETTINGS))
+        paused = self.phase in (Phase.RUNNING, Phase.RESTORING) and self.mode >= Mode.STAGE
+        return resume() if paused else None
+
+    def allows_amends(self, command: Command) -> bool:
+        """The gate of `amends`."""
+        return permitted(command, self.mode, self.change_stream, self._asking)
+
+    @property
+    def _writable(self) -> bool:
+        """False for a device that is only observed: another model, or a firmware not known."""
+        return self.identity is None or self.identity.profile.writable
+
+    @property
+    def _must_restore(self) -> bool:
+        """The device that was read, and no other, may hold settings of this session."""
+        left = self.change_stream and bool(self.outputs.left)
+        return (self._touched or left) and bool(self.outputs.users) and self._writable
+
+    def _on_time(self, now_s: float) -> list[Event]:
+        """What is due without a word from the device: the end of a stop, a silence to be ended."""
+        if self.limit.over(now_s):
+            return [] if self.phase is Phase.DONE else self._give_up(now_s)
+        if not (self.idle and self._may_ask and self._writable):
+            return []
+        if self.silence.pays(now_s):
+            if not self._unkept:
+                return self.identify_again(now_s)
+            self.phase = Phase.KEEPING
+            self.outputs.keep()
+            return []
+        if not self.silence.breaks(now_s):
+            return []
+        if self.silence.asked == 1:
+            self._warn("the device is silent: it is asked for its output, again and again")
+        if self.silence.asked > 1 and self.change_stream:
+            return self.identify_again(now_s)
+        self._resume_blindly()  # costs nothing, should the device only be slow
+        return []
+
+    def _resume_blindly(self) -> None:
+        """VNASY,1, and nobody waits for the reply."""
+        self._purpose, self._extra_gate = self._asking, None
+        self.session.last_word(RESUME)
+
+    def _give_up(self, now_s: float) -> list[Event]:
+        """What takes too long ends here; a last VNASY,1 goes out, its reply is not waited for."""
+        linked, self.phase = self.phase is not Phase.CLOSED, Phase.CLOSED
+        events = self._abandon(now_s)
+        if linked and self._may_ask and self._writable:
+            self._resume_blindly()
+        self._done(OutOfTime(self._failure) if self._must_restore else None)
+        return events
+
+    def _warn(self, text: str) -> None:
+        self._said.append(StreamChanged(text, "warning"))
+
+    def _done(self, error: Exception | None) -> None:
+        self.phase = Phase.DONE
+        self._said.append(Closed(error))
+
+    def _restore(self, wait_s: float, now_s: float) -> list[Event]:
+        self.phase = Phase.RESTORING
+        procedure = closing.put_back_to(self._serial, self.outputs.users, wait_s)
+        return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
+
+    def _own_is_gone(self, events: list[Event]) -> bool:
+        names = [event.layout.name for event in events if isinstance(event, Measurement)]
+        self._foreign = 0 if self._own in names else self._foreign + len(names)
+        return self._foreign >= _FOREIGN
+
+    def _start(self, procedure: Procedure[object], purpose: Purpose, now_s: float) -> list[Event]:
+        self._purpose = purpose
+        return self.session.start(procedure, now_s)
+
+    def _digest(self, events: list[Event], now_s: float) -> list[Event]:
+        """Keep what is for the core's stream; let ends of procedures move the phase."""
+        kept: list[Event] = []
+        queue = list(events)
+        while queue:
+            event = queue.pop(0)
+            if isinstance(event, Finished):
+                queue = self._advance(event.result, None, now_s) + queue
+            elif isinstance(event, Failed):
+                queue = self._advance(None, event.error, now_s) + queue
+            else:
+                kept.append(event)
+        return kept
+
+    def _advance(self, result: object, error: Exception | None, now_s: float) -> list[Event]:
+        phase = self.phase
+        if phase is Phase.RUNNING:
+            self._extra_gate = None
+            self._ready(now_s)
+            self._said.append(Completed(self._name, result, error))
+            return []
+        if phase is Phase.LOOKING:
+            self._ready(now_s)
+            self._said.append(Looked(result if isinstance(result, Seen) else None, error))
+            return []
+        if phase is Phase.CLOSED:
+            return []
+        if phase is Phase.RESTORING:
+            return self._restored(error, now_s)
+        if phase is Phase.SETTING_UP and error is not None:
+            return self._not_set_up(error, now_s)
+        if error is not None:
+            self._say_unanswered(f"{phase.value}: {error}")
+            self.phase = Phase.IDENTIFYING
+            later, self._ask_again_s = self._ask_again_s, min(2 * self._ask_again_s, ASK_AGAIN_S[1])
+            return self._start(closing.identify_in(later), Purpose.READ, now_s)
+        return self._next(phase, result, now_s)
+
+    def _restored(self, error: Exception | None, now_s: float) -> list[Event]:
+        """Once more where it failed: a stop has a limit of its own."""
+        if isinstance(error, LinkGone | WrongDevice):
+            self._done(error)
+        elif error is not None:
+            self._failure = str(error)
+            return self._restore(RESTORE_AGAIN_S, now_s)
+        else:
+            self._touched, self.phase = False, Phase.CLOSING
+            self._said.append(StreamChanged("outputs put back as they were"))
+            self.outputs.give_back()
+        return []
+
+    def _not_set_up(self, error: Exception, now_s: float) -> list[Event]:
+        again = closing.again_after(error)
+        own = "" if again is closing.PUT_BACK_AGAIN_S else ", the device's own stays"
+        if not self.silence.owed:
+            self._warn(f"the session's output cannot be set up{own}: {error}")
+        else:
+            self._said.append(StreamChanged(""))
+        if again is not None:
+            self.silence.owe(now_s, *again)
+        self._ready(now_s)
+        return []
+
+    def _ready(self, now_s: float) -> None:
+        self.phase = Phase.READY
+        self.silence.begin(now_s)
+
+    def _say_unanswered(self, text: str) -> None:
+        """Once. What a device that was known sends now is not used: its registers will be read."""
+        if not self._unanswered:
+            known = StreamChanged(f"{text}; asking again", "warning")
+            self._said.append(Unanswered(text) if self._serial is None else known)
+        self._unanswered = True
+
+    def _next(self, phase: Phase, result: object, now_s: float) -> list[Event]:
+        if phase is Phase.IDENTIFYING and isinstance(result, Identity):
+            if result.serial != self._serial:
+                self._touched = False  # nothing of another device's is put back to this one
+            self.identity, self._serial = result, result.serial
+            self._said.append(Identified(result))
+            self.phase = Phase.READING
+            twice = (*CALIBRATION, *(SESSION_SETTINGS if self.change_stream else ()))
+            return self._start(closing.read_surely(result, twice), Purpose.READ, now_s)
+        if phase is Phase.READING and isinstance(result, dict) and self.identity is not None:
+            self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]
+            self.identity = self.identity.observed_without(result)
+            if not self._writable:
+                why = self.identity.profile.observed_for
+                self._warn(f"observed only, nothing is written to it: {why}")
+            self._said.append(ConfigurationRead(result))
+            if self.change_stream and self._writable:
+                self.phase = Phase.KEEPING
+                return []
+        if isinstance(result, CalibrationStream):
+            self._own, self._foreign = result.layout, 0
+            self.silence.settle()
+            self._said.append(StreamChanged(f"output set up for the session: {result}"))
+        self._ready(now_s)
+        return []

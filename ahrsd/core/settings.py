@@ -1,0 +1,43 @@
+"""What the core needs from the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ahrsd.core.calibration_pipeline import CalibratorSettings
+from ahrsd.gates import Level
+from ahrsd.writeback.policy import WriteBackPolicy
+
+BESIDE_KEY = "examined"  # in a capture's header where `beside` was set
+
+
+@dataclass(frozen=True, slots=True)
+class CoreSettings:
+    """What the core needs from the configuration.
+
+    output_rate_hz:  of the stream that `configure_stream` sets up
+    reply_timeout_s: how long a reply may take
+    stream_rate_hz, stream_rate_source: of streams without time, and how it is known
+    keep: how many decisions, and how many of the first and of the newest gaps, stay in memory for
+        a summary; None: all, for a recording, whose length is known. Counts and hash are always
+        those of everything.
+    columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
+    warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
+    beside: the slow part of the work is done beside the core (`examination`), not at once
+    """
+
+    calibrator: CalibratorSettings
+    policy: WriteBackPolicy = field(default_factory=WriteBackPolicy)
+    output_rate_hz: float = 100.0
+    reply_timeout_s: float = 0.4
+    stream_rate_hz: float | None = None
+    stream_rate_source: str = "as given"
+    keep: int | None = None
+    columns_max_age_s: float = 0.5
+    beside: bool = False
+    warm_start_s: float = 0.0
+
+    @property
+    def level(self) -> Level:
+        """Which gates must hold before RAM is written; those of the flash are asked at the save."""
+        return Level.UNATTENDED if self.policy.approval == "auto" else Level.RAM

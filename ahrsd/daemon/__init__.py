@@ -1,0 +1,1 @@
+"""What surrounds the core in a running process: port, files, threads, journal, logs."""

@@ -1,0 +1,204 @@
+"""What surrounds the core: the record of every input, the journal, the viewer, the summary.
+
+`Shell.feed` is the only way into the core, for the daemon and for a replay. It records the input
+before the core sees it, carries out what the core answers, and returns the bytes to send.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from ahrsd import events
+from ahrsd.core.core import Core
+from ahrsd.daemon import host_clock
+from ahrsd.daemon.estimation_worker import Worker
+from ahrsd.daemon.journal import Journal
+from ahrsd.errors import JournalError
+from ahrsd.inputs import Input, Journalled, JournalOpened
+from ahrsd.recording.capture import CaptureWriter
+from ahrsd.writeback.journal_history import of_another_device
+
+log = logging.getLogger("ahrsd")
+
+_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
+_FOLD_S = 60.0
+_FOLD_TEXTS = 64
+
+
+class Viewer(Protocol):
+    """Where events go to be looked at; never blocks."""
+
+    def push(self, event: events.Event, host_s: float) -> None:
+        """Take an event."""
+
+
+Listener = Callable[[events.Event], None]  # somebody else who wants every event, in order
+
+
+@dataclass(slots=True)
+class FoldedLog:
+    """The log, in which a text that comes again within a minute is only counted."""
+
+    write: Callable[[int, str], None] = lambda level, text: log.log(level, "%s", text)
+    _open: OrderedDict[tuple[int, str], tuple[float, int]] = field(default_factory=OrderedDict)
+
+    def say(self, level: int, text: str, now_s: float) -> None:
+        """Write it now, or count it."""
+        self.settle(now_s)
+        key = (level, text)
+        if key in self._open:
+            since_s, count = self._open[key]
+            self._open[key] = (since_s, count + 1)
+            return
+        self.write(level, text)
+        self._open[key] = (now_s, 0)
+        if len(self._open) > _FOLD_TEXTS:
+            self._end(*self._open.popitem(last=False))
+
+    def unfold(self, level: int, text: str) -> None:
+        """The text is news again: the next time it is written."""
+        if (counted := self._open.pop((level, text), None)) is not None:
+            self._end((level, text), counted)
+
+    def settle(self, now_s: float) -> None:
+        """Write the counts whose minute is over."""
+        while self._open and now_s - next(iter(self._open.values()))[0] >= _FOLD_S:
+            self._end(*self._open.popitem(last=False))
+
+    def finish(self) -> None:
+        """The end: write every count."""
+        while self._open:
+            self._end(*self._open.popitem(last=False))
+
+    def _end(self, key: tuple[int, str], value: tuple[float, int]) -> None:
+        if value[1]:
+            self.write(key[0], f"{key[1]} ({value[1]} more times)")
+
+
+@dataclass(slots=True)
+class JournalKeeper:
+    """Opens the journal of the device that answers, appends, and says how it went."""
+
+    open: Callable[[int], Journal]
+    now_ns: Callable[[], int]
+    journal: Journal | None = None
+
+    def opened(self, serial: int) -> JournalOpened:
+        """Open the journal of a device; an error is an answer, not an exception."""
+        self.journal = None
+        try:
+            journal = self.open(serial)
+        except JournalError as error:
+            return JournalOpened(self.now_ns(), serial, [], str(error))
+        if other := of_another_device(journal.records(), serial):
+            text = f"{journal.path}: {other}; move the file away or put that device's name on it"
+            return JournalOpened(self.now_ns(), serial, [], text)
+        self.journal = journal
+        records: list[dict[str, object]] = [
+            {"kind": r.kind, "facts": dict(r.facts)} for r in journal.records()
+        ]
+        return JournalOpened(self.now_ns(), serial, records)
+
+    def append(self, item: events.JournalAppend) -> Journalled:
+        """Make a record durable."""
+        if self.journal is None:
+            return Journalled(self.now_ns(), item.kind, "no journal is open")
+        try:
+            self.journal.append(item.kind, **{**host_clock.stamp(), **item.facts})
+        except JournalError as error:
+            return Journalled(self.now_ns(), item.kind, str(error))
+        return Journalled(self.now_ns(), item.kind)
+
+
+@dataclass(slots=True)
+class Shell:
+    """A core and its side taps; each tap may be absent."""
+
+    core: Core
+    capture: CaptureWriter | None = None
+    journal: JournalKeeper | None = None
+    viewer: Viewer | None = None
+    listeners: list[Listener] = field(default_factory=list)
+    finished: bool = False
+    folded: FoldedLog = field(default_factory=FoldedLog)
+    worker: Worker | None = None
+
+    def feed(self, item: Input) -> bytes:
+        """One input through the core; returns what must be written to the port."""
+        waiting: list[Input] = [item]
+        output = bytearray()
+        while waiting:
+            one = waiting.pop(0)
+            if self.capture is not None:
+                self.capture.write(one)
+            for event in self.core.handle(one):
+                output += self._carry_out(event, one.host_ns, waiting)
+        return bytes(output)
+
+    def say(self, level: int, text: str, host_ns: int) -> None:
+        """A fact of the shell's own, for the log and the record."""
+        self.folded.say(level, text, host_ns * 1e-9)
+        if self.capture is not None:
+            name = logging.getLevelName(level).lower()
+            self.capture.write_event(host_ns, {"note": text, "level": name})
+
+    def _carry_out(self, event: events.Event, host_ns: int, waiting: list[Input]) -> bytes:
+        if self.viewer is not None:
+            self.viewer.push(event, host_ns * 1e-9)
+        for listener in self.listeners:
+            listener(event)
+        match event:
+            case events.Send(data):
+                if self.capture is not None:
+                    self.capture.write_sent(host_ns, data)
+                return data
+            case events.OpenJournal(serial) if self.journal is not None:
+                waiting.append(self.journal.opened(serial))
+            case events.JournalAppend() if self.journal is not None:
+                waiting.append(self.journal.append(event))
+            case events.Examine(work) if self.worker is not None:
+                self.worker.put(work)
+            case events.RegistersRead(_, values) if self.capture is not None:
+                self.capture.write_registers(host_ns, {str(n): v for n, v in values.items()})
+            case events.Finished():
+                self.finished = True
+            case _:
+                self._log(event, host_ns)
+        return b""
+
+    def _log(self, event: events.Event, host_ns: int) -> None:
+        line: tuple[int, str] | None = None
+        match event:
+            case events.Noted(at_s, _, level, text):
+                line = (_LEVELS[level], text)
+                fact: dict[str, object] = {"note": text, "level": level, "at_s": at_s}
+            case events.StateChanged(at_s, _, old, new, reason):
+                line = (logging.INFO, f"{old} -> {new}: {reason}")
+                fact = {"state": new, "from": old, "reason": reason, "at_s": at_s}
+            case events.RegisterWritten(at_s, _, register, old_values, new_values, outcome):
+                line = (logging.INFO, f"register {register} {outcome}: {new_values}")
+                values = {"old": old_values, "new": new_values}
+                fact = {"register": register, **values, "outcome": outcome, "at_s": at_s}
+            case events.Judged(at_s, _, gates):
+                fact = {"at_s": at_s, "gates": {g.gate: [g.value, g.limit, g.ok] for g in gates}}
+            case _:
+                return
+        if line is not None:
+            self.folded.say(*line, host_ns * 1e-9)
+        if self.capture is not None:
+            self.capture.write_event(host_ns, fact)
+
+
+def journal_in(directory: Path) -> Callable[[int], Journal]:
+    """Opener of journals in a state directory, one per serial number."""
+    from ahrsd.daemon.journal import journal_path
+
+    def opener(serial: int) -> Journal:
+        return Journal.open(journal_path(directory, serial))
+
+    return opener

@@ -1,0 +1,419 @@
+"""The daemon: a port, a clock and the shell around the core.
+
+One loop: wait for bytes, a deadline, the vehicle's word or a signal; hand each to the core as an
+input; write what it answers. Losing the port is normal: the loop waits for it to come back and the
+core identifies the device again. At the end (SIGTERM, SIGINT) the core first puts back what it
+changed for the session.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Protocol
+
+from ahrsd import events, inputs
+from ahrsd.config.loading import Config
+from ahrsd.daemon import host_clock
+from ahrsd.daemon.columns_file import ColumnsFile
+from ahrsd.daemon.core_runner import Shell
+from ahrsd.daemon.health_log import Watch
+from ahrsd.daemon.operator_inbox import Answer, OperatorInbox
+from ahrsd.daemon.recall import Recall
+from ahrsd.daemon.reloading import Change, Reloader
+from ahrsd.daemon.serial_link import Bytes, Lost, SerialLink, find_device
+from ahrsd.telemetry.public import Public
+from ahrsd.telemetry.status import LinkFacts
+from ahrsd.viewer.sink import RerunSink
+from drivers.serial_port import LinkLost, PortError
+from drivers.usb import latency_timer_ms
+from drivers.vn100.device import Device
+from drivers.vn100.errors import DriverError
+
+log = logging.getLogger("ahrsd")
+
+_REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
+_LONGEST_WAIT_S = 0.2
+_BEHIND_S = 0.05
+_SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
+_STOP_S = 1.6  # for putting things back; a service manager's patience is limited
+_AMENDS_S = 2.0
+_INTERLOCK_S = 0.2
+_COLUMNS_S = 0.04
+_WATCH_S = 1.0
+_WALL_STEP_S = 1.0
+_SUSPENDED_S = 0.5
+
+
+def _asleep_s() -> float:
+    """How long the host has been suspended since it booted."""
+    while True:  # until nothing came between the clocks
+        before_s = time.clock_gettime(time.CLOCK_MONOTONIC)
+        boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+        if time.clock_gettime(time.CLOCK_MONOTONIC) - before_s < _SUSPENDED_S / 10:
+            return boot_s - before_s
+
+
+class Vehicle(Protocol):
+    """Who says whether a write is safe now."""
+
+    def safe(self) -> bool:
+        """The word; anything that goes wrong is no."""
+
+
+@dataclass(frozen=True, slots=True)
+class HostClock:
+    """Monotonic host time in ns, `speed` times as fast as real time (1 but for demonstrations)."""
+
+    speed: float = 1.0
+    start_ns: int = field(default_factory=time.monotonic_ns)
+
+    def now_ns(self) -> int:
+        """Nanoseconds, never falling."""
+        return self.start_ns + int((time.monotonic_ns() - self.start_ns) * self.speed)
+
+    def boot(self) -> tuple[str, float]:
+        """Id of the host's boot and seconds since then; one that runs faster began with itself."""
+        if self.speed == 1.0:
+            return host_clock.boot_id(), host_clock.boot_s()
+        return self._own_boot()
+
+    def _own_boot(self) -> tuple[str, float]:
+        return f"{host_clock.boot_id()} {self.start_ns}", (self.now_ns() - self.start_ns) * 1e-9
+
+
+class Daemon:
+    """Runs one device until `stop` is called. `listeners` on the shell see every event.
+
+    baud: of the port where it was found already, else as the configuration says
+    terms: text of a repaired model; columns: what the vehicle measures, for its terms
+    recall: reads what earlier runs left
+    complaints: each is asked once a second what is wrong with a file of somebody else's
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        shell: Shell,
+        port_path: Path,
+        clock: HostClock,
+        interlock: Vehicle | None = None,
+        *,
+        baud: int | None = None,
+        words: OperatorInbox | None = None,
+        public: Public | None = None,
+        terms: str = "",
+        columns: ColumnsFile | None = None,
+        complaints: Iterable[Callable[[], str]] = (),
+        reloader: Reloader | None = None,
+        recall: Recall | None = None,
+    ) -> None:
+        self.config, self.shell, self.clock = config, shell, clock
+        self._may_query = config.mode != "passive"
+        said = None if config.device.baud == "auto" else config.device.baud
+        known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
+        self._link = SerialLink(port_path, known, clock.now_ns)
+        self._inbox = self._link.inbox
+        if shell.worker is not None:
+            shell.worker.woken = self._inbox.wake
+        self._interlock, self._words, self._public = interlock, words, public
+        if words is not None:
+            words.woken = self._inbox.wake
+            shell.listeners.append(self._answer)
+        self._terms, self._columns = terms, columns
+        self._complaints = dict.fromkeys(complaints, "")  # what each said last
+        self._reloader, self._recall = reloader, recall
+        self.on_change: Callable[[Change], None] = lambda change: None  # who made the files
+        self._safe = False
+        self._latency_timer_ms: int | None = None
+        self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
+        self._stop_reason = ""
+        self.stopped_s: float | None = None  # when `stop` was called, monotonic
+        self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
+        self._next_interlock_ns = self._next_columns_ns = 0
+        self._offsets_s = [float("inf")] * 2  # of wall clock and boottime, as last told
+        self._asleep_s = _asleep_s()
+        self._watch = Watch(time.monotonic())
+        self._next_watch_s = self._retry_s = 0.0
+        self._messages_before = 0
+        self._wait_s = _REOPEN_S[0]
+        self._waiting = False  # whether it was said what is waited for since the link was lost
+
+    # -- from outside ------------------------------------------------------------------------------
+
+    def stop(self, reason: str) -> None:
+        """End the run; safe from a signal handler and from another thread."""
+        if not self._stop_reason:
+            self._stop_reason, self.stopped_s = reason, time.monotonic()
+        self._inbox.wake()
+
+    def operate(self, verb: str, argument: str = "", word: str = "") -> None:
+        """A person's command; safe from another thread."""
+        self._operator.put(inputs.Operator(self.clock.now_ns(), verb, argument, word))
+        self._inbox.wake()
+
+    # -- the run -----------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Until stopped. Raises PortError only where the port cannot be opened the first time."""
+        with ExitStack() as leaving:
+            leaving.callback(self.shell.folded.finish)
+            leaving.callback(self._link.close)
+            leaving.push(self._after_a_bug)
+            self._tell_wall()
+            if self._terms:
+                self._feed(inputs.TermsKnown(self.clock.now_ns(), self._terms))
+            self._open()
+            while not self._stop_reason:
+                self._turn(_LONGEST_WAIT_S)
+            self._finish()
+
+    def _after_a_bug(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """On the way out: whatever it was, the device is put back; what was raised goes on."""
+        if isinstance(error, Exception) and not isinstance(error, PortError):
+            self._make_amends(error)
+
+    def _turn(self, longest_s: float) -> None:
+        """One wait and what it brought."""
+        if not self._link.is_open:
+            self._reopen()
+        item = self._wait(self._patience_s(longest_s))
+        if self._slept():
+            return
+        self._around()
+        if isinstance(item, Bytes):
+            self._feed(inputs.Received(item.host_ns, item.data))
+        elif isinstance(item, Lost):
+            self._lost(item.host_ns, item.reason)
+        # What is waited for may lie in the inbox or in the port already: a reply is late only
+        # against what was taken, and a silence is one only where nothing waits to be read.
+        now_ns = self.clock.now_ns() if item is None else item.host_ns
+        if item is not None or (self._inbox.empty and not self._link.has_more()):
+            self._tick(now_ns)
+        self._take_findings(now_ns)
+        if self._recall is not None and (earlier := self._recall.take(now_ns)) is not None:
+            self._feed(earlier)
+        self._look()
+        if self._public is not None:
+            well = self.shell.worker is None or not self.shell.worker.stuck
+            self._public.turn(self.shell.core, time.monotonic(), well=well)
+
+    def _wait(self, longest_s: float) -> Bytes | Lost | None:
+        """The next bytes; while the estimator is behind they wait, and the rest goes on."""
+        worker = self.shell.worker
+        if worker is not None and worker.full and not self._stop_reason:
+            worker.wait_for_room(min(longest_s, _BEHIND_S))
+            return None
+        return self._inbox.get(longest_s)
+
+    def _take_findings(self, now_ns: int) -> None:
+        """What was done beside the core, told at the time of what was taken last."""
+        worker = self.shell.worker
+        for pieces, failure in () if worker is None else worker.take_done():
+            self._feed(inputs.Examined(now_ns, pieces, failure))
+
+    def _slept(self) -> bool:
+        """Whether the host was suspended; then the link begins anew, with the device's registers.
+
+        Its clock stood still and the device's did not: nothing that is at hand may be joined over
+        that, nor is it known whether the device kept its power.
+        """
+        asleep_s = _asleep_s()
+        slept_s, self._asleep_s = asleep_s - self._asleep_s, asleep_s
+        if slept_s < _SUSPENDED_S or not self._link.is_open:
+            return False
+        reason = f"the host was suspended for {slept_s:.1f} s"
+        self._lost(self.clock.now_ns(), reason, heard=False)
+        return True
+
+    def _tick(self, now_ns: int) -> None:
+        deadline = self.shell.core.deadline_ns
+        if deadline is not None and now_ns >= deadline:
+            self._feed(inputs.Tick(now_ns))
+
+    def _around(self) -> None:
+        """Vehicle, operators and the wall clock: before bytes are judged by what they say."""
+        now = self.clock.now_ns()
+        if self._interlock is not None and now >= self._next_interlock_ns:
+            self._next_interlock_ns = now + int(self._interlock_s * 1e9)
+            self._safe = self._interlock.safe()
+            self._feed(inputs.Interlock(now, self._safe))
+        if self._columns is not None and now >= self._next_columns_ns:
+            self._next_columns_ns = now + int(_COLUMNS_S * 1e9)
+            if (values := self._columns.news()) is not None:
+                self._feed(inputs.Columns(now, values))
+        for word in self._words.take() if self._words is not None else ():
+            self.operate(word.verb, word.argument, word.name)
+        while not self._operator.empty():
+            self._feed(self._operator.get())
+        self._tell_wall()
+
+    def _patience_s(self, longest_s: float) -> float:
+        """How long to wait for bytes: until somebody wants to be woken."""
+        if not self._link.is_open:
+            longest_s = min(longest_s, self._retry_s - time.monotonic())
+        deadline = self.shell.core.deadline_ns
+        if deadline is not None:
+            left_s = (deadline - self.clock.now_ns()) * 1e-9 / self.clock.speed
+            longest_s = min(longest_s, left_s)
+        return max(longest_s, _SHORTEST_WAIT_S)
+
+    def _tell_wall(self) -> None:
+        """The host's other clocks, at the start and when one was set or the host was suspended."""
+        now_ns = self.clock.now_ns()
+        wall_s, (boot_id, boot_s) = time.time(), self.clock.boot()
+        offsets_s = [wall_s - now_ns * 1e-9 / self.clock.speed, boot_s - now_ns * 1e-9]
+        steps_s = [abs(a - b) for a, b in zip(offsets_s, self._offsets_s, strict=True)]
+        if not max(steps_s) < _WALL_STEP_S:
+            self._offsets_s = offsets_s
+            self._feed(inputs.WallClock(now_ns, wall_s, boot_id, boot_s))
+
+    def _feed(self, item: inputs.Input) -> None:
+        output = self.shell.feed(item)
+        if output:
+            try:
+                self._link.write(output)
+            except LinkLost as error:
+                self._lost(self.clock.now_ns(), str(error))
+
+    def _look(self) -> None:
+        """Once a second: what a person should hear."""
+        now_s = time.monotonic()
+        if now_s < self._next_watch_s:
+            return
+        self._next_watch_s = now_s + _WATCH_S
+        capture, now_ns = self.shell.capture, self.clock.now_ns()
+        error = "" if capture is None else capture.status.error
+        for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
+            self.shell.say(remark.level, remark.text, now_ns)
+        for complaint, before in self._complaints.items():
+            if (text := complaint()) != before:
+                self._complaints[complaint] = text
+                self.shell.say(logging.WARNING, text or f"over: {before}", now_ns)
+        for well, text in () if self._reloader is None else self._reloader.take(self._change):
+            self.shell.say(logging.INFO if well else logging.WARNING, text, now_ns)
+        self.shell.folded.settle(now_ns * 1e-9)
+        if self._public is not None:
+            self._public.look(self.shell.core, self._link_facts(error), now_s)
+        device = self.config.device
+        if self._watch.garbage and device.baud == "auto":
+            self._link.doubt()
+            self._lost(now_ns, "no message in what arrives: looking for the rate")
+        elif self._watch.silent and device.configure_stream and self._may_query:
+            self._lost(now_ns, "silence: asking the device again for its output")
+
+    def watch_files(
+        self,
+        interlock: Vehicle | None,
+        columns: ColumnsFile | None,
+        complaints: Iterable[Callable[[], str]],
+    ) -> None:
+        """Other files of the vehicle from now on; the word begins anew with them."""
+        self._interlock, self._columns = interlock, columns
+        self._complaints = dict.fromkeys(complaints, "")
+
+    def _change(self, change: Change) -> None:
+        """What a person changed in the configuration takes effect."""
+        before, self.config = self.config, change.config
+        self.on_change(change)
+        capture, gates = change.config.capture, change.config.gates
+        if self.shell.capture is not None:
+            sizes = capture.part_megabytes * 1_000_000, capture.keep_megabytes * 1_000_000
+            self.shell.capture.resize(*sizes)
+        if gates != before.gates:
+            self._feed(inputs.LimitsChanged(self.clock.now_ns(), asdict(gates.limits())))
+
+    def _answer(self, event: events.Event) -> None:
+        """Tell a person what became of the word."""
+        if isinstance(event, events.Answered) and event.word and self._words is not None:
+            self._words.answer(event.word, Answer(event.accepted, event.text))
+
+    def _link_facts(self, capture_error: str) -> LinkFacts:
+        capture, viewer = self.shell.capture, self.shell.viewer
+        counters = viewer.counters if isinstance(viewer, RerunSink) else None
+        return LinkFacts(
+            port=str(self._link.path),
+            baud=self._link.baud,
+            is_open=self._link.is_open,
+            latency_timer_ms=self._latency_timer_ms,
+            capture="" if capture is None else str(capture.path),
+            capture_error=capture_error,
+            viewer_dropped=0 if counters is None else counters.dropped,
+            viewer_fault="" if counters is None else counters.last_fault,
+            interlock="none" if self._interlock is None else "safe" if self._safe else "not safe",
+            complaints=tuple(text for text in self._complaints.values() if text),
+            estimator_stuck=self.shell.worker is not None and self.shell.worker.stuck,
+        )
+
+    # -- the port ----------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self._link.open(may_query=self._may_query)
+        self._messages_before = self._messages
+        self._watch.link_opened(time.monotonic())
+        path, now = self._link.path, self.clock.now_ns()
+        self._latency_timer_ms = latency_timer_ms(path)
+        self._feed(inputs.LinkOpened(now, str(path), self._link.baud, self._latency_timer_ms))
+
+    @property
+    def _messages(self) -> int:
+        return self.shell.core.conversation.session.deframer.counters.valid
+
+    def _lost(self, host_ns: int, reason: str, *, heard: bool = True) -> None:
+        for item in self._link.close():
+            if heard:  # before the link went
+                self._feed(inputs.Received(item.host_ns, item.data))
+        if self._stop_reason:  # the mark that `stop` left went with them
+            self._inbox.wake()
+        if self._messages > self._messages_before:  # it was a device: it may be back at once
+            self._wait_s = _REOPEN_S[0]
+        self._retry_s, self._waiting = time.monotonic() + self._wait_s, False
+        self._feed(inputs.LinkLost(host_ns, reason))
+
+    def _reopen(self) -> None:
+        """Try again and again, quickly first."""
+        if time.monotonic() < self._retry_s:
+            return
+        self._wait_s = min(self._wait_s * 1.5, _REOPEN_S[1])
+        self._retry_s = time.monotonic() + self._wait_s
+        try:
+            self._open()
+        except PortError as error:
+            text = f"waiting for the device: {error}"
+            if not self._waiting:  # after each loss at once, however short ago the last one was
+                self.shell.folded.unfold(logging.WARNING, text)
+            self._waiting = True
+            self.shell.say(logging.WARNING, text, self.clock.now_ns())
+
+    # -- the end -----------------------------------------------------------------------------------
+
+    def _finish(self) -> None:
+        """Let the core put back what it changed; bounded in time."""
+        until = (self.stopped_s or time.monotonic()) + _STOP_S
+        if self._public is not None:
+            self._public.stopping()
+        self._feed(inputs.Stop(self.clock.now_ns(), self._stop_reason))
+        while not self.shell.finished and time.monotonic() < until:
+            self._turn(0.05)
+        if not self.shell.finished:
+            text = f"stopped ({self._stop_reason}) without having put everything back"
+            self.shell.say(logging.ERROR, text, self.clock.now_ns())
+
+    def _make_amends(self, bug: Exception) -> None:
+        """After a bug of ours: the device streams again as before, whatever the core believes."""
+        log.error("internal error; putting the device's output back", exc_info=bug)
+        talk = self.shell.core.conversation
+        procedure, port = talk.amends(), self._link.take_port()
+        if port is None:
+            return
+        try:
+            with Device(port, talk.allows_amends) as device:
+                if procedure is not None:
+                    device.run(procedure, _AMENDS_S)
+        except DriverError as error:
+            log.error("the device's output is not as it was: %s", error)

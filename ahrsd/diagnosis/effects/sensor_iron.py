@@ -1,0 +1,182 @@
+"""Iron on the vehicle that changes: steps, drifts, soft iron, hysteresis, viscosity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis.effects.base import Linear, Readings, Setting
+from ahrsd.diagnosis.values import Columns
+
+_MG = 1e-3
+#: time constants of a drift that settles, as a vehicle that warms up does
+SETTLING_S = (30.0, 60.0, 120.0, 240.0)
+
+
+class HardIronStep(Linear):
+    """M1."""
+
+    identifier = "hard_iron_step"
+    code = "M1"
+    family = "sensor"
+    words = "the hard iron jumped: a payload was moved, a magnet put on or taken off, a shock"
+    equation = "m += k from t0 on"
+    parameters = shapes.vector("step", "gauss", 10.0 * _MG, 1000.0 * _MG)
+    typical = shapes.along(5.0 * _MG)
+    signature = "one jump in the sensor frame, the same on every heading"
+    confusers = (
+        ("soft_iron_step", "its size turns with the heading: all headings before and after"),
+        ("field_step", "it stays put in the world: turn once after the jump"),
+        ("hard_iron_drift", "near an end of the recording: record longer on both sides"),
+        ("switched_device", "several switchings"),
+    )
+    manoeuvre = "all headings before and after"
+    size = "1 to 300 mG"
+    source = "BROAD trials 32 to 36; retentive error (dossier M1)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """A coarse grid of times."""
+        return shapes.onsets(readings)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """1 from the onset on, on each axis."""
+        return Columns(mag=shapes.on_axes(shapes.since(readings, setting)))
+
+
+class HardIronDrift(Linear):
+    """M2: straight, relaxing like viscous iron, or settling; the parameter is the whole change."""
+
+    identifier = "hard_iron_drift"
+    code = "M2"
+    family = "sensor"
+    words = "the hard iron drifts slowly"
+    equation = (
+        "m += k s, s = t / T, or ln(1 + t/t1) / ln(1 + T/t1), or "
+        "(1 - exp(-t/t1)) / (1 - exp(-T/t1)); T: length of the recording"
+    )
+    parameters = shapes.vector("change", "gauss", 1.0 * _MG, 50.0 * _MG)
+    typical = shapes.along(2.0 * _MG)
+    signature = "a steady course in the sensor frame"
+    confusers = (
+        ("mag_bias_temperature", "a warm-up is nearly straight in time: heat soak, or run longer"),
+        ("geomagnetic_drift", "it stays put in the world: turn through all headings throughout"),
+        ("hard_iron_step", "near an end of the recording"),
+    )
+    manoeuvre = "a longer recording with all headings throughout"
+    size = "0.1 to 5 mG/h; more after a shock"
+    source = "retentive error of ship's compasses (dossier M2)"
+    stands_for = ("mag_bias_temperature",)
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Straight; fast, then slow; settling, with time constants a factor of two apart."""
+        over = shapes.span(readings)
+        return (
+            {**over, "shape": "line"},
+            {**over, "shape": "log", "relaxation_s": 10.0},
+            *({**over, "shape": "settling", "time_constant_s": tau} for tau in SETTLING_S),
+        )
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The course from 0 to 1 on each axis."""
+        part = shapes.elapsed(readings, setting)
+        if setting["shape"] == "log":
+            ratio = setting["span_s"] / setting["relaxation_s"]
+            part = np.log1p(np.maximum(part, 0.0) * ratio) / np.log1p(ratio)
+        elif setting["shape"] == "settling":
+            ratio = setting["span_s"] / setting["time_constant_s"]
+            part = np.expm1(-np.maximum(part, 0.0) * ratio) / np.expm1(-ratio)
+        return Columns(mag=shapes.on_axes(part))
+
+
+class SoftIronStep(Linear):
+    """M3."""
+
+    identifier = "soft_iron_step"
+    code = "M3"
+    family = "sensor"
+    words = "the soft iron changed: steel was added, removed or moved"
+    equation = "m += dA h from t0 on, dA symmetric"
+    parameters = shapes.symmetric("change", "1", 0.01, 0.3)
+    typical = (0.01, -0.006, 0.004, 0.005, -0.004, 0.006)
+    signature = "a jump whose size and direction turn with the heading"
+    confusers = (
+        ("hard_iron_step", "turn through all headings before and after"),
+        ("field_step", "pitch and roll before and after"),
+    )
+    manoeuvre = "all headings and some pitch before and after"
+    size = "0.5 to 5 %"
+    source = "dossier M3"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """A coarse grid of times."""
+        return shapes.onsets(readings)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The symmetric matrices on the field, from the onset on."""
+        on = shapes.since(readings, setting)[:, :, None]
+        return Columns(mag=shapes.times_symmetric(readings.field_b) * on)
+
+
+class Hysteresis(Linear):
+    """M16.  The play operator's middle trails the field by up to its radius."""
+
+    identifier = "hysteresis"
+    code = "M16"
+    family = "sensor"
+    form_share = 5e-3  # one play stands for a loop, and sampled play misses its turning points
+    words = "hysteresis of iron near the sensor"
+    equation = "m_i += k_i (play_r[(A h)_i] - (A h)_i) / r"
+    # three times the largest that is known: in a spin the field along the axis has no swing but the
+    # filter's own noise, of which a width of thirty explains a part of the innovations
+    parameters = shapes.vector("width", "gauss", 2.0 * _MG, 10.0 * _MG)
+    typical = shapes.along(2.0 * _MG)
+    signature = "the error depends on the direction of turning, not on its rate"
+    confusers = (
+        ("eddy_current", "change the turn's rate: eddies scale with it, hysteresis does not"),
+        ("mag_time_lag", "change the turn's rate"),
+        ("viscous_magnetisation", "stop after a turn and wait"),
+    )
+    manoeuvre = "full turns to the left and to the right, slowly and quickly"
+    size = "0.1 to 3 mG"
+    source = "play operator (Preisach); Bowditch on retentive error (dossier M16)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Radii from the noise of a few readings to more than half of the field's usual swing."""
+        return tuple({"radius_gauss": radius} for radius in (0.0015, 0.006, 0.02, 0.06, 0.15))
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """Between -1 and 1 per axis."""
+        induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
+        gap = (series.play(induced, radius, setting.get("memory")) - induced) / radius
+        return Columns(mag=np.asarray(gap[:, :, None] * np.eye(3)))
+
+
+class ViscousMagnetisation(Linear):
+    """M18."""
+
+    identifier = "viscous_magnetisation"
+    code = "M18"
+    family = "sensor"
+    words = "iron that takes its time to follow a turn"
+    equation = "m += dA (LP_tau[h] - h), dA symmetric, LP_tau: first-order low-pass"
+    parameters = shapes.symmetric("lagging_part", "1", 0.005, 0.1)
+    typical = (0.006, 0.004, -0.003, 0.003, 0.002, -0.003)
+    signature = "an offset that relaxes for 10 to 120 s after a turn"
+    confusers = (
+        ("eddy_current", "stop after a turn and wait"),
+        ("hysteresis", "it does not relax: stop and wait"),
+        ("hard_iron_drift", "several turns with pauses"),
+    )
+    manoeuvre = "quick quarter turns with two minutes of rest between them"
+    size = "0.1 to 5 mG"
+    source = "Gaussin error (dossier M18)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Time constants a factor of three and a half apart."""
+        return tuple({"time_constant_s": tau} for tau in (5.0, 18.0, 60.0))
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The symmetric matrices on what trails."""
+        tau, memory = setting["time_constant_s"], setting.get("memory")
+        slow = series.low_pass(readings.field_b, readings.dt_s, tau, memory)
+        return Columns(mag=shapes.times_symmetric(slow - readings.field_b))

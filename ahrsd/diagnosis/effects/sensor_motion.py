@@ -1,0 +1,216 @@
+"""What turning does to the reading: lag, filters, eddy currents, a mount that gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd import so3
+from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis.effects.base import Effect, Linear, Parameter, Readings, Setting, readings_of
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+
+class EddyCurrent(Linear):
+    """M17."""
+
+    identifier = "eddy_current"
+    code = "M17"
+    family = "sensor"
+    words = "eddy currents in hull or housing"
+    equation = "m += E dh/dt, dh/dt = h x w"
+    parameters = shapes.matrix("eddy", "s", 0.01, 0.2)
+    typical = (0.01, 0.002, 0.0, -0.003, 0.008, 0.001, 0.0, 0.002, 0.014)
+    signature = "proportional to the turn's rate, changes sign with its direction"
+    confusers = (
+        ("mag_time_lag", "contains it (E = -tau A): called a lag where it is the same all round"),
+        ("hysteresis", "two rates of turn"),
+        ("viscous_magnetisation", "stop after a turn and wait"),
+    )
+    manoeuvre = "turns about all three axes at two rates"
+    size = "0.1 to 20 mG at 0.5 rad/s near plates of aluminium or titanium"
+    source = "eddy block of Tolles and Lawson (dossier M17)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Nothing to choose."""
+        return ({},)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """A matrix on the field's derivative."""
+        return Columns(mag=shapes.times_matrix(series.field_dot(readings)))
+
+
+class MagTimeLag(Effect):
+    """M19.  Exact: the true field, turned back along the steps."""
+
+    identifier = "mag_time_lag"
+    code = "M19"
+    family = "sensor"
+    words = "the magnetometer trails the gyro"
+    equation = "m(t) = A h(t - tau) + b"
+    parameters = (Parameter("lag", "s", 0.02, 0.3),)
+    typical = (0.02,)
+    signature = "acts like a gyro error of tau dw/dt: seen only in angular acceleration"
+    confusers = (
+        ("gyro_time_lag", "only the difference of the two can be seen"),
+        ("gyro_integration", "half a sample: use the device's delta-theta output"),
+        ("eddy_current", "turn about all axes: a lag is the same all round"),
+        ("mag_low_pass", "two rates of turn"),
+        ("gyro_g_sensitivity", "on small motion: brisk reversals in heading"),
+    )
+    manoeuvre = "brisk reversals in heading"
+    size = "1 to 60 ms; EKF3 corrects 60 ms"
+    source = "ArduPilot #15899 (dossier M19)"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """Nothing to choose."""
+        return ({},)
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """-A dh/dt."""
+        readings = readings_of(context)
+        change = series.field_dot(readings) @ readings.soft_iron.T
+        return Columns(mag=-change[:, :, None])
+
+    def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
+        """The field of `value` seconds ago in place of the present one."""
+        delay_s = np.full(len(readings.time_s), float(value[0]))
+        return with_field(readings, series.delayed_field(readings, delay_s))
+
+    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
+        """Twenty milliseconds."""
+        return strength * np.array(self.typical), {}
+
+
+class MagLowPass(Linear):
+    """M20.  Straight in its parameter; with the delay equal to the setting it is the filter."""
+
+    identifier = "mag_low_pass"
+    code = "M20"
+    family = "sensor"
+    words = "the magnetometer is smoothed by a low-pass"
+    equation = "m += (tau / tau0) A (LP_tau0[h] - h); tau = tau0 is the filter itself"
+    parameters = (Parameter("time_constant", "s", 0.03, 0.3),)
+    typical = (0.03,)
+    signature = "a lag, and a loss of field in fast turns"
+    confusers = (
+        ("mag_time_lag", "two rates of turn: the loss grows with the square of the rate"),
+        ("gyro_time_lag", "two rates of turn"),
+        ("mag_sample_hold", "look for repeated readings"),
+    )
+    manoeuvre = "shake the heading at several rates"
+    size = "5 to 50 ms"
+    source = "studies of telephones' magnetometer filters (dossier M20)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Time constants a factor of three apart."""
+        return tuple({"time_constant_s": tau} for tau in (0.03, 0.1, 0.3))
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """Of the smooth field: the differences of another would be its noise."""
+        return self.terms(replace(readings_of(context), field_b=context.smooth_b), setting)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """What the filter takes away, per second of its time constant."""
+        tau0 = setting["time_constant_s"]
+        field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
+        change = series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
+        return Columns(mag=np.asarray(change @ readings.soft_iron.T / tau0)[:, :, None])
+
+    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
+        """The filter itself, of `strength` times 30 ms."""
+        value = strength * np.array(self.typical)
+        return value, {"time_constant_s": float(max(value[0], 1e-6))}
+
+
+class FlexibleMount(Effect):
+    """M22.  Exact: a rotation by C a."""
+
+    identifier = "flexible_mount"
+    code = "M22"
+    family = "sensor"
+    words = "the magnetometer's mount gives under its weight and acceleration"
+    equation = "m = A Exp(C a) h + b, a: specific force in g"
+    parameters = shapes.matrix("bend", "rad/g", 0.01, 0.2)
+    typical = (0.0, 0.008, 0.002, -0.009, 0.0, 0.001, 0.002, -0.003, 0.0)
+    needs = ("accel",)
+    signature = "the error follows tilt and thrust"
+    confusers = (
+        ("mag_gyro_misalignment", "level, the weight is constant: pitch and roll far"),
+        ("gyro_g_sensitivity", "accelerate without turning"),
+        ("gyro_nonorthogonality", "accelerate without turning"),
+    )
+    manoeuvre = "pitch and roll to 45 degrees, upside down if it can be"
+    size = "0.1 to 2 degrees"
+    source = "dossier M22"
+    # C = c I turns about the specific force, which at rest is the vertical: Exp(c g_b) R^T h is
+    # R^T (Exp(c g_n) h), another field in the world, and which one is there nobody knows
+    unseen = (tuple(np.eye(3).ravel() / np.sqrt(3.0)),)
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """Nothing to choose, where there is an accelerometer."""
+        return ({},) if context.track.accel_b_m_s2 is not None else ()
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """A ((C a) x h)."""
+        readings = readings_of(context)
+        force = shapes.specific_force_g(readings)
+        turn = readings.soft_iron @ shapes.turned_by(readings.field_b)  # (N, 3, 3)
+        return Columns(mag=np.einsum("nka,nb->nkab", turn, force).reshape(len(force), 3, 9))
+
+    def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
+        """The field seen from the bent mount."""
+        bend = shapes.specific_force_g(readings) @ value.reshape(3, 3).T
+        return with_field(readings, np.einsum("nij,nj->ni", so3.exp(bend), readings.field_b))
+
+    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
+        """About half a degree per g."""
+        if not shapes.has_accel(readings):
+            raise ValueError(f"{self.identifier} needs an accelerometer")
+        return strength * np.array(self.typical), {}
+
+
+class MagGyroMisalignment(Effect):
+    """G3.  Exact: the magnetometer sees the field turned by phi."""
+
+    identifier = "mag_gyro_misalignment"
+    code = "G3"
+    family = "gyro"
+    form_share = 1e-4  # its second order
+    words = "magnetometer and gyro are not aligned"
+    equation = "m = A Exp(phi) h + b; the same as a soft iron that is not symmetric"
+    parameters = shapes.vector("angle", "rad", 0.01, 0.35)
+    typical = shapes.along(0.02)
+    signature = "an error that depends on the attitude; a symmetric soft iron cannot hold it"
+    confusers = (
+        ("flexible_mount", "pitch and roll far, upside down if it can be"),
+        ("mag_cross_axis", "pitch to 45 degrees"),
+        ("gyro_nonorthogonality", "turn about all three axes"),
+    )
+    manoeuvre = "turns about all three axes"
+    size = "0.05 degrees within a device, up to 3 where the sensors are mounted apart"
+    source = "Kok and Schon 2016, arXiv 1612.01044 (dossier G3)"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """Nothing to choose."""
+        return ({},)
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """A (phi x h)."""
+        return Columns(mag=context.model.soft_iron @ shapes.turned_by(context.field_b))
+
+    def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
+        """The field turned by Exp(phi)."""
+        return with_field(readings, readings.field_b @ so3.exp(value).T)
+
+    def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
+        """About a degree."""
+        return strength * np.array(self.typical), {}
+
+
+def with_field(readings: Readings, field_b: Array) -> Readings:
+    """The readings with another field at the sensor, whatever else is in them."""
+    change = (field_b - readings.field_b) @ readings.soft_iron.T
+    return replace(readings, mag_b_gauss=readings.mag_b_gauss + change)

@@ -1,0 +1,320 @@
+"""Sources on the vehicle whose course somebody logs: currents, temperature, joints, switches.
+
+Each is a field in the sensor frame, straight onto the reading: D = e_i f(covariate).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.diagnosis.effects import pulses, series, shapes
+from ahrsd.diagnosis.effects.base import Linear, Readings, Setting, left_over, readings_of
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+_MG = 1e-3
+_TACHOMETER = 1e-3  # part of its reading by which a shaft's speed may be wrong
+
+
+class MotorCurrentField(Linear):
+    """M4."""
+
+    identifier = "motor_current_field"
+    code = "M4"
+    family = "sensor"
+    rides = True
+    words = "the magnetic field of a motor, thruster or battery current"
+    equation = "m += k I(t)"
+    parameters = shapes.vector("field_per_ampere", "gauss/A", 1.0 * _MG, 50.0 * _MG)
+    typical = shapes.along(1.0 * _MG)
+    needs = ("current",)
+    signature = "follows the current in the sensor frame, the same on every heading"
+    confusers = (
+        ("vibration_rectification", "it acts on the gyro: pulse the motor at rest"),
+        ("current_derivative_field", "it lives on the edges: hold the current for some seconds"),
+        ("mag_bias_temperature", "heat follows the load slowly: pulse the motor, then pause"),
+        ("speed_field", "change the load at the same speed"),
+    )
+    manoeuvre = "pulse the motor at rest on one heading, then on another"
+    size = "0.1 to 5 mG/A; 50 to 500 mG in the hover of small drones"
+    source = "Ampere; ArduPilot #116 and PR 6448, PX4 PR 14457, inav #4820 (dossier M4)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """One per current that was logged."""
+        return shapes.per_covariate(readings, "current")
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """I on each axis."""
+        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+
+
+class CurrentDerivativeField(Linear):
+    """M5."""
+
+    identifier = "current_derivative_field"
+    code = "M5"
+    family = "sensor"
+    rides = True
+    words = "a field that follows the change of a current: loops and eddies in the frame"
+    equation = "m += k dI/dt"
+    parameters = shapes.vector("field_per_ampere_per_second", "gauss s/A", 0.1 * _MG, 10.0 * _MG)
+    typical = shapes.along(0.1 * _MG)
+    needs = ("current",)
+    signature = "spikes at the edges of the current, of opposite sign at opposite edges"
+    confusers = (
+        ("motor_current_field", "a late log of the current looks like it: edges of both signs"),
+    )
+    manoeuvre = "step the motor up and down at rest"
+    size = "1 to 10 % of the current's own field"
+    source = "preprints 202401.1460 (dossier M5)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """One per current that was logged."""
+        return shapes.per_covariate(readings, "current")
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """dI/dt on each axis."""
+        change = series.derivative(
+            shapes.course_of(readings, setting), readings.time_s, readings.dt_s
+        )
+        return Columns(mag=shapes.on_axes(change))
+
+
+class SpeedField(Linear):
+    """M6."""
+
+    identifier = "speed_field"
+    code = "M6"
+    family = "sensor"
+    rides = True
+    words = "a field that follows speed or shaft speed"
+    equation = "m += k f(v), f = v / 1 m/s, (v / 1 m/s)^2 or rpm / 1000"
+    parameters = shapes.vector("field_per_unit_speed", "gauss", 0.5 * _MG, 200.0 * _MG)
+    typical = shapes.along(1.0 * _MG)
+    needs = ("speed|rpm",)
+    signature = "a constant offset at constant speed, on every heading"
+    confusers = (
+        ("motor_current_field", "change the load at the same speed"),
+        ("eddy_current", "drive straight at two speeds"),
+    )
+    manoeuvre = "the same straight leg at three speeds"
+    size = "20 to 250 nT on underwater vehicles; 50 mG per m/s over a rover's drive motors"
+    source = "Remote Sensing 15:4164 (dossier M6)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Each speed, straight and squared; each shaft in thousands of turns."""
+        speeds = [
+            setting
+            for power in (1, 2)
+            for setting in shapes.per_covariate(readings, "speed", power=power, unit=1.0)
+        ]
+        return (*shapes.per_covariate(readings, "rpm", power=1, unit=1e3), *speeds)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """f(v) on each axis."""
+        course = (shapes.course_of(readings, setting) / setting["unit"]) ** setting["power"]
+        return Columns(mag=shapes.on_axes(course))
+
+
+class SyncPulses(Linear):
+    """M9."""
+
+    identifier = "sync_pulses"
+    code = "M9"
+    family = "sensor"
+    words = "pulses of a transmitter: sonar, DVL, radio"
+    equation = "m += k in the samples that a pulse hits"
+    parameters = shapes.vector("pulse", "gauss", 1.0 * _MG, 100.0 * _MG)
+    typical = shapes.along(2.0 * _MG)
+    signature = "outliers of one size in one direction, in step with the pings or with themselves"
+    confusers = (
+        ("switched_device", "pulses last a sample or two, a device stays on"),
+        ("noise_burst", "log the ping times"),
+    )
+    manoeuvre = "switch the transmitter off for a minute"
+    size = "0.2 to 5 mG"
+    source = "dossier M9"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """One per column of pulses, and the likeliest regular train that nobody logged."""
+        track = context.track
+        logged = shapes.per_covariate(readings_of(context), "ping")
+        return (*logged, *pulses.trains(left_over(context), track.time_s, track.step_s))
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """The columns of pulses, else 60 ms every two seconds."""
+        start_s = float(readings.time_s[0])
+        regular = {"start_s": start_s, "period_s": 2.0, "phase_s": 0.5, "width_s": 0.06}
+        return shapes.per_covariate(readings, "ping") or (regular,)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The pulses on each axis."""
+        if "covariate" in setting:
+            return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+        return Columns(mag=shapes.on_axes(pulses.train(readings.time_s, setting)[:, None]))
+
+
+class MagBiasTemperature(Linear):
+    """M10; the reference is kept in the setting: the hard iron is that of this temperature."""
+
+    identifier = "mag_bias_temperature"
+    code = "M10"
+    family = "sensor"
+    rides = True
+    words = "an offset of the magnetometer that follows temperature"
+    equation = "m += k (T - T0)"
+    parameters = shapes.vector("offset_per_degree", "gauss/K", 0.1 * _MG, 5.0 * _MG)
+    typical = shapes.along(0.2 * _MG)
+    needs = ("temperature",)
+    signature = "follows the warm-up, not the heading"
+    confusers = (
+        ("hard_iron_drift", "a warm-up is nearly straight in time: heat soak, or a longer run"),
+        ("mag_scale_temperature", "it turns with the heading: all headings at two temperatures"),
+    )
+    manoeuvre = "a heat soak: ten minutes at rest while it warms, then all headings again"
+    size = "0.01 to 0.5 mG/K"
+    source = "Sensors 19:1850 (2019), HMC5983 sheet (dossier M10)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """One per thermometer."""
+        return shapes.per_covariate(readings, "temperature")
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """T - T0 on each axis."""
+        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+
+
+class MovingIron(Linear):
+    """M23."""
+
+    identifier = "moving_iron"
+    code = "M23"
+    family = "sensor"
+    words = "iron that moves on the vehicle: rudder, manipulator, turret, steering wheel"
+    equation = "m += k_c cos(psi) + k_s sin(psi)"
+    parameters = (
+        *shapes.vector("cosine", "gauss", 3.0 * _MG, 100.0 * _MG),
+        *shapes.vector("sine", "gauss", 3.0 * _MG, 100.0 * _MG),
+    )
+    typical = (*shapes.along(2.0 * _MG), *(2.0 * _MG * part for part in (0.48, 0.6, -0.64)))
+    needs = ("angle",)
+    signature = "follows the joint's angle in the sensor frame"
+    confusers = (
+        ("motor_current_field", "the actuator's current: move the joint unloaded"),
+        ("eddy_current", "a rudder moves with the turn: move it at rest"),
+    )
+    manoeuvre = "move the joint through its range at rest on one heading"
+    size = "0.5 to 50 mG"
+    source = "car compass patents (dossier M23)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """One per angle."""
+        return shapes.per_covariate(readings, "angle")
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """cos, then sin, on each axis."""
+        angle = shapes.course_of(readings, setting)[:, 0]
+        if setting["covariate"].endswith("_deg"):
+            angle = np.radians(angle)
+        return Columns(mag=shapes.on_axes(np.column_stack([np.cos(angle), np.sin(angle)])))
+
+
+class SwitchedDevice(Linear):
+    """M24."""
+
+    identifier = "switched_device"
+    code = "M24"
+    family = "sensor"
+    rides = True
+    words = "a device that is switched on and off: lamp, gripper, pump"
+    equation = "m += k u(t), u = 0 or 1"
+    parameters = shapes.vector("field", "gauss", 3.0 * _MG, 200.0 * _MG)
+    typical = shapes.along(2.0 * _MG)
+    needs = ("switch",)
+    signature = "jumps to and fro between two values in one direction of the sensor frame"
+    confusers = (
+        ("hard_iron_step", "switch it several times"),
+        ("motor_current_field", "switch it with the motors off"),
+    )
+    manoeuvre = "switch the device several times at rest"
+    size = "0.2 to 20 mG"
+    source = "US20030140510, accessory interference (dossier M24)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """One per switch."""
+        return shapes.per_covariate(readings, "switch")
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The switch on each axis."""
+        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+
+
+class RotorField(Linear):
+    """M25.  The samples see the shaft's phase itself, so its alias comes out right."""
+
+    identifier = "rotor_field"
+    code = "M25"
+    family = "sensor"
+    words = "a magnetised rotor that turns with the shaft"
+    equation = "m += k_c cos(n phi) + k_s sin(n phi), dphi/dt = 2 pi rpm / 60"
+    parameters = (
+        *shapes.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *shapes.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
+    )
+    typical = (*shapes.along(1.0 * _MG), *(1.0 * _MG * part for part in (0.48, 0.6, -0.64)))
+    needs = ("rpm",)
+    signature = "a line at the alias of the shaft, two axes a quarter turn apart"
+    confusers = (
+        ("ac_interference", "it stays at one frequency and in one direction: change the rpm"),
+    )
+    manoeuvre = "run the shaft slowly up through its range"
+    size = "0.1 to 10 mG"
+    source = "dossier M25"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """The shaft and its second harmonic, each at the speed nearby that fits best.
+
+        A tachometer is right to a few parts in a thousand, and a tenth of a turn a minute is a
+        whole turn in ten minutes.
+        """
+        readings, left = readings_of(context), left_over(context)
+        found = []
+        for setting in self.choices(readings):
+            phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
+            off_hz, searched = _strongest_near(left, phase, context.track.time_s)
+            found.append({**setting, "off_hz": off_hz, "searched": searched})
+        return tuple(found)
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """The shaft and its second harmonic."""
+        return tuple(
+            setting
+            for harmonic in (1, 2)
+            for setting in shapes.per_covariate(readings, "rpm", harmonic=harmonic)
+        )
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """cos, then sin, of the shaft's phase on each axis."""
+        phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
+        phase += 2 * np.pi * setting.get("off_hz", 0.0) * (readings.time_s - readings.time_s[0])
+        return Columns(mag=shapes.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
+
+
+def _shaft_phase(readings: Readings, name: str) -> Array:
+    """Integral of the shaft's rate by the trapezoid rule, rad (N,)."""
+    rate = readings.covariates[name] * 2 * np.pi / 60.0
+    step = np.diff(readings.time_s) * (rate[1:] + rate[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(step)])
+
+
+def _strongest_near(left: Array, phase: Array, time_s: Array) -> tuple[float, int]:
+    """By how many hertz a line in (N, 3) is off the phase (N,), and how many were looked at."""
+    since, cycles = time_s - time_s[0], (phase[-1] - phase[0]) / (2 * np.pi)
+    reach = max(1, int(np.ceil(2 * _TACHOMETER * cycles)))
+    off_hz = np.arange(-reach, reach + 1) / (2 * max(since[-1], 1e-9))
+    turned = left * np.exp(-1j * phase)[:, None]
+    starts = np.arange(0, len(since), max(1, len(since) // (16 * (reach + 1))))
+    sums, middle = np.add.reduceat(turned, starts), since[starts]
+    power = np.sum(np.abs(np.exp(-2j * np.pi * np.outer(off_hz, middle)) @ sums) ** 2, axis=1)
+    best = int(np.argmax(power))
+    return float(off_hz[best]) + series.peak(power, best) * float(off_hz[1] - off_hz[0]), reach + 1

@@ -1,0 +1,215 @@
+"""Operations on columns of samples that know about gap-free runs: rates, delays, filters, play.
+
+A run begins where `dt_s` is nan.  Nothing here reaches over a gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd import so3
+from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.recursive import first_order
+from ahrsd.samples import Array
+
+
+def runs(dt_s: Array) -> list[slice]:
+    """The gap-free runs, in order."""
+    starts = [0, *(np.flatnonzero(np.isnan(dt_s[1:])) + 1).tolist()]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(dt_s)], strict=True)]
+
+
+def derivative(values: Array, time_s: Array, dt_s: Array) -> Array:
+    """d values / dt by central differences, one-sided at the ends of runs; (N,) or (N, k)."""
+    out = np.zeros_like(values)
+    for run in runs(dt_s):
+        if run.stop - run.start > 1:
+            out[run] = np.gradient(values[run], time_s[run], axis=0)
+    return out
+
+
+def instant_rate(readings: Readings) -> Array:
+    """True rate (N, 3) at the instant of the sample: the mean of the steps before and after."""
+    out = readings.rate_b_rad_s.copy()
+    for run in runs(readings.dt_s):
+        rate = readings.rate_b_rad_s[run]
+        if len(rate) > 1:
+            out[run][:-1] = (rate[:-1] + rate[1:]) / 2
+            out[run][0] = rate[1]
+    return out
+
+
+def field_dot(readings: Readings) -> Array:
+    """d field_b / dt (N, 3) gauss/s at the instant of the sample: h x w."""
+    return np.cross(readings.field_b, instant_rate(readings))
+
+
+def delayed_field(readings: Readings, delay_s: Array) -> Array:
+    """The true field (N, 3) `delay_s` (N,) ago in the body frame of that time.
+
+    Between samples the body turns at the rate of the step, so the field is known in between; before
+    the first sample of a run it is taken to have turned at the first step's rate, behind the last
+    at the last's.
+    """
+    out = np.empty_like(readings.field_b)
+    for run in runs(readings.dt_s):
+        time_s, rate = readings.time_s[run], readings.rate_b_rad_s[run].copy()
+        rate[:1] = rate[1:2] if len(rate) > 1 else rate[:1]
+        wanted = time_s - delay_s[run]
+        end = np.clip(np.searchsorted(time_s, wanted), 0, len(time_s) - 1)  # the step's last sample
+        turn = so3.exp(rate[end] * (time_s[end] - wanted)[:, None])
+        out[run] = np.einsum("nij,nj->ni", turn, readings.field_b[run][end])
+    return out
+
+
+def delayed_rate(readings: Readings, delay_s: float) -> Array:
+    """The mean rate (N, 3) over the step that ended `delay_s` ago; straight on at a run's ends."""
+    out = readings.rate_b_rad_s.copy()
+    for run in runs(readings.dt_s):
+        time_s, rate = readings.time_s[run], readings.rate_b_rad_s[run]
+        if len(rate) < 2:
+            continue
+        wanted = time_s - delay_s
+        end = np.clip(np.searchsorted(time_s, wanted), 1, len(time_s) - 1)
+        back = (time_s[end] - wanted) / (time_s[end] - time_s[end - 1])
+        out[run] = rate[end] - back[:, None] * (rate[end] - rate[end - 1])
+    return out
+
+
+def low_pass(
+    values: Array, dt_s: Array, time_constant_s: float, memory: Sequence[float] | None = None
+) -> Array:
+    """First-order low-pass of (N, k), exact for values that are straight between samples.
+
+    Each run begins settled; the first one, where given, by `memory` (k,) beside the first value.
+    """
+    out = np.empty_like(values)
+    for run in runs(dt_s):
+        out[run] = _low_pass(values[run], dt_s[run][1:], time_constant_s)
+    if memory is not None:
+        out += np.asarray(memory) * forgotten(dt_s, time_constant_s)[:, None]
+    return out
+
+
+def forgotten(dt_s: Array, time_constant_s: float) -> Array:
+    """(N,) what is left in the first run of 1 at its first sample, 0 in the others."""
+    out = np.zeros(len(dt_s))
+    first = next(iter(runs(dt_s)))
+    out[first] = np.exp(-np.concatenate([[0.0], np.cumsum(dt_s[first][1:])]) / time_constant_s)
+    return out
+
+
+def _low_pass(x: Array, step_s: Array, time_constant_s: float) -> Array:
+    if len(x) < 2:
+        return x.copy()
+    keep = np.exp(-step_s / time_constant_s)
+    ratio = time_constant_s / step_s * (1 - keep)
+    new, old = 1 - ratio, ratio - keep
+    driven = np.vstack([x[:1], new[:, None] * x[1:] + old[:, None] * x[:-1]])
+    return first_order(driven, keep)
+
+
+def low_pass_of_curves(values: Array, time_s: Array, dt_s: Array, time_constant_s: float) -> Array:
+    """First-order low-pass of (N, k), exact for cubic curves through the samples and their slopes.
+
+    A filter quicker than the samples sees next to nothing of straight lines between them: the
+    bend of the course within a step, tau dt / 2, is as large as its own tau^2.
+    """
+    slope = derivative(values, time_s, dt_s)
+    out = np.empty_like(values)
+    for run in runs(dt_s):
+        out[run] = _low_pass_of_curves(values[run], slope[run], dt_s[run][1:], time_constant_s)
+    return out
+
+
+def _low_pass_of_curves(x: Array, slope: Array, step_s: Array, time_constant_s: float) -> Array:
+    if len(x) < 2:
+        return x.copy()
+    a = step_s / time_constant_s
+    keep = np.exp(-a)
+    # integrals of a exp(-a u) u^n over the step, u from its end back to its begin
+    I0 = 1 - keep
+    I1 = I0 / a - keep
+    I2 = 2 * I1 / a - keep
+    I3 = 3 * I2 / a - keep
+    early, late = -step_s[:, None] * slope[:-1], -step_s[:, None] * slope[1:]
+    change = x[:-1] - x[1:]
+    new = (
+        I0[:, None] * x[1:]
+        + I1[:, None] * late
+        + I2[:, None] * (3 * change - 2 * late - early)
+        + I3[:, None] * (late + early - 2 * change)
+    )
+    first = x[:1] - time_constant_s * slope[:1]  # as after a long course of that slope
+    return first_order(np.vstack([first, new]), keep)
+
+
+def play(values: Array, radius: float, memory: Sequence[float] | None = None) -> Array:
+    """The play operator (N, k): the middle of a slot of half-width `radius` that `values` drags.
+
+    memory (k,): where in the slot the first of the values lies, -1 to 1; its middle if None
+    """
+    low, high = values - radius, values + radius
+    start = values[0] + radius * np.asarray(memory or (0.0,) * values.shape[1])
+    # a clamp after a clamp is a clamp: pairs of rows first, then pairs of those
+    reach = 1
+    while reach < len(values):
+        before, after = (slice(None, -reach), slice(reach, None))
+        low[after], high[after] = (
+            np.minimum(np.maximum(end[before], low[after]), high[after]) for end in (low, high)
+        )
+        reach *= 2
+    return np.asarray(np.minimum(np.maximum(start, low), high))
+
+
+def moving_mean(values: Array, dt_s: Array, rows: int) -> Array:
+    """Centred mean of (N,) over about `rows` rows of the same run."""
+    out = np.empty_like(values)
+    half = max(rows // 2, 0)
+    for run in runs(dt_s):
+        total = np.concatenate([[0.0], np.cumsum(values[run])])
+        index = np.arange(run.stop - run.start)
+        first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(index))
+        out[run] = (total[last] - total[first]) / (last - first)
+    return out
+
+
+def median_step(dt_s: Array) -> float:
+    """The usual step, seconds."""
+    known = dt_s[np.isfinite(dt_s)]
+    return float(np.median(known)) if len(known) else 1.0
+
+
+def kept(readings: Readings, rows: NDArray[np.bool]) -> Readings:
+    """The rows (N,) bool that are left; a step reaches over what was left out, a gap stays one."""
+    index = np.flatnonzero(rows)
+    run = np.cumsum(np.isnan(readings.dt_s))[index]
+    time_s = readings.time_s[index]
+    step = np.concatenate([[np.nan], np.where(np.diff(run) > 0, np.nan, np.diff(time_s))])
+    force = readings.force_b_m_s2
+    return replace(
+        readings,
+        time_s=time_s,
+        dt_s=step,
+        mag_b_gauss=readings.mag_b_gauss[index],
+        gyro_b_rad_s=readings.gyro_b_rad_s[index],
+        accel_b_m_s2=readings.accel_b_m_s2[index],
+        rate_b_rad_s=readings.rate_b_rad_s[index],
+        field_b=readings.field_b[index],
+        R_nb=readings.R_nb[index],
+        covariates={name: values[index] for name, values in readings.covariates.items()},
+        force_b_m_s2=None if force is None else force[index],
+    )
+
+
+def peak(power: Array, best: int) -> float:
+    """Where the parabola through a largest value and its neighbours is highest, in steps."""
+    if not 0 < best < len(power) - 1:
+        return 0.0
+    left, middle, right = (float(p) for p in power[best - 1 : best + 2])
+    bend = left - 2 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0 else 0.0

@@ -1,0 +1,377 @@
+"""What differs in the world: the field from place to place, from time to time, near iron.
+
+All of them are fields n in the world, seen in the sensor frame: D = A R^T f.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+
+from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis.effects.base import Linear, Parameter, Readings, Setting, readings_of
+from ahrsd.diagnosis.effects.dipole import found_place, unit_fields
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+_MG = 1e-3
+_NED = ("position_north_m", "position_east_m", "position_down_m")
+#: the world's x axis is magnetic north where the field made it, true north where positions come
+#: from: their difference in degrees, coarsely
+_DECLINATIONS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
+_BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
+_BUMPS = 2
+_DISTANCES_M = (1.0, 3.0)
+_SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+_NEAREST_M = 0.2
+_WAY = 5  # places along the way around which it is sought, too
+_CLEAR = 4.0  # usual departures of the size from which an object is sought
+#: half waves of a slow pulsation, in lengths of the recording, and their phases, coarsely
+_HALF_WAVES, _PHASES_DEG = (0.45, 0.7, 1.05), (0.0, 45.0, 90.0, 135.0)
+#: metres in which a field from below falls by e, in ranges of the height, coarsely
+_DECAYS = (0.15, 0.4, 1.0)
+#: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
+_GRADIENT = ("nn", "ee", "ne", "nd", "ed")
+
+
+class FieldGradient(Linear):
+    """W1."""
+
+    identifier = "field_gradient"
+    code = "W1"
+    family = "world"
+    words = "the earth's field changes from place to place"
+    equation = "m += A R^T G (p - p0), G symmetric and traceless"
+    parameters = tuple(
+        Parameter(f"gradient_{e}", "gauss/m", 0.3 * _MG, 50 * _MG) for e in _GRADIENT
+    )
+    typical = (0.3 * _MG, -0.1 * _MG, 0.2 * _MG, -0.2 * _MG, 0.15 * _MG)
+    needs = ("position",)
+    signature = "fixed in the world; the same again at the same place"
+    confusers = (
+        ("geomagnetic_drift", "on a single pass: cross the place twice"),
+        ("altitude_field", "change depth at one place"),
+        ("field_anomaly", "a finer grid of passes"),
+    )
+    manoeuvre = "cross the same place twice, on different headings"
+    size = "0.02 to 2 mG/m outdoors, 1 to 50 mG/m indoors"
+    source = "MAINS arXiv 2312.02599, GRSL 2016 (dossier W1)"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """None where nothing says what is level: positions are in north, east, down."""
+        return super().settings(context) if context.world_levelled else ()
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """The turn between the world's frame and that of the positions."""
+        place = position_m(readings)
+        if place is None:
+            return ()
+        middle = [round(float(x), 3) for x in place.mean(axis=0)]
+        return tuple({"reference_m": middle, "turn_deg": turn} for turn in _DECLINATIONS_DEG)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The five independent gradients times the position."""
+        place = position_m(readings)
+        if place is None:
+            raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
+        n, e, d = turned_down(place - setting["reference_m"], setting["turn_deg"]).T
+        zero = np.zeros_like(n)
+        field = np.stack(
+            [
+                np.column_stack([n, zero, -d]),
+                np.column_stack([zero, e, -d]),
+                np.column_stack([e, n, zero]),
+                np.column_stack([d, zero, n]),
+                np.column_stack([zero, d, e]),
+            ],
+            axis=2,
+        )
+        return Columns(mag=_seen(readings, field))
+
+
+class FieldAnomaly(Linear):
+    """W2: a dipole at a place, or, without positions, a bump of some seconds."""
+
+    identifier = "field_anomaly"
+    code = "W2"
+    family = "world"
+    words = "iron or a magnet in the world, passed by"
+    equation = (
+        "m += A R^T (3 r (r k) - k) (d/|p - p0|)^3, r = unit(p - p0); or k sin^2(pi (t - t0)/L)"
+    )
+    parameters = shapes.vector("field", "gauss", 10 * _MG, 2000 * _MG)
+    typical = shapes.along(15 * _MG)
+    signature = "a bump of seconds, fixed in the world; the field's size changes"
+    confusers = (
+        ("field_gradient", "a finer grid of passes"),
+        ("switched_device", "turn while it lasts"),
+        ("noise_burst", "pass the place again"),
+    )
+    manoeuvre = "pass the place again on another heading"
+    size = "1 to 500 mG"
+    source = "BROAD trials 28 to 31 (dossier W2)"
+
+    def settings(self, context: Context) -> tuple[Setting, ...]:
+        """Where the calibrated field's size departs most: bumps then, a dipole near that place."""
+        readings = readings_of(context)
+        size = size_departure(context)
+        rows, searched = departures(size, readings)
+        first = float(readings.time_s[0])
+        bumps = [
+            {
+                "onset_s": round(max(float(readings.time_s[row]) - part * length, first), 3),
+                "length_s": length,
+            }
+            for row, length, part in product(rows, _BUMP_LENGTHS_S, (0.35, 0.5, 0.65))
+        ]
+        dipoles = _dipoles(context, readings, size, rows)
+        return tuple({**setting, "searched": searched} for setting in (*bumps, *dipoles))
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """A dipole below the middle of the way, or a bump in the middle of the recording."""
+        place = position_m(readings)
+        if place is None:
+            return ({"onset_s": shapes.middle_s(readings), "length_s": 12.0},)
+        return (_object(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """Its field for unit sources along the world's axes."""
+        if "onset_s" in setting:
+            part = (readings.time_s - setting["onset_s"]) / setting["length_s"]
+            bump = np.where((part > 0) & (part < 1), np.sin(np.pi * part) ** 2, 0.0)
+            return Columns(mag=shapes.in_world(readings, bump[:, None]))
+        place = position_m(readings)
+        if place is None:
+            raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
+        away = turned_down(place - setting["place_m"], setting.get("turn_deg", 0.0))
+        axes = shapes.world_axes(readings)
+        return Columns(mag=unit_fields(away, setting["distance_m"], axes))
+
+
+class GeomagneticDrift(Linear):
+    """W3."""
+
+    identifier = "geomagnetic_drift"
+    code = "W3"
+    family = "world"
+    words = "the earth's field changes with time: daily variation, magnetic storm"
+    equation = (
+        "m += A R^T k s(t), s = t/T, sin(pi t/T), or sin(pi (t - T/2)/L + phase); "
+        "T: length of the recording"
+    )
+    parameters = shapes.vector("change", "gauss", 1.0 * _MG, 50 * _MG)
+    typical = shapes.along(2.0 * _MG)
+    signature = "a trend fixed in the world, the same for all vehicles there"
+    confusers = (
+        ("mag_scale_temperature", "compare with an observatory (INTERMAGNET)"),
+        ("hard_iron_drift", "turn through all headings throughout"),
+        ("field_gradient", "cross the same place twice"),
+    )
+    manoeuvre = "all headings throughout; compare with an observatory"
+    size = "0.2 to 1 mG a day when quiet, several mG within minutes in storms"
+    source = "dossier W3"
+    # north is where the field points: what turns it about the vertical turns the world as well, is
+    # seen by nothing, and would run away in the joint fit (from 2 mG to 25, dfc55efa of `ring600f`)
+    loose = 3.0
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """There, or there and back, or half a wave or more of any phase: a slow pulsation."""
+        over = shapes.span(readings)
+        waves = tuple(
+            {
+                **over,
+                "shape": "wave",
+                "length_s": round(part * over["span_s"], 3),
+                "turn_deg": phase,
+            }
+            for part, phase in product(_HALF_WAVES, _PHASES_DEG)
+        )
+        return ({**over, "shape": "line"}, {**over, "shape": "hump"}, *waves)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The course on each axis of the world."""
+        part = shapes.elapsed(readings, setting)
+        if setting["shape"] == "wave":
+            # its phase is that of the middle: there it and the length are known apart
+            turns = (part - 0.5) * setting["span_s"] / setting["length_s"]
+            course = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
+        else:
+            course = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
+        return Columns(mag=shapes.in_world(readings, course))
+
+
+class AltitudeField(Linear):
+    """W4; `near` falls off like a dipole layer's field, `decay` like that of stripes in the ground.
+
+    Both have slope 1 at the lowest point.
+    """
+
+    identifier = "altitude_field"
+    code = "W4"
+    family = "world"
+    words = "the field changes with height above basalt, a wreck or reinforced concrete"
+    equation = (
+        "m += A R^T k f(a), f = a - a0, or with the lowest height a0 (1 - (a0/a)^3) a0/3, "
+        "or (1 - exp(-(a - a0)/L)) L"
+    )
+    parameters = shapes.vector("per_metre", "gauss/m", 0.5 * _MG, 100 * _MG)
+    typical = shapes.along(0.5 * _MG)
+    needs = ("altitude|position",)
+    signature = "follows height, fixed in the world"
+    confusers = (("field_gradient", "change height at one place"),)
+    manoeuvre = "rise and sink at one place"
+    size = "0.1 to 50 mG"
+    source = "Sentry 9N, East Pacific Rise (dossier W4)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Straight in each height; as of something close below where the height is over ground."""
+        found = list(shapes.per_covariate(readings, "altitude", shape="line"))
+        if "position_down_m" in roles.named(readings.covariates, "position"):
+            depth = readings.covariates["position_down_m"]
+            line = {"covariate": "position_down_m", "reference": float(depth.mean())}
+            found += [{**line, "shape": "line"}] if float(np.ptp(depth)) > 0 else []
+        for name in roles.named(readings.covariates, "altitude"):
+            lowest = float(np.min(readings.covariates[name]))
+            if lowest > 0.1:
+                found.append({"covariate": name, "reference": lowest, "shape": "near"})
+            reach = float(np.ptp(readings.covariates[name]))
+            if reach > 0:
+                at = {"covariate": name, "reference": lowest, "shape": "decay"}
+                found += [{**at, "length_m": round(part * reach, 3)} for part in _DECAYS]
+        return tuple(found)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """f on each axis of the world."""
+        course = shapes.course_of(readings, setting)
+        if setting["shape"] == "near":
+            lowest = setting["reference"]
+            course = (1 - (lowest / np.maximum(course + lowest, 0.5 * lowest)) ** 3) * lowest / 3
+        if setting["shape"] == "decay":
+            course = -np.expm1(-course / setting["length_m"]) * setting["length_m"]
+        return Columns(mag=shapes.in_world(readings, course))
+
+
+class FieldStep(Linear):
+    """W7."""
+
+    identifier = "field_step"
+    code = "W7"
+    family = "world"
+    words = "the vehicle left iron behind: calibrated beside it, then moved off"
+    equation = "m += A R^T k from t0 on"
+    parameters = shapes.vector("step", "gauss", 10 * _MG, 1000 * _MG)
+    typical = shapes.along(8 * _MG)
+    signature = "one jump, fixed in the world"
+    confusers = (
+        ("hard_iron_step", "it turns with the vehicle: turn once after the jump"),
+        ("soft_iron_step", "pitch and roll before and after"),
+        ("field_gradient", "log the position"),
+    )
+    manoeuvre = "all headings before and after"
+    size = "5 to 100 mG"
+    source = "inav #8004 (dossier W7)"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """A coarse grid of times."""
+        return shapes.onsets(readings)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """1 from the onset on, on each axis of the world."""
+        return Columns(mag=shapes.in_world(readings, shapes.since(readings, setting)))
+
+
+@lru_cache(maxsize=2)
+def position_m(readings: Readings) -> Array | None:
+    """North, east, down (N, 3) in metres, down 0 where it was not logged.
+
+    None without north and east, or where the vehicle does not move.
+    """
+    usable = roles.named(readings.covariates, "position")
+    if not {"position_north_m", "position_east_m"} <= set(usable):
+        return None
+    zero = np.zeros(len(readings.time_s))
+    place = np.column_stack([readings.covariates[n] if n in usable else zero for n in _NED])
+    return place if float(np.ptp(place, axis=0).max()) > 0 else None
+
+
+def turned_down(vectors: Array, turn_deg: float) -> Array:
+    """Vectors (N, 3) turned about down."""
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    return np.asarray(vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
+
+
+def size_departure(context: Context) -> Array:
+    """Size of the calibrated field minus its usual value (N,), gauss.
+
+    The size does not turn with the sensor, so nothing but the calibration goes into it.
+    """
+    track, model = context.track, context.model
+    field = np.linalg.solve(model.soft_iron, (track.mag_b_gauss - model.hard_iron_gauss).T)
+    size = np.linalg.norm(field, axis=0)
+    return np.asarray(np.where(np.isfinite(size), size - np.nanmedian(size), 0.0))
+
+
+def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
+    """Rows where the size departs most, and how many places there were to look at."""
+    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / series.median_step(readings.dt_s)), 1)
+    away = np.abs(series.moving_mean(size, readings.dt_s, rows))
+    found: list[int] = []
+    for _ in range(_BUMPS):
+        found.append(int(np.argmax(away)))
+        near = np.abs(readings.time_s - readings.time_s[found[-1]]) < _BUMP_LENGTHS_S[-1] / 2
+        away = np.where(near, -1.0, away)
+        if away.max() <= 0:
+            break
+    return found, max(len(size) // rows, 1)
+
+
+def _dipoles(
+    context: Context, readings: Readings, size: Array, rows: list[int]
+) -> tuple[Setting, ...]:
+    """Objects near the way, sought where the size clearly departs, and guessed all around it."""
+    place = position_m(readings) if context.world_levelled else None
+    if place is None:
+        return ()
+    field_n = np.einsum("nij,nj->ni", readings.R_nb, readings.field_b).mean(axis=0)
+    usual = 1.4826 * float(np.median(np.abs(size)))
+    found: list[Setting] = []
+    for row in rows:
+        window = slice(max(row - 2, 0), row + 3)
+        if abs(float(np.mean(size[window]))) > _CLEAR * usual:
+            best = found_place(size, place, field_n, row)
+            if best is not None:
+                nearest = float(np.linalg.norm(place - best[0], axis=1).min())
+                found.append(_object(best[0], max(nearest, _NEAREST_M), np.degrees(best[1])))
+        around = product(_DISTANCES_M, _SIDES)
+        found += [_object(place[row] + far * np.array(side), far) for far, side in around]
+    far = _DISTANCES_M[-1]
+    along = place[:: max(len(place) // _WAY, 1)]
+    found += [_object(at + far * np.array(side), far) for at, side in product(along, _SIDES)]
+    return tuple(found)
+
+
+def moved_object(context: Context, setting: Setting, place_and_turn: Array) -> Setting:
+    """The setting of an object (3 m, 1 deg) elsewhere, its distance that to the nearest place."""
+    way = position_m(readings_of(context))
+    if way is None:
+        return setting
+    away = way - place_and_turn[:3]
+    nearest = float(np.sqrt(np.einsum("ni,ni->n", away, away).min()))
+    at = _object(place_and_turn[:3], max(nearest, _NEAREST_M), float(place_and_turn[3]))
+    return {**setting, **at}
+
+
+def _seen(readings: Readings, field_n: Array) -> Array:
+    """Fields of the world (N, 3, p) as the magnetometer reads them."""
+    return np.asarray(shapes.world_axes(readings) @ field_n)
+
+
+def _object(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
+    return {
+        "place_m": [round(float(x), 4) for x in place],
+        "distance_m": round(distance, 3),
+        "turn_deg": round(float(turn_deg) % 360.0, 3),
+    }

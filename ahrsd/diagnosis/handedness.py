@@ -1,0 +1,107 @@
+"""Which sensor has the odd axes, and whether a magnetometer is mirrored or turned.
+
+Gyro and magnetometer alone tell a signed permutation P between the two, true rate = P reading, and
+P only: a field m and its negative turn alike.  So a proper P, by which the gyro would be turned, is
+also what a mirrored magnetometer shows whose readings are right as Q m with Q = -P^T, and what a
+turned one shows, Q = P^T.  To take the one for the other turns every heading by 180 degrees.
+
+The accelerometer says which sensor is odd: it agrees with the gyro as recorded or with the
+magnetometer.  Of the two ways to put the magnetometer right one has the field point into the
+ground, which it does north of the magnetic equator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.diagnosis.frames import ranked, windows
+from ahrsd.diagnosis.prior import sphere_centre
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+_AXES = "xyz"
+#: part of gravity's turns that the gyro must explain, and by how much better than by other axes
+_EXPLAINED, _BETTER = 0.5, 1.5
+#: sine of the inclination from which up and down are told
+_STEEP = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odd:
+    """A magnetometer with odd axes.
+
+    right, other: (3, 3) signed permutations by which its readings are right, and right on the other
+                  half of the Earth
+    """
+
+    right: Array
+    other: Array
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether its readings are left-handed."""
+        return bool(np.linalg.det(self.right) < 0)
+
+    @property
+    def words(self) -> str:
+        """One line: what is odd, what to do, and when it is the other one."""
+        what = "is left-handed" if self.mirrored else "is turned against the gyro"
+        return (
+            f"the magnetometer {what}: {advice(self.right)} (where the field points out of the "
+            f"ground, south of the magnetic equator: {advice(self.other)})"
+        )
+
+
+def odd_magnetometer(track: Track, gyro: Array) -> Odd | None:
+    """The magnetometer's own odd axes; None where the gyro's may be the odd ones.
+
+    gyro: (3, 3) the signed permutation P by which the gyro's readings would be the magnetometer's
+    """
+    if np.linalg.det(gyro) < 0.0 or not turns_gravity(track, np.eye(3)):
+        return None
+    ways = sorted((gyro.T, -gyro.T), key=_negations)
+    if _down(track, ways[0]) < -_STEEP:
+        ways.reverse()
+    return Odd(ways[0], ways[1])
+
+
+def turns_gravity(track: Track, P: Array) -> bool:
+    """Whether the gyro's readings are the accelerometer's by P (3, 3), clearly."""
+    accel = track.accel_b_m_s2
+    found = None if accel is None else windows(replace(track, mag_b_gauss=accel))
+    order = [] if found is None else ranked(found)
+    if len(order) < 2 or order[0].cost > _EXPLAINED or order[1].cost < _BETTER * order[0].cost:
+        return False
+    return bool(np.array_equal(order[0].matrix, P))
+
+
+def _down(track: Track, way: Array) -> float:
+    """Sine of the field's mean inclination with the readings put right by a permutation."""
+    accel = track.accel_b_m_s2
+    if accel is None:
+        return 0.0
+    known = np.isfinite(track.mag_b_gauss).all(axis=1) & np.isfinite(accel).all(axis=1)
+    mag = track.mag_b_gauss[known]
+    field, down = (mag - sphere_centre(mag)) @ way.T, -accel[known]
+    size = np.linalg.norm(field, axis=1) * np.linalg.norm(down, axis=1)
+    return float(np.median(np.sum(field * down, axis=1) / np.maximum(size, 1e-300)))
+
+
+def _negations(way: Array) -> int:
+    return int(np.count_nonzero(way < 0.0))
+
+
+def advice(way: Array) -> str:
+    """`negate its y`, or what its right x y z are."""
+    negated = [_AXES[k] for k in range(3) if way[k, k] < 0.0]
+    if np.all(np.diag(way) != 0.0) and negated:
+        return f"negate its {' and '.join(negated)}"
+    return f"its right x y z are its {' '.join(_reading(row) for row in way)} as read"
+
+
+def _reading(row: Sequence[float] | Array) -> str:
+    axis = int(np.flatnonzero(np.asarray(row))[0])
+    return f"{'-' if row[axis] < 0 else ''}{_AXES[axis]}"

@@ -1,0 +1,234 @@
+"""Before any physics: what is wrong with the recording itself.
+
+Counting and comparing only, no calibration: repeated and doubled readings, limits, coarse steps,
+the clock, units, and whether gyro and magnetometer mean the same axes.  `put_right` gives the
+track as it would be without what was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis.clipping import clipping, quantisation
+from ahrsd.diagnosis.coarse import noise_of
+from ahrsd.diagnosis.dead import stuck_axes, stuck_gyro
+from ahrsd.diagnosis.diagnosis import Value, Where
+from ahrsd.diagnosis.effects import series
+from ahrsd.diagnosis.facts import Fact
+from ahrsd.diagnosis.frames import Frame, ranked, windows
+from ahrsd.diagnosis.handedness import advice, odd_magnetometer, turns_gravity
+from ahrsd.diagnosis.repeats import repeats
+from ahrsd.diagnosis.stamps import regular, stamps
+from ahrsd.diagnosis.track import Track
+
+_EXPLAINED = 0.6  # cost of the best frame, of that of no motion, at most
+_BETTER = 1.5  # times the cost that the frame as recorded must be worse
+_BENT = 3.0  # times, by which iron that deforms may favour another frame: it is left out here
+_NATS = 20.0  # log likelihood by which it must be worse
+_FAST_RAD_S, _NEAR = 3.0, 1.1  # rates that no vehicle has for long; a factor that is another's
+_UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
+#: median readings in gauss of the Earth's field (0.2 to 0.7 G) taken in other units
+MAG_UNITS = (
+    ("uT", 1e-2, 20.0, 70.0),
+    ("mG", 1e-3, 200.0, 700.0),
+    ("nT", 1e-5, 2e4, 7e4),
+    ("T", 1e4, 2e-5, 7e-5),
+)
+GYRO_UNITS = (("deg/s", np.pi / 180), ("mrad/s", 1e-3), ("rpm", 2 * np.pi / 60))
+
+
+def hygiene(track: Track) -> tuple[Fact, ...]:
+    """Everything that is found, what stops first."""
+    wrong = as_recorded(track)
+    limits = clipping(track)
+    clipped = next((fact.bad for fact in limits if fact.bad is not None), None)
+    again = repeats(track, clipped) + stuck_gyro(track)
+    known = [fact.bad for fact in again + limits if fact.bad is not None]
+    again += stuck_axes(track, np.any([np.zeros(len(track), bool), *known], axis=0))
+    rest = again + limits + quantisation(track) + stamps(track)
+    return tuple(sorted(wrong + rest, key=lambda fact: not fact.stops))
+
+
+def as_recorded(track: Track) -> list[Fact]:
+    """Units, axes and signs that are wrong: nothing fitted before they are right means anything."""
+    return mag_unit(track) + _gyro(track)
+
+
+def mag_unit(track: Track) -> list[Fact]:
+    """The magnetometer in another unit, told by the Earth's field only."""
+    size = track.usual_gauss
+    for name, factor, low, high in MAG_UNITS:
+        if low <= size <= high:
+            words = f"the magnetometer reads {size:.3g}: that is {name}, not gauss"
+            return [
+                _unit_error(track, words, 1 / factor, {"sensor": "mag", "unit": name}, "sensor")
+            ]
+    return []
+
+
+def _gyro(track: Track) -> list[Fact]:
+    """Axes, signs and unit of the gyro against the magnetometer."""
+    found = windows(track)
+    if found is None:
+        return []
+    order = ranked(found)
+    same = next((one for one in order if one.is_identity), None)
+    if not order:
+        return []
+    best = order[0]
+    if best.cost > _EXPLAINED:
+        return _gyro_unit(track, best) if _in_degrees(track, best, found.count) else []
+    if same is not None and (
+        same.cost < _BENT * best.cost or not _worse(same.cost, best.cost, found.count)
+    ):
+        best = same
+    facts = []
+    if not best.is_identity:
+        equal = [one for one in order if not _worse(one.cost, best.cost, found.count)]
+        facts.append(_frame_error(track, best, len(equal)))
+    if not 1 / _UNIT < best.scale < _UNIT:
+        facts += _gyro_unit(track, best)
+    return facts
+
+
+def _in_degrees(track: Track, best: Frame, count: int) -> bool:
+    """Whether rates that explain the field only in part are in degrees beyond doubt.
+
+    In a room, or beside a motor, no frame explains most; but no vehicle turns at 3 rad/s a tenth
+    of the time while its field turns at a fifty-seventh of that.
+    """
+    clear = best.is_identity and -1.5 * count * np.log(max(best.cost, 1e-12)) > _NATS
+    size = np.linalg.norm(track.gyro_b_rad_s, axis=1)
+    fast = float(np.nanpercentile(size, 90)) > _FAST_RAD_S
+    return bool(clear and fast and abs(np.log(best.scale * 180 / np.pi)) < np.log(_NEAR))
+
+
+def _worse(cost: float, best: float, count: int) -> bool:
+    """Whether a frame explains so much less that it is out."""
+    ratio = max(cost, 1e-12) / max(best, 1e-12)
+    return ratio > _BETTER and 1.5 * count * np.log(ratio) > _NATS
+
+
+def _frame_error(track: Track, best: Frame, equal: int) -> Fact:
+    """equal: how many frames explain the recording as well, this one among them."""
+    odd = odd_magnetometer(track, best.matrix)
+    return Fact(
+        "frame_error",
+        _frame_words(track, best) if odd is None else odd.words,
+        Where(_whole(track), ("x", "y", "z"), "gyro" if odd is None else "sensor"),
+        1.0 / equal,
+        (Value("present", 1.0, 0.0, "1"),),
+        # the true rate is signs * reading[axes]
+        {"axes": list(best.axes), "signs": list(best.signs)},
+        stops=True,
+    )
+
+
+def _frame_words(track: Track, best: Frame) -> str:
+    """What is said of the gyro's axes; with both ways where nothing tells which sensor is odd."""
+    P = best.matrix
+    words = f"the gyro's x y z are the magnetometer's {' '.join(_inverse_words(best))}"
+    if np.linalg.det(P) < 0:
+        return f"{words} (left-handed)"
+    if turns_gravity(track, P):
+        return f"{words} and the accelerometer's"
+    return (
+        f"{words}, or the magnetometer is left-handed ({advice(-P.T)}): turn none of them before "
+        "you know which, the wrong one turns every heading by 180 deg"
+    )
+
+
+def _inverse_words(frame: Frame) -> list[str]:
+    """What the reading's axes are in the magnetometer's frame."""
+    out = [""] * 3
+    for true_axis, (axis, sign) in enumerate(zip(frame.axes, frame.signs, strict=True)):
+        out[axis] = f"{'-' if sign < 0 else ''}{'xyz'[true_axis]}"
+    return out
+
+
+def _gyro_unit(track: Track, best: Frame) -> list[Fact]:
+    """The unit whose factor is nearest, if one is near."""
+    tried = [(name, f) for name, factor in GYRO_UNITS for f in (factor, 1 / factor)]
+    name, factor = min(tried, key=lambda pair: abs(np.log(best.scale / pair[1])))
+    if abs(np.log(best.scale / factor)) > np.log(1.5):
+        return []
+    way = f"in {name}" if factor < 1 else f"divided by {factor:.4g} once too often"
+    words = f"the gyro's rates are {1 / best.scale:.3g} times too large: they are {way}"
+    if factor > 1:
+        words = f"the gyro's rates are {best.scale:.3g} times too small: they are {way}"
+    setting = {"sensor": "gyro", "unit": name}
+    return [_unit_error(track, words, 1 / factor, setting, "gyro")]
+
+
+def _unit_error(
+    track: Track, words: str, too_large: float, setting: dict[str, str], frame: str
+) -> Fact:
+    parameters = (Value("factor_less_one", too_large - 1, 0.0, "1"),)
+    where = Where(_whole(track), ("x", "y", "z"), frame)
+    return Fact("unit_error", words, where, 0.99, parameters, dict(setting), stops=True)
+
+
+def put_right(track: Track, facts: Sequence[Fact]) -> Track:
+    """The track without what the facts say: frames and units undone, false readings nan.
+
+    Jittering stamps are put on their regular clock, the turn of lost samples is put back, and
+    where the turn is not known a run ends.  Rows stay as they are in number and order.
+    """
+    mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
+    time_s, dt_s, unseen = track.time_s, track.dt_s, track.lost_turns
+    for fact in facts:
+        if fact.effect == "frame_error":
+            gyro = gyro[:, fact.setting["axes"]] * np.array(fact.setting["signs"])
+        elif fact.effect == "unit_error":
+            factor = 1.0 / (1.0 + fact.parameters[0].value)
+            if fact.setting["sensor"] == "gyro":
+                gyro = gyro * factor
+            else:
+                mag = mag * factor
+        elif fact.effect == "timestamp_jitter" and not fact.stops:
+            time_s = regular(track)
+            dt_s = np.where(np.isnan(dt_s), np.nan, np.diff(time_s, prepend=np.nan))
+        if fact.turned is not None:
+            known = np.isfinite(fact.turned)
+            gyro[known] *= fact.turned[known, None]
+            dt_s = np.where(known, dt_s, np.nan)
+            unseen = fact.unseen if fact.unseen is not None else unseen
+        if fact.bad is not None:
+            mag[fact.bad] = np.nan
+    runs = track.runs if dt_s is track.dt_s else tuple(series.runs(dt_s))
+    return replace(
+        track,
+        time_s=time_s,
+        dt_s=dt_s,
+        mag_b_gauss=mag,
+        gyro_b_rad_s=gyro,
+        runs=runs,
+        lost_turns=unseen,
+    )
+
+
+def would_have_shown(track: Track) -> tuple[str, ...]:
+    """What the checks would have shown here, one line each."""
+    mag, gyro = noise_of(track)
+    step = track.step_s
+    found = windows(track)
+    shown = [
+        f"a magnetometer stuck while the field turns by {1e3 * 8 * mag:.2g} mG",
+        f"readings in steps above {1e3 * 2 * mag:.2g} mG (noise {1e3 * mag:.2g} mG, "
+        f"{1e3 * gyro:.2g} mrad/s)",
+        f"time stamps that jitter by {1e3 * 0.03 * step:.2g} ms",
+        "1 sample in 1000 missing",
+    ]
+    axes = "swapped, negated or left-handed axes, wrong units of the gyro"
+    turned = found is not None and ranked(found) and ranked(found)[0].cost < _EXPLAINED
+    if turned:
+        shown.append(axes)
+    said = f"would also have been seen: {'; '.join(shown)}"
+    return (said,) if turned else (said, f"would not have been seen, it hardly turned: {axes}")
+
+
+def _whole(track: Track) -> tuple[tuple[float, float], ...]:
+    return ((float(track.time_s[0]), float(track.time_s[-1])),)

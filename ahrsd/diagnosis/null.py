@@ -1,0 +1,162 @@
+"""The null: calibration and noise that explain a recording best, alone or with named terms.
+
+`descent` finds the lowest cost from where it is set down.  The cold start descends on a thinned
+track (`coarse`) from two starts, a sphere and a linear fit with the gyro, with the gyro's noise
+inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.
+
+A Gaussian prior (`prior`) keeps what the motion does not show.
+
+Noise by innovation likelihood: the filter's gain is a function of sigma_gyro / sigma_mag, the
+scale follows from the mean square.  sigma_gyro is never more than CAP times what the gyro's own
+differences say: free, it swallows every drift of the gyro.  For the same reason the bias wanders
+only when the likelihood says so, and not faster than WALK_CAP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis import noise_fit
+from ahrsd.diagnosis.coarse import group_size, thinned
+from ahrsd.diagnosis.descent import FitProblem, FittedTerm, NullFit, descended
+from ahrsd.diagnosis.innovation import run_filter
+from ahrsd.diagnosis.prior import TURNED, prior_of, repetition_of, sphere_centre, turned
+from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.values import NullModel
+from ahrsd.estimator import chain
+from ahrsd.estimator.start import linear_start
+
+_INFLATIONS = (30.0, 10.0, 3.0, 1.0)
+_FEWEST = 15  # steps that a fit needs
+_SHORTEST_RUN = 8  # samples of a run that the linear start can use
+_STEPS = 6
+_REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
+_GOOD = 1.5  # normalised innovation of a start that needs no rival
+_WORTH = 10.0  # by which a further start's cost must be lower
+_FARTHEST_GAUSS = 3.0  # hard iron of a start: beyond, the start is nonsense
+
+
+def fit_null(
+    track: Track,
+    spec: Spec | None = None,
+    start: NullModel | None = None,
+    terms: Sequence[FittedTerm] = (),
+    *,
+    noise: bool = True,
+    walk: bool = True,
+) -> NullFit:
+    """Fit calibration, noise and terms to a track.
+
+    start: begin there (a fit of nearly the same data) instead of cold
+    noise: estimate what the spec leaves open; else keep the noise of `start`
+    walk:  let the gyro's bias wander where the data say so
+
+    ValueError where there is nothing to fit to (`unusable`).
+    """
+    reason = unusable(track)
+    if reason:
+        raise ValueError(reason)
+    known = spec or Spec()
+    problem = FitProblem(track, tuple(terms), prior_of(track))
+    if start is None:
+        start = noise_fit.estimated(
+            run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
+        )
+    fit = descended(problem, start, _STEPS)
+    prior = problem.prior.sharper(repetition_of(fit.filtered))
+    if prior is not problem.prior:
+        problem = replace(problem, terms=fit.terms, prior=prior)
+        fit = descended(problem, start, _STEPS)
+    if not noise:
+        return fit
+    if abs(np.log(fit.filtered.normalised_innovation)) > _REESTIMATE:
+        again = noise_fit.estimated(fit.filtered, known, fit.terms_mag, fit.terms_gyro, walk=walk)
+        fit = descended(replace(problem, terms=fit.terms), again, _STEPS)
+    again = noise_fit.rescaled(fit.filtered, known)
+    if noise_fit.alike(again, fit.model):
+        return fit
+    return descended(replace(problem, terms=fit.terms), again, 2)
+
+
+def at_model(track: Track, model: NullModel, terms: Sequence[FittedTerm]) -> NullFit:
+    """The filter at a model and terms of the same data cut otherwise; nothing is fitted."""
+    return descended(FitProblem(track, tuple(terms), prior_of(track)), model, 0)
+
+
+def unusable(track: Track) -> str | None:
+    """Why there is nothing that a calibration could be fitted to; None where there is."""
+    if track.usual_gauss == 0.0:
+        return "the magnetometer has no readings: nothing can be said about the field"
+    steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
+    if np.count_nonzero(steps) < _FEWEST:
+        return f"{np.count_nonzero(steps)} samples follow another one, {_FEWEST} are needed"
+    return None
+
+
+def cold_start(track: Track, spec: Spec) -> NullModel:
+    """A model to begin from, without knowing anything but the track."""
+    size = group_size(track)
+    coarse = thinned(track, size)
+    first = noise_fit.first_guess(track, spec)
+    # a row's rate is the mean of its samples': their noise averages
+    quiet = first.sigma_gyro_rad_s / np.sqrt(size)
+    problem = FitProblem(coarse, (), prior_of(track))
+    best: NullFit | None = None
+    for model in _starts(coarse, replace(first, gyro_bias_rad_s=problem.prior.mean[8:])):
+        fit = _loosely(problem, model, quiet)
+        agreed = best is not None and abs(fit.cost - best.cost) < _WORTH
+        if best is None or fit.cost < best.cost - _WORTH:
+            best = fit
+        if agreed or fit.filtered.normalised_innovation < _GOOD:
+            break
+    found = first if best is None else best.model
+    return replace(
+        found,
+        sigma_mag_gauss=first.sigma_mag_gauss,
+        sigma_gyro_rad_s=first.sigma_gyro_rad_s,
+    )
+
+
+def _loosely(problem: FitProblem, model: NullModel, quiet: float) -> NullFit:
+    """Descend with less and less inflation of the gyro's noise."""
+    for inflation in _INFLATIONS[:-1]:
+        loose = replace(model, sigma_gyro_rad_s=quiet * inflation)
+        model = descended(problem, loose, 2).model
+    return descended(problem, replace(model, sigma_gyro_rad_s=quiet), _STEPS)
+
+
+def _starts(track: Track, base: NullModel) -> list[NullModel]:
+    """Calibrations to descend from, the most likely first."""
+    seen = np.isfinite(track.mag_b_gauss).all(axis=1)
+    mag = track.mag_b_gauss[seen]
+    out = []
+    out.append(replace(base, hard_iron_gauss=sphere_centre(mag)))
+    out.append(base)
+    well = turned(mag) > TURNED and seen.all()
+    linear = linear_start(_epochs(track)) if well else None
+    if linear is not None and np.linalg.norm(linear[6:]) < _FARTHEST_GAUSS:
+        A = chain.symmetric(linear[:6])
+        A = A * 3 / np.trace(A)
+        if np.linalg.norm(A - np.eye(3)) < 1.0:
+            out.append(replace(base, soft_iron=A, hard_iron_gauss=linear[6:]))
+    return out
+
+
+def _epochs(track: Track) -> list[chain.Data]:
+    """Runs as the estimator's linear start takes them."""
+    dt = np.nan_to_num(track.dt_s, nan=0.0)
+    return [
+        chain.Data(
+            track.mag_b_gauss[run],
+            track.gyro_b_rad_s[run] * dt[run, None],
+            dt[run],
+            np.full((run.stop - run.start, 3), np.nan),
+            track.time_s[run],
+            measures_first=True,
+        )
+        for run in track.runs
+        if run.stop - run.start > _SHORTEST_RUN
+    ]

@@ -1,0 +1,119 @@
+"""What is believed of a calibration before the data, and the first place to look for it.
+
+Gaussian, and a thousand times too wide to matter where the motion shows anything.  Where it does
+not, it keeps the calibration from running after slow noise: at rest A and b would go anywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.diagnosis.coarse import noise_of
+from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+#: prior deviations of the 11: soft iron about I, hard iron (gauss) about 0, gyro bias (rad/s)
+PRIOR = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
+PRIOR.flags.writeable = False
+#: scatter of the field over its size that shows the iron
+TURNED = 0.1
+_BLOCKS = 40  # in which the scores are summed
+_REPEATED = 3.0  # repetition from which the prior is made to count
+_AT_REST_RAD_S = 1e-3  # what the mean of a resting gyro may differ from its bias
+_SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What is believed before the data: mean and deviation (11,), in the order of the fit.
+
+    repetition: of how many data one says something new: the deviations are for that many
+    """
+
+    mean: Array
+    deviation: Array
+    repetition: float = 1.0
+
+    def sharper(self, repetition: float) -> Prior:
+        """For data of which only one in `repetition` says anything new; itself where all do."""
+        if repetition < _REPEATED:
+            return self
+        sharp = self.deviation / np.sqrt(repetition / self.repetition)
+        return Prior(self.mean, sharp, repetition)
+
+
+def prior_of(track: Track) -> Prior:
+    """The usual one; where the sensor rests for long, its gyro reads its bias.
+
+    Iron shows itself by turning only.  Without turning, slow noise of the magnetometer would be
+    laid at its door, so the less the field turned, the closer the iron is held.
+    """
+    mean, deviation = np.zeros(11), PRIOR.copy()
+    deviation[:8] *= np.clip(turned(track.mag_b_gauss) / TURNED, 0.02, 1.0)
+    rest = rate_at_rest(track)
+    if rest is not None:
+        mean[8:], deviation[8:] = rest, _AT_REST_RAD_S
+    return Prior(mean, deviation)
+
+
+def rate_at_rest(track: Track) -> Array | None:
+    """Mean gyro reading (3,) over the still seconds, None where fewer than a fifth are still.
+
+    Still: neither the readings' scatter within the second nor the magnetometer's mean against the
+    second before is more than their noise.
+    """
+    mag_noise, gyro_noise = noise_of(track)
+    rows = max(8, round(1.0 / max(track.step_s, 1e-6)))
+    whole = len(track) // rows * rows
+    if whole < 5 * rows:
+        return None
+    mag = track.mag_b_gauss[:whole].reshape(-1, rows, 3)
+    gyro = track.gyro_b_rad_s[:whole].reshape(-1, rows, 3)
+    moved = np.linalg.norm(np.diff(mag.mean(axis=1), axis=0, prepend=np.nan), axis=1)
+    still = (
+        (np.max(gyro.std(axis=1), axis=1) < 2 * gyro_noise)
+        & (np.max(mag.std(axis=1), axis=1) < 2 * mag_noise)
+        & (moved < 6 * mag_noise / np.sqrt(rows) + 1e-4)
+    )
+    if np.count_nonzero(still) < 0.2 * len(still):
+        return None
+    return np.asarray(np.median(gyro[still].mean(axis=1), axis=0))
+
+
+def turned(mag: Array) -> float:
+    """Scatter of the field (N, 3) over its size; 0 where there is no field."""
+    seen = mag[np.isfinite(mag).all(axis=1)]
+    if not len(seen):
+        return 0.0
+    size = float(np.median(np.linalg.norm(seen, axis=1)))
+    return float(np.linalg.norm(np.std(seen, axis=0))) / max(size, 1e-12)
+
+
+def sphere_centre(mag: Array) -> Array:
+    """Centre of the sphere |m - b| = r, |m|^2 = 2 m.b + c, drawn to 0 where the motion is poor."""
+    if not len(mag):
+        return np.zeros(3)
+    square = np.sum(mag**2, axis=1)
+    off = 2 * (mag - mag.mean(axis=0))
+    weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
+    gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
+    return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
+
+
+def repetition_of(done: Filtered) -> float:
+    """How many times larger the variance of the scores is than if the innovations were white.
+
+    A misfit that lasts makes the data look surer than they are: of the sum of a block's scores
+    white innovations have the block's information as variance.  1 on a null.
+    """
+    X = sensitivities(done, nuisance_columns(done))
+    score = np.einsum("nia,ni->na", X, done.whitened)
+    edges = np.linspace(0, len(score), _BLOCKS + 1).astype(int)[:-1]
+    sums = np.add.reduceat(score, edges, axis=0)
+    flat = X.reshape(-1, 11)
+    ridge = np.diag(1.0 / PRIOR**2)
+    ratio = np.trace(np.linalg.solve(flat.T @ flat + ridge, sums.T @ sums))
+    return float(ratio / 11 / (1 - 11 / _BLOCKS))

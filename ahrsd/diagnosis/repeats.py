@@ -1,0 +1,174 @@
+"""Readings that repeat: a stuck magnetometer, one that is updated too slowly, doubled samples.
+
+Equal bit by bit on all three axes is the sign, and only where the gyro says that the sensor
+turned by more than the readings' resolution: a quiet sensor at rest repeats itself honestly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis.clipping import step_of
+from ahrsd.diagnosis.coarse import noise_of
+from ahrsd.diagnosis.diagnosis import Value, Where
+from ahrsd.diagnosis.facts import Fact, spans_of
+from ahrsd.diagnosis.prior import sphere_centre
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+_AXES = ("x", "y", "z")
+#: rows that a stuck reading lasts at least, and so many times as long as a reading usually does
+_STUCK_ROWS, _LONGER = 8, 5.0
+_MOVED = 8.0  # noise levels by which the field must have turned during the repetition
+_STEPS = 3.0  # steps of coarse numbers by which the field must turn to have a new reading
+_HELD_SHARE = 0.4  # of the moving samples that repeat the one before
+_DOUBLED_SHARE = 2e-3
+_TURNING = 5.0  # gyro noise levels
+
+
+def repeats(track: Track, clipped: NDArray[np.bool] | None = None) -> list[Fact]:
+    """Stuck, held and doubled samples.  clipped: (N,) readings at a limit: they repeat."""
+    again = _again(track, track.mag_b_gauss)
+    if clipped is not None:
+        again &= ~clipped
+    expected = _expected_change(track)
+    stuck, bad = _stuck(track, again)
+    held = _held(track, again & ~bad, expected)
+    doubled = [] if held else _doubled(track, again & ~bad)
+    return stuck + held + doubled
+
+
+def _again(track: Track, values: Array) -> NDArray[np.bool]:
+    """(N,) rows equal to the row before, within a run."""
+    out = np.zeros(len(values), dtype=bool)
+    out[1:] = np.all(values[1:] == values[:-1], axis=1)
+    for run in track.runs:
+        out[run.start] = False
+    return out
+
+
+def _expected_change(track: Track) -> Array:
+    """(N,) gauss by which a step turns the field at most, the gyro's middle taken as its bias."""
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    size = track.usual_gauss
+    step = np.linalg.norm(rate, axis=1) * np.nan_to_num(track.dt_s, nan=0.0)
+    return np.asarray(step * size)
+
+
+def _turned(track: Track, centre: Array, first: int, last: int) -> float:
+    """Gauss by which the whole turn over these rows moves the reading that they repeat.
+
+    centre (3,): of the readings' sphere, which does not turn
+    """
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    turn = rate[first:last].T @ np.nan_to_num(track.dt_s[first:last], nan=0.0)
+    said = track.mag_b_gauss[first]
+    if not said.any():  # 0 0 0 is no field that could have been turned
+        return float(np.linalg.norm(turn)) * track.usual_gauss
+    return float(np.linalg.norm(np.cross(turn, said - centre)))
+
+
+def _resolution(track: Track) -> float:
+    """The noise, or the step of the numbers where that is coarser: within it readings repeat."""
+    return max(noise_of(track)[0], _step(track), 1e-6)
+
+
+def _step(track: Track) -> float:
+    """The coarsest step of the three axes' numbers, 0 where there is none."""
+    return max(step_of(column) for column in track.mag_b_gauss.T)
+
+
+def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[np.bool]]:
+    """What repeats too long.  Where it was stuck while it turned, so it was where it did not, if
+    the numbers are fine enough to show the noise of a sensor at rest."""
+    bad = np.zeros(len(track), dtype=bool)
+    intervals: list[tuple[float, float]] = []
+    usual = float(np.median(np.diff(np.flatnonzero(~again), append=len(again))))
+    least = max(_STUCK_ROWS, _LONGER * usual)
+    long = [(first, last) for first, last in spans_of(again) if last - first >= least]
+    mag = track.mag_b_gauss
+    centre = sphere_centre(mag[np.isfinite(mag).all(axis=1) & mag.any(axis=1)])
+    turned = [_turned(track, centre, *span) >= _MOVED * _resolution(track) for span in long]
+    fine = any(turned) and _step(track) == 0.0
+    for (first, last), moved in zip(long, turned, strict=True):
+        if moved or fine:
+            bad[first - (not track.mag_b_gauss[first].any()) : last] = True
+            intervals.append((float(track.time_s[first - 1]), float(track.time_s[last - 1])))
+    if not intervals:
+        return [], bad
+    total = sum(b - a for a, b in intervals)
+    step = track.step_s
+    words = f"the magnetometer repeats one reading while the sensor turns, {total:.1f} s in all"
+    return [
+        Fact(
+            "stuck_magnetometer",
+            words,
+            Where(tuple(intervals), _AXES, "sensor"),
+            1.0,
+            (Value("length", total, step, "s"),),
+            {"onset_s": intervals[0][0]},
+            bad,
+        )
+    ], bad
+
+
+def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
+    moving = expected > max(float(np.quantile(expected, 0.5)), _STEPS * _step(track))
+    count = int(np.count_nonzero(moving))
+    if count < 50 or np.count_nonzero(again & moving) < _HELD_SHARE * count:
+        return []
+    fresh = np.flatnonzero(~again)
+    lengths = np.diff(fresh)
+    if len(lengths) < 10:
+        return []
+    usual = int(np.median(lengths))
+    if usual < 2 or np.mean(np.abs(lengths - usual) <= 1) < 0.8:
+        return []
+    step = track.step_s
+    words = (
+        f"the magnetometer has a new reading only every {usual} samples "
+        f"({1 / (usual * step):.3g} Hz)"
+    )
+    return [
+        Fact(
+            "mag_sample_hold",
+            words,
+            Where(_whole(track), _AXES, "sensor"),
+            1.0,
+            (Value("held_part", 1.0, 0.0, "1"),),
+            {"hold": usual, "period_s": usual * step},
+            again.copy(),
+        )
+    ]
+
+
+def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
+    """Rows that repeat magnetometer and gyro: a sample that was sent or stored twice.
+
+    Only while the sensor turns: at rest coarse numbers repeat by chance.
+    """
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    turning = np.max(np.abs(rate), axis=1) > _TURNING * noise_of(track)[1]
+    both = again & _again(track, track.gyro_b_rad_s) & turning
+    count = int(np.count_nonzero(both))
+    if count < max(3, _DOUBLED_SHARE * len(track)):
+        return []
+    share = count / len(track)
+    step = track.step_s
+    times = tuple((float(t) - step, float(t)) for t in track.time_s[both][:50])
+    return [
+        Fact(
+            "dropped_samples",
+            f"{count} samples repeat the one before, gyro and magnetometer: they came twice",
+            Where(times, _AXES, "link"),
+            0.95,
+            (Value("part", share, float(np.sqrt(share / len(track))), "1"),),
+            {"doubled": True},
+            both,
+        )
+    ]
+
+
+def _whole(track: Track) -> tuple[tuple[float, float], ...]:
+    return ((float(track.time_s[0]), float(track.time_s[-1])),)

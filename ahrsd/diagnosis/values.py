@@ -1,0 +1,129 @@
+"""The values that the parts of the mismatch engine pass to each other.
+
+Model of the readings, with every named term in:
+
+    mag_k  = A h_k + b + sum_terms D_k theta + white noise (sigma_mag)
+    gyro_k = w_k + w_b + sum_terms W_k theta + white noise (sigma_gyro)
+    h_k    = Exp(-w_k dt_k) h_{k-1}                       field in body axes, |h| constant
+
+A is symmetric with trace 3; the field strength is the gauge and sits in h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Scatter of the sensors, standard deviations per sample.
+
+    gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias
+    colour:  autoregression of the magnetometer's noise, e_k = sum_j colour_j e_(k-j) + white;
+             empty: white.  mag_gauss is the deviation of e whatever its colour
+    freedom: of Student's t, which the magnetometer's white noise follows; inf: normal
+    level:   (N,) of the magnetometer's noise row by row, in parts of mag_gauss; None: 1
+    """
+
+    mag_gauss: float
+    gyro_rad_s: float
+    gyro_walk_rad_s_sqrt_s: float = 0.0
+    colour: tuple[float, ...] = ()
+    freedom: float = float("inf")
+    level: Array | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where a deviation is negative or the colour grows without end."""
+        if min(self.mag_gauss, self.gyro_rad_s, self.gyro_walk_rad_s_sqrt_s) < 0:
+            raise ValueError("noise: a deviation is negative")
+        if len(self.colour) and np.abs(np.roots([1.0, *(-c for c in self.colour)])).max() >= 1:
+            raise ValueError("noise: the colour's autoregression is not stable")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NullModel:
+    """The calibration and the noise of a recording: what the simulation already knows.
+
+    soft_iron (3, 3), hard_iron_gauss (3,), gyro_bias_rad_s (3,); deviations are per sample.
+    gyro_walk_rad_s_sqrt_s: random walk of the gyro's bias, 0 where it does not wander; the bias is
+    then the one at the first sample
+    """
+
+    soft_iron: Array
+    hard_iron_gauss: Array
+    gyro_bias_rad_s: Array
+    sigma_mag_gauss: float
+    sigma_gyro_rad_s: float
+    gyro_walk_rad_s_sqrt_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """How the readings move with the parameters of an effect, (N, 3, p); None where they do not.
+
+    mag:  d mag_b_gauss / d theta, the field in body axes held
+    gyro: d gyro_b_rad_s / d theta, the true rate held
+    """
+
+    mag: Array | None = None
+    gyro: Array | None = None
+
+    @property
+    def width(self) -> int:
+        """How many parameters, p."""
+        side = self.gyro if self.mag is None else self.mag
+        return 0 if side is None else int(side.shape[2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Context:
+    """The recording as the present model sees it: all that an effect may build its columns from.
+
+    model:        calibration and noise at which everything is linearised
+    field_b:      (N, 3) gauss, true field in body axes as the readings before foretell it
+                  (A field_b + b ~ mag): what is made of it row by row shares no noise with the
+                  innovation, of which a coefficient of 1 would explain a part
+    smooth_b:     (N, 3) the same smoothed both ways: for what is made of its differences
+    rate_b_rad_s: (N, 3) true rate: gyro minus bias and terms, zero-phase smoothed: it shares
+                  next to no noise with a single innovation
+    field_dot_b:  (N, 3) gauss/s, smooth_b x rate_b_rad_s
+    R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
+                  is an accelerometer (`world_levelled`), else fixed but
+                  of unknown orientation
+    force_b_m_s2: (N, 3) specific force without the accelerometer's noise, None without one
+    """
+
+    track: Track
+    model: NullModel
+    field_b: Array
+    smooth_b: Array
+    rate_b_rad_s: Array
+    field_dot_b: Array
+    R_nb: Array
+    world_levelled: bool
+    force_b_m_s2: Array | None = None
+
+    @property
+    def heading_rad(self) -> Array:
+        """(N,) direction of the body's x axis in R_nb's level plane, from its x to its y."""
+        return np.asarray(np.arctan2(self.R_nb[:, 1, 0], self.R_nb[:, 0, 0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """One named effect in a fitted model.
+
+    setting: the effect's non-linear choices (onset, time constant, covariate, ...), JSON-able
+    value, deviation: (p,) parameters and standard deviations, units of the effect's table row
+    """
+
+    identifier: str
+    value: Array
+    deviation: Array
+    setting: dict[str, Any] = field(default_factory=dict)

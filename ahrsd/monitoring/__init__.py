@@ -1,0 +1,1 @@
+"""The online step detector of the magnetometer's residual."""

@@ -1,0 +1,326 @@
+"""Beside the running estimator: did hard iron or gyro bias step since the calibration was made?
+
+Every ten seconds of the stream give one small Gram (`block_score`), scored against the newest
+converged estimate of that moment. The newest blocks that show motion are tested together against
+the estimate as it stood before the first of them, its covariance taken into account:
+
+    T = 2 max over D of the gain in log likelihood by a step D of the hard iron (or the gyro bias)
+
+T is measured by what such blocks usually give in this stream (lag, gradients, coloured noise), and
+a step is told only if one D explains two blocks or more, each of them by itself, and better than
+the other sensor and than a field that changes in the world. Then the time is looked for.
+
+A step is told once; `restart` begins anew, with data from after it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.calibration import Estimate
+from ahrsd.monitoring.block_score import (
+    DRIFT,
+    GYRO,
+    IRON,
+    LEAST_ROWS,
+    ROWS,
+    Block,
+    Reference,
+    Scorer,
+    Thinned,
+)
+from ahrsd.samples import Array, SampleBlock
+
+RATE_HZ = 12.5  # of the thinned samples: larger follows faster motion and costs more
+KEPT = 16  # blocks
+_MOST = 100.0  # gauss or rad/s: more than any of these sensors reads
+_RATE_ROWS = 9  # from which a piece's rate is measured, whatever blocks they came in
+_WINDOWS = (1, 2, 4, 8)  # informative blocks that are tested together; 1: for the usual size only
+_LEAST_USUAL, _MOST_USUAL = 4, 24  # blocks that say what is usual
+_LIMIT = 40.0  # T over what is usual; in a simulated week 17, with coloured noise 27
+_SHARE = 0.7  # of what each block could gain by a D of its own
+_CLEAR = 4.0  # sigmas from which a component counts
+_INFORMATIVE = 0.005  # gauss (rad/s): a block whose best-known direction is worse says nothing
+_BELIEF = {"hard iron": 0.5, "gyro bias": 0.1}  # 1-sigma of a step before anything is known
+_LEAST = {"hard iron": 0.005, "gyro bias": 0.002}  # smaller ones are nobody's business
+_COLUMNS = {"hard iron": IRON, "gyro bias": GYRO}
+_SHOWN = {"hard iron": (1e3, "mG"), "gyro bias": (1e3, "mrad/s")}
+_WHY = {
+    "hard iron": "something magnetic was mounted, moved or removed",
+    "gyro bias": "the gyro got a shock, or its temperature jumped",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What stepped ("hard iron" or "gyro bias"): by `size` +- `sigma`, (3,), gauss or rad/s.
+
+    at_s: when, device time; told_s: end of the block that decided it; blocks: how many agree.
+    """
+
+    what: str
+    at_s: float
+    told_s: float
+    size: Array
+    sigma: Array
+    blocks: int
+
+    @property
+    def frame(self) -> str:
+        """Where it sits."""
+        return "sensor" if self.what == "hard iron" else "gyro"
+
+    @property
+    def unit(self) -> str:
+        """Of size and sigma."""
+        return "gauss" if self.what == "hard iron" else "rad/s"
+
+    @property
+    def words(self) -> str:
+        """For the log: size, time, what it means."""
+        factor, unit = _SHOWN[self.what]
+        size = ", ".join(f"{value:+.1f}" for value in self.size * factor)
+        sigma = ", ".join(f"{value:.1f}" for value in self.sigma * factor)
+        return (
+            f"the {self.what} changed by ({size}) +- ({sigma}) {unit} at {self.at_s:.0f} s: the "
+            f"calibration in force is void; {_WHY[self.what]}"
+        )
+
+
+class StepDetector:
+    """Samples and the newest estimate in, a `Step` out, once. Bounded memory, deterministic."""
+
+    def __init__(self) -> None:
+        self.found: Step | None = None
+        self._scorer = Scorer()
+        self._estimate: Estimate | None = None
+        self._reference: Reference | None = None
+        self.scored = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything: what follows has another iron, or another calibration."""
+        self._estimate = self._reference = self.found = None
+        self._blocks: deque[Block] = deque(maxlen=KEPT)
+        self._single: deque[float] = deque(maxlen=_MOST_USUAL + max(_WINDOWS))
+        self._intake = _Intake()
+
+    @property
+    def armed(self) -> bool:
+        """Whether a step would be told."""
+        return self.found is None and self._usual() is not None
+
+    def add(self, block: SampleBlock, estimate: Estimate | None) -> Step | None:
+        """Take samples; the step, where they show one."""
+        if self.found is not None:
+            return None
+        if estimate is not None and estimate is not self._estimate and estimate.converged:
+            self._estimate = estimate
+            if np.isfinite(estimate.covariance).all():
+                self._reference = Reference.of(estimate)
+        for rows in self._intake.add(block):
+            step = None if self._reference is None else self._judge(rows, self._reference)
+            if step is not None:
+                self.found = step
+                return step
+        return None
+
+    def _judge(self, rows: Thinned, reference: Reference) -> Step | None:
+        block = self._scorer.score(rows, reference)
+        self._blocks.append(block)
+        self.scored += 1
+        if not _informative(block):
+            return None
+        told = [b for b in self._blocks if _informative(b)]
+        usual = self._usual()
+        step = None
+        for count in _WINDOWS:
+            if count > len(told):
+                break
+            newest = told[-count:]
+            gains = _gains(newest)
+            if count == 1:
+                self._single.append(max(gain for gain, _, _ in gains.values()) / 3.0)
+            elif step is None and usual is not None:
+                step = self._decide(newest, gains, usual)
+        return step
+
+    def _usual(self) -> float | None:
+        """What a block without a step gains, 1 if all is as modelled; the newest do not count."""
+        known = list(self._single)
+        older = known[: -min(max(_WINDOWS), max(2, len(known) - _LEAST_USUAL))]
+        return None if len(older) < _LEAST_USUAL else max(1.0, float(np.mean(older)))
+
+    def _decide(
+        self, newest: list[Block], gains: dict[str, tuple[float, Array, Array]], usual: float
+    ) -> Step | None:
+        what = max(gains, key=lambda name: gains[name][0])
+        gain, size, information = gains[what]
+        if gain < _LIMIT * usual or _clear_size(size, information) < _LEAST[what]:
+            return None
+        if gain < sum(_drift_gain(block, newest[0].reference) for block in newest):
+            return None
+        if any(_share(block, newest[0].reference, what, size) < _SHARE for block in newest):
+            return None
+        at_s = float(newest[0].time_s[0])
+        if what == "hard iron":
+            # it may have come within the first block: then only the others have all of it
+            _, late, of_late = _gains(newest[1:], newest[0].reference)[what]
+            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, late)]
+            at_s = self._when(newest[0], late if explained[1] > explained[0] else size)
+            if at_s > newest[0].time_s[0]:
+                size, information = late, of_late
+        sigma = np.sqrt(usual * np.diag(np.linalg.inv(information)))
+        return Step(what, at_s, float(newest[-1].time_s[-1]), size, sigma, len(newest))
+
+    def _when(self, first: Block, size: Array) -> float:
+        """The time from which on the step explains most, from the first block backwards.
+
+        While the vehicle stands only the jump itself shows.
+        """
+        blocks = list(self._blocks)
+        best, at_s, after = 0.0, float(first.time_s[0]), 0.0
+        last = next(k for k, block in enumerate(blocks) if block is first)
+        for block in reversed(blocks[: last + 1]):
+            gains = after + _onset_gains(block, size)
+            row = int(np.argmax(gains))
+            if gains[row] > best:
+                best, at_s = float(gains[row]), float(block.time_s[row])
+            after = float(gains[0])
+        return at_s
+
+
+class _Intake:
+    """Samples to thinned blocks; a gap, a clock that falls or a change of registers ends one."""
+
+    def __init__(self) -> None:
+        self._waiting: list[SampleBlock] = []
+        self._count = 0
+        self._averaged = 0
+
+    def add(self, block: SampleBlock) -> list[Thinned]:
+        if len(block) == 0:
+            return []
+        out = self._close() if self._breaks(block) else []
+        self._waiting.append(block)
+        self._count += len(block)
+        if not self._averaged and self._count >= _RATE_ROWS:
+            first = np.concatenate([b.time_s for b in self._waiting])[:_RATE_ROWS]
+            usual_s = max(1e-4, float(np.median(np.diff(first))))
+            self._averaged = max(1, round(1.0 / (usual_s * RATE_HZ)))
+        while self._averaged and self._count >= ROWS * self._averaged:
+            out += self._cut(ROWS)
+        return out
+
+    def _breaks(self, block: SampleBlock) -> bool:
+        if not self._waiting:
+            return False
+        last = self._waiting[-1]
+        return block.gap_before or block.epoch != last.epoch or block.time_s[0] <= last.time_s[-1]
+
+    def _close(self) -> list[Thinned]:
+        rows = self._count // self._averaged if self._averaged else 0
+        out = self._cut(rows) if rows >= LEAST_ROWS else []
+        self._waiting, self._count, self._averaged = [], 0, 0
+        return out
+
+    def _cut(self, rows: int) -> list[Thinned]:
+        """The first `rows` thinned rows; none where a number is not one that a sensor reads."""
+        m, used = self._averaged, rows * self._averaged
+        time_s = np.concatenate([b.time_s for b in self._waiting])
+        table = np.concatenate(
+            [np.column_stack([b.raw_b_gauss, b.gyro_b_rad_s]) for b in self._waiting]
+        )
+        last = self._waiting[-1]
+        left = len(time_s) - used
+        self._waiting = [_tail(last, left)] if left else []
+        self._count = left
+        dt_s = np.diff(time_s[:used], prepend=time_s[:1])
+        if not ((np.abs(table) < _MOST).all() and (dt_s[1:] > 0).all()):
+            return []
+        table = table[:used]
+        angle = np.cumsum(table[:, 3:] * dt_s[:, None], axis=0)
+        mean = np.column_stack([time_s[:used], table[:, :3], angle])
+        mean = mean.reshape(rows, m, 7).mean(axis=1)
+        return [Thinned(mean[:, 0], mean[:, 1:4], mean[:, 4:], m)]
+
+
+def _tail(block: SampleBlock, rows: int) -> SampleBlock:
+    return replace(
+        block,
+        time_s=block.time_s[-rows:],
+        dt_s=block.dt_s[-rows:],
+        raw_b_gauss=block.raw_b_gauss[-rows:],
+        gyro_b_rad_s=block.gyro_b_rad_s[-rows:],
+        covariates={},
+    )
+
+
+def _informative(block: Block) -> bool:
+    """Whether the block alone knows the hard iron in some direction."""
+    return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE**-2)
+
+
+def _believed(blocks: list[Block], reference: Reference) -> tuple[Array, Array]:
+    """Information (12, 12) and score (12,) of what departs from it, less its own error."""
+    total = sum((b.information[:12, :12] for b in blocks), np.zeros((12, 12)))
+    score = np.zeros(12)
+    for b in blocks:
+        score += b.score[:12] + b.information[:12, :12] @ (b.reference.theta - reference.theta)
+    K = total @ reference.root
+    inner = np.eye(12) + reference.root.T @ K
+    solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score]))
+    return total - K @ solved[:, :12], score - K @ solved[:, 12]
+
+
+def _gains(
+    blocks: list[Block], reference: Reference | None = None
+) -> dict[str, tuple[float, Array, Array]]:
+    """By what steps: T, the step (3,), its information (3, 3), against the first's reference."""
+    information, score = _believed(blocks, reference or blocks[0].reference)
+    return {what: _gain(information, score, what) for what in _COLUMNS}
+
+
+def _gain(information: Array, score: Array, what: str) -> tuple[float, Array, Array]:
+    columns = _COLUMNS[what]
+    J = information[columns, columns] + np.eye(3) / _BELIEF[what] ** 2
+    size = np.asarray(np.linalg.solve(J, score[columns]), float)
+    return float(score[columns] @ size), size, J
+
+
+def _share(block: Block, reference: Reference, what: str, size: Array) -> float:
+    """Of the gain that a step of its own gives the block, what this step gives."""
+    information, score = _believed([block], reference)
+    most, _, J = _gain(information, score, what)
+    return float(2 * size @ score[_COLUMNS[what]] - size @ J @ size) / max(most, 1e-12)
+
+
+def _drift_gain(block: Block, reference: Reference) -> float:
+    """T of a field that changes in the world during the block."""
+    score = block.score + block.information[:, :12] @ (block.reference.theta - reference.theta)
+    G, K = block.information, block.information[:, :12] @ reference.root
+    inner = np.eye(12) + reference.root.T @ K[:12]
+    solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score[:12]]))
+    J = (G - K @ solved[:, :15])[DRIFT, DRIFT] + np.eye(3) * 1e-6
+    s = (score - K @ solved[:, 15])[DRIFT]
+    return float(s @ np.linalg.solve(J, s))
+
+
+def _clear_size(size: Array, information: Array) -> float:
+    """Length of the step along the directions in which it is clear."""
+    values, vectors = np.linalg.eigh(information)
+    along = vectors.T @ size
+    return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _CLEAR]))
+
+
+def _onset_gains(block: Block, size: Array) -> Array:
+    """(n,) what a step that begins in row k gains in this block, its own field fitted."""
+    moved = block.lever @ size
+    residual = block.residual
+    cross = np.cumsum(np.sum(moved * residual, axis=1)[::-1])[::-1]
+    square = np.cumsum(np.sum(moved**2, axis=1)[::-1])[::-1]
+    mean = np.cumsum(moved[::-1], axis=0)[::-1]
+    return np.asarray(2 * cross - square + np.sum(mean**2, axis=1) / len(moved))

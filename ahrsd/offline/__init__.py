@@ -1,0 +1,1 @@
+"""Recordings as a whole: calibrate, diagnose, compare methods, replay."""

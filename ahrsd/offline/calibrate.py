@@ -1,0 +1,206 @@
+"""Batch calibration: every sample of a recording in one estimate, iterated to the end.
+
+Byte streams, tables and captures of `ahrsd capture` go through a core that holds nothing out. In a
+capture of the daemon the core must decide as it did then, so that each sample is un-mapped through
+the registers of its time; all of its samples then go through an estimator of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ahrsd.calibration import Estimate
+from ahrsd.config.loading import Config
+from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.core import Core
+from ahrsd.diagnosis.correction import without
+from ahrsd.diagnosis.facts import matters
+from ahrsd.diagnosis.hygiene import hygiene
+from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.diagnosis.roles import prepared
+from ahrsd.errors import AhrsdError
+from ahrsd.estimator.misalignment import Misalignment
+from ahrsd.events import Estimated, Event, SamplesSeen
+from ahrsd.offline.diagnose import checked, track_of
+from ahrsd.offline.replay import Replayed, replay
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.report.calibration_json import calibration_json, why_not_converged
+from ahrsd.report.summary import said_of, serial_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchResult:
+    """What `ahrsd calibrate` says.
+
+    wrong: units, axes, signs and times that cannot be as recorded, in words
+    """
+
+    name: str
+    core: Core
+    estimate: Estimate | None
+    events: tuple[Event, ...]
+    warnings: tuple[str, ...]
+    misalignment: Misalignment | None = None
+    wrong: tuple[str, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Samples used."""
+        return self.core.stream.facts.samples
+
+    @property
+    def converged(self) -> bool:
+        """Whether the recording determines the calibration."""
+        return self.estimate is not None and self.estimate.converged
+
+    def said(self) -> list[str]:
+        """Warnings of recording and stream."""
+        turned = self.misalignment
+        return [
+            *(f"{words}: put this right and calibrate again" for words in self.wrong),
+            *said_of(self.core, self.warnings),
+            *(self.estimate.warnings if self.estimate is not None else ()),
+            *([] if turned is None or not turned.significant else [_spoken(turned)]),
+        ]
+
+    def reasons(self) -> list[str]:
+        """Why it has not converged; empty where it has."""
+        return why_not_converged(self.estimate)
+
+    def json(self, method: str) -> dict[str, object]:
+        """The contract's calibration.json."""
+        return calibration_json(
+            self.name,
+            self.estimate,
+            self.core.registers,
+            method=method,
+            samples=self.samples,
+            gyro_is_raw=not self.core.stream.compensated_gyro,
+            warnings=self.said(),
+            serial=serial_of(self.core),
+        )
+
+    def write_report(self, path: Path) -> None:
+        """A page with pictures.  AhrsdError where it cannot be written."""
+        from ahrsd.report import EventCollector, write_report
+
+        collector = EventCollector()
+        for event in self.events:
+            collector.add(event)
+        report = collector.report(
+            f"Calibration of {self.name}",
+            verdict=" ".join(f"{text[:1].upper()}{text[1:]}." for text in self.reasons()),
+            good=self.converged,
+            command=f"ahrsd calibrate {self.name}",
+            warnings=tuple(self.said()),
+        )
+        try:
+            write_report(path, report)
+        except OSError as error:
+            raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def calibrate(
+    path: Path,
+    config: Config,
+    *,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+    model: RepairedModel | None = None,
+    columns: ColumnMap = NO_MAP,
+) -> BatchResult:
+    """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`.
+
+    model: what its terms add to the readings is taken out first; AhrsdError where a term needs a
+    column that the recording has not. columns: names and units of a table.
+    """
+    seen: list[Event] = []
+    done = replay(
+        path,
+        config,
+        rate_hz=rate_hz,
+        listeners=[seen.append],
+        progress=progress,
+        held_out=False,
+        columns=columns,
+        most_samples=TABLE_ROWS,
+    )
+    left: tuple[str, ...] = ()
+    if model is not None:
+        seen, left = _without_terms(path, seen, model)
+    calibrator = _of_everything(done, seen, again=model is not None)
+    estimate = calibrator.finish()
+    if estimate is not None:
+        seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
+    turned = calibrator.estimator.misalignment()
+    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
+    facts = hygiene(track_of(blocks)) if blocks else ()
+    wrong = tuple(fact.words for fact in facts if fact.stops)
+    warnings = (
+        *done.warnings,
+        *(f"{name} is in the model and cannot be taken out" for name in left),
+        *(fact.words for fact in facts if not fact.stops and matters(fact)),
+        *([] if calibrator.step is None else [calibrator.step.words]),
+    )
+    return BatchResult(
+        done.recording.name, done.core, estimate, tuple(seen), warnings, turned, wrong
+    )
+
+
+def _without_terms(
+    path: Path, seen: list[Event], model: RepairedModel
+) -> tuple[list[Event], tuple[str, ...]]:
+    """The events, their samples without what the model's terms add; and what stays in them."""
+    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
+    if not blocks:
+        return seen, ()
+    track, refused = prepared(checked(track_of(blocks))[0])
+    try:
+        track, left = without(track, model.calibration, model.terms)
+    except ValueError as error:
+        raise AhrsdError("; ".join([f"{path}: {error}", *refused])) from None
+    rows = iter(np.cumsum([0, *map(len, blocks)]).tolist())
+    begin, events = next(rows), []
+    for event in seen:
+        if isinstance(event, SamplesSeen):
+            part, begin = slice(begin, end := next(rows)), end
+            event = replace(
+                event,
+                block=replace(
+                    event.block,
+                    raw_b_gauss=track.mag_b_gauss[part],
+                    gyro_b_rad_s=track.gyro_b_rad_s[part],
+                ),
+            )
+        events.append(event)
+    return events, left
+
+
+def _spoken(turned: Misalignment) -> str:
+    x, y, z = np.degrees(turned.rotation_rad)
+    rows = ", ".join(f"{v:.4f}" for v in turned.correction.matrix.ravel())
+    return (
+        f"the magnetometer is turned against the gyro by ({x:.2f}, {y:.2f}, {z:.2f}) deg "
+        f"({np.sqrt(turned.chi2):.0f} sigma): the correction that includes it is C = [{rows}], "
+        f"b = {np.round(turned.correction.offset, 4).tolist()} gauss"
+    )
+
+
+def _of_everything(done: Replayed, seen: list[Event], *, again: bool) -> Calibrator:
+    """A calibrator that has had every sample; `again`: not as the core took them."""
+    core = done.core
+    if not done.of_daemon and not again:
+        return core.calibrator
+    settings = replace(core.settings.calibrator, held_out=False)
+    calibrator = Calibrator(
+        settings, core.calibrator.present, core.calibrator.present_gyro_bias_rad_s
+    )
+    for event in seen:
+        if isinstance(event, SamplesSeen):
+            calibrator.take(event.block)
+    return calibrator

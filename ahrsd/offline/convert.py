@@ -1,0 +1,138 @@
+"""Any recording as one table, with what is known of it: unit, frame, clock, source, undone.
+
+What the device sent goes through the daemon's pipeline, so that the table holds what `calibrate`
+would use. Whether field, gyro and gravity mean the same axes is told by comparing them, never put
+right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ahrsd import __version__
+from ahrsd.config.loading import Config
+from ahrsd.diagnosis.frames import windows
+from ahrsd.diagnosis.hygiene import as_recorded
+from ahrsd.errors import AhrsdError, RecordingError
+from ahrsd.events import Event, SamplesSeen
+from ahrsd.offline.diagnose import track_of
+from ahrsd.offline.replay import replay
+from ahrsd.recording.bytestream import read_chunks
+from ahrsd.recording.column_names import ACCEL, GYRO, MAG, TIME
+from ahrsd.recording.foreign.formats import format_of, ready
+from ahrsd.recording.foreign.sensors import Choice
+from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.recording.opening import Kind, Recording, open_recording
+from ahrsd.recording.table_writer import write_table
+from ahrsd.samples import Array, SampleBlock
+
+_UNITS = "time_s s, mag gauss, gyro rad/s, accel m/s^2 (specific force); others by their names"
+_CLOCKS = {
+    Kind.TABLE: "time_s of the table",
+    Kind.BYTES: "the device's where it sends one, else even steps at its rate",
+    Kind.CAPTURE: "the device's where it sends one, else the host's times of arrival",
+}
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Converted:
+    """columns of the table by name; facts for its metadata; notes for a person."""
+
+    columns: dict[str, Array]
+    facts: dict[str, str]
+    notes: tuple[str, ...]
+
+
+def listed(path: Path) -> list[str]:
+    """What is in a recording, one line for each thing.  Raises RecordingError."""
+    start = b"" if path.is_dir() or not path.is_file() else next(read_chunks(path, _HEAD_BYTES))
+    kind = format_of(path, start)
+    if kind is not None:
+        ready(path, kind)
+        return [f"{path.name} {kind.what}", *kind.list(path)]
+    recording = open_recording(path)
+    lines = [f"{recording.name} is a {recording.kind.value}"]
+    if recording.table is not None:
+        rows = recording.table.rows
+        lines.append(f"{len(rows)} rows over {rows.time_s[-1] - rows.time_s[0]:.1f} s")
+        lines += [f"column {name}" for name in (TIME, *MAG, *GYRO, *sorted(rows.covariates))]
+    return lines
+
+
+def converted(
+    path: Path,
+    choice: Choice,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Converted:
+    """The recording as columns.  Raises RecordingError."""
+    recording = open_recording(path, rate_hz, columns=choice.columns, choice=choice)
+    if recording.table is not None:
+        blocks, notes = list(recording.table.blocks()), list(recording.notes)
+    else:
+        blocks, notes = _sent(recording, rate_hz, progress)
+    if not blocks:
+        raise RecordingError(path, "holds no samples", "record again")
+    track = track_of(blocks)
+    agreement = [fact.words for fact in as_recorded(track)]
+    agree = "field and gyro agree" if windows(track) else "not compared: it turns too little"
+    facts = {
+        "format": f"{recording.kind.value} of ahrsd",
+        "frame": "the sensor's own axes, as recorded",
+        "clock": _CLOCKS[recording.kind],
+        "undone": "nothing" if recording.kind is Kind.TABLE else "registers 23 and 84, where known",
+        **recording.facts,
+        "file": recording.name,
+        "unit": _UNITS,
+        "axes": "; ".join(agreement) or agree,
+        "notes": "\n".join(notes),
+        "ahrsd": __version__,
+    }
+    return Converted(_columns(blocks), facts, (*notes, *agreement))
+
+
+def _sent(
+    recording: Recording, rate_hz: float | None, progress: Callable[[int], None] | None
+) -> tuple[list[SampleBlock], list[str]]:
+    seen: list[SampleBlock] = []
+
+    def keep(event: Event) -> None:
+        if isinstance(event, SamplesSeen):
+            seen.append(event.block)
+
+    done = replay(
+        recording.path, Config(), rate_hz=rate_hz, listeners=[keep], progress=progress,
+        most_samples=TABLE_ROWS, opened=recording,
+    )  # fmt: skip
+    return seen, [*done.warnings, *done.core.stream.warnings]
+
+
+def _columns(blocks: list[SampleBlock]) -> dict[str, Array]:
+    """Columns of all blocks; a covariate that some have not is empty there."""
+    out = {TIME: np.concatenate([block.time_s for block in blocks])}
+    for names, pick in ((MAG, "raw_b_gauss"), (GYRO, "gyro_b_rad_s"), (ACCEL, "accel_b_m_s2")):
+        values = np.concatenate([getattr(block, pick) for block in blocks])
+        if names is not ACCEL or np.isfinite(values).any():
+            out |= dict(zip(names, values.T, strict=True))
+    for name in dict.fromkeys(name for block in blocks for name in block.covariates):
+        out[name] = np.concatenate(
+            [block.covariates.get(name, np.full(len(block), np.nan)) for block in blocks]
+        )
+    return out
+
+
+def save(table: Converted, path: Path) -> None:
+    """As Parquet; the file is there as a whole or not at all.  Raises AhrsdError."""
+    part = path.with_name(f".{path.stem}.part.parquet")
+    facts = {f"ahrsd.{name}": text for name, text in table.facts.items()}
+    try:
+        write_table(part, table.columns, facts)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}; check the path") from error

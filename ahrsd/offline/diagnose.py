@@ -1,0 +1,260 @@
+"""From a recording to a diagnosis: load, align with the user's simulation, ask the engine.
+
+A table may have any units or axes here: that they are wrong is one of the possible answers.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from ahrsd.diagnosis.aligned import align, differing
+from ahrsd.diagnosis.dead import dead_axes, possible
+from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
+from ahrsd.diagnosis.logged import diagnose_logged
+from ahrsd.diagnosis.model_file import RepairedModel, from_text
+from ahrsd.diagnosis.pauses import without_jumps
+from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.errors import AhrsdError, RecordingError
+from ahrsd.events import Event, SamplesSeen
+from ahrsd.printable import printable
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.recording.opening import Kind, open_recording
+from ahrsd.recording.table import read_table
+from ahrsd.samples import Array, SampleBlock
+
+SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
+FEWEST_ROWS = 100
+RATE_AGREES = 0.05  # of a spec and the stamps' median step: clocks are closer, units are not
+_FEW_MISSING = 0.02  # of the rows, whose acceleration is filled from their neighbours
+_ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
+#: what a spec may say, the least and the most that is believable, and its unit
+_SPEC_KEYS = {
+    "sigma_mag_gauss": (1e-7, 0.3, "gauss per sample"),
+    "sigma_gyro_rad_s": (1e-7, 1.0, "rad/s per sample"),
+    "rate_hz": (0.1, 1e4, "Hz"),
+    "field_gauss": (0.01, 10.0, "gauss"),
+}
+
+
+def load_track(
+    path: Path,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+    *,
+    spec: Spec | None = None,
+    columns: ColumnMap = NO_MAP,
+) -> tuple[Track, list[str]]:
+    """The recording as one track, and what a person should know of how it was read.
+
+    rate_hz: for a byte stream without a time of its own, before that of the spec; columns: names
+    and units of a table
+    Raises RecordingError where there is nothing to diagnose.
+    """
+    recording = open_recording(path, rate_hz, check_units=False, columns=columns)
+    said_hz = None if spec is None else spec.rate_hz
+    if recording.kind is Kind.TABLE:
+        table = recording.table or read_table(path, check_units=False, columns=columns)
+        blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
+    else:
+        blocks, notes = _streamed(path, rate_hz or said_hz, progress)
+    track, said = checked(track_of(blocks))
+    if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
+        raise RecordingError(
+            path,
+            f"is too short to diagnose: {len(track)} samples in {track.duration_s:.1f} s",
+            f"record at least {SHORTEST_S:.0f} s and {FEWEST_ROWS} samples, better some minutes",
+        )
+    return track, [*notes, *said, *_of_its_rate(track, said_hz)]
+
+
+def checked(track: Track) -> tuple[Track, list[str]]:
+    """The track without what no sensor gives, and one line for each such thing."""
+    track, jumped = without_jumps(track)
+    track, notes = possible(track)
+    accel, said = _acceleration(track)
+    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
+
+
+def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
+    """(N, 3) m/s^2, short holes filled; None where it cannot be used; one line on what was done."""
+    accel = track.accel_b_m_s2
+    if accel is None:
+        return None, []
+    known = np.isfinite(accel).all(axis=1)
+    missing = int(np.count_nonzero(~known))
+    if missing == len(track):
+        return None, []
+    if missing > _FEW_MISSING * len(track):
+        return None, [f"the acceleration was left out: {missing} of {len(track)} rows have none"]
+    notes = [f"{missing} rows without acceleration were filled"] if missing else []
+    if missing:
+        time_s = track.time_s
+        accel = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    if size == 0.0:
+        return None, ["the acceleration was left out: it is 0 throughout, not even gravity"]
+    for unit, factor in _ACCEL_UNITS:
+        if 0.7 * GRAVITY_M_S2 < size * factor < 1.4 * GRAVITY_M_S2:
+            return accel * factor, [*notes, f"the acceleration was in {unit}: taken as m/s^2"]
+    return accel, notes
+
+
+def _of_its_rate(track: Track, said_hz: float | None) -> list[str]:
+    """One line where the time stamps and the spec's rate say different things."""
+    rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
+    if said_hz is None or abs(rate_hz / said_hz - 1.0) < RATE_AGREES:
+        return []
+    return [
+        f"the spec says {said_hz:g} Hz, the time stamps {rate_hz:.4g} Hz: the stamps are used; "
+        "check that they are in seconds"
+    ]
+
+
+def _streamed(
+    path: Path, rate_hz: float | None, progress: Callable[[int], None] | None
+) -> tuple[list[SampleBlock], list[str]]:
+    # the daemon's whole pipeline, which a table does not need
+    from ahrsd.config.loading import Config
+    from ahrsd.offline.replay import replay
+
+    seen: list[Event] = []
+    done = replay(
+        path,
+        Config(),
+        rate_hz=rate_hz,
+        listeners=[seen.append],
+        progress=progress,
+        most_samples=TABLE_ROWS,
+    )
+    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
+    return blocks, [*done.warnings, *done.core.stream.warnings]
+
+
+def track_of(blocks: list[SampleBlock]) -> Track:
+    """Blocks in order as one track; only covariates that every block has are kept."""
+    names = set.intersection(*(set(block.covariates) for block in blocks)) if blocks else set()
+
+    def join(pick: Callable[[SampleBlock], Array]) -> Array:
+        return np.concatenate([pick(block) for block in blocks])
+
+    dt_s = join(lambda b: b.dt_s).copy()
+    row = 0
+    for block in blocks:
+        if block.gap_before:
+            dt_s[row] = np.nan
+        row += len(block)
+    dt_s[:1] = np.nan
+    starts = [*np.flatnonzero(np.isnan(dt_s)).tolist(), len(dt_s)]
+    accel = join(lambda b: b.accel_b_m_s2)
+    with_accel = bool(np.isfinite(accel).any())
+    return Track(
+        time_s=join(lambda b: b.time_s),
+        dt_s=dt_s,
+        mag_b_gauss=join(lambda b: b.raw_b_gauss),
+        gyro_b_rad_s=join(lambda b: b.gyro_b_rad_s),
+        accel_b_m_s2=accel if with_accel else None,
+        covariates={
+            name: np.concatenate([block.covariates[name] for block in blocks])
+            for name in sorted(names)
+        },
+        runs=tuple(slice(a, b) for a, b in pairwise(starts)),
+    )
+
+
+def load_spec(path: Path) -> tuple[Spec, list[str]]:
+    """What the user knows of the sensor (JSON), and one line on each entry that was not used.
+
+    Raises AhrsdError, one line, where it cannot be read.
+    """
+    try:
+        body = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise AhrsdError(f"{path}: is not JSON: {error}") from None
+    if not isinstance(body, dict):
+        raise AhrsdError(f"{path}: must be an object with some of {', '.join(_SPEC_KEYS)}")
+    notes = [_unknown_key(path, key) for key in body if key not in _SPEC_KEYS]
+    values: dict[str, float] = {}
+    for key, (least, most, unit) in _SPEC_KEYS.items():
+        value = body.get(key)
+        if value is None:
+            continue
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0.0 < value < math.inf:
+            raise AhrsdError(f"{path}: {key} = {value!r}: must be a positive number")
+        if least <= value <= most:
+            values[key] = float(value)
+        else:
+            words = f"{path.name}: {key} = {value:g} was left out"
+            notes.append(f"{words}: a sensor has {least:g} to {most:g} {unit}")
+    return Spec(**values), notes
+
+
+def _unknown_key(path: Path, key: str) -> str:
+    near = difflib.get_close_matches(key, _SPEC_KEYS, n=1, cutoff=0.3)
+    hint = f"is {near[0]} meant?" if near else f"it may have {', '.join(_SPEC_KEYS)}"
+    return f"{path.name}: {key} is no entry of a spec and was left out; {hint}"
+
+
+def load_model(path: Path) -> RepairedModel:
+    """A repaired model's file.  AhrsdError in one line where it cannot be read or is none."""
+    try:
+        return from_text(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be read: {error.strerror}; check the path") from error
+    except ValueError as error:
+        raise AhrsdError(f"{path}: {error}") from None
+
+
+def diagnose_recording(
+    real: Path,
+    *,
+    simulation: Path | None = None,
+    spec: Path | None = None,
+    rate_hz: float | None = None,
+    progress: Callable[[int], None] | None = None,
+    columns: ColumnMap = NO_MAP,
+) -> Diagnosis:
+    """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError.
+
+    columns: names and units of REAL, where it is a table of another program
+    """
+    known, unused = (Spec(), []) if spec is None else load_spec(spec)
+    track, notes = load_track(real, rate_hz, progress, spec=known, columns=columns)
+    notes = [*unused, *notes]
+    if simulation is None:
+        found = _answered(real, track, known)
+        return replace(found, notes=(*notes, *found.notes))
+    simulated, _ = load_track(simulation, rate_hz, spec=known)
+    try:
+        overlap = align(track, simulated)
+    except ValueError as error:
+        raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
+    found = _answered(real, overlap.real, known)
+    own = _answered(simulation, overlap.simulated, Spec())
+    left = differing(found, own)
+    return replace(left, notes=(*notes, *overlap.notes, *left.notes))
+
+
+def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
+    try:
+        return diagnose_logged(track, spec, recording=printable(path.name, 200))
+    except np.linalg.LinAlgError:
+        raise RecordingError(
+            path,
+            "the fit found no end: no calibration comes near these readings",
+            "diagnose parts of it, and look at gyro and magnetometer where a part cannot be",
+        ) from None
+    except ValueError as error:
+        raise RecordingError(path, str(error), "record again, with the vehicle turning") from None

@@ -1,0 +1,191 @@
+"""Replay: a recording through the same shell and core as a live run.
+
+A capture of the daemon is fed its own inputs, ticks and answers included, so the decisions are
+those of the run. Everything else has nobody to talk to and is taken as a passive run over what it
+holds; the registers that `ahrsd capture` read first hold for the bytes that came meanwhile, too.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ahrsd.config.core_settings import core_settings, terms_text
+from ahrsd.config.loading import CONFIG_KEY, Config, recorded_config
+from ahrsd.core.core import Core
+from ahrsd.core.settings import BESIDE_KEY, CoreSettings
+from ahrsd.daemon.core_runner import Listener, Shell, Viewer
+from ahrsd.errors import RecordingError
+from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
+from ahrsd.recording.bytestream import read_stream, unpacked_size
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
+from ahrsd.recording.opening import Kind, Recording, open_recording
+from ahrsd.stream.assembler import NoSamplesError
+from ahrsd.stream.rate import rate_of
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+from drivers.vn100.deframer import Cause
+from drivers.vn100.errors import NO_CHECKSUM
+
+_CUT = "cut it in parts"
+_PASSIVE = WriteBackPolicy(mode=Mode.PASSIVE)
+
+
+@dataclass(slots=True)
+class Replayed:
+    """What a replay leaves behind."""
+
+    core: Core
+    recording: Recording
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def of_daemon(self) -> bool:
+        """Whether it is a capture of the daemon, which decided for itself what to do."""
+        return CONFIG_KEY in self.recording.header
+
+
+def replay(
+    path: Path,
+    config: Config,
+    *,
+    rate_hz: float | None = None,
+    speed: float = 0.0,
+    viewer: Viewer | None = None,
+    listeners: list[Listener] | None = None,
+    progress: Callable[[int], None] | None = None,
+    held_out: bool = True,
+    settings: CoreSettings | None = None,
+    columns: ColumnMap = NO_MAP,
+    most_samples: float = math.inf,
+    opened: Recording | None = None,
+) -> Replayed:
+    """Feed a recording to a core; speed 0 is as fast as it goes, 1 real time.
+
+    settings: of the core, else those of `config`; a capture of the daemon brings its own
+    configuration, and its own `held_out`. columns: names and units of a table. most_samples: for
+    who keeps them all. opened: the recording at `path`, where it is open already. Raises
+    RecordingError where nothing in the recording can be calibrated.
+    """
+    if rate_hz is not None and not math.isfinite(rate_hz):
+        raise RecordingError(path, f"a rate of {rate_hz} Hz is none", "give --rate in Hz")
+    recording = opened or open_recording(path, rate_hz, columns=columns)
+    core = Core(settings or _settings(recording, config, rate_hz, held_out))
+    shell = Shell(core, viewer=viewer, listeners=listeners or [])
+    done = Replayed(core, recording, list(recording.notes))
+    items = recording.inputs() if done.of_daemon else _registers_first(recording)
+    share = _share_of_file(recording)
+    if (text := terms_text(config)) and not done.of_daemon:
+        shell.feed(TermsKnown(0, text))
+    for item in _paced(items, core, speed):
+        shell.feed(item)
+        if progress is not None:
+            progress(share(item))
+        refuse_beyond(path, core.stream.facts.samples, most_samples, "samples", _CUT)
+        counters = core.conversation.session.deframer.counters
+        if counters.valid == 0 and counters.fed_bytes > GARBAGE_BYTES:
+            break
+    _refuse_empty(core, path)
+    done.warnings += [note for note in recording.notes if note not in done.warnings]
+    if recording.kind is Kind.BYTES and _cut_off(core):
+        done.warnings.append("the recording ends in the middle of a message")
+    return done
+
+
+def _share_of_file(recording: Recording) -> Callable[[Input], int]:
+    """How many bytes of the file an input is: of what is packed as much as its part of the whole.
+
+    Of a capture the bytes that were received, as nobody knows what else is in the file.
+    """
+    scale = 1.0
+    on_disk = recording.path.stat().st_size
+    if recording.kind is Kind.TABLE and recording.table is not None:
+        scale = on_disk / max(len(recording.table.rows), 1)
+    elif recording.kind is Kind.BYTES:
+        scale = on_disk / max(unpacked_size(recording.path), 1)
+
+    def share(item: Input) -> int:
+        match item:
+            case Received(data=data):
+                return round(scale * len(data))
+            case Samples(block=block):
+                return round(scale * len(block))
+        return 0
+
+    return share
+
+
+def _settings(
+    recording: Recording, config: Config, rate_hz: float | None, held_out: bool
+) -> CoreSettings:
+    """A capture of the daemon says itself how it was made; the others are passive."""
+    if text := recording.header.get(CONFIG_KEY):
+        own = recorded_config(text)
+        if config not in (Config(), own):
+            recording.notes.append("the configuration in the capture was used, not the given one")
+        return replace(core_settings(own), beside=BESIDE_KEY in recording.header)
+    if recording.kind is not Kind.BYTES:
+        return core_settings(config, policy=_PASSIVE, held_out=held_out)
+    found = None if rate_hz is not None else rate_of(read_stream(recording.path))
+    rate = rate_hz if found is None else found[0]
+    settings = core_settings(config, stream_rate_hz=rate, policy=_PASSIVE, held_out=held_out)
+    return settings if found is None else replace(settings, stream_rate_source=found[1])
+
+
+def _registers_first(recording: Recording) -> Iterator[Input]:
+    """The inputs; registers that were read at the beginning are known from the first byte on."""
+    if recording.kind is not Kind.CAPTURE:
+        yield from recording.inputs()
+        return
+    found = next((i for i in recording.inputs() if isinstance(i, RegistersKnown)), None)
+    if found is not None:
+        yield replace(found, host_ns=0)
+    for item in recording.inputs():
+        if item != found:
+            yield item
+
+
+def _paced(items: Iterator[Input], core: Core, speed: float) -> Iterator[Input]:
+    """Hold inputs back so that device time passes `speed` times as fast as real time."""
+    start = time.monotonic()
+    for item in items:
+        if speed > 0 and isinstance(item, Received | Samples):
+            ahead_s = (core.at_s - core.first_s) / speed - (time.monotonic() - start)
+            if ahead_s > 0:
+                time.sleep(ahead_s)
+        yield item
+
+
+def _cut_off(core: Core) -> bool:
+    """Whether bytes were left that begin a message; silence cannot cut one in a byte stream."""
+    deframer = core.conversation.session.deframer
+    return deframer.pending > 0 or Cause.CUT in deframer.counters.damage
+
+
+def _refuse_empty(core: Core, path: Path) -> None:
+    counters = core.conversation.session.deframer.counters
+    try:
+        core.stream.check()
+    except NoSamplesError as error:
+        raise RecordingError(path, "nothing to calibrate from", str(error)) from error
+    if core.stream.facts.samples:
+        return
+    if counters.fed_bytes == 0:
+        raise RecordingError(path, "is empty", "record again with the device on")
+    if counters.valid == 0:
+        raise RecordingError(
+            path,
+            f"no VN-100 message in {counters.fed_bytes} bytes",
+            NO_CHECKSUM
+            if counters.unchecked
+            else "wrong baud rate while recording, or not a VN-100 stream",
+        )
+    raise RecordingError(
+        path,
+        "no complete sample",
+        "record longer, with a message that carries the magnetometer and the gyroscope",
+    )

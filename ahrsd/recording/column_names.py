@@ -1,0 +1,339 @@
+"""Which column of a table is what, and in which unit.
+
+The canonical names carry their units (`mag_x_gauss`). Other names are told by the user
+(`--columns mag_x=MagX:uT`) or known from a program that everybody uses; capitals and blanks do not
+count. What is missing is answered with the option that would give it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from ahrsd.errors import AhrsdError
+from ahrsd.printable import printable
+
+TIME = "time_s"
+MAG = ("mag_x_gauss", "mag_y_gauss", "mag_z_gauss")
+GYRO = ("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s")
+ACCEL = ("accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2")
+REQUIRED = (TIME, *MAG, *GYRO)
+GRAVITY_M_S2 = 9.80665
+DEGREE = 0.017453292519943295
+
+#: kind -> unit as people write it, lower case -> factor to the canonical unit
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9},
+    "mag": {
+        "gauss": 1.0, "ga": 1.0, "mgauss": 1e-3, "ut": 1e-2, "µt": 1e-2, "μt": 1e-2, "nt": 1e-5,
+        "tesla": 1e4,
+    },
+    "gyro": {
+        "rad/s": 1.0, "rad_s": 1.0, "rps": 1.0, "deg/s": DEGREE, "deg_s": DEGREE, "dps": DEGREE,
+        "°/s": DEGREE, "mrad/s": 1e-3, "mrad_s": 1e-3, "mdps": 1e-3 * DEGREE,
+    },
+    "accel": {
+        "m/s^2": 1.0, "m/s2": 1.0, "m_s2": 1.0, "m/s²": 1.0, "g": GRAVITY_M_S2,
+        "mg": 1e-3 * GRAVITY_M_S2, "ug": 1e-6 * GRAVITY_M_S2,
+    },
+}  # fmt: skip
+#: where capitals make the difference
+_EXACT = {"mag": {"G": 1.0, "mG": 1e-3, "T": 1e4, "mT": 10.0}}
+_SHORT = {
+    "time": TIME,
+    **{name.rsplit("_", 1)[0]: name for name in MAG},
+    **{f"gyro_{axis}": name for axis, name in zip("xyz", GYRO, strict=True)},
+    **{f"accel_{axis}": name for axis, name in zip("xyz", ACCEL, strict=True)},
+}
+_KINDS = {TIME: "time", **dict.fromkeys(MAG, "mag"), **dict.fromkeys(GYRO, "gyro"),
+          **dict.fromkeys(ACCEL, "accel")}  # fmt: skip
+_HOW = "write NAME=COLUMN:UNIT, for example --columns mag_x=MagX:uT,gyro_x=GyrX:deg/s,time=t:ms"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a canonical column comes from: value = factor * table[column]."""
+
+    column: str
+    factor: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMap:
+    """What `--columns` says: canonical name -> source; empty where it was not given."""
+
+    sources: Mapping[str, Source]
+
+    def __bool__(self) -> bool:
+        return bool(self.sources)
+
+
+NO_MAP = ColumnMap({})
+
+
+def parse_columns(texts: Iterable[str]) -> ColumnMap:
+    r"""`mag_x=MagX:uT,...` of one or several options; a comma of a name is written `\,`.
+
+    A minus in front of a column turns its sign. Raises AhrsdError naming the entry.
+    """
+    sources: dict[str, Source] = {}
+    for entry in (part for text in texts for part in re.split(r"(?<!\\),", text)):
+        entry = entry.replace("\\,", ",").strip()
+        if not entry:
+            continue
+        key, equals, value = entry.partition("=")
+        name = _SHORT.get(key.strip().lower(), key.strip())
+        if not equals or not name or not value.strip():
+            raise AhrsdError(f"--columns {printable(entry)}: is no entry; {_HOW}")
+        if name in sources:
+            raise AhrsdError(f"--columns {printable(entry)}: {name} is given twice; {_HOW}")
+        sources[name] = _source(entry, name, value.strip())
+    return ColumnMap(sources)
+
+
+def _source(entry: str, name: str, value: str) -> Source:
+    column, colon, unit = value.rpartition(":")
+    kind = _KINDS.get(name)
+    if not colon:
+        return Source(value)
+    factor = 1.0 if kind is None else _factor(kind, unit.strip())
+    if kind is not None and factor is None:
+        units = ", ".join(dict.fromkeys([*_EXACT.get(kind, {}), *UNITS[kind]]))
+        raise AhrsdError(
+            f"--columns {printable(entry)}: {printable(unit)!r} is no unit of {name}; it may be "
+            f"{units}"
+        )
+    if kind is None:  # a covariate keeps its unit, and its name may hold a colon
+        return Source(value)
+    return Source(column.strip(), factor or 1.0)
+
+
+def _factor(kind: str, unit: str) -> float | None:
+    exact = _EXACT.get(kind, {}).get(unit)
+    return exact if exact is not None else UNITS[kind].get(unit.lower())
+
+
+def _program(*entries: tuple[str, str, float]) -> dict[str, Source]:
+    """Vector columns by their stem: ("mag", "UncompMag", 1.0) -> mag_x_gauss from UncompMagX."""
+    names = {"mag": MAG, "gyro": GYRO, "accel": ACCEL}
+    return {
+        name: Source(f"{stem}{axis}", factor)
+        for kind, stem, factor in entries
+        for name, axis in zip(names[kind], "XYZ", strict=True)
+    }
+
+
+#: names that programs write, best first; the exporter of VectorNav's SDK has times in ns
+_PROGRAMS: tuple[dict[str, Source], ...] = (
+    {"time_s": Source("TimeStartup", 1e-9), "temperature_c": Source("Temperature"),
+     "pressure_kpa": Source("Pressure")},
+    _program(("mag", "UncompMag", 1.0), ("gyro", "UncompGyro", 1.0), ("accel", "UncompAcc", 1.0)),
+    _program(("gyro", "UncompAngularRate", 1.0), ("accel", "UncompAccel", 1.0)),
+    _program(("mag", "Mag", 1.0), ("gyro", "AngularRate", 1.0), ("accel", "Accel", 1.0)),
+    {"time_s": Source("TimeGps", 1e-9)},
+)  # fmt: skip
+#: the parts of ROS messages that hold a vector, with the factor from their unit
+_ROS_PARTS = (
+    ("magnetic_field", MAG, 1e4),
+    ("angular_velocity", GYRO, 1.0),
+    ("linear_acceleration", ACCEL, 1.0),
+)
+_ROS_TIMES = ("field.header.stamp", "%time")  # in ns, best first
+_WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+_WORDS = {"time": "time|stamp", "mag": "mag|field", "gyro": "gyr|ang|rate|omega", "accel": "acc"}
+_SDK_MARKS = {"TimeStartup", "TimeGps", "UncompMagX", "AngularRateX"}
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """sources: canonical name -> source, all required ones; covariates: name -> column."""
+
+    sources: dict[str, Source]
+    covariates: dict[str, str]
+    notes: tuple[str, ...]
+
+
+class ColumnError(ValueError):
+    """What is wrong with the names, and the remedy."""
+
+    def __init__(self, what: str, remedy: str) -> None:
+        super().__init__(what)
+        self.what, self.remedy = what, remedy
+
+
+def resolve(names: Sequence[str], given: ColumnMap = NO_MAP) -> Resolved:
+    """Where each canonical column comes from.  Raises ColumnError."""
+    double = [name for name, count in Counter(names).items() if count > 1 and name.strip()]
+    present = set(names)
+    sources: dict[str, Source] = {}
+    for name, source in given.sources.items():
+        sources[name] = _found(name, source, names)
+    notes: list[str] = []
+    plain = {name.strip().lower().replace(" ", "_"): name for name in reversed(names)}
+    recased = []
+    for name in (*REQUIRED, *ACCEL):
+        if name in sources:
+            continue
+        if name in present:
+            sources[name] = Source(name)
+        elif name in plain:
+            sources[name] = Source(plain[name])
+            recased.append(printable(plain[name]))
+    if recased:
+        notes.append(f"columns {', '.join(recased[:3])} ... were read without their capitals")
+    if _SDK_MARKS & present:
+        notes += _of_programs(sources, present)
+    notes += _of_ros(sources, names)
+    notes += _with_units(sources, names)
+    used = {source.column for source in sources.values()}
+    for name in double:
+        if name in used:
+            raise ColumnError(f"has the column {printable(name)} twice", "rename one of them")
+    missing = [name for name in REQUIRED if name not in sources]
+    if missing:
+        raise ColumnError(f"has no column {', '.join(missing)}", _remedy(missing, names, used))
+    further = {name for name in sources if name not in _KINDS}
+    covariates = _covariates(names, used, further)
+    return Resolved(sources, covariates, tuple(notes))
+
+
+def _found(name: str, source: Source, names: Sequence[str]) -> Source:
+    if source.column in names:
+        return source
+    if source.column.startswith("-") and source.column[1:] in names:
+        return Source(source.column[1:], -source.factor)
+    near = difflib.get_close_matches(source.column, names[:1000], n=1, cutoff=0.5)
+    hint = f"is {printable(near[0])} meant?" if near else f"it has {_some(names)}"
+    raise ColumnError(f"has no column {printable(source.column)} (--columns, for {name})", hint)
+
+
+def _some(names: Sequence[str]) -> str:
+    listed = ", ".join(printable(name, 30) for name in names[:12])
+    return f"{listed}, ... ({len(names)} in all)" if len(names) > 12 else listed
+
+
+def _of_programs(sources: dict[str, Source], present: set[str]) -> list[str]:
+    taken = []
+    for program in _PROGRAMS:
+        vectors = [name for name in program if name in _KINDS and name != TIME]
+        for name, source in program.items():
+            whole = name not in vectors or all(
+                program[one].column in present for one in vectors if _KINDS[one] == _KINDS[name]
+            )
+            if name not in sources and source.column in present and whole:
+                sources[name] = source
+                taken.append(source.column)
+    if not taken:
+        return []
+    return [f"the columns are those of VectorNav's SDK: {', '.join(taken[:3])}, ... were taken"]
+
+
+def _of_ros(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
+    """Columns of `rostopic echo -p` and of tools that write paths of messages."""
+    taken: list[str] = []
+    for part, wanted, factor in _ROS_PARTS:
+        ends = re.compile(rf"(?:^|[./]){part}([./])x$")
+        stems = [name[:-1] for name in names if ends.search(name)]
+        whole = len(stems) == 1 and all(f"{stems[0]}{axis}" in names for axis in "xyz")
+        if not whole or any(name in sources for name in wanted):
+            continue
+        for name, axis in zip(wanted, "xyz", strict=True):
+            sources[name] = Source(f"{stems[0]}{axis}", factor)
+        taken.append(f"{stems[0]}x")
+    if taken and TIME not in sources:
+        clock = next((name for name in _ROS_TIMES if name in names), None)
+        if clock is not None:
+            sources[TIME] = Source(clock, 1e-9)
+            taken.append(clock)
+    if not taken:
+        return []
+    shown = ", ".join(printable(name) for name in taken)
+    return [f"the columns are those of ROS messages: {shown} (T, rad/s, m/s^2, ns) were taken"]
+
+
+def _with_units(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
+    """Columns whose names end in their unit in brackets, where only one can be meant."""
+    matches = [(name, _WITH_UNIT.match(name)) for name in names[:1000]]
+    told = [(match[1].lower(), match[2], name) for name, match in matches if match is not None]
+    taken: list[str] = []
+    for wanted in ((TIME,), MAG, GYRO, ACCEL):
+        if any(name in sources for name in wanted):
+            continue
+        kind = _KINDS[wanted[0]]
+        found = [_only(kind, axis, told) for axis in ("xyz" if len(wanted) > 1 else ("",))]
+        known = [one for one in found if one is not None]
+        if len(known) == len(wanted):
+            sources.update(zip(wanted, known, strict=True))
+            taken.append(printable(known[0].column))
+    if not taken:
+        return []
+    return [f"names and units are those in the file's names: {', '.join(taken)} ... were taken"]
+
+
+def _only(kind: str, axis: str, told: Sequence[tuple[str, str, str]]) -> Source | None:
+    """The one column of this kind and axis; None where there is none, or several."""
+    place = rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$" if axis else ""
+    found = [
+        Source(name, factor)
+        for stem, unit, name in told
+        if re.search(_WORDS[kind], stem)
+        and re.search(place, stem)
+        and (factor := _factor(kind, unit)) is not None
+    ]
+    return found[0] if len(found) == 1 else None
+
+
+def _remedy(missing: Sequence[str], names: Sequence[str], used: set[str]) -> str:
+    """The option that names the missing columns, as far as the others are alike."""
+    others = [name for name in names[:1000] if name not in used and name.strip()]
+    alike = [(name, _alike(name, others)) for name in missing]
+    short = {long: key for key, long in _SHORT.items()}
+    guessed = [
+        f"{short[name]}={printable(column)}{_unit_of(name, column)}"
+        for name, column in alike
+        if column is not None
+    ]
+    meant = next((column for _, column in alike if column is not None), None)
+    hint = f" (is {printable(meant)} meant? --columns {','.join(guessed)})" if meant else ""
+    return f"a table needs {', '.join(REQUIRED)}{hint or '; other names and units: --columns'}"
+
+
+def _alike(name: str, others: Sequence[str]) -> str | None:
+    folded = {other.lower(): other for other in reversed(others)}
+    found = difflib.get_close_matches(name, folded, n=1, cutoff=0.5)
+    if name == TIME:
+        times = [other for other in others if re.search(r"time|stamp|date|^t$", other.lower())]
+        return times[0] if times else None
+    kind, axis = name.split("_")[:2]
+    words = _WORDS[kind]
+    fit = [
+        other
+        for low, other in folded.items()
+        if re.search(words, low) and re.search(rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$", low)
+    ]
+    return fit[0] if fit else folded[found[0]] if found else None
+
+
+def _unit_of(name: str, column: str) -> str:
+    """`:unit` where the column's own name ends in one."""
+    kind = _KINDS[name]
+    tail = re.split(r"[\s_\[(.]+", column.rstrip(" )]"))[-1]
+    two = "_".join(re.split(r"[\s_\[(.]+", column.rstrip(" )]"))[-2:])
+    for text in (two, tail):
+        if _factor(kind, text) is not None and text.lower() not in ("s", name):
+            return f":{text}"
+    return ""
+
+
+def _covariates(names: Sequence[str], used: set[str], taken: set[str]) -> dict[str, str]:
+    """Printable name -> column of everything else; the first of equal names."""
+    out: dict[str, str] = {}
+    for column in names:
+        name = printable(column.strip())
+        if not name or column in used or name in out or name in taken:
+            continue
+        out[name] = column
+    return out

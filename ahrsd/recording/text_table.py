@@ -1,0 +1,286 @@
+"""Text of any program to columns: encodings, comment lines, separators, decimal commas, cut rows.
+
+What can be read without guessing at a value is read, and a note says what was done; what cannot
+ends in one line.  Row numbers are those of the file, as editors count.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pyarrow
+import pyarrow.csv
+
+from ahrsd.errors import RecordingError
+from ahrsd.printable import printable
+from ahrsd.recording.bytestream import read_chunks, utf16_of
+from ahrsd.recording.foreign.recognised import recognised
+from ahrsd.recording.limits import (
+    HEADER_BYTES,
+    TABLE_BYTES,
+    TABLE_COLUMNS,
+    TABLE_ROWS,
+    refuse_beyond,
+)
+
+_CHUNK_BYTES = 1 << 18
+csv.field_size_limit(HEADER_BYTES + 1)  # of a quoted name; 128 KiB as it comes
+_COMMENTS = (b"#", b"%", b"//")
+_ROSTOPIC = b"%time,"  # how the names of `rostopic echo -p` begin, which are no comment
+_COMMENT_LINE = re.compile(rb"(?m)^(?:#|%|//)[^\n]*(?:\n|\Z)")
+_SEPARATOR_LINE = re.compile(rb"^\"?sep=(.)\"?\s*$", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(rb"^\s*[+-]?\d+,\d+\s*$")
+_WRONG_SHARE, _WRONG_FEW = 0.01, 3  # rows with another number of cells that are left out
+_LESS = "keep fewer of them, or cut the recording in parts"
+_MISSING = ["", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "N/A", "n/a", "NA", "#N/A"]
+
+
+@dataclass(slots=True)
+class TextTable:
+    """columns by name; first_row: number in the file of the first row below the names."""
+
+    table: pyarrow.Table
+    first_row: int
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Text:
+    """UTF-8 text whose lines end in LF; `at` is where the first row below the names begins."""
+
+    data: bytearray
+    names: list[str]
+    separator: str
+    at: int
+    first_row: int
+
+
+def read_text_table(path: Path) -> TextTable:
+    """The columns of a text file.  Raises RecordingError naming what is wrong, where."""
+    notes: list[str] = []
+    data, cut = _gathered(path, notes)
+    data = _plain_text(path, data, notes)
+    if (found := recognised(bytes(data[:4096]))) is not None:
+        raise RecordingError(path, found.what, found.remedy)
+    text = _with_header(path, data, notes)
+    _drop_comments(text, notes)
+    _drop_repeated_header(text, notes)
+    _drop_cut_row(text, cut, notes)
+    refuse_beyond(path, text.data.count(b"\n", text.at), TABLE_ROWS, "rows", _LESS)
+    return TextTable(_parsed(path, text, notes), text.first_row, notes)
+
+
+def _gathered(path: Path, notes: list[str]) -> tuple[bytearray, bool]:
+    """The unpacked text, not beyond the limit; whether it was cut off."""
+    data = bytearray()
+    told: list[str] = []
+    for chunk in read_chunks(path, _CHUNK_BYTES, told):
+        data += chunk
+        refuse_beyond(path, len(data), TABLE_BYTES, "bytes of text and more", _LESS)
+        if len(data) > HEADER_BYTES and not _has_lines(data):
+            raise RecordingError(
+                path,
+                f"has no line end within its first {HEADER_BYTES:,} bytes",
+                "it is no table of text; give a CSV file",
+            )
+    notes += told
+    return data, bool(told)
+
+
+def _has_lines(data: bytearray) -> bool:
+    return any(end in data[: HEADER_BYTES + 2] for end in (b"\n", b"\r"))
+
+
+def _plain_text(path: Path, data: bytearray, notes: list[str]) -> bytearray:
+    """UTF-8 without marks, NUL bytes and stray returns."""
+    if (encoding := utf16_of(bytes(data[:400]))) is not None:
+        notes.append("the text is UTF-16: read as such")
+        data = bytearray(data.decode(encoding, "replace").encode("utf-8"))
+    if data.startswith(b"\xef\xbb\xbf"):
+        del data[:3]
+    if nuls := len(data) - len(data.rstrip(b"\0")):
+        del data[-nuls:]
+        notes.append(f"it ends in {nuls} NUL bytes (the recorder lost its power): left out")
+        if not data:
+            raise RecordingError(path, "holds nothing but NUL bytes", "record again")
+    if (nuls := data.count(b"\0")) > 0:
+        data = bytearray(re.sub(rb"\0+", b"\n", bytes(data)))
+        notes.append(f"{nuls} NUL bytes amid the rows were left out")
+    if not data.isascii():
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError:
+            data = bytearray(data.decode("cp1252", "replace").encode("utf-8"))
+    if b"\r" in data:
+        data = bytearray(re.sub(rb"\r+\n|\r", b"\n", bytes(data)))
+    return data
+
+
+def _with_header(path: Path, data: bytearray, notes: list[str]) -> _Text:
+    """The names and where the rows begin; comment lines, blank lines and `sep=` before them."""
+    at = row = 0
+    separator: bytes | None = None
+    comment = b""
+    while True:
+        end = data.find(b"\n", at)
+        line = bytes(data[at : end if end >= 0 else len(data)]).strip()
+        row += 1
+        after = end + 1 if end >= 0 else len(data)
+        if (found := _SEPARATOR_LINE.match(line)) is not None:
+            separator = found[1]
+        elif line.startswith(_ROSTOPIC):
+            break
+        elif line.startswith(_COMMENTS):
+            comment = line
+        elif line:
+            break
+        if end < 0:
+            raise RecordingError(path, "is no CSV table: it has no rows", "record again")
+        at = after
+    if _is_numbers(line, separator) and comment:  # as numpy writes the names
+        line, row, after = comment.lstrip(b"#%/ "), row - 1, at
+    mark = separator or _separator_of(line)
+    refuse_beyond(path, line.count(mark) + 1, TABLE_COLUMNS, "columns", _LESS)
+    names = _split(line.decode("utf-8", "replace"), mark.decode())
+    if _is_numbers(line, mark):
+        raise RecordingError(
+            path,
+            f"row {row} holds numbers where the columns' names should be",
+            "write their names in front: time_s,mag_x_gauss,...",
+        )
+    if mark != b",":
+        words = {b";": "semicolons", b"\t": "tabs", b" ": "blanks"}.get(mark, repr(mark.decode()))
+        notes.append(f"the columns are separated by {words}: read as such")
+    if mark == b" ":
+        rows = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", bytes(data[after:])))
+        data, after = bytearray(rows), 0
+    return _Text(data, names, mark.decode(), after, row + 1)
+
+
+def _separator_of(line: bytes) -> bytes:
+    best = max((b",", b";", b"\t"), key=line.count)
+    if line.count(best):
+        return best
+    return b" " if b" " in line else b","
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    return [name.strip() for name in next(csv.reader(io.StringIO(line), delimiter=separator), [])]
+
+
+def _is_numbers(line: bytes, separator: bytes | None) -> bool:
+    """Whether all cells of a line are numbers, so that it names no columns."""
+    mark = separator or _separator_of(line)
+    cells = line.split() if mark == b" " else line.split(mark)
+    try:
+        for cell in cells:
+            float(cell.replace(b",", b".") if mark == b";" else cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _drop_comments(text: _Text, notes: list[str]) -> None:
+    body = bytes(text.data[text.at :]) if any(b"\n" + c in text.data for c in _COMMENTS) else b""
+    if body and (count := len(_COMMENT_LINE.findall(body))):
+        text.data, text.at = bytearray(_COMMENT_LINE.sub(b"", body)), 0
+        notes.append(f"{count} comment lines amid the rows were left out")
+
+
+def _drop_repeated_header(text: _Text, notes: list[str]) -> None:
+    """A logger that was started again writes its names again."""
+    first = re.escape(text.names[0].encode()) if text.names else b"\0"
+    body = bytes(text.data[text.at :])
+    if not text.names[0] or not re.search(rb"(?m)^\"?" + first + rb"\"?\s*[,;\t ]", body):
+        return
+    lines = body.split(b"\n")
+    kept = [line for line in lines if _split_safe(line, text) != text.names]
+    if len(kept) < len(lines):
+        text.data, text.at = bytearray(b"\n".join(kept)), 0
+        notes.append(
+            f"the line of names comes {len(lines) - len(kept)} times more amid the rows: left out"
+        )
+
+
+def _split_safe(line: bytes, text: _Text) -> list[str]:
+    if not line[:1].strip(b"-+.0123456789 "):  # a row of numbers, which most are
+        return []
+    return _split(line.decode("utf-8", "replace"), text.separator)
+
+
+def _drop_cut_row(text: _Text, cut: bool, notes: list[str]) -> None:
+    """The last row where the file ends within it."""
+    if len(text.data) == text.at or text.data.endswith(b"\n"):
+        return
+    start = max(text.data.rfind(b"\n") + 1, text.at)
+    cells = text.data.count(text.separator.encode(), start) + 1
+    if cut or cells < len(text.names):
+        del text.data[start:]
+        notes.append("the last row is cut off: left out")
+
+
+def _parsed(path: Path, text: _Text, notes: list[str]) -> pyarrow.Table:
+    names = _as_wide_as_rows(text)
+    wrong: list[pyarrow.csv.InvalidRow] = []
+    count = 0
+
+    def left_out(row: pyarrow.csv.InvalidRow) -> str:
+        nonlocal count
+        count += 1
+        wrong[:] = wrong or [row]
+        return "skip"
+
+    if not bytes(memoryview(text.data)[text.at :]).strip():
+        return pyarrow.Table.from_arrays([pyarrow.nulls(0) for _ in names], names=names)
+    decimal = "," if text.separator != "," and _has_decimal_comma(text) else "."
+    try:
+        table = pyarrow.csv.read_csv(
+            pyarrow.BufferReader(pyarrow.py_buffer(memoryview(text.data)[text.at :])),
+            pyarrow.csv.ReadOptions(
+                use_threads=False, column_names=[str(k) for k in range(len(names))]
+            ),
+            pyarrow.csv.ParseOptions(delimiter=text.separator, invalid_row_handler=left_out),
+            pyarrow.csv.ConvertOptions(decimal_point=decimal, null_values=_MISSING),
+        )
+    except (pyarrow.ArrowInvalid, pyarrow.ArrowKeyError, UnicodeDecodeError) as error:
+        words = printable(str(error).splitlines()[0], 200)
+        raise RecordingError(path, f"is no CSV table: {words}", "repair that row") from error
+    if count:
+        row = (wrong[0].number or 1) + text.first_row - 1
+        words = f"{wrong[0].actual_columns} cells where {wrong[0].expected_columns} are named"
+        if count > max(_WRONG_FEW, _WRONG_SHARE * (table.num_rows + count)):
+            raise RecordingError(path, f"row {row} has {words} ({count} such rows)", "repair them")
+        notes.append(f"{count} rows have another number of cells: left out, first row {row}")
+    if decimal == ",":
+        notes.append("the numbers have decimal commas: read as such")
+    keep = [k for k, name in enumerate(names) if name or table.column(k).null_count < len(table)]
+    return table.select(keep).rename_columns([names[k] or f"column {k + 1}" for k in keep])
+
+
+def _as_wide_as_rows(text: _Text) -> list[str]:
+    """The names, with one more or less where each row ends in a separator and they do not."""
+    end = text.data.find(b"\n", text.at)
+    first = bytes(text.data[text.at : end if end >= 0 else len(text.data)]).rstrip(b"\r")
+    cells = len(_split(first.decode("utf-8", "replace"), text.separator)) if first else 0
+    names = list(text.names)
+    while (
+        cells > len(names)
+        and cells <= TABLE_COLUMNS
+        and not _split(first.decode("utf-8", "replace"), text.separator)[len(names)]
+    ):
+        names.append("")
+    while names and not names[-1] and 0 < cells < len(names):
+        names.pop()
+    return names
+
+
+def _has_decimal_comma(text: _Text) -> bool:
+    lines = bytes(text.data[text.at : text.at + 8192]).split(b"\n")[:20]
+    cells = [cell for line in lines for cell in line.split(text.separator.encode())]
+    return any(_DECIMAL_COMMA.match(cell) for cell in cells)

@@ -1,0 +1,173 @@
+"""The closing summary of a run and of a replay: one JSON object, and lines for a person."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ahrsd.calibration import Estimate
+from ahrsd.core.core import Core
+from ahrsd.counting import counted
+from ahrsd.events import GateResult
+from ahrsd.gates import Level, guards_a_write
+from ahrsd.report.calibration_json import (
+    HeadingErrors,
+    calibration_json,
+    heading_words,
+    why_not_converged,
+)
+from ahrsd.stream.decompensation import Compensation
+
+_TABLE_IS_RAW = (
+    "a table says nothing of registers: it was taken as raw, so the result holds on top of "
+    "whatever registers 23, 26 and 84 did to it"
+)
+_NAMES = (*(f"hard iron {a}" for a in "xyz"), *(f"gyro bias {a}" for a in "xyz"))
+_DIGITS = 6  # of times in the summary: microseconds
+
+
+def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> dict[str, object]:
+    """The contract's `ahrsd.replay/1`."""
+    counters = core.conversation.session.deframer.counters
+    facts = core.stream.facts
+    return {
+        "schema": "ahrsd.replay/1",
+        "recording": recording,
+        "bytes": counters.fed_bytes,
+        "packets": {
+            "valid": counters.valid,
+            "rejected": counters.rejected + core.undecodable,
+            "by_type": dict(core.stream.by_layout),
+        },
+        "skipped_bytes": counters.skipped_bytes,
+        "samples": facts.samples,
+        "duration_s": round(facts.duration_s, _DIGITS),
+        "rate_hz": _finite(facts.rate_hz),
+        "rate_source": facts.rate_source,
+        "gaps": [
+            {"at_s": round(gap.at_s, _DIGITS), "length_s": round(gap.length_s, _DIGITS)}
+            for gap in core.stream.gaps
+        ],
+        "device_restarts": core.stream.restarts,
+        "state": core.writeback.state.value,
+        "calibration": calibration_json(
+            recording,
+            core.calibrator.estimate,
+            core.registers,
+            samples=facts.samples,
+            gyro_is_raw=not core.stream.compensated_gyro,
+            heading=heading_errors(core),
+            warnings=said_of(core, warnings),
+            serial=serial_of(core),
+        ),
+        "decisions": core.decisions.entries,
+        "decision_sha256": core.decisions.sha256,
+    }
+
+
+def serial_of(core: Core) -> int | None:
+    """Serial number of the device that the recording is of; None where it does not say."""
+    identity = core.conversation.identity
+    return None if identity is None else identity.serial
+
+
+def said_of(core: Core, warnings: Iterable[str] = ()) -> list[str]:
+    """What a reader of the result must know: of the recording, the stream and the registers."""
+    said = [*warnings, *core.stream.warnings]
+    if not core.registers:
+        is_table = not core.stream.by_layout
+        said += [_TABLE_IS_RAW] if is_table else Compensation.unknown().warnings
+    return list(dict.fromkeys(said))
+
+
+def heading_errors(core: Core) -> HeadingErrors:
+    """Held-out heading errors of the newest evidence."""
+    evidence = core.calibrator.evidence
+    if evidence is None:
+        return HeadingErrors()
+    before, after = evidence.heldout_rms_before_deg, evidence.heldout_rms_deg
+    return HeadingErrors(_finite(before), _finite(after))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> list[str]:
+    """What a person wants to know first."""
+    counters = core.conversation.session.deframer.counters
+    facts, stream = core.stream.facts, core.stream
+    rate = f"{facts.rate_hz:.4g} Hz" if math.isfinite(facts.rate_hz) else "unknown rate"
+    source = f", {facts.rate_source}" if facts.rate_source else ""
+    lines = [
+        f"{recording}: {counted(facts.samples, 'sample')} in {facts.duration_s:.1f} s "
+        f"({rate}{source})"
+    ]
+    if counters.fed_bytes:
+        rejected = counters.rejected + core.undecodable
+        lines.append(
+            f"  messages: {counters.valid} valid, {rejected} rejected, "
+            f"{counted(counters.skipped_bytes, 'byte')} skipped"
+        )
+    gaps = stream.all_gaps
+    if gaps.count or stream.restarts:
+        lines.append(
+            f"  {counted(gaps.count, 'gap')}, {gaps.length_s:.1f} s in all; "
+            f"{counted(stream.restarts, 'restart')} of the device"
+        )
+    lines += estimate_lines(core.calibrator.estimate)
+    lines += _gate_lines(core.calibrator.gates, core.settings.level)
+    lines += [f"  warning: {text}" for text in said_of(core, warnings)]
+    lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
+    return lines
+
+
+def _gate_lines(gates: Sequence[GateResult], level: Level) -> list[str]:
+    """Gates that are shut: of a write and its save, and of one without a person where that is."""
+    guards = [gate for gate in gates if guards_a_write(gate.gate)]
+    alone = [gate for gate in gates if not guards_a_write(gate.gate)]
+    lines = _shut_lines(guards, "a write back")
+    return lines + (
+        _shut_lines(alone, "a write without approval back") if level > Level.FLASH else []
+    )
+
+
+def _shut_lines(gates: Sequence[GateResult], what: str) -> list[str]:
+    """Gates that are shut, those with the same advice together."""
+    shut: dict[str, list[str]] = {}
+    for gate in gates:
+        if not gate.ok:
+            shut.setdefault(gate.advice, []).append(gate.gate)
+    if not shut:
+        return []
+    number = sum(len(names) for names in shut.values())
+    head = f"  {number} of {len(gates)} gates {'holds' if number == 1 else 'hold'} {what}:"
+    return [head, *(f"    {', '.join(names)}: {advice}" for advice, names in shut.items())]
+
+
+def estimate_lines(estimate: Estimate | None) -> list[str]:
+    """An estimate in the units of a field engineer."""
+    if estimate is None:
+        return ["  no estimate: too few samples"]
+    numbers = np.concatenate([estimate.hard_iron_gauss, estimate.gyro_bias_rad_s]) * 1e3
+    sigmas = estimate.sigma[6:] * 1e3
+    blind = [name in estimate.observability.unobservable for name in _NAMES]
+    values = [
+        _value(number, sigma, 2 if k < 3 else 3) if not blind[k] else "not determined"
+        for k, (number, sigma) in enumerate(zip(numbers, sigmas, strict=True))
+    ]
+    late_ms = 1e3 * estimate.mag_lag_s
+    return [
+        f"  hard iron  {', '.join(values[:3])} mG",
+        f"  gyro bias  {', '.join(values[3:])} mrad/s",
+        f"  heading    {heading_words(estimate.heading_sigma_deg)}",
+        *([f"  lag        the field is {late_ms:.1f} ms late against the gyro"] if late_ms else []),
+        *(f"  {text}" for text in why_not_converged(estimate)),
+    ]
+
+
+def _value(value: float, sigma: float, digits: int) -> str:
+    """Value and sigma; never -0.00."""
+    return f"{round(value, digits) + 0.0:+.{digits}f} +- {sigma:.{digits}f}"

@@ -1,0 +1,1 @@
+"""Messages to samples: assembly, device time, rate, and undoing the device's own compensation."""

@@ -1,0 +1,188 @@
+"""Numbers for Prometheus, on 127.0.0.1 only, out of the newest status. Off by default.
+
+`METRICS` is the whole list; docs/guide/operating.md is checked against it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+from wsgiref.simple_server import WSGIServer
+
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from ahrsd.telemetry.explain import STATES
+
+Status = Mapping[str, Any]
+Samples = list[tuple[tuple[str, ...], float]]  # values of the labels, value
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One metric: name, kind, help, labels, and where its numbers come from."""
+
+    name: str
+    kind: Literal["counter", "gauge"]
+    help: str
+    labels: tuple[str, ...]
+    read: Callable[[Status], Samples]
+
+
+def _number(*path: str) -> Callable[[Status], Samples]:
+    """The number at a path; absent where there is none yet."""
+
+    def read(status: Status) -> Samples:
+        value: Any = status
+        for key in path:
+            value = None if value is None else value.get(key)
+        return [] if value is None else [((), float(value))]
+
+    return read
+
+
+def _axes(*path: str) -> Callable[[Status], Samples]:
+    def read(status: Status) -> Samples:
+        value: Any = status
+        for key in path:
+            value = None if value is None else value.get(key)
+        return [] if value is None else [((a,), float(v)) for a, v in zip("xyz", value)]
+
+    return read
+
+
+def _gates(status: Status) -> Samples:
+    return [((gate["gate"],), float(gate["ok"])) for gate in status["gates"]]
+
+
+def _states(status: Status) -> Samples:
+    now = status["write_back"]["state"]
+    return [((state,), float(state == now)) for state in STATES]
+
+
+def _locked(status: Status) -> Samples:
+    return [((), float(status["write_back"]["locked"] is not None))]
+
+
+def _capture(status: Status) -> Samples:
+    return [((), float(bool(status["capture"]["error"])))]
+
+
+METRICS: Final = (
+    Row("ahrsd_link_up", "gauge", "The port is open", (), _number("link", "open")),
+    Row("ahrsd_bytes", "counter", "Bytes from the device", (), _number("link", "bytes")),
+    Row("ahrsd_messages", "counter", "Valid messages", (), _number("stream", "messages")),
+    Row("ahrsd_rejected", "counter", "Messages refused", (), _number("stream", "rejected")),
+    Row(
+        "ahrsd_skipped_bytes",
+        "counter",
+        "Bytes that were in no message",
+        (),
+        _number("stream", "skipped_bytes"),
+    ),
+    Row("ahrsd_samples", "counter", "Samples taken", (), _number("stream", "samples")),
+    Row("ahrsd_sample_rate_hertz", "gauge", "Sample rate", (), _number("stream", "rate_hz")),
+    Row("ahrsd_gaps", "counter", "Gaps in the stream", (), _number("stream", "gaps")),
+    Row(
+        "ahrsd_device_restarts",
+        "counter",
+        "Restarts of the device",
+        (),
+        _number("stream", "restarts"),
+    ),
+    Row("ahrsd_device_errors", "counter", "VNERR reported", (), _number("stream", "faults")),
+    Row(
+        "ahrsd_heading_sigma_degrees",
+        "gauge",
+        "Heading, worst 1 sigma",
+        (),
+        _number("estimate", "heading_sigma_deg"),
+    ),
+    Row(
+        "ahrsd_converged",
+        "gauge",
+        "The estimate has converged",
+        (),
+        _number("estimate", "converged"),
+    ),
+    Row(
+        "ahrsd_hard_iron_gauss",
+        "gauge",
+        "Hard iron",
+        ("axis",),
+        _axes("estimate", "hard_iron_gauss"),
+    ),
+    Row(
+        "ahrsd_gyro_bias_radians_per_second",
+        "gauge",
+        "Gyro bias",
+        ("axis",),
+        _axes("estimate", "gyro_bias_rad_s"),
+    ),
+    Row("ahrsd_gate_open", "gauge", "1 where the gate holds nothing back", ("gate",), _gates),
+    Row("ahrsd_state", "gauge", "1 for the write-back's state", ("state",), _states),
+    Row("ahrsd_locked", "gauge", "A person locked the write-back", (), _locked),
+    Row(
+        "ahrsd_flash_writes",
+        "counter",
+        "Flash writes of this device, by its journal",
+        (),
+        _number("write_back", "flashes"),
+    ),
+    Row("ahrsd_capture_failing", "gauge", "Records are being lost", (), _capture),
+    Row(
+        "ahrsd_viewer_dropped",
+        "counter",
+        "Batches that the viewer did not take",
+        (),
+        _number("viewer", "dropped"),
+    ),
+)
+
+
+class StatusCollector(Collector):
+    """Turns the newest status into metrics when it is scraped."""
+
+    def __init__(self) -> None:
+        self.status: Status | None = None
+
+    def collect(self) -> Iterator[Metric]:
+        """One family per row that has numbers; nothing before the first status."""
+        status = self.status
+        for row in METRICS if status is not None else ():
+            family = (CounterMetricFamily if row.kind == "counter" else GaugeMetricFamily)(
+                row.name, row.help, labels=row.labels
+            )
+            for labels, value in row.read(status or {}):
+                family.add_metric(labels, value)
+            yield family
+
+
+class MetricsServer:
+    """Serves on 127.0.0.1:`port` until `close`. Raises OSError where the port is taken."""
+
+    def __init__(self, port: int) -> None:
+        self._collector = StatusCollector()
+        registry = CollectorRegistry()
+        registry.register(self._collector)
+        self._server: WSGIServer
+        self._thread: threading.Thread
+        self._server, self._thread = start_http_server(port, "127.0.0.1", registry)
+
+    @property
+    def port(self) -> int:
+        """Where it serves."""
+        return int(self._server.server_port)
+
+    def status(self, status: Status) -> None:
+        """The newest status."""
+        self._collector.status = status
+
+    def close(self) -> None:
+        """Serve no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(1.0)

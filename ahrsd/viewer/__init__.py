@@ -1,0 +1,1 @@
+"""The rerun viewer: a process of its own, fed by a bounded queue."""

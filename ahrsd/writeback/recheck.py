@@ -1,0 +1,43 @@
+"""When a device that is written or listened to is asked again who it is and what it holds.
+
+At intervals, because another program may write through the device's other port and a restart in a
+stream without device time shows nowhere else; soon after anything that makes it doubtful (a
+silence, readings or a time that jump), because another device may have the cable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+LEAST_S = 5.0  # between two that doubts ask for: a poor link must not be filled with reads
+
+
+@dataclass(slots=True)
+class Recheck:
+    """See the module. `due_s` is None while nothing is to be asked."""
+
+    interval_s: float
+    due_s: float | None = None
+    _last_s: float = float("-inf")
+
+    def begin(self, host_s: float) -> None:
+        """The device was read, or is being read."""
+        self._last_s, self.due_s = host_s, host_s + self.interval_s
+
+    def off(self) -> None:
+        """Nobody is there to be asked."""
+        self.due_s = None
+
+    def soon(self, host_s: float) -> None:
+        """Something is doubtful, or there was no answer."""
+        if self.due_s is not None:
+            self.due_s = min(self.due_s, max(host_s, self._last_s + LEAST_S))
+
+    def now(self, host_s: float) -> None:
+        """Something waits for it."""
+        if self.due_s is not None:
+            self.due_s = host_s
+
+    def is_due(self, host_s: float) -> bool:
+        """Whether to ask now."""
+        return self.due_s is not None and host_s >= self.due_s

@@ -1,0 +1,96 @@
+"""Whether the device restarted, by what it shows itself: seen in this run, or told by its time.
+
+A suspicion has the device read again at once. Only a proof confirms what is in flash: its time
+since start-up against the journal's newest record (`clocks.restarted_since`); its time that fell in
+this run, for a record of before this run; or a restart that it reported, where it tells no time.
+
+A message may have lain in a buffer, as old as its time says, so a proof by its time takes the
+earliest start-up that a second of messages shows.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from ahrsd.writeback.clocks import CLOCK_RATE, LATENCY_S, Stamp, restarted_since
+
+SETTLE_S: Final = 1.0
+
+
+class RestartWatch:
+    """Of the device that was bound last; host times are monotonic."""
+
+    def __init__(self) -> None:
+        self._serial: int | None = None
+        self._bound = False
+        self._seen: int | None = None
+        self._in_run = False  # its time fell since this run knows it
+        self._read_from_s = math.inf
+        self._first_s: float | None = None  # when its time was heard first since it was bound
+        self._newest_s = self._newest_at_s = math.nan  # its time, as last heard, and when
+        self._started_s = math.inf  # when it started up, at the latest
+
+    def seen(self, record: Stamp, now: Stamp, host_s: float, uptime_s: float | None = None) -> None:
+        """A restart was seen; a device that tells its time must show that it was after the record.
+
+        So what the device only reports (VNERR) counts where its stream has no time.
+        """
+        if uptime_s is not None:
+            self._in_run |= self._fell(uptime_s) and self._may_have_restarted(uptime_s, host_s)
+        untimed = uptime_s is None and self._first_s is None
+        if untimed or self._proves(record, now, uptime_s):
+            self._seen = self._serial
+        self._bound = False
+
+    def concluded(self) -> None:
+        """Its time has proven a restart: the device is read again, and that counts."""
+        self._seen, self._bound = self._serial, False
+
+    def lost(self) -> None:
+        """The link went away, or nobody is there to ask."""
+        self._bound = False
+
+    def bind(self, serial: int, read_from_s: float) -> bool:
+        """A device was identified and read; whether this one was seen to restart before."""
+        restarted = self._seen == serial
+        if serial != self._serial:
+            self._in_run, self._newest_s = False, math.nan
+        self._serial, self._seen, self._bound = serial, None, True
+        self._read_from_s = math.inf if restarted else read_from_s
+        self._first_s, self._started_s = None, math.inf
+        return restarted
+
+    def heard(self, uptime_s: float, host_s: float) -> str:
+        """The device's time; why its registers must be read again, empty where they need not."""
+        if not self._bound:
+            return ""
+        if first := self._first_s is None:
+            self._first_s = host_s
+        fell = self._fell(uptime_s)
+        if fell and not first:
+            return "the device restarted: its time fell"
+        self._in_run |= fell and self._may_have_restarted(uptime_s, host_s)
+        self._newest_s, self._newest_at_s = uptime_s, host_s
+        self._started_s = min(self._started_s, host_s - uptime_s)
+        stale = first and uptime_s < host_s - self._read_from_s - LATENCY_S
+        return "the device restarted since it was read" if stale else ""
+
+    def proven(self, record: Stamp, now: Stamp, host_s: float) -> bool:
+        """Whether the device's time proves a restart since this record."""
+        if not self._bound or self._first_s is None or host_s - self._first_s < SETTLE_S:
+            return False
+        return self._proves(record, now, host_s - self._started_s)
+
+    def _proves(self, record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
+        """A record of another boot of the host is older than this run."""
+        of_before = bool(now.boot_id) and record.boot_id != now.boot_id
+        return (self._in_run and of_before) or restarted_since(record, now, uptime_s)
+
+    def _fell(self, uptime_s: float) -> bool:
+        return uptime_s < self._newest_s - LATENCY_S
+
+    def _may_have_restarted(self, uptime_s: float, host_s: float) -> bool:
+        """Not where its time says that it runs for longer than since it was heard before."""
+        since_s = host_s - self._newest_at_s
+        return uptime_s <= since_s * (1.0 + CLOCK_RATE) + LATENCY_S

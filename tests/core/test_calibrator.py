@@ -1,0 +1,159 @@
+"""Samples to a judged estimate: what the estimator sees and what not, and the field's scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from streams import binary_device, emitted, inputs
+
+from ahrsd.calibration import Affine
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config
+from ahrsd.core.calibration_pipeline import Calibrator, CalibratorSettings
+from ahrsd.core.core import Core
+from ahrsd.events import Event, SamplesSeen
+from ahrsd.evidence.values import BasisFacts, HealthFacts
+from ahrsd.samples import SampleBlock
+from ahrsd.world_field import world_field
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+
+HEALTH = HealthFacts(crc_error_rate=0.0, drop_rate=0.0, saturated=0, negative_dt=0, rate_hz=40.0)
+BASIS = BasisFacts(
+    registers_read=True,
+    changed=False,
+    hsi_applied=False,
+    compensated_only=False,
+    firmware_known=True,
+)
+DEVICE = binary_device(12, {})
+
+
+@pytest.fixture(scope="module")
+def blocks() -> list[SampleBlock]:
+    """60 s of a tumbling sensor."""
+    seen: list[Event] = []
+    core = Core(core_settings(Config(), policy=WriteBackPolicy(mode=Mode.PASSIVE)))
+    for item in inputs([emitted(DEVICE, 60.0)]):
+        seen += core.handle(item)
+    return [event.block for event in seen if isinstance(event, SamplesSeen)]
+
+
+def settings(**changes: object) -> CalibratorSettings:
+    config = Config()
+    plain = CalibratorSettings(config.estimator.parameters(), config.gates.limits())
+    return replace(plain, **changes)
+
+
+def run(blocks: list[SampleBlock], **changes: object) -> Calibrator:
+    calibrator = Calibrator(settings(**changes), Affine.identity(), np.zeros(3))
+    for block in blocks:
+        calibrator.take(block)
+    return calibrator
+
+
+def test_it_finds_what_is_hidden_in_the_device(blocks):
+    estimate = run(blocks).finish()
+    assert estimate is not None
+    assert estimate.converged
+    truth = DEVICE.truth
+    assert (
+        np.abs((estimate.hard_iron_gauss - truth.hard_iron_gauss) / estimate.sigma[6:9]).max() < 4
+    )
+    assert np.abs((estimate.gyro_bias_rad_s - truth.gyro_bias_rad_s) / estimate.sigma[9:]).max() < 4
+
+
+def test_what_is_held_out_is_never_seen_by_the_estimator(blocks):
+    """Whatever is in the held-out parts changes nothing (a step would: `mismatch.online`)."""
+    plain, other = (Calibrator(settings(), Affine.identity(), np.zeros(3)) for _ in range(2))
+    held, rng = 0, np.random.default_rng(1)
+    for block in later(blocks, 3):
+        plain.take(block)
+        kept_out = all(role == "heldout" for role, _ in other.collector.parts(block))
+        held += len(block) * kept_out
+        raw = block.raw_b_gauss + 0.2 * rng.standard_normal(block.raw_b_gauss.shape)
+        other.take(replace(block, raw_b_gauss=raw) if kept_out else block)
+    assert 300 < held < 3 * 2400
+    assert plain.estimate is not None
+    assert other.estimate is not None
+    assert np.array_equal(plain.estimate.hard_iron_gauss, other.estimate.hard_iron_gauss)
+    assert np.array_equal(plain.estimate.covariance, other.estimate.covariance)
+
+
+def later(blocks: list[SampleBlock], times: int) -> list[SampleBlock]:
+    """The same minute again and again, a minute apart."""
+    return [
+        replace(block, time_s=block.time_s + 60.0 * k, host_s=block.host_s + 60.0 * k)
+        for k in range(times)
+        for block in blocks
+    ]
+
+
+def test_nothing_is_held_out_of_a_batch_and_no_step_is_lost(blocks):
+    samples = sum(len(block) for block in blocks)
+    seen: list[SampleBlock] = []
+    calibrator = Calibrator(settings(held_out=False), Affine.identity(), np.zeros(3))
+    add = calibrator.estimator.add
+
+    def spy(block: SampleBlock) -> bool:
+        seen.append(block)
+        return add(block)
+
+    calibrator.estimator.add = spy  # type: ignore[method-assign]
+    for block in blocks:
+        calibrator.take(block)
+    assert sum(len(block) for block in seen) == samples
+    assert sum(int(np.count_nonzero(np.isnan(block.dt_s))) for block in seen) == 1  # the very first
+    estimate = calibrator.finish()
+    assert estimate is not None
+    assert estimate.samples == samples
+
+
+def test_a_known_field_gives_the_scale(blocks):
+    field = world_field(37.8, -122.4, 0.0, 2025.5)
+    plain, known = run(blocks).estimate, run(blocks, world_field=field).estimate
+    assert plain is not None
+    assert known is not None
+    assert (plain.field_known, known.field_known) == (False, True)
+    assert known.field_gauss == field.total_gauss
+    factor = plain.field_gauss / field.total_gauss
+    assert known.soft_iron == pytest.approx(plain.soft_iron * factor)
+    assert known.sigma[:6] == pytest.approx(plain.sigma[:6] * factor)
+    assert known.hard_iron_gauss == pytest.approx(plain.hard_iron_gauss)
+    assert known.sigma[6:] == pytest.approx(plain.sigma[6:])
+    inside = blocks[40].raw_b_gauss
+    strength = np.linalg.norm(known.correction.apply(inside), axis=1)
+    assert strength.mean() == pytest.approx(field.total_gauss, rel=0.01)
+
+
+def test_without_an_estimate_nothing_is_judged():
+    calibrator = Calibrator(settings(), Affine.identity(), np.zeros(3))
+    assert calibrator.judged(0.0, HEALTH, BASIS) == ()
+    assert calibrator.finish() is None
+
+
+def test_it_is_judged_by_every_gate(blocks):
+    calibrator = run(blocks)
+    gates = calibrator.judged(60.0, HEALTH, BASIS)
+    assert len(gates) > 30
+    assert len({gate.gate for gate in gates}) == len(gates)
+    verdicts = {gate.gate: gate.ok for gate in gates}
+    assert verdicts["observability.converged"]
+    assert verdicts["stream_health.errors"]
+    worse = replace(HEALTH, crc_error_rate=0.5)
+    assert not {g.gate: g.ok for g in calibrator.judged(61.0, worse, BASIS)}["stream_health.errors"]
+
+
+def test_anew_has_seen_nothing_and_keeps_what_is_in_force(blocks):
+    present = Affine(np.eye(3), np.array([0.1, 0.0, 0.0]))
+    calibrator = Calibrator(settings(), present, np.array([0.01, 0.0, 0.0]))
+    for block in blocks[:100]:
+        calibrator.take(block)
+    assert calibrator.estimate is not None
+    fresh = calibrator.anew()
+    assert fresh.estimate is None
+    assert not fresh.started
+    assert fresh.present is present
+    assert fresh.present_gyro_bias_rad_s.tolist() == [0.01, 0.0, 0.0]

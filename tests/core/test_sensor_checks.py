@@ -1,0 +1,231 @@
+"""A stuck or saturated sensor, a wrong unit and a wrong sign are said; a sound sensor is not."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config
+from ahrsd.core.core import Core
+from ahrsd.core.sensor_checks import Limits, SensorChecks
+from ahrsd.events import Noted
+from ahrsd.inputs import RegistersKnown, Samples
+from ahrsd.recording.inputs_json import to_json
+from ahrsd.samples import SampleBlock
+from ahrsd.so3 import exp
+from ahrsd.telemetry.explain import explain_json, explain_lines
+from ahrsd.telemetry.lines import status_lines
+from ahrsd.telemetry.status import LinkFacts, StatusMaker
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+
+RATE_HZ = 40.0
+FIELD = np.array([0.22, 0.02, 0.42])
+IRON = np.array([[1.15, 0.05, -0.04], [0.05, 0.95, 0.03], [-0.04, 0.03, 0.9]])
+OFFSET = np.array([0.21, -0.17, 0.3])
+BIAS = np.array([0.01, -0.02, 0.015])
+
+
+def motion(kind, seconds):
+    """Rates (N, 3) of the body, rad/s."""
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    if kind == "rest":
+        return np.zeros((len(t), 3))
+    if kind == "planar":
+        return np.column_stack([0 * t, 0 * t, 0.25 + 0.1 * np.sin(0.3 * t)])
+    return np.column_stack([0.5 * np.sin(0.7 * t), 0.6 * np.cos(0.5 * t), 0.4 + 0 * t])
+
+
+def stream(kind="3D", seconds=90.0, seed=1, noise=1.0):
+    return tuple(part.copy() for part in made(kind, seconds, seed, noise))
+
+
+@cache
+def made(kind, seconds, seed, noise):
+    """time_s, raw field, raw rate: a sensor with iron and bias, and with noise."""
+    rates = motion(kind, seconds)
+    R, fields = np.eye(3), []
+    for w in rates:
+        R = R @ exp(w / RATE_HZ)
+        fields.append(IRON @ (R.T @ FIELD) + OFFSET)
+    random = np.random.default_rng(seed)
+    field = np.array(fields) + noise * 1.5e-3 * random.standard_normal((len(rates), 3))
+    gyro = rates + BIAS + noise * 1e-3 * random.standard_normal((len(rates), 3))
+    return np.arange(1, len(rates) + 1) / RATE_HZ, field, gyro
+
+
+def said(time_s, field, gyro, rows=10):
+    checks, told = SensorChecks(), []
+    for a in range(0, len(time_s), rows):
+        part = slice(a, a + rows)
+        dt_s = np.full(len(time_s[part]), 1 / RATE_HZ)
+        if a == 0:
+            dt_s[0] = np.nan
+        block = SampleBlock(
+            time_s[part], dt_s, time_s[part], field[part], gyro[part],
+            np.full((len(dt_s), 3), np.nan), gap_before=a == 0,
+        )  # fmt: skip
+        told += checks.take(block)
+    return checks, told
+
+
+@pytest.mark.parametrize("kind", ["rest", "planar", "3D"])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sound_sensor_is_not_spoken_of(kind, seed):
+    checks, told = said(*stream(kind, seed=seed))
+    assert told == []
+    assert checks.findings == {}
+
+
+def test_what_fits_is_what_is():
+    checks, _ = said(*stream())
+    g, sigma = checks._fit()
+    assert np.allclose(g, 1.0, atol=0.2)
+    assert np.all(sigma < 0.2)
+
+
+def test_a_magnetometer_that_is_stuck_while_the_vehicle_turns():
+    time_s, field, gyro = stream()
+    field[:] = field[0]
+    checks, told = said(time_s, field, gyro)
+    (text,) = checks.findings.values()
+    assert text.startswith("the magnetometer gives the same value on all axes (")
+    assert " while the vehicle turned by " in text
+    assert "it is stuck" in text
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_axis_that_is_stuck_is_named(axis):
+    time_s, field, gyro = stream()
+    field[1000:, axis] = 0.1234
+    checks, _ = said(time_s, field, gyro)
+    (text,) = checks.findings.values()
+    assert f"the magnetometer gives the same value on axis {'xyz'[axis]} (0.1234 gauss)" in text
+
+
+def test_a_saturated_axis_is_called_so():
+    time_s, field, gyro = stream()
+    field[:, 2] = 2.5
+    checks, _ = said(time_s, field, gyro)
+    (text,) = checks.findings.values()
+    assert "on axis z (2.5 gauss)" in text
+    assert "it is saturated: move it away from the magnet" in text
+
+
+def test_a_field_without_noise_at_rest():
+    time_s, field, gyro = stream("rest", noise=0.0)
+    checks, _ = said(time_s, field, gyro)
+    assert set(checks.findings) == {"magnetometer still", "gyroscope still"}
+    assert all("not even noise moves it" in text for text in checks.findings.values())
+    assert not any("turned" in text for text in checks.findings.values())
+
+
+@pytest.mark.parametrize("kind", ["planar", "3D"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gyroscope_in_degrees(kind, seed):
+    time_s, field, gyro = stream(kind, seed=seed)
+    checks, told = said(time_s, field, np.degrees(gyro))
+    (text,) = checks.findings.values()
+    assert "deg/s where rad/s are wanted" in text
+    assert text.startswith(("the field turns 5", "the field turns 6"))
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(("kind", "axes"), [("planar", "z"), ("3D", "x, y, z")])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gyroscope_of_the_wrong_sign(kind, axes, seed):
+    time_s, field, gyro = stream(kind, seed=seed)
+    checks, _ = said(time_s, field, -gyro)
+    (text,) = checks.findings.values()
+    assert text.startswith(f"the field turns against the gyroscope on axis {axes}:")
+
+
+def test_one_axis_of_the_wrong_sign_is_named():
+    time_s, field, gyro = stream()
+    checks, _ = said(time_s, field, gyro * [1, -1, 1])
+    (text,) = checks.findings.values()
+    assert text.startswith("the field turns against the gyroscope on axis y:")
+
+
+def test_what_is_over_is_said_once():
+    time_s, field, gyro = stream()
+    field[400:1200] = field[400]
+    checks, told = said(time_s, field, gyro)
+    assert checks.findings == {}
+    assert len(told) == 2
+    assert told[1] == f"over: {told[0]}" or told[1].startswith("over: the magnetometer gives")
+
+
+def test_how_the_blocks_are_cut_says_nothing_else():
+    time_s, field, gyro = stream()
+    for rows in (3, 64):
+        checks, _ = said(time_s, field, -gyro, rows)
+        assert set(checks.findings) == {"gyroscope sign"}
+
+
+def test_readings_that_no_sensor_gives_are_counted():
+    checks = SensorChecks()
+    assert checks.count(3, 480) == []  # too few to speak of
+    assert checks.count(10, 490) == [checks.findings["readings"]]
+    assert checks.findings["readings"].startswith("2 % of the newest 500 readings are of no use")
+    assert checks.count(11, 990) == ["over: " + checks_text(2, 500)]
+
+
+def checks_text(percent, count):
+    checks = SensorChecks(Limits())
+    checks.count(percent * count // 100, count - percent * count // 100)
+    return checks.findings["readings"]
+
+
+def test_a_device_that_restarts_begins_anew():
+    time_s, field, gyro = stream()
+    field[:] = field[0]
+    checks, _ = said(time_s, field, gyro)
+    assert checks.findings
+    one = slice(0, 10)
+    block = SampleBlock(
+        time_s[one],
+        np.full(10, 0.025),
+        time_s[one],
+        field[one],
+        gyro[one],
+        np.full((10, 3), np.nan),
+    )
+    (text,) = checks.take(block)
+    assert text.startswith("over: ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.degrees, "deg/s where rad/s are wanted"),
+        (np.negative, "the field turns against the gyroscope on axis x, y, z"),
+    ],
+    ids=["degrees", "negated"],
+)
+def test_status_and_explain_say_it_and_the_core_goes_on(change, words):
+    core = Core(core_settings(Config(), policy=WriteBackPolicy(mode=Mode.PASSIVE)))
+    core.handle(RegistersKnown(0, {}, "test"))
+    time_s, field, gyro = stream(seconds=40.0)
+    out = []
+    for a in range(0, len(time_s), 10):
+        part = slice(a, a + 10)
+        block = SampleBlock(
+            time_s[part], np.full(10, 1 / RATE_HZ), time_s[part], field[part], change(gyro[part]),
+            np.full((10, 3), np.nan), gap_before=a == 0,
+        )  # fmt: skip
+        out += core.handle(Samples(int(time_s[part][-1] * 1e9), block))
+    noted = [e.text for e in out if isinstance(e, Noted) and words in e.text]
+    assert len(noted) == 1
+    status = json.loads(to_json(StatusMaker(0.0).make(core, LinkFacts("x", 115200, True), 1.0)))
+    assert words in status["sensors"][0]
+    assert any(line.startswith("sensor: ") and words in line for line in status_lines(status))
+    explained = explain_json(status)
+    assert words in explained["next"]
+    assert any(words in line for line in explain_lines(explained))
+    assert core.stream.facts.samples == len(time_s)

@@ -1,0 +1,270 @@
+"""Files of others under a running daemon: FIFOs, `/dev/full`, owners, modes, control codes.
+
+At every path that the daemon opens something stands that never answers or that is no file.
+Promised: the device is heard on, a stop ends, and what is on trial is undone when the vehicle's
+word ends.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from scripted_process import PATIENCE_S, Program
+
+pytestmark = pytest.mark.timeout(400)
+STRANGER = 65534
+LOCATION = "[location]\nlatitude_deg = 48.0\nlongitude_deg = 11.0\n"
+root_only = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act for another user")
+
+
+@pytest.fixture
+def program(tmp_path):
+    """`with program(...) as running`; the options are those of `Program`."""
+
+    def make(**options: object) -> Program:
+        return Program(tmp_path, **options)
+
+    return make
+
+
+def captured(running: Program) -> int:
+    """Bytes of the captures so far."""
+    return sum(path.stat().st_size for path in running.state.rglob("*.mcap"))
+
+
+def goes_on(running: Program, bytes_more: int = 20_000) -> None:
+    """The device is heard and recorded still."""
+    before = captured(running)
+    running.until(lambda: captured(running) > before + bytes_more)
+
+
+def replace_by_fifo(path: Path) -> None:
+    """From this moment on there is a FIFO in the file's place; nobody writes into it."""
+    draft = path.with_suffix(".fifo")
+    os.mkfifo(draft)
+    draft.rename(path)
+
+
+# -- what never answers ----------------------------------------------------------------------------
+
+
+def test_a_fifo_as_interlock_from_the_start_stops_nothing(program):
+    with program() as running:
+        running.word = None
+        os.mkfifo(running.interlock)
+        running.start()
+        running.until(lambda: "OBSERVING" in running.said)
+        goes_on(running)
+        assert running.stop(30.0) == 0
+        assert running.writes(running.unit.serial) == []
+
+
+def test_a_fifo_as_interlock_in_a_trial_undoes_the_trial(program):
+    with program(trial_s=60.0) as running:
+        running.start()
+        running.until_record("RAM_VERIFIED")
+        running.word = None
+        time.sleep(0.3)
+        replace_by_fifo(running.interlock)
+        running.until_record("ROLLED_BACK", 30.0)
+        goes_on(running)
+        assert running.unit.memory.ram[23] == running.unit.memory.flash[23]
+        assert running.stop(30.0) == 0
+
+
+def test_a_word_that_ends_in_a_trial_undoes_it_whatever_else_hangs(program, tmp_path):
+    """The columns hang and an operator's word is a FIFO while the vehicle falls silent."""
+    columns = tmp_path / "columns.json"
+    columns.write_text("{}")
+    more = f'[terms]\nfile = "{columns}"\n'
+    with program(trial_s=60.0, more=more) as running:
+        running.start()
+        running.until_record("RAM_VERIFIED")
+        replace_by_fifo(columns)
+        os.mkfifo(running.state / "operator" / "1.json")
+        running.for_s(2.0)
+        running.word = None
+        running.until_record("ROLLED_BACK", 30.0)
+        assert running.stop(30.0) == 0
+
+
+@pytest.mark.parametrize("name", ["columns", "operator's word", "journal"])
+def test_a_fifo_at_any_path_of_others_stops_neither_stream_nor_stop(program, tmp_path, name):
+    columns = tmp_path / "columns.json"
+    with program(more=f'[terms]\nfile = "{columns}"\n') as running:
+        if name == "columns":
+            os.mkfifo(columns)
+        elif name == "operator's word":
+            (running.state / "operator").mkdir(mode=0o700)
+            os.mkfifo(running.state / "operator" / "1.json")
+        else:
+            os.mkfifo(running.state / f"journal-{running.unit.serial}.jsonl")
+        running.start()
+        running.until(lambda: captured(running) > 20_000)
+        goes_on(running)
+        if name == "journal":
+            assert "journal" in running.said
+            assert running.writes(running.unit.serial) == []
+        assert running.stop(30.0) == 0
+
+
+def test_dev_full_as_journal_writes_nothing_and_stops_nothing(program):
+    with program() as running:
+        (running.state / f"journal-{running.unit.serial}.jsonl").symlink_to("/dev/full")
+        running.start()
+        running.until(lambda: captured(running) > 60_000)
+        goes_on(running, 60_000)
+        assert running.stop(30.0) == 0
+        assert running.writes(running.unit.serial) == []
+
+
+@pytest.mark.parametrize("place", ["config", "capture directory", "model", "state directory"])
+def test_a_fifo_where_a_start_reads_ends_in_one_line(program, tmp_path, place):
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    more = {
+        "capture directory": f'[capture]\ndirectory = "{fifo}"\n',
+        "model": f'[terms]\nmodel = "{fifo}"\n',
+    }.get(place, "")
+    with program(more=more) as running:
+        config = running.config
+        if place == "state directory":
+            text = config.read_text().replace(str(running.state), str(fifo))
+            config.write_text(text)
+        done = subprocess.run(
+            running.command("run", "--config", fifo if place == "config" else config),
+            capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+        assert done.returncode == 2, done.stderr
+        last = done.stderr.strip().splitlines()[-1]
+        assert str(fifo) in last
+        assert "Traceback" not in done.stderr
+
+
+def test_a_bundle_follows_no_link_and_waits_for_no_fifo(program, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_text("nobody's business")
+    secret.chmod(0o600)
+    with program() as running:
+        (running.state / "captures").mkdir()
+        (running.state / "journal-1.jsonl").symlink_to(secret)
+        os.mkfifo(running.state / "journal-2.jsonl")
+        os.mkfifo(running.state / "captures" / "z.mcap")
+        archive = tmp_path / "b.tar.gz"
+        done = running.ask("bundle", "-o", archive, "--config", running.config)
+    assert done.returncode == 0, done.stderr
+    listed = subprocess.run(
+        ["tar", "xzOf", str(archive)], capture_output=True, check=True, timeout=PATIENCE_S
+    ).stdout
+    assert b"nobody's business" not in listed
+
+
+# -- who may say what ------------------------------------------------------------------------------
+
+
+@root_only
+@pytest.mark.parametrize(("owner", "mode"), [(STRANGER, 0o777), (STRANGER, 0o700), (0, 0o777)])
+def test_a_folder_of_words_that_others_may_write_is_refused_by_name(program, owner, mode):
+    with program(approval="operator") as running:
+        box = running.state / "operator"
+        box.mkdir()
+        os.chown(box, owner, owner)
+        box.chmod(mode)
+        running.start()
+        running.until(lambda: "candidate" in running.said)
+        word = f'{{"verb": "approve", "argument": "{running.candidate()}"}}'
+        (box / ".w").write_text(word)
+        os.chown(box / ".w", STRANGER, STRANGER)
+        (box / ".w").rename(box / "1.json")
+        running.for_s(6.0)
+        assert running.writes(running.unit.serial) == []
+        assert str(box) in running.said
+        running.stop()
+
+
+@pytest.mark.parametrize("umask", [0o077, 0o022, 0o777])
+def test_a_caller_with_any_umask_is_heard(program, umask):
+    with program() as running:
+        running.start()
+        running.until(lambda: "OBSERVING" in running.said)
+        assert running.operate("lock", "maintenance", umask=umask) == 0
+        running.until(lambda: "maintenance" in running.said)
+        running.stop()
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o000])
+def test_captures_are_the_owners_alone(program, umask):
+    with program(more=LOCATION) as running:
+        running.start(umask=umask)
+        running.until(lambda: captured(running) > 10_000)
+        running.stop()
+        for path in running.state.rglob("*.mcap"):
+            assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0, path
+
+
+def test_a_persons_text_forges_no_line_of_the_log(program):
+    with program() as running:
+        running.start()
+        running.until(lambda: "OBSERVING" in running.said)
+        running.operate("lock", "so\n<7>forged: all is well\x1b[2J")
+        running.until(lambda: "so" in running.said and "forged" in running.said)
+        running.stop()
+        assert not [line for line in running.said.splitlines() if line.startswith("<7>forged")]
+        assert "\x1b" not in running.said
+
+
+def test_a_folder_in_the_place_of_a_word_is_complained_about_once(program):
+    with program() as running:
+        running.start()
+        running.until(lambda: "OBSERVING" in running.said)
+        (running.state / "operator" / "folder.json").mkdir()
+        running.for_s(6.0)
+        running.stop()
+        assert len([line for line in running.said.splitlines() if "folder.json" in line]) <= 2
+
+
+# -- a word is fresh when it is seen to change -----------------------------------------------------
+
+
+def stamped(running: Program, ahead_s: float) -> None:
+    """The vehicle's last word, stamped so far in the future; nobody says anything more."""
+    running.word = None
+    time.sleep(0.3)
+    draft = running.folder / "late"
+    draft.write_text("safe")
+    at_s = time.time() + ahead_s
+    os.utime(draft, (at_s, at_s))
+    draft.rename(running.interlock)
+
+
+@pytest.mark.parametrize("ahead_s", [0.8, 8.0, 30.0])
+def test_an_old_word_with_a_stamp_ahead_is_never_fresh_again(program, ahead_s):
+    with program(approval="operator") as running:
+        running.start()
+        running.until(lambda: "candidate" in running.said)
+        stamped(running, ahead_s)
+        running.for_s(min(ahead_s, 8.0) + 3.0)
+        begun = time.monotonic()
+        running.operate("approve", running.candidate())
+        while time.monotonic() - begun < max(ahead_s - 8.0, 0.0) + 6.0 and ahead_s > 8.0:
+            running.for_s(1.0)
+        assert running.writes(running.unit.serial) == []
+        running.stop()
+
+
+def test_a_clock_that_is_set_back_revives_no_word(program):
+    with program(approval="operator") as running:
+        running.start()
+        running.until(lambda: "candidate" in running.said)
+        running.word = None
+        running.for_s(4.0)
+        running.set_wall(-4.5)
+        running.operate("approve", running.candidate())
+        running.for_s(4.0)
+        assert running.writes(running.unit.serial) == []
+        running.stop()

@@ -1,0 +1,106 @@
+"""`ahrsd run` killed after a drive and started again: its candidate comes in much less time.
+
+The device's time runs faster than the host's, so times are those of the device.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+from cabled_run import lenient_gates
+
+from ahrsd.config.loading import check_config
+from ahrsd.config.text import print_config
+from ahrsd.core.warm_start import CONFIRM_S
+from ahrsd.offline.replay import replay
+from ahrsd.recording.capture import CaptureReader
+from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.scenarios import Setup
+
+SPEED = 8.0
+PATIENCE_S = 240.0
+AGAIN_S = 7.0  # within it the device is read once more, which every used sample needs
+MOTION = (("static", 12.0), ("tumble", 5000.0))
+SCENE = Setup("rov", seed=2, output="binary", rate_hz=50, baud=115200, motion=MOTION)
+
+
+class Started:
+    """`ahrsd run`, and its capture."""
+
+    def __init__(self, folder, port):
+        self.config = check_config(
+            {
+                "state_directory": str(folder),
+                "device": {"port": str(port), "baud": 115200, "reply_timeout_s": 2.0},
+                "gates": lenient_gates(),
+                "write_back": {"recheck_s": 5.0},
+            },
+            "test",
+        )
+        self.folder, path = folder / "captures", folder / "ahrsd.toml"
+        path.write_text(print_config(self.config), encoding="utf-8")
+        before = set(self.folder.glob("*.mcap"))
+        self.log = folder / f"log{len(before)}"
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "ahrsd", "-v", "run", "--config", str(path)],
+                stdout=log,
+                stderr=log,
+            )
+        self.until(lambda: set(self.folder.glob("*.mcap")) - before)
+        (self.capture,) = set(self.folder.glob("*.mcap")) - before
+
+    @property
+    def said(self):
+        return self.log.read_text(encoding="utf-8")
+
+    def until(self, condition):
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < end, self.said
+            time.sleep(0.1)
+
+    def kill(self):
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(PATIENCE_S)
+
+    def facts(self):
+        """Facts of the capture with the device's time."""
+        found = [fact for _, fact in CaptureReader(self.capture).facts("event")]
+        return [fact for fact in found if "at_s" in fact]
+
+    def qualified_s(self):
+        return next(f["at_s"] for f in self.facts() if f.get("state") == "QUALIFIED")
+
+    def warm_s(self):
+        return next(f["at_s"] for f in self.facts() if f.get("note", "").startswith("warm start"))
+
+
+def test_a_kill_does_not_lose_the_drive(tmp_path):
+    port = tmp_path / "vn100"
+    with EmulatorProcess(SCENE, link=port, speed=SPEED, lossless=True):
+        cold = Started(tmp_path, port)
+        try:
+            cold.until(lambda: "-> QUALIFIED" in cold.said)
+            time.sleep(AGAIN_S)
+        finally:
+            cold.kill()
+        warm = Started(tmp_path, port)
+        try:
+            warm.until(lambda: "-> QUALIFIED" in warm.said)
+            time.sleep(1.0)  # what is said is on its way to the capture
+        finally:
+            warm.kill()
+    assert "no warm start: there is no earlier capture" in cold.said
+    assert f"from {cold.capture.name}" in warm.said
+    needed_s = warm.qualified_s() - warm.warm_s()
+    assert needed_s + 1.0 >= CONFIRM_S
+    assert needed_s < 0.8 * cold.qualified_s()
+    done = replay(warm.capture, warm.config)  # the samples are inputs: nothing else is needed
+    assert done.core.warm.text.endswith("this run agrees")
+    states = [entry["state"] for entry in done.core.decisions.entries if "reason" in entry]
+    assert states[-2:] == ["CANDIDATE", "QUALIFIED"]

@@ -1,0 +1,136 @@
+"""Currents of many shapes: named where they are logged, never taken for lost samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of, true_model
+
+from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.thin import thinned
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+#: gauss per ampere
+K = np.array([2e-3, -1e-3, 1.5e-3])
+#: amperes at the times (N,)
+SHAPES = {
+    "square": lambda t: 5 + 4 * np.sign(np.sin(t / 3)) + np.sin(0.7 * t),
+    "quick square": lambda t: 5 + 5 * np.sign(np.sin(1.5 * t)),
+    "ramps": lambda t: 10 * np.abs((t / 12) % 2 - 1),
+    "pulses": lambda t: 8.0 * (t % 9 < 0.7),
+    "levels": lambda t: np.random.default_rng(7).uniform(0, 10, 100)[(t / 8).astype(int)],
+}
+
+
+def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
+    covariates = {"motor_current_a": current} if logged else {}
+    return replace(
+        track, mag_b_gauss=track.mag_b_gauss + np.outer(current, K), covariates=covariates
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("seed", [6, pytest.param(11, marks=pytest.mark.slow)])
+def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
+    track = track_of(experiment("wam", seed=seed, samples=2500))
+    found = diagnose(_disturbed(track, SHAPES[shape](track.time_s), logged=True))
+    assert [one.effect for one in found.findings] == ["motor_current_field"]
+    assert not found.unexplained.detected
+    for parameter, truth in zip(found.findings[0].parameters, K, strict=True):
+        assert parameter.value == pytest.approx(truth, abs=4 * parameter.std + 2e-5)
+
+
+@pytest.mark.parametrize(
+    "shape", ["square", "quick square", "pulses", pytest.param("levels", marks=pytest.mark.slow)]
+)
+def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
+    track = track_of(experiment("wam", seed=6, samples=3000))
+    found = diagnose(_disturbed(track, 0.3 * SHAPES[shape](track.time_s), logged=False))
+    assert found.findings == ()
+    where = found.unexplained.where
+    assert where is not None
+    assert where.frame == "sensor"
+    assert where.direction is not None
+    assert np.abs(np.array(where.direction) @ K) / np.linalg.norm(K) > 0.9
+
+
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow)])
+def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None:
+    track = track_of(experiment("wam", seed=seed, samples=3000))
+    found = diagnose(_disturbed(track, SHAPES["square"](track.time_s), logged=False))
+    assert "dropped_samples" not in [one.effect for one in found.findings]
+    assert found.unexplained.detected
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
+    """Without the current turns are put right where none was lost; of 5, steps are named there."""
+    track = track_of(experiment("wam", seed=seed, samples=3000))
+    track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
+    cut = Track(
+        track.time_s[: len(keep)],
+        track.dt_s[: len(keep)],
+        track.mag_b_gauss[keep],
+        track.gyro_b_rad_s[keep],
+        None,
+        {name: values[keep] for name, values in track.covariates.items()},
+        (slice(0, len(keep)),),
+    )
+    found = {one.effect: one for one in diagnose(cut).findings}
+    assert found.keys() == {"motor_current_field", "dropped_samples"}
+    assert found["dropped_samples"].parameters[0].value == pytest.approx(0.01, abs=0.005)
+
+
+def _at_the_instant(track: Track) -> Track:
+    """A gyro that is read at the sample, not averaged over the step before it: half a step late."""
+    rate = track.gyro_b_rad_s.copy()
+    rate[:-1] = (rate[:-1] + rate[1:]) / 2
+    return replace(track, gyro_b_rad_s=rate)
+
+
+def test_a_strong_current_is_not_turned_with_the_field_and_no_eddy_is_named_for_that() -> None:
+    """0.3 G of a rover's motor, averaged in pairs at 20 Hz: nothing but the current, and a lag."""
+    track = _at_the_instant(track_of(experiment("mam", seed=3, samples=3000, rate_hz=20.0)))
+    k = np.array([7.5e-3, -3.75e-3, 7.5e-3])
+    current = 4.0 * SHAPES["square"](track.time_s)
+    field = np.outer(current, k)
+    mag = track.mag_b_gauss + field
+    found = diagnose(replace(track, mag_b_gauss=mag, covariates={"motor_current_a": current}))
+    names = [one.effect for one in found.findings]
+    assert names[0] == "motor_current_field"
+    assert set(names[1:]) <= {"gyro_integration", "mag_time_lag"}
+    values = [one.value for one in found.findings[0].parameters]
+    np.testing.assert_allclose(values, k, atol=5e-5)
+
+
+def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
+    """Two rows of a turning sensor made one: the field is turned to the second, a motor's not."""
+    made = experiment("mam", seed=3, samples=2000, rate_hz=20.0, sigma_mag=1e-12, sigma_gyro=1e-12)
+    track = track_of(made)
+    riding = np.outer(SHAPES["square"](track.time_s), [0.03, -0.02, 0.03])
+    loud = replace(track, mag_b_gauss=track.mag_b_gauss + riding)
+    model = true_model(made)
+    pure, told, untold = (
+        thinned(*given) for given in ((track, 2, model), (loud, 2, model, riding), (loud, 2, model))
+    )
+    means = riding.reshape(-1, 2, 3).mean(axis=1)
+    assert np.abs(told.mag_b_gauss - pure.mag_b_gauss - means).max() < 1e-9
+    assert np.abs(untold.mag_b_gauss - pure.mag_b_gauss - means).max() > 1e-3
+    assert told.covariates == {}
+
+
+def test_a_rover_s_field_by_its_speed_is_named() -> None:
+    """50 mG per m/s over drive motors without a logged current."""
+    track = track_of(experiment("wam", seed=6, samples=2500))
+    k = np.array([0.04, -0.02, 0.022])
+    speed = 0.2 * SHAPES["ramps"](track.time_s) * (track.time_s % 40 > 8)
+    mag = track.mag_b_gauss + np.outer(speed, k)
+    found = diagnose(replace(track, mag_b_gauss=mag, covariates={"speed_m_s": speed}))
+    assert [one.effect for one in found.findings] == ["speed_field"]
+    assert not found.unexplained.detected
+    values = [one.value for one in found.findings[0].parameters]
+    np.testing.assert_allclose(values, k, atol=1e-3)

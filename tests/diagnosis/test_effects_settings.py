@@ -1,0 +1,234 @@
+"""What the operators behind the effects do, and the settings that effects find in a recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_motion import FIELD_N, SOFT_IRON, moving
+
+from ahrsd import so3
+from ahrsd.diagnosis.effects import series
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.effects.sensor_element import aliased, lines
+
+
+def seen(context, mag):
+    """The context with other readings of the magnetometer."""
+    return replace(context, track=replace(context.track, mag_b_gauss=mag))
+
+
+def test_play_follows_at_a_distance_and_rests_when_it_turns_round():
+    values = np.array([0.0, 1.0, 2.0, 1.5, 0.5, -1.0])[:, None]
+    assert series.play(values, 0.5)[:, 0].tolist() == [0.0, 0.5, 1.5, 1.5, 1.0, -0.5]
+
+
+def test_a_low_pass_trails_a_ramp_by_its_time_constant():
+    dt_s = np.full(400, 0.05)
+    dt_s[0] = np.nan
+    ramp = 0.05 * np.arange(400)[:, None]
+    out = series.low_pass(ramp, dt_s, 0.8)
+    assert out[-1] == pytest.approx(ramp[-1] - 0.8, abs=1e-8)
+    response = 0.05 * np.arange(400) - 0.8 * (1 - np.exp(-0.05 * np.arange(400) / 0.8))
+    assert out[:, 0] == pytest.approx(response, abs=1e-12)
+
+
+def test_uneven_steps_give_the_same_filter():
+    rng = np.random.default_rng(0)
+    time_s = np.cumsum(rng.uniform(0.02, 0.08, 500))
+    dt_s = np.concatenate([[np.nan], np.diff(time_s)])
+    out = series.low_pass(time_s[:, None] - time_s[0], dt_s, 0.8)[:, 0]
+    passed = time_s - time_s[0]
+    assert out == pytest.approx(passed - 0.8 * (1 - np.exp(-passed / 0.8)), abs=1e-12)
+
+
+@pytest.mark.parametrize("tau_s", [0.013, 0.1])
+def test_a_low_pass_quicker_than_the_samples_is_exact_on_a_curve(tau_s):
+    """Straight lines between the samples would put half a step's bend into it."""
+    time_s = 0.04 * np.arange(1000)
+    dt_s = np.diff(time_s, prepend=np.nan)
+    wave = np.sin(3.0 * time_s)[:, None]
+    expected = np.imag(np.exp(3j * time_s) / (1 + 3j * tau_s))
+    out = series.low_pass_of_curves(wave, time_s, dt_s, tau_s)[:, 0]
+    straight = series.low_pass(wave, dt_s, tau_s)[:, 0]
+    inner = slice(50, -1)
+    assert np.abs(out - expected)[inner].max() < 2e-5
+    assert np.abs(straight - expected)[inner].max() > 1e-3
+    jittered = np.sort(time_s + np.random.default_rng(0).uniform(-0.01, 0.01, 1000))
+    uneven = np.sin(3.0 * jittered)[:, None]
+    steps = np.diff(jittered, prepend=np.nan)
+    out = series.low_pass_of_curves(uneven, jittered, steps, tau_s)[:, 0]
+    expected = np.imag(np.exp(3j * jittered) / (1 + 3j * tau_s))
+    assert np.abs(out - expected)[inner].max() < 1e-3
+
+
+def test_a_delay_of_whole_steps_is_an_earlier_row():
+    _, readings = moving(1, rows=200)
+    back = series.delayed_field(readings, np.full(200, 0.15))
+    assert back[3:] == pytest.approx(readings.field_b[:-3], abs=1e-12)
+    half = series.delayed_field(readings, np.full(200, 0.075))
+    between = so3.exp(readings.rate_b_rad_s[5] * 0.025) @ readings.field_b[5]
+    assert half[6] == pytest.approx(between, abs=1e-12)
+
+
+def test_a_line_is_found_where_it_is():
+    context, readings = moving(2, rows=2000)
+    rng = np.random.default_rng(0)
+    course = 1e-3 * np.sin(2 * np.pi * 3.217 * readings.time_s)[:, None] * [0.5, 0.3, -0.7]
+    mag = readings.mag_b_gauss + course + 1e-3 * rng.standard_normal((2000, 3))
+    first, second = EFFECTS["ac_interference"].settings(seen(context, mag))
+    assert first["frequency_hz"] == pytest.approx(3.217, abs=0.004)
+    assert first["searched"] == 1000
+    assert abs(second["frequency_hz"] - 3.217) > 0.01
+
+
+def test_mains_are_named_by_their_alias():
+    assert aliased(60.0, 25.0) == pytest.approx(10.0)
+    assert aliased(50.0, 25.0) == 0.0
+    assert aliased(50.0, 40.0) == pytest.approx(10.0)
+    context, readings = moving(2, rows=2000, rate_hz=40.0)
+    mag = readings.mag_b_gauss + 1e-3 * np.sin(2 * np.pi * 50.0 * readings.time_s)[:, None]
+    noisy = mag + 1e-4 * np.random.default_rng(1).standard_normal((2000, 3))
+    first, _ = EFFECTS["ac_interference"].settings(seen(context, noisy))
+    assert first["mains_hz"] == [50.0]
+
+
+@pytest.mark.parametrize(("hold", "phase"), [(2, 0), (4, 3), (5, 1)])
+def test_repeated_readings_are_counted(hold, phase):
+    context, readings = moving(3)
+    effect = EFFECTS["mag_sample_hold"]
+    setting = {"hold_samples": hold, "phase": phase}
+    rng = np.random.default_rng(0)
+    noisy = replace(
+        readings, mag_b_gauss=readings.mag_b_gauss + 1e-3 * rng.standard_normal((600, 3))
+    )
+    assert effect.settings(seen(context, noisy.mag_b_gauss)) == ()
+    held = effect.simulate(noisy, np.ones(1), setting)
+    assert effect.settings(seen(context, held.mag_b_gauss)) == (setting,)
+
+
+def test_a_passed_object_is_looked_for_where_the_field_s_size_departs():
+    context, readings = moving(4, rows=1200)
+    effect = EFFECTS["field_anomaly"]
+    value = 0.03 * FIELD_N / np.linalg.norm(FIELD_N)
+    bump = {"onset_s": 30.0, "length_s": 12.0}
+    made = effect.simulate(readings, value, bump)
+    assert np.flatnonzero(np.abs(made.mag_b_gauss - readings.mag_b_gauss).max(axis=1) > 1e-9)[
+        [0, -1]
+    ] == pytest.approx(np.searchsorted(readings.time_s, [30.05, 41.95]), abs=1)
+    found = effect.settings(seen(context, made.mag_b_gauss))
+    bumps = [s for s in found if "onset_s" in s]
+    nearest = min(abs(s["onset_s"] - 30) + abs(s["length_s"] - 12) for s in bumps)
+    assert nearest < 1.5
+    assert len([s for s in found if "place_m" in s]) >= 2
+    assert {s["searched"] for s in found} == {30}
+
+
+def test_positions_need_a_level_world():
+    context, _ = moving(5)
+    adrift = replace(context, world_levelled=False)
+    assert len(EFFECTS["field_gradient"].settings(context)) == 8
+    assert EFFECTS["field_gradient"].settings(adrift) == ()
+    assert all("onset_s" in s for s in EFFECTS["field_anomaly"].settings(adrift))
+
+
+def test_without_its_columns_an_effect_offers_nothing_and_says_what_it_needs():
+    context, readings = moving(6)
+    bare = replace(context, track=replace(context.track, covariates={}, accel_b_m_s2=None))
+    empty = replace(readings, covariates={}, accel_b_m_s2=np.full((600, 3), np.nan))
+    for name, effect in EFFECTS.items():
+        if effect.needs:
+            assert effect.settings(bare) == (), name
+            with pytest.raises(ValueError, match=f"^{name} needs "):
+                effect.example(empty, 1.0)
+        else:
+            assert effect.example(empty, 1.0)[0].shape == (len(effect.parameters),)
+
+
+def test_the_earth_turns_fifteen_degrees_an_hour():
+    _, readings = moving(8)
+    effect = EFFECTS["earth_rotation"]
+    value, setting = effect.example(readings, 1.0)
+    added = effect.simulate(readings, value, setting).gyro_b_rad_s - readings.gyro_b_rad_s
+    assert np.linalg.norm(added, axis=1) == pytest.approx(np.full(600, 7.292e-5), rel=5e-3)
+
+
+def test_a_gradient_is_a_field_without_sources():
+    """Its matrix, read off three places, is symmetric and has no trace."""
+    _, readings = moving(9, rows=3)
+    places = {
+        f"position_{name}_m": np.eye(3)[:, i] for i, name in enumerate(("north", "east", "down"))
+    }
+    at = replace(readings, covariates=places, R_nb=np.tile(np.eye(3), (3, 1, 1)))
+    setting = {"reference_m": [0.0, 0.0, 0.0], "turn_deg": 0.0}
+    value = np.array([1.0, -0.3, 0.2, 0.5, -0.7])
+    made = EFFECTS["field_gradient"].simulate(at, value, setting)
+    gradient = np.linalg.solve(SOFT_IRON, (made.mag_b_gauss - at.mag_b_gauss).T)
+    assert gradient == pytest.approx(gradient.T)
+    assert np.trace(gradient) == pytest.approx(0.0, abs=1e-12)
+    assert np.diag(gradient)[:2] == pytest.approx(value[:2])
+
+
+def test_an_object_beside_the_way_is_found_to_a_hand_s_breadth():
+    context, readings = moving(10, rows=1500)
+    effect = EFFECTS["field_anomaly"]
+    way = np.column_stack(
+        [readings.covariates[f"position_{n}_m"] for n in ("north", "east", "down")]
+    )
+    truth = {"place_m": (way[700] + [0.4, 1.2, 1.5]).tolist(), "distance_m": 2.0}
+    made = effect.simulate(readings, np.array([0.01, -0.012, 0.02]), truth)
+    rng = np.random.default_rng(0)
+    noisy = made.mag_b_gauss + 5e-4 * rng.standard_normal((1500, 3))
+    places = [s["place_m"] for s in effect.settings(seen(context, noisy)) if "place_m" in s]
+    away = np.linalg.norm(np.array(places) - truth["place_m"], axis=1)
+    assert away.min() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "found"),
+    [(40 / 3, False), (40 / 6, False), (10.0, True), (7.3, True), (19.8, True), (20.0, False)],
+)
+def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_hz, found):
+    """10 Hz is what 50 Hz looks like at 40 Hz."""
+    time_s = np.arange(4000) / 40.0
+    residual = np.random.default_rng(2).normal(size=(4000, 3))
+    residual[:, 1] += 0.5 * np.cos(2 * np.pi * frequency_hz * time_s)
+    dt_s = np.r_[np.nan, np.diff(time_s)]
+    at = [line["frequency_hz"] for line in lines(residual, np.zeros((4000, 3)), dt_s)]
+    assert len(at) == 2
+    assert any(abs(one - frequency_hz) < 2e-3 for one in at) == found
+
+
+@pytest.mark.parametrize(
+    ("turns_hz", "line_hz", "found"),
+    [(0.5, 0.5, False), (0.5, 0.53, False), (0.5, 1.3, True), (0.02, 0.5, True), (7.3, 7.3, True)],
+)
+def test_a_line_at_the_rate_at_which_the_vehicle_turns_to_and_fro_is_none(turns_hz, line_hz, found):
+    rng = np.random.default_rng(3)
+    time_s = np.arange(4000) / 40.0
+    gyro = 0.01 * rng.normal(size=(4000, 3))
+    gyro[:, 0] += np.sin(2 * np.pi * turns_hz * time_s)
+    gyro[:, 2] += np.cos(2 * np.pi * turns_hz * time_s)
+    residual = rng.normal(size=(4000, 3))
+    residual[:, 1] += 0.5 * np.cos(2 * np.pi * line_hz * time_s)
+    dt_s = np.r_[np.nan, np.diff(time_s)]
+    at = [line["frequency_hz"] for line in lines(residual, gyro, dt_s)]
+    assert any(abs(one - line_hz) < 5e-3 for one in at) == found
+
+
+def test_a_gain_with_temperature_is_of_the_field_within_the_iron_of_the_reading_or_of_the_field():
+    context, readings = moving(3, rows=120)
+    effect = EFFECTS["mag_scale_temperature"]
+    forms = {setting["of"]: setting for setting in effect.settings(context)}
+    seen = {
+        "field": readings.field_b @ readings.soft_iron.T,
+        "reading": readings.mag_b_gauss,
+        "outside": readings.field_b,
+    }
+    assert set(forms) == set(seen)
+    gain = np.array([1e-3, -2e-3, 5e-4])
+    for of, setting in forms.items():
+        warmer = readings.covariates[setting["covariate"]] - setting["reference"]
+        made = effect.simulate(readings, gain, setting).mag_b_gauss - readings.mag_b_gauss
+        assert made == pytest.approx(gain * warmer[:, None] * seen[of], abs=1e-12)

@@ -1,0 +1,73 @@
+"""Change points and departures of a course in segments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd.diagnosis.intervals import change_points, departures, explained, levels, reaching, spans
+from ahrsd.diagnosis.locate import segments
+
+
+def course_with(levels_at, noise=0.3, seed=0):
+    """G and s of 40 segments whose neighbours share information; a fixed constant is unknown."""
+    rng = np.random.default_rng(seed)
+    truth = np.zeros((40, 3))
+    for start, end, value in levels_at:
+        truth[start:end] = value
+    band = np.eye(40) + 0.3 * (np.eye(40, k=1) + np.eye(40, k=-1))
+    band -= band.sum(0)[:, None] * band.sum(0) / band.sum()
+    G = np.kron(band / noise**2, np.eye(3))
+    values, vectors = np.linalg.eigh(G)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return G, G @ truth.ravel() + root @ rng.standard_normal(120)
+
+
+def test_a_step_and_a_pulse_are_found_where_they_are():
+    G, s = course_with([(10, 40, [3.0, 0.0, -2.0])])
+    assert change_points(G, s) == [10]
+    G, s = course_with([(12, 20, [3.0, 0.0, -2.0])])
+    assert change_points(G, s) == [12, 20]
+    assert explained(G, s, [12, 20]) > 0.9 * explained(G, s, list(range(1, 40)))
+
+
+def test_noise_has_no_change_points():
+    assert [change_points(*course_with([], seed=k)) for k in range(20)] == [[]] * 20
+
+
+def test_departures_are_from_the_level_that_holds_for_longest():
+    edges = np.linspace(0.0, 400.0, 41)
+    course = np.zeros((40, 3))
+    course[12:20] = 2.0
+    level = levels(course, np.full(40, 0.1), [12, 20])
+    assert departures(edges, level, np.full(40, 0.1), course) == [(120.0, 200.0)]
+    course[20:] = 1.0
+    course[:12] = -1.0
+    level = levels(course, np.full(40, 0.1), [12, 20])
+    assert departures(edges, level, np.full(40, 0.1), course) == [(0.0, 200.0)]
+
+
+def test_neighbouring_segments_join():
+    edges = np.arange(6.0)
+    assert spans(edges, np.array([True, True, False, False, True])) == [(0.0, 2.0), (4.0, 5.0)]
+
+
+def test_segments_cover_every_sample_once():
+    time_s = np.linspace(3.0, 103.0, 1001)
+    cut = segments(time_s, 7)
+    counts = np.bincount(cut.index, minlength=7)
+    assert counts.sum() == 1001
+    assert counts.max() - counts.min() <= 1
+    assert cut.middle_s[0] == pytest.approx(3.0 + 100 / 14)
+
+
+def test_what_comes_and_goes_slowly_is_told_as_long_as_it_shows():
+    """Its levels miss the slopes; beyond them there is noise."""
+    rng = np.random.default_rng(2)
+    course = 0.1 * rng.standard_normal((40, 3))
+    course[10:18, 0] += 1.5 * np.sin(np.pi * (np.arange(8) + 0.5) / 8) ** 2 + 0.15
+    inside = np.zeros(40, bool)
+    inside[12:16] = True
+    found = np.flatnonzero(reaching(inside, course, np.full(40, 0.1)))
+    assert (found[0], found[-1]) in {(10, 17), (10, 16), (11, 17), (11, 16)}
+    assert np.array_equal(found, np.arange(found[0], found[-1] + 1))

@@ -1,0 +1,306 @@
+"""The report of a diagnosis in a real browser, and its words."""
+
+import inspect
+import re
+from dataclasses import replace
+from html import escape
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from browser import BROWSER, look_at
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from ahrsd.diagnosis import predictive
+from ahrsd.diagnosis.diagnosis import (
+    Baseline,
+    Check,
+    Contribution,
+    Cost,
+    Diagnosis,
+    Drawn,
+    Finding,
+    Heldout,
+    Limit,
+    RegimeMap,
+    Share,
+    Suspect,
+    Unexplained,
+    Validation,
+    Value,
+    Where,
+)
+from ahrsd.diagnosis.shown import MOST, shown
+from ahrsd.diagnosis.spoken import lines
+from ahrsd.diagnosis.values import NullModel
+from ahrsd.report import diagnosis_figures
+from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report
+from ahrsd.viewer.diagnosis import write_rrd
+
+
+def diagnosis(**changes):
+    """A diagnosis with one of everything; text that HTML must not take for its own."""
+    rng = np.random.default_rng(1)
+    time_s = np.arange(4000) / 12.0
+    finding = Finding(
+        effect="motor_current_field",
+        confidence=0.97,
+        alternatives=(Share("vibration_rectification", 0.02),),
+        where=Where(((120.0, 260.5),), ("y", "z"), "sensor", "motor_current_a > 6"),
+        parameters=(Value("field_per_ampere_y", 1.3e-3, 4e-5, "gauss/A"),),
+        heldout=Heldout(1.2e-3, 1.0e-3, 0.052, 0.0006),
+        cost_if_left_out=Cost(1.4e-3, 0.35),
+        separate_from="pulse the motor at rest on one heading",
+        words="the field of a motor current",
+        equation="m += k I(t)",
+        term=0,
+    )
+    left = Unexplained(
+        detected=True,
+        where=Where(((300.0, 320.0),), ("x",), "world"),
+        heldout=Heldout(1e-3, 9e-4, 0.01, 0.0),
+        size=2.5,
+        unit="mG",
+        single_source_share=0.93,
+        follows=(Suspect("<b>throttle</b>", 0.95, 1e-6),),
+    )
+    drawn = Drawn(
+        time_s=time_s,
+        before=rng.standard_normal((4000, 3)),
+        after=rng.standard_normal((4000, 3)),
+        before_gauss=rng.standard_normal((4000, 3)) * 2e-3,
+        after_gauss=rng.standard_normal((4000, 3)) * 1e-3,
+        contributions=(
+            Contribution(
+                "motor_current_field", time_s, rng.standard_normal((4000, 3)) * 1e-3, "gauss"
+            ),
+        ),
+        courses=(),
+        evidence={"motor_current_field": 2102.0, "hysteresis": 5.0, "mag_time_lag": -2.0},
+    )
+    fields = {
+        "recording": "dive <7>.csv",
+        "baseline": Baseline(1.2e-3, -9.0, 1.09),
+        "mismatch": True,
+        "p_value": 1e-9,
+        "findings": (finding,),
+        "unexplained": left,
+        "posterior_predictive": {
+            "normalised_innovation": Check(1.0934, (0.97123, 1.0311), False, True),
+            "autocorrelation": Check(255.2, (106.44, 384.1), False, True),
+        },
+        "notes": ("column a & b was left out",),
+        "model": NullModel(np.eye(3), np.array([0.1, 0.0, -0.2]), np.zeros(3), 1e-3, 5e-4),
+        "drawn": drawn,
+        "validation": Validation(0.052, 0.01, 0.0006),
+        "regime_map": (
+            RegimeMap(
+                "heading_deg", (0.0, 120.0, 240.0, 360.0), (2.0, 900.0, 1.0), (1.0, 2.0, 1.5)
+            ),
+            RegimeMap("motor_current_a", (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),
+        ),
+    }
+    return Diagnosis(**(fields | changes))
+
+
+def test_the_words_of_a_diagnosis():
+    assert lines(diagnosis())[:12] == [
+        "dive <7>.csv: MISMATCH: 1 effect left out and something that the library has no name for "
+        "(p = 1e-09)",
+        "",
+        "1. the field of a motor current (motor_current_field), 97.0% sure",
+        "   where      120.0-260.5 s; axes y z; turns with the vehicle; motor_current_a > 6",
+        "   size       field_per_ampere_y = 0.0013 +- 4e-05 gauss/A",
+        "   left out   m += k I(t)",
+        "   without it hard iron off by 1.40 mG, heading by 0.35 deg",
+        "   held out   +0.0520 nats/sample (moved in time: at most +0.0006)",
+        "   or else    vibration_rectification 2.0%",
+        "   to be sure pulse the motor at rest on one heading",
+        "",
+        "not in the library:",
+    ]
+
+
+def test_one_line_where_before_and_after_are_the_same():
+    found = diagnosis()
+    drawn = found.drawn
+    assert drawn is not None
+
+    def labels(drawn):
+        axes = diagnosis_figures.residual(found, drawn).axes[0]
+        return [line.get_label() for line in axes.get_lines()]
+
+    assert labels(drawn) == ["before", "after"]
+    alike = replace(drawn, after_gauss=drawn.before_gauss)
+    assert labels(alike) == ["nothing named"]
+
+
+def page_of(found, folder):
+    write_diagnosis_report(folder / "report.html", found, "ahrsd diagnose x")
+    return (folder / "report.html").read_text()
+
+
+def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
+    found = diagnosis()
+    drawn = found.drawn
+    worse = replace(drawn, after=10.0 * drawn.before)
+    better = replace(drawn, before=10.0 * drawn.after)
+    assert diagnosis_figures.spectrum_is_worse(worse)
+    assert not diagnosis_figures.spectrum_is_worse(better)
+    assert not diagnosis_figures.spectrum_is_worse(replace(drawn, after=drawn.before))
+    title = diagnosis_figures.spectrum(worse).axes[0].get_title(loc="left")
+    assert title == "" or "Farther" in title
+    assert "Here it is farther from 1 after than before" in page_of(
+        replace(found, drawn=worse), tmp_path
+    )
+    assert "farther from 1" not in page_of(replace(found, drawn=better), tmp_path)
+
+
+def test_a_longer_grey_bar_is_explained(tmp_path):
+    found = diagnosis()
+    assert "A longer grey bar" not in page_of(found, tmp_path)
+    longer = replace(found.drawn, evidence={"motor_current_field": 80.0, "hysteresis": 300.0})
+    assert "A longer grey bar is no contradiction" in page_of(
+        replace(found, drawn=longer), tmp_path
+    )
+
+
+@pytest.mark.parametrize(("size", "real"), [(0.5e-3, False), (5e-3, True)])
+def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
+    edges = tuple(np.linspace(0.0, 333.0, 11))
+    course = np.zeros((10, 3))
+    course[4] = size
+    drawn_course = SimpleNamespace(
+        frame="world", course=course, deviation=np.full(10, 1e-3), evidence=20.0,
+        cut=SimpleNamespace(edges_s=edges),
+    )  # fmt: skip
+    found = diagnosis()
+    found = replace(found, drawn=replace(found.drawn, courses=(drawn_course,)))
+    text = page_of(found, tmp_path)
+    assert ("It is real" in text) is real
+    assert ("at no moment does it leave the band" in text) is not real
+
+
+def test_statistics_are_named_in_words(tmp_path):
+    text = page_of(diagnosis(), tmp_path)
+    assert "how much innovations remember of those before them" in text
+    assert "mean square of the innovations, 1: as the noise says" in text
+    assert ">autocorrelation<" not in text
+
+
+def test_every_statistic_that_is_compared_has_its_words():
+    source = inspect.getsource(predictive.statistics)
+    compared = set(re.findall(r'"([a-z_]+)"[:\]]', source))
+    assert compared == set(_STATISTICS)
+
+
+@pytest.mark.parametrize("draw", ["residual", "spectrum", "contribution"])
+def test_no_legend_lies_on_the_curves(draw):
+    found = diagnosis()
+    drawn = found.drawn
+    figure = {
+        "residual": lambda: diagnosis_figures.residual(found, drawn),
+        "spectrum": lambda: diagnosis_figures.spectrum(drawn),
+        "contribution": lambda: diagnosis_figures.contribution(drawn.contributions[0]),
+    }[draw]()
+    assert [axes.get_legend() for axes in figure.axes] == [None] * len(figure.axes)
+    (legend,) = figure.legends
+    FigureCanvasAgg(figure).draw()
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
+
+
+def test_labels_of_the_map_do_not_overlap():
+    row = diagnosis().regime_map[0]
+    figure = diagnosis_figures.regime_map((row,) * 10)
+    FigureCanvasAgg(figure).draw()
+    for axes in figure.axes[:2]:
+        boxes = [label.get_window_extent() for label in axes.get_yticklabels()]
+        assert len(boxes) == 10
+        assert not any(one.overlaps(other) for one, other in pairwise(boxes))
+
+
+def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees():
+    checks = {
+        "line": Check(9.0, (1.0, 3.0), False, False),
+        "tail": Check(1.0, (0.0, 3.0), True, True),
+    }
+    none = Unexplained(False)
+    silent = diagnosis(mismatch=False, findings=(), unexplained=none, posterior_predictive=checks)
+    assert lines(silent)[0] == (
+        "dive <7>.csv: nothing was found, and yet they differ in: line (see the checks)"
+    )
+
+
+def test_nothing_found_says_what_would_have_been_seen():
+    limits = (
+        Limit("mag_time_lag", "lag", 1.5e-3, "s"),
+        Limit("gyro_scale", "scale_x", None, "1"),
+        Limit("clock_rate", "rate_error", 0.0069, "1"),
+        Limit("motor_current_field", "field_per_ampere_x", 3e-4, "gauss/A"),
+        Limit("gyro_g_sensitivity", "g_xx", 1.7453e-3, "rad/s/g"),
+    )
+    none = Unexplained(False)
+    said = lines(diagnosis(mismatch=False, findings=(), unexplained=none, sensitivity=limits))
+    assert said[0] == "dive <7>.csv: recording and model agree"
+    assert said[2] == (
+        "this recording would have shown: mag_time_lag above 1.5 ms, clock_rate above 0.69 %, "
+        "motor_current_field above 0.3 mG/A, gyro_g_sensitivity above 0.1 deg/s/g"
+    )
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+@pytest.mark.parametrize("width_px", [360, 1000])
+def test_the_page_in_a_browser(tmp_path, width_px):
+    page = tmp_path / "report.html"
+    write_diagnosis_report(page, diagnosis(), "ahrsd diagnose dive")
+    seen = look_at(page, width_px, tmp_path)
+    assert seen["errors"] == []
+    assert len(seen["pictures"]) == 6
+    assert all(complete and width > 0 for _, width, complete in seen["pictures"])
+    assert seen["window"] == width_px
+    assert seen["width"] <= width_px
+    assert seen["cut"] == []  # no table that has to be pushed aside to be read
+    assert "Unknown, here" in seen["headings"]
+    assert "<b>throttle" not in page.read_text()
+
+
+def test_the_rerun_recording_is_written(tmp_path):
+    write_rrd(tmp_path / "d.rrd", diagnosis())
+    assert (tmp_path / "d.rrd").stat().st_size > 10_000
+
+
+NAMES = ("$x_{", "a$b$c", "two\nlines\x1b[31m", "\\frac{$", "n" * 1_000_000)
+
+
+@pytest.mark.parametrize("name", NAMES, ids=lambda name: name[:6].encode().hex())
+def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
+    """No formula of matplotlib's, no control character."""
+    maps = (RegimeMap(name, (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),)
+    figure = diagnosis_figures.regime_map(maps)
+    figure.draw_without_rendering()
+    label = figure.axes[0].get_yticklabels()[0].get_text()
+    assert label.replace(r"\$", "$") == f"{shown(name)}\n0 to 27"
+    left = replace(diagnosis().unexplained, follows=(Suspect(name, 0.9, 0.01),))
+    told = lines(diagnosis(unexplained=left))
+    assert "\x1b" not in "\n".join(told)
+    assert max(map(len, told)) < 300
+
+
+def test_a_long_name_makes_no_large_page(tmp_path):
+    left = replace(diagnosis().unexplained, follows=(Suspect(NAMES[-1], 0.9, 0.01),))
+    page = tmp_path / "report.html"
+    write_diagnosis_report(page, diagnosis(unexplained=left, drawn=None), "ahrsd diagnose x")
+    text = page.read_text(encoding="utf-8")
+    assert len(text) < 20_000
+    assert escape(shown(NAMES[-1])) in text
+
+
+def test_a_long_name_keeps_its_beginning_and_its_end():
+    assert shown("motor_current_a") == "motor_current_a"
+    assert shown("a\tb") == "a\\tb"
+    long = shown("begin" + "x" * 100 + "_a")
+    assert len(long) == MOST
+    assert long.startswith("begin")
+    assert long.endswith("..." + "x" * 8 + "_a")

@@ -1,0 +1,128 @@
+"""Iron that changes before the answer is sure: no mixture, but the calibration of what is now."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ahrsd.config.loading import Config
+from ahrsd.estimator import change
+from ahrsd.estimator.online import WHOLE, Estimator
+from ahrsd.offline.calibrate import calibrate
+from ahrsd.recording.table import read_table
+from ahrsd.report.calibration_json import why_not_converged
+
+BROAD = Path(__file__).parents[3] / "shared" / "recordings" / "broad"
+STEP_GAUSS = np.array([0.05, -0.04, 0.08])
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module("bench_estimator")
+
+
+def answer(bench, run):
+    estimator = Estimator()
+    bench.feed(estimator, run.block, 500)
+    return estimator, estimator.finish()
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("mam", 3), ("lam", 4)])
+def test_a_magnet_put_on_early(bench, kind, seed):
+    run = bench.simulate(kind, "rov", seed, samples=5000)
+    field = run.block.raw_b_gauss + STEP_GAUSS * (run.block.time_s > 50.0)[:, None]
+    estimator, found = answer(bench, replace(run, block=replace(run.block, raw_b_gauss=field)))
+    assert 35.0 < estimator.restarted_s < 75.0
+    assert any("the iron changed" in text for text in found.warnings)
+    error = found.hard_iron_gauss - run.hard_iron_gauss - STEP_GAUSS
+    assert np.max(np.abs(error) / found.sigma[6:9]) < 4.5
+    assert np.linalg.norm(error) < 0.01
+
+
+@pytest.mark.parametrize("kind", ["wam", "mam", pytest.param("lam", marks=pytest.mark.slow)])
+def test_iron_that_stays_is_not_divided(bench, kind):
+    for seed in range(3):
+        run = bench.simulate(kind, "slow", seed, samples=4000)
+        assert answer(bench, run)[0].restarted_s is None
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(
+    "name",
+    ["32_disturbed_attached_magnet_1cm", "34_disturbed_attached_magnet_3cm",
+     "36_disturbed_attached_magnet_5cm"],
+)  # fmt: skip
+def test_a_magnet_that_was_taken_off_again(name):
+    found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate
+    # 0.58, 0.135 and 0.06 G from about 40 to 97 s; without it the sensor has next to none
+    assert found.converged
+    assert np.linalg.norm(found.hard_iron_gauss) < 0.02
+
+
+@pytest.mark.recordings
+def test_a_magnet_that_was_taken_off_again_in_one_go():
+    """All epochs of the recording at once: that it is settled shows only at the very end."""
+    estimator = Estimator(at_once=WHOLE)
+    for block in read_table(BROAD / "34_disturbed_attached_magnet_3cm.csv.gz").blocks():
+        estimator.add(block)
+    found = estimator.finish()
+    assert 90.0 < estimator.restarted_s < 105.0
+    assert np.linalg.norm(found.hard_iron_gauss) < 0.02
+
+
+def _with_magnet(bench, seed, samples, near):
+    """A stream with a step of the hard iron where `near` (time in s) says so."""
+    run = bench.simulate("mam", "rov", seed, samples=samples)
+    field = run.block.raw_b_gauss + STEP_GAUSS * near(run.block.time_s)[:, None]
+    return run, replace(run.block, raw_b_gauss=field)
+
+
+def test_what_the_newest_motion_contradicts_is_in_doubt_until_motion_agrees_again(bench):
+    """Epochs are 20.48 s long: the field is another in the ninth alone."""
+    run, block = _with_magnet(bench, 3, 5800, lambda t: (t > 163.8) & (t < 184.3))
+    estimator, seen = Estimator(), []
+    for start in range(0, len(block), 500):
+        if estimator.add(bench.piece(block, start, start + 500)):
+            seen.append(estimator.estimate())
+    doubted = [found.contradicted_s for found in seen]
+    assert doubted.count(None) == len(seen) - 1
+    k = next(k for k, since_s in enumerate(doubted) if since_s is not None)
+    assert doubted[k] == pytest.approx(163.88)
+    assert [found.converged for found in seen[k - 1 : k + 2]] == [True, False, True]
+    assert "contradicts what was before" in why_not_converged(seen[k])[0]
+    found = estimator.finish()
+    assert found.converged
+    assert estimator.restarted_s is None
+    error = found.hard_iron_gauss - run.hard_iron_gauss
+    assert np.max(np.abs(error) / found.sigma[6:9]) < 4.0
+
+
+def test_iron_that_changed_at_the_end_of_a_recording_is_in_doubt(bench):
+    _, block = _with_magnet(bench, 3, 5000, lambda t: t > 184.4)
+    estimator = Estimator()
+    bench.feed(estimator, block, 500)
+    found = estimator.finish()
+    assert not found.converged
+    assert found.contradicted_s == pytest.approx(184.36)
+
+
+@pytest.mark.parametrize(("step_sigma", "parted"), [(0.0, 1.0), (20.0, 5.4)])
+def test_two_parts_that_differ_amid_other_trouble_make_the_answer_as_uncertain(step_sigma, parted):
+    """24 epochs that disagree by 7 sigma among themselves anyway; the later half by more."""
+    rng = np.random.default_rng(1)
+    graph = SimpleNamespace(
+        temper=49.0, hold=0.0, c=np.r_[0.5, 0, 0, 0.5, 0, 0.5, np.zeros(3)],
+        anchor=(np.zeros(9), 1e-6 * np.eye(9)),
+    )  # fmt: skip
+    H = np.tile(np.eye(17), (24, 1, 1))
+    away = 7.0 * rng.standard_normal((24, 17))
+    away[12:, 6:9] += step_sigma / np.sqrt(3)
+    found = change.divided((H, -away), graph, 1.0, 1e3)
+    assert found.first is None
+    assert found.parted == pytest.approx(parted, rel=0.1)

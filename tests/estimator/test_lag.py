@@ -1,0 +1,117 @@
+"""A magnetometer that is late against the gyro: found, taken out; none found where none is."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.config.loading import Config
+from ahrsd.estimator import chain
+from ahrsd.estimator.lag import delayed, rates
+from ahrsd.estimator.online import Estimator
+from ahrsd.montecarlo.accuracy import nees
+from ahrsd.offline.calibrate import calibrate
+from ahrsd.report.calibration_json import why_not_converged
+
+BROAD = Path(__file__).parents[3] / "shared" / "recordings" / "broad"
+WALK = BROAD.parent / "vn100" / "walk_square_2024_sazgar.vnraw.gz"
+UPPER = np.triu_indices(3)
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module("bench_estimator")
+
+
+def late(run, lag_s):
+    """The run with its field as it was `lag_s` before; the same noise."""
+    before = np.einsum("kij,kj->ki", so3.exp(lag_s * run.rate_b_rad_s), run.field_b_gauss)
+    moved = (before - run.field_b_gauss) @ run.soft_iron
+    return replace(run, block=replace(run.block, raw_b_gauss=run.block.raw_b_gauss + moved))
+
+
+def answer(bench, run):
+    estimator = Estimator()
+    bench.feed(estimator, run.block, 500)
+    return estimator.finish()
+
+
+@pytest.mark.parametrize(("kind", "lag_s"), [("wam", 0.03), ("mam", 0.012), ("wam", -0.02)])
+def test_a_lag_is_found_and_taken_out(bench, kind, lag_s):
+    run = bench.simulate(kind, "rov", 5, samples=6000)
+    found = answer(bench, late(run, lag_s))
+    assert found.mag_lag_s == pytest.approx(lag_s, abs=4e-3)
+    error = np.r_[
+        (found.soft_iron - run.soft_iron)[UPPER],
+        found.hard_iron_gauss - run.hard_iron_gauss,
+        found.gyro_bias_rad_s - run.gyro_bias_rad_s,
+    ]
+    assert nees(error, found.covariance, run.soft_iron) < 2.5
+    assert np.linalg.norm(error[6:9]) < 1e-3
+
+
+def test_where_there_is_no_lag_none_is_found(bench):
+    lags = [
+        answer(bench, bench.simulate(kind, "rov", seed, samples=4000)).mag_lag_s
+        for kind in ("wam", "lam")
+        for seed in range(3)
+    ]
+    assert lags == [0.0] * 6
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.1])
+def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
+    run = bench.simulate("mam", "rov", 2, samples=5000)
+    gyro = run.block.gyro_b_rad_s * factor
+    found = answer(bench, replace(run, block=replace(run.block, gyro_b_rad_s=gyro)))
+    assert found.gyro_misscaled == pytest.approx(1 / factor - 1, abs=0.06)
+    assert not found.converged
+    (reason,) = why_not_converged(found)
+    assert f"{abs(found.gyro_misscaled):.0%} {'more' if factor < 1 else 'less'} than" in reason
+    right = answer(bench, run)
+    assert right.converged and right.gyro_misscaled == 0.0
+
+
+@pytest.mark.recordings
+def test_a_rate_that_lost_messages_made_wrong_is_no_answer():
+    assert calibrate(WALK, Config(), rate_hz=40.0).estimate.gyro_misscaled == 0.0
+    found = calibrate(WALK, Config(), rate_hz=30.0).estimate
+    assert not found.converged
+    assert found.gyro_misscaled == pytest.approx(30 / 40 - 1, abs=0.08)
+
+
+def test_delay_turns_what_the_field_is_the_image_of():
+    rate = np.array([0.0, 0.0, 2.0])
+    dt = np.full(5, 0.05)
+    data = chain.Data(
+        np.ones((5, 3)), rate * dt[:, None], dt, np.ones((5, 3)), np.cumsum(dt), measures_first=True
+    )
+    np.testing.assert_allclose(rates(data), np.tile(rate, (5, 1)))
+    seen = delayed(data, 0.1).seen(np.tile([1.0, 0.0, 0.0], (5, 1)))
+    # u turns against the sensor, so 0.1 s before it was 0.2 rad ahead
+    np.testing.assert_allclose(seen, np.tile([np.cos(0.2), np.sin(0.2), 0.0], (5, 1)))
+    back = delayed(delayed(data, 0.1), -0.1).seen(np.tile([1.0, 0.0, 0.0], (5, 1)))
+    np.testing.assert_allclose(back, np.tile([1.0, 0.0, 0.0], (5, 1)), atol=1e-15)
+
+
+def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
+    angle = np.array([[0.0, 0, 0], [0.1, 0, 0], [9.0, 0, 0], [0.3, 0, 0]])
+    data = chain.Data(
+        np.ones((4, 3)), angle, np.full(4, 0.1), np.ones((4, 3)), np.arange(4.0),
+        measures_first=True, linked=np.array([0.0, 1.0, 0.0, 1.0]),
+    )  # fmt: skip
+    np.testing.assert_allclose(rates(data)[:, 0], [1.0, 1.0, 3.0, 3.0])
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", ["02_undisturbed_slow_rotation_B", "21_undisturbed_fast_combined"])
+def test_the_lag_of_a_real_instrument(name):
+    found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate
+    # optics say 11.5 ms; half a step of its 286 Hz more, because its rate is sampled
+    assert 0.011 < found.mag_lag_s < 0.0155

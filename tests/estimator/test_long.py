@@ -1,0 +1,18 @@
+"""Cost and memory of a long run: the short form of `tests/benchmarks/bench_long.py`."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+
+
+def test_the_hundred_thousandth_sample_costs_what_the_first_did(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    points, error = importlib.import_module("bench_long").measure(100_000)
+    assert points[0].samples == 10_000
+    assert points[-1].samples == 100_000
+    assert min(p.cost_us for p in points[5:]) < 1.1 * points[0].cost_us  # others use the machine
+    assert points[-1].resident_mb - points[3].resident_mb < 1.0
+    assert np.linalg.norm(error) < 2e-4

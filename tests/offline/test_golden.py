@@ -1,0 +1,101 @@
+"""Golden replays: what each stream of fixtures/replays/golden.toml must give, decision by decision.
+
+Counts, gates, states and the hash of all decisions are compared everywhere, whatever the Python and
+the processor; the bytes of the streams only where the arithmetic is the one on which they were made
+(tests/support/golden.py says why).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import golden
+import pytest
+
+FACTS = tomllib.loads(golden.TABLE.read_text())
+ARITHMETIC = FACTS.pop("arithmetic")
+NUMBERS = ("hard_iron_gauss", "gyro_bias_rad_s")
+
+
+@pytest.fixture(scope="module")
+def found():
+    """`found(name)`: each stream is replayed once."""
+    cache = {}
+
+    def get(name):
+        if name not in cache:
+            cache[name] = golden.found_in(name)
+        return cache[name]
+
+    return get
+
+
+def test_there_are_thirty_and_ten_with_faults():
+    assert set(FACTS) == set(golden.STREAMS)
+    assert len(FACTS) >= 30
+    assert sum(bool(one.setup.faults) for one in golden.STREAMS.values()) >= 10
+    assert sum(path.stat().st_size for path in golden.FOLDER.iterdir()) < 2_500_000
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_a_stream_replays_to_its_facts(found, name):
+    expected, seen = FACTS[name], found(name)
+    assert set(seen) == set(expected)
+    for key in set(expected) - {"sha256", *NUMBERS}:
+        assert seen[key] == expected[key], key
+    for key in set(expected) & set(NUMBERS):
+        assert seen[key] == pytest.approx(expected[key], rel=1e-4, abs=1e-6), key
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_the_decisions_are_the_same_to_the_last_digit(found, name):
+    why = f"the hashes were made on {ARITHMETIC}, this is {golden.arithmetic()}"
+    assert found(name)["sha256"] == FACTS[name]["sha256"], why
+
+
+@pytest.mark.parametrize("kernels", ["Prescott", "Nehalem"])
+def test_the_decisions_are_the_same_with_the_kernels_of_another_processor(kernels):
+    """OpenBLAS has kernels for each; with those of an older one the last digits differ."""
+    names = ["clean_rov_binary", "clean_narrow", "fault_iron"]
+    code = "import golden, sys; print(*(golden.found_in(name)['sha256'] for name in sys.argv[1:]))"
+    folder = Path(golden.__file__).parent
+    paths = [str(folder), str(folder.parents[1]), os.environ.get("PYTHONPATH", "")]
+    ended = subprocess.run(
+        [sys.executable, "-c", code, *names],
+        env=os.environ
+        | {"OPENBLAS_CORETYPE": kernels, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert ended.stdout.split() == [FACTS[name]["sha256"] for name in names], ended.stderr
+
+
+def test_what_is_wrong_shows():
+    """The streams differ in what was done to them."""
+    assert len({facts["sha256"] for facts in FACTS.values()}) == len(FACTS)
+    assert {name for name, facts in FACTS.items() if facts["restarts"]} == {
+        "fault_reset", "fault_clock_wrap",
+    }  # fmt: skip
+    for name in ("fault_byte_drop", "fault_bit_flip", "fault_mute", "fault_clock_step"):
+        assert FACTS[name]["gaps"] > 0, name
+    for name in ("fault_bit_flip", "fault_noise_insert", "fault_byte_drop"):
+        assert FACTS[name]["rejected"] > 0, name
+    for name in ("fault_garbage", "fault_wrong_rate"):  # not even the shape of a message is left
+        assert FACTS[name]["samples"] < 0.95 * FACTS["clean_tumble_vnymr"]["samples"], name
+
+
+@pytest.mark.parametrize("name", ["clean_tumble_vnymr", "fault_garbage"])
+def test_a_stream_is_made_as_the_table_says(name, tmp_path, monkeypatch):
+    kept = golden.path_of(name).read_bytes()
+    monkeypatch.setattr(golden, "FOLDER", tmp_path)
+    golden.make_stream(name)
+    made = golden.path_of(name).read_bytes()
+    if golden.arithmetic() == ARITHMETIC:
+        assert hashlib.sha256(made).hexdigest() == hashlib.sha256(kept).hexdigest()
+    assert len(made) == pytest.approx(len(kept), rel=0.01)

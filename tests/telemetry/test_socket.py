@@ -1,0 +1,168 @@
+"""The socket beside the real daemon and an emulated device."""
+
+import json
+import socket
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+
+import pytest
+
+from ahrsd.errors import DeviceError
+from ahrsd.telemetry.client import Asked
+from ahrsd.telemetry.lines import status_lines
+from ahrsd.telemetry.public import Public
+from ahrsd.telemetry.server import MOST_CLIENTS, SocketServer
+
+
+@pytest.fixture
+def served(live, tmp_path):
+    """A live daemon at 100 Hz with its socket."""
+    daemon = live(device={"configure_stream": True, "rate_hz": 100.0})
+    public = Public(time.monotonic())
+    public.open_socket(tmp_path / "socket", tmp_path)
+    daemon.shell.listeners.append(public.event)
+    daemon.daemon._public = public
+    with daemon:
+        yield daemon, tmp_path / "socket"
+    public.close()
+
+
+def until_status(path):
+    """The first status with samples."""
+    for _ in range(100):
+        with Asked(path) as asked:
+            try:
+                status = asked.ask("status")
+            except DeviceError:
+                status = None
+        if status is not None and status["stream"]["samples"] > 100:
+            return status
+        time.sleep(0.1)
+    raise AssertionError("no samples within 10 s")
+
+
+def test_status_explain_and_watch_of_a_running_daemon(served):
+    live, path = served
+    status = until_status(path)
+    assert status["schema"] == "ahrsd.status/1"
+    assert status["device"]["serial"] == live.core.conversation.identity.serial
+    assert status["stream"]["rejected"] == 0
+    assert status["mode"] == "observe"
+    assert any(line.startswith("device: VN-100") for line in status_lines(status))
+    with Asked(path) as asked:
+        explained = asked.ask("explain")
+    assert explained["state"] == "OBSERVING"
+    assert "the mode is observe; stage or commit may write" in explained["others"]
+    assert explained["next"].startswith("drive two full circles")
+    with Asked(path) as asked:
+        records = asked.watch(("samples",))
+        assert next(records) == {"watching": ["samples"]}
+        some = [next(records) for _ in range(20)]
+    assert [one["seq"] for one in some] == list(range(some[0]["seq"], some[0]["seq"] + 20))
+    times = [t for one in some for t in one["time_s"]]
+    assert times == sorted(times)
+    assert all(len(one["raw_b_gauss"]) == len(one["time_s"]) for one in some)
+
+
+def test_readers_that_never_read_cost_no_sample(served):
+    live, path = served
+    until_status(path)
+    with ExitStack() as sleepers:
+        for _ in range(8):
+            one = sleepers.enter_context(socket.socket(socket.AF_UNIX))
+            one.connect(str(path))
+            one.sendall(b'{"ask": "watch", "of": ["status", "events", "samples"]}\n')
+        before = live.samples
+        live.until(lambda: live.samples >= before + 300, 60.0)
+        facts = replace(live.core.stream.facts)
+    assert live.core.stream.gaps == []
+    assert facts.damaged == 0
+    assert facts.samples == pytest.approx(facts.expected, abs=1.0)
+
+
+def test_a_request_that_is_none_is_answered_and_the_connection_lives(tmp_path):
+    server = SocketServer(tmp_path / "s")
+    try:
+        with Asked(tmp_path / "s") as asked:
+            asked._socket.sendall(b'nonsense\n{"ask":"status"}\n')
+            assert "not a JSON object" in asked._line()["error"]
+            assert "only just begun" in asked._line()["error"]
+            asked._socket.sendall(b"x" * 5000)
+            assert asked._line()["error"] == "a line of over 4096 bytes"
+    finally:
+        server.close()
+    assert not (tmp_path / "s").exists()
+
+
+def test_too_many_clients_and_a_second_daemon_are_refused(tmp_path):
+    path = tmp_path / "s"
+    server = SocketServer(path)
+    try:
+        assert path.stat().st_mode & 0o777 == 0o660
+        held = [Asked(path) for _ in range(MOST_CLIENTS)]
+        with pytest.raises(DeviceError, match="clients are connected already"):
+            Asked(path)
+        for one in held:
+            one.__exit__()
+        with pytest.raises(FileExistsError, match="another daemon serves here"):
+            SocketServer(path)
+    finally:
+        server.close()
+
+
+def test_what_a_dead_daemon_left_is_replaced(tmp_path):
+    path = tmp_path / "s"
+    dead = socket.socket(socket.AF_UNIX)
+    dead.bind(str(path))
+    dead.close()
+    server = SocketServer(path)
+    with Asked(path):
+        server.close()
+
+
+def test_no_daemon_is_one_clear_line(tmp_path):
+    with pytest.raises(DeviceError, match=r"no daemon answers .*; is `ahrsd run` running"):
+        Asked(tmp_path / "none")
+
+
+def test_a_slow_reader_gets_a_gap_record(tmp_path):
+    server = SocketServer(tmp_path / "s", limit_bytes=20_000)
+    try:
+        with Asked(tmp_path / "s") as asked:
+            asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
+            assert asked._line() == {"watching": ["status"]}
+            for number in range(600):
+                server.status({"number": number, "fill": "x" * 2000})
+                time.sleep(0.0005)
+            until = time.monotonic() + 5.0
+            while server.dropped == 0 and time.monotonic() < until:
+                time.sleep(0.01)
+            seqs, gaps = [], []
+            asked._socket.settimeout(1.0)
+            while not gaps:
+                record = asked._line()
+                (gaps if record["record"] == "gap" else seqs).append(record)
+                server.status({"number": -1})
+    finally:
+        server.close()
+    assert gaps[0]["first_seq"] == seqs[-1]["seq"] + 1
+    assert gaps[0]["lost"] == gaps[0]["last_seq"] - gaps[0]["first_seq"] + 1
+    assert json.dumps(seqs[0])  # plain values
+
+
+def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
+    server = SocketServer(tmp_path / "s")
+    try:
+        server.status({"number": 0})
+        for number in range(400):
+            with Asked(tmp_path / "s") as asked:
+                asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
+                assert asked._line() == {"watching": ["status"]}
+                asked._socket.sendall(b'{"ask": "status"}\n')
+                server.status({"number": number})
+            server.status({"number": number})
+        with Asked(tmp_path / "s") as asked:
+            assert asked.ask("status") == {"number": 399}
+    finally:
+        server.close()

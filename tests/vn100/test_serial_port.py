@@ -1,0 +1,373 @@
+"""The serial port on ptys: locks and holders, hang-ups, full buffers, the search for the rate."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import grp
+import os
+import stat
+import subprocess
+import sys
+import termios
+import threading
+import time
+import tty
+
+import psutil
+import pytest
+
+from drivers import serial_port
+from drivers.port_holders import holders
+from drivers.serial_port import (
+    BaudNotFound,
+    LinkLost,
+    PortAbsent,
+    PortBusy,
+    PortForbidden,
+    PortUnusable,
+    SerialPort,
+    detect_baud,
+)
+from drivers.usb import latency_timer_ms, set_latency_timer
+
+YMR = (
+    b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"
+    b"-00.000018,+00.001122,-00.000551*69\r\n"
+)  # fdcl-gwu/vectornav
+MODEL_REPLY = b"$VNRRG,01,VN-200T-CR*31\r\n"  # fdcl-gwu/vectornav
+MODEL_REQUEST = b"$VNRRG,01*72\r\n"
+
+
+class Pty:
+    """The device's end of a pty. `slave` stays open until `hang_up`, as an emulator's does."""
+
+    def __init__(self):
+        self.master, slave = os.openpty()
+        self.path = os.ttyname(slave)
+        tty.setraw(slave)
+        os.set_blocking(self.master, False)
+        self.slave = slave
+
+    def rate(self):
+        speed = termios.tcgetattr(self.master)[4]
+        return {getattr(termios, f"B{b}"): b for b in (9600, 57600, 115200, 230400, 921600)}.get(
+            speed
+        )
+
+    def received(self):
+        try:
+            return os.read(self.master, 4096)
+        except BlockingIOError:
+            return b""
+
+    def hang_up(self):
+        for descriptor in (self.slave, self.master):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+@pytest.fixture
+def pty():
+    pty = Pty()
+    yield pty
+    pty.hang_up()
+
+
+@contextlib.contextmanager
+def another_program(path, code):
+    """A process that opens `path` as `fd`, runs `code` and stays."""
+    script = (
+        "import os, sys, fcntl, termios, time\n"
+        "fd = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)\n"
+        f"{code}\nprint('ready', flush=True)\ntime.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, path], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"ready\n"
+        try:
+            yield process.pid
+        finally:
+            process.kill()
+
+
+def test_bytes_both_ways(pty):
+    with SerialPort(pty.path, 115200) as port:
+        assert port.read() == b""
+        os.write(pty.master, YMR)
+        assert port.wait_readable(1.0)
+        assert port.read() == YMR
+        port.write(b"\x00\xfa$\r\n\xff")
+        time.sleep(0.01)
+        assert pty.received() == b"\x00\xfa$\r\n\xff"
+        assert port.baud == pty.rate() == 115200
+        port.set_baud(921600)
+        assert port.baud == pty.rate() == 921600
+
+
+def test_an_absent_port_is_one_clear_line():
+    with pytest.raises(PortAbsent) as caught:
+        SerialPort("/dev/ttyVN100-absent", 115200)
+    assert "/dev/ttyVN100-absent does not exist" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_is_no_serial_port(tmp_path):
+    file = tmp_path / "recording.log"
+    file.write_bytes(YMR)
+    with pytest.raises(PortUnusable, match=r"recording\.log cannot be opened as a serial port"):
+        SerialPort(file, 115200)
+    assert file.read_bytes() == YMR
+
+
+@pytest.mark.parametrize(
+    "lock",
+    [
+        "fcntl.flock(fd, fcntl.LOCK_EX)",
+        "fcntl.ioctl(fd, termios.TIOCEXCL)",
+        "pass",
+    ],
+)
+def test_a_port_in_use_names_its_holder_and_is_left_alone(pty, lock):
+    settings = termios.tcgetattr(pty.master)
+    with another_program(pty.path, lock) as pid:
+        with pytest.raises(PortBusy) as caught:
+            SerialPort(pty.path, 9600)
+        assert [holder.pid for holder in caught.value.holders] == [pid]
+        assert f"process {pid} (" in str(caught.value)
+        assert "python" in str(caught.value)
+        assert termios.tcgetattr(pty.master) == settings
+    SerialPort(pty.path, 115200).close()
+
+
+def test_our_own_second_opening_is_refused_too(pty):
+    with SerialPort(pty.path, 115200), pytest.raises(PortBusy, match="in use"):
+        SerialPort(pty.path, 115200)
+    SerialPort(pty.path, 115200).close()
+
+
+def test_both_locks_are_held_and_released(pty):
+    def flag():
+        return fcntl.ioctl(pty.slave, 0x80045440, b"\0\0\0\0")[0]
+
+    other = os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        with SerialPort(pty.path, 115200):
+            assert flag() == 1
+            with pytest.raises(BlockingIOError):
+                fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        assert flag() == 0
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    finally:
+        os.close(other)
+
+
+def test_whoever_serves_a_pty_is_no_holder():
+    serve = (
+        "import os, time\nm, s = os.openpty()\nprint(os.ttyname(s), flush=True)\ntime.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", serve], stdout=subprocess.PIPE) as process:
+        path = process.stdout.readline().decode().strip()
+        try:
+            assert holders(path) == ()
+            SerialPort(path, 115200).close()
+        finally:
+            process.kill()
+
+
+def test_hang_up_is_link_lost_for_reading_and_writing(pty):
+    port = SerialPort(pty.path, 115200)
+    pty.hang_up()
+    assert port.wait_readable(1.0)
+    with pytest.raises(LinkLost, match=pty.path):
+        port.read()
+    with pytest.raises(LinkLost):
+        port.write(b"$VNRRG,01*72\r\n")
+    port.close()
+    port.close()
+    with pytest.raises(LinkLost):
+        port.read()
+
+
+def test_writing_waits_for_a_slow_reader_and_not_for_ever(pty):
+    data = os.urandom(100_000)
+    taken = bytearray()
+
+    def slow_reader():
+        os.set_blocking(pty.master, True)
+        while len(taken) < len(data):
+            taken.extend(os.read(pty.master, 4096))
+
+    with SerialPort(pty.path, 115200) as port:
+        reader = threading.Thread(target=slow_reader)
+        reader.start()
+        port.write(data, timeout_s=20.0)
+        reader.join(20.0)
+        assert bytes(taken) == data
+        begin_s = time.monotonic()
+        with pytest.raises(LinkLost, match="of 200000 bytes"):
+            port.write(bytes(200_000), timeout_s=0.2)
+        assert 0.15 < time.monotonic() - begin_s < 60.0
+
+
+def test_opening_and_losing_a_port_leaks_nothing():
+    def cycle():
+        pty = Pty()
+        port = SerialPort(pty.path, 115200)
+        pty.hang_up()
+        with pytest.raises(LinkLost):
+            while True:
+                port.wait_readable(1.0)
+                port.read()
+        port.close()
+
+    process = psutil.Process()
+    cycle()
+    before = process.num_fds(), process.num_threads()
+    for _ in range(30):
+        cycle()
+    assert (process.num_fds(), process.num_threads()) == before
+
+
+class Device(threading.Thread):
+    """Talks at one rate; at any other the line carries garbage. Answers the model request."""
+
+    def __init__(self, pty, rate, *, streams=True, answers=True, garbage=b"\xe0\x8c\xfa\x7f\x03"):
+        super().__init__(daemon=True)
+        self.pty, self.right, self.streams, self.answers = pty, rate, streams, answers
+        self.garbage, self.heard, self.stop = garbage, b"", threading.Event()
+
+    def run(self):
+        while not self.stop.wait(0.01):
+            right = self.pty.rate() == self.right
+            self.heard += self.pty.received()
+            answer = b""
+            if right and self.answers and MODEL_REQUEST in self.heard:
+                answer, self.heard = MODEL_REPLY, b""
+            stream = (YMR if right else self.garbage * 20) if self.streams else b""
+            with contextlib.suppress(BlockingIOError):
+                os.write(self.pty.master, answer + stream)
+
+
+@contextlib.contextmanager
+def device(pty, rate, **options):
+    thread = Device(pty, rate, **options)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        thread.stop.set()
+        thread.join()
+
+
+def test_the_last_good_rate_is_tried_first(pty):
+    with device(pty, 230400) as talking:
+        found = detect_baud(pty.path, last_good=230400, configured=57600)
+    assert found.baud == 230400
+    assert found.why == "heard at 230400 baud, the last good rate"
+    assert [heard.baud for heard in found.tried] == [230400]
+    assert talking.heard == b""
+
+
+def test_a_wrong_configured_rate_is_found_by_listening_alone(pty):
+    with device(pty, 921600) as talking:
+        found = detect_baud(pty.path, configured=57600, may_query=True)
+    assert found.baud == 921600
+    assert [heard.baud for heard in found.tried] == [57600, 115200, 921600]
+    assert all(heard.received > 100 for heard in found.tried)
+    assert [heard.messages > 0 for heard in found.tried] == [False, False, True]
+    assert talking.heard == b""
+
+
+def test_a_quiet_device_is_asked_only_where_that_is_allowed(pty):
+    with device(pty, 57600, streams=False) as talking:
+        with pytest.raises(BaudNotFound) as caught:
+            detect_baud(pty.path, 57600, listen_s=0.03)
+        assert caught.value.silent
+        assert "57600: silence" in str(caught.value)
+        assert talking.heard == b""
+        found = detect_baud(pty.path, 115200, 57600, may_query=True)
+    assert found.baud == 57600
+    assert found.why == "an answer came at 57600 baud, the configured rate"
+
+
+def test_garbage_at_every_rate_is_told_from_silence(pty):
+    with device(pty, 0) as talking, pytest.raises(BaudNotFound) as caught:
+        detect_baud(pty.path, listen_s=0.05)
+    assert not caught.value.silent
+    assert len(caught.value.tried) == 9
+    assert "bytes arrive but no message" in str(caught.value)
+    assert talking.heard == b""
+
+
+def test_a_rate_that_the_adapter_cannot_do_is_passed_over(pty, monkeypatch):
+    real = SerialPort.set_baud
+
+    def cannot(port, baud):
+        if baud == 115200:
+            raise PortUnusable("no 115200")
+        real(port, baud)
+
+    monkeypatch.setattr(SerialPort, "set_baud", cannot)
+    with device(pty, 921600):
+        found = detect_baud(pty.path, listen_s=0.2)
+    assert [heard.baud for heard in found.tried] == [921600]
+
+
+def test_the_latency_timer_is_read_and_set_where_allowed(tmp_path):
+    folder = tmp_path / "class" / "tty" / "ttyUSB7" / "device"
+    folder.mkdir(parents=True)
+    (folder / "latency_timer").write_text("16\n")
+    assert latency_timer_ms("/dev/ttyUSB7", tmp_path) == 16
+    assert set_latency_timer("/dev/ttyUSB7", 1, tmp_path) == 1
+    assert (folder / "latency_timer").read_text() == "1\n"
+    assert latency_timer_ms("/dev/ttyUSB8", tmp_path) is None
+    assert set_latency_timer("/dev/ttyUSB8", 1, tmp_path) is None
+    with pytest.raises(ValueError, match="latency timer is 1"):
+        set_latency_timer("/dev/ttyUSB7", 0, tmp_path)
+    (folder / "latency_timer").write_text("soon\n")
+    assert latency_timer_ms("/dev/ttyUSB7", tmp_path) is None
+
+
+def test_a_pty_has_no_latency_timer(pty):
+    assert latency_timer_ms(pty.path) is None
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes device nodes")
+def test_a_pty_of_the_same_number_elsewhere_is_no_holder(tmp_path):
+    """A container counts its ptys from 0 as well: what is open there is another device."""
+    master, slave = os.openpty()
+    try:
+        path = os.ttyname(slave)
+        os.mknod(tmp_path / "elsewhere", stat.S_IFCHR | 0o600, os.fstat(slave).st_rdev)
+        for pid, node in (("7", path), ("8", str(tmp_path / "elsewhere"))):
+            (tmp_path / "proc" / pid / "fd").mkdir(parents=True)
+            (tmp_path / "proc" / pid / "fd" / "3").symlink_to(node)
+            (tmp_path / "proc" / pid / "cmdline").write_bytes(b"minicom\0")
+        assert [holder.pid for holder in holders(path, tmp_path / "proc")] == [7]
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("mode", "member", "advice"),
+    [
+        (0o660, False, "join its group: sudo usermod -aG dialout ada, then log in again"),
+        (0o660, True, "you are in its group dialout since you logged in: log in again"),
+        (0o600, False, "no group may open it: give it to one by a udev rule"),
+    ],
+)
+def test_no_permission_names_the_group_to_join(monkeypatch, tmp_path, mode, member, advice):
+    port = tmp_path / "ttyUSB0"
+    port.write_bytes(b"")
+    port.chmod(mode)
+    group = grp.struct_group(("dialout", "x", 20, ["ada"] if member else []))
+    status = os.stat_result((0o020000 | mode, 0, 0, 1, 0, 20, 0, 0, 0, 0))
+    monkeypatch.setattr(serial_port.grp, "getgrgid", lambda _: group)
+    monkeypatch.setattr(serial_port.os, "getgroups", lambda: [1000])
+    monkeypatch.setattr(serial_port, "_user", lambda: "ada")
+    monkeypatch.setattr(serial_port.Path, "stat", lambda _: status)
+    error = serial_port._why(str(port), PermissionError(errno.EACCES, "no"))
+    assert isinstance(error, PortForbidden)
+    assert str(error) == f"{port}: no permission; {advice}"

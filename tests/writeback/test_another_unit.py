@@ -1,0 +1,141 @@
+"""Another unit takes over the cable: what was judged of one device never reaches another.
+
+Judged by the units' own records (`cabled_units`), which share nothing with the project.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cabled_run import FIRST, SPARE, CabledRun, two_units
+
+from ahrsd.inputs import Operator
+
+STREAMS = pytest.mark.parametrize("binary", [False, True], ids=["VNIMU", "packets"])
+
+
+def untouched(run: CabledRun) -> None:
+    """The spare unit is as it left the factory, and both numbers were told."""
+    spare = run.cable.units[SPARE]
+    assert spare.writes == []
+    assert spare.saves == []
+    assert run.told(str(SPARE), str(FIRST)), run.notes
+
+
+@STREAMS
+def test_the_whole_way_on_one_unit(binary):
+    run = CabledRun(two_units(binary=binary))
+    unit = run.cable.unit
+    run.proven()
+    assert unit.held("flash") == ("1,0,0,0,1,0,0,0,1,0,0,0", "1,0,0,0,1,0,0,0,1,0,0,0")
+    run.park()
+    assert run.state == "COMMITTED", (run.notes, run.core.writeback.holds())
+    assert unit.held("flash") == unit.held()
+    assert unit.held()[0].endswith(",0.05,-0.03,0.04")
+    assert [n for n, _ in unit.writes] == [23, 84]
+    by = {r["kind"]: r["facts"].get("serial") for r in run.journal[FIRST]}
+    assert by["RAM_VERIFIED"] == by["FLASH_ACKED"] == FIRST
+
+
+@STREAMS
+@pytest.mark.parametrize("bound", [None, FIRST])
+def test_before_the_approval(binary, bound):
+    run = CabledRun(two_units(binary=binary), serial=bound)
+    assert run.until("QUALIFIED")
+    wanted = run.core.writeback.proposal.id
+    run.cable.swap(SPARE)
+    run.run(2.2)
+    run.feed(Operator(run.now_ns, "approve", wanted))
+    run.run(20.0)
+    untouched(run)
+    assert run.cable.units[FIRST].writes == []
+    assert run.kinds(SPARE) == []
+    assert run.told("another device", str(SPARE), str(FIRST), "begins anew")
+
+
+@pytest.mark.parametrize(("binary", "silent_s"), [(False, 0.6), (True, 2.0)])
+@pytest.mark.parametrize("at", range(1, 57, 4))
+def test_at_every_command_of_the_write(binary, at, silent_s):
+    """The cable goes at the n-th command after the approval."""
+    run = CabledRun(two_units(binary=binary))
+    first, heard = run.cable.unit, []
+    assert run.until("QUALIFIED")
+
+    def pull(line: str) -> None:
+        heard.append(line)
+        if len(heard) == at:
+            run.cable.swap(SPARE, silent_s)
+
+    first.before = pull
+    run.approve()
+    run.run(25.0)
+    assert len(heard) >= at
+    untouched(run)
+    assert run.journal.get(SPARE, []) == []
+    assert {r["facts"].get("serial", FIRST) for r in run.journal[FIRST]} == {FIRST}
+    assert first.saves == []
+
+
+@STREAMS
+@pytest.mark.parametrize("when", ["trial", "proven"])
+def test_while_the_values_are_on_trial_or_proven(binary, when):
+    run = CabledRun(two_units(binary=binary))
+    if when == "trial":
+        run.approve()
+        assert run.until("TRIAL")
+    else:
+        run.proven()
+    run.cable.swap(SPARE)
+    run.run(10.0)
+    run.park()
+    untouched(run)
+    assert run.cable.units[FIRST].saves == []
+    run.cable.swap(FIRST)
+    run.run(15.0)
+    # it restarted and has its old values; a stream without the device's time does not prove that
+    assert run.kinds()[-1] in ("LOST", "REVERTED", "ROLLED_BACK")
+    assert len(run.cable.units[FIRST].writes) == 2
+
+
+@STREAMS
+@pytest.mark.parametrize("at", range(1, 36, 5))
+def test_at_every_command_of_the_save(binary, at):
+    run = CabledRun(two_units(binary=binary))
+    run.proven()
+    first, heard = run.cable.unit, []
+
+    def pull(line: str) -> None:
+        if run.state == "SAVING":
+            heard.append(line)
+            if len(heard) == at:
+                run.cable.swap(SPARE)
+
+    first.before = pull
+    run.park(30.0)
+    assert len(heard) >= at
+    untouched(run)
+    assert first.held("flash") in ((first.held()), ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2)
+
+
+@STREAMS
+@pytest.mark.parametrize("at", range(1, 22, 4))
+def test_a_rollback_writes_nothing_into_another_unit(binary, at):
+    run = CabledRun(two_units(binary=binary))
+    run.approve()
+    assert run.until("TRIAL")
+    first, spare, heard = run.cable.unit, run.cable.units[SPARE], []
+    for number, text in ((23, "1.1,0,0,0,1,0,0,0,1,0.2,0,0"), (84, "1,0,0,0,1,0,0,0,1,0.01,0,0")):
+        spare.flash[number] = text  # its own calibration
+    spare.ram = dict(spare.flash)
+
+    def pull(line: str) -> None:
+        heard.append(line)
+        if len(heard) == at:
+            run.cable.swap(SPARE, 0.6)
+
+    first.before = pull
+    run.feed(Operator(run.now_ns, "rollback"))
+    run.run(15.0)
+    assert len(heard) >= at
+    untouched(run)
+    assert np.allclose(float(spare.held()[0].split(",")[9]), 0.2)

@@ -1,0 +1,74 @@
+"""Registers that somebody else changed: what was un-mapped through the old ones proves nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planted_calibrator import PlantedCalibrator
+from virtual_run import VirtualRun
+
+from ahrsd.calibration import Estimate, Observability
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import Config
+from ahrsd.core.device_record import Rollcall
+from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.policy import WriteBackPolicy
+from drivers.vn100.emulator.scenarios import Setup, build
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+OTHER = (*IDENTITY[:9], 0.05, 0.0, 0.0)
+
+
+def estimate() -> Estimate:
+    return Estimate(
+        np.diag([1.1, 1.0, 1 / 1.1]), np.array([0.03, 0.04, -0.02]), np.zeros(3),
+        0.48, False, np.eye(12) * 1e-6, 1e-3, 1e-3, 1.0, 0.1,
+        Observability(np.full(12, 0.01), (), 10.0), 10_000, 300.0, True,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def observing() -> VirtualRun:
+    """A run that would write what its calibrator says, as soon as it says it."""
+    policy = WriteBackPolicy(
+        mode=Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=180.0
+    )
+    device = build(Setup("rov", seed=3, output="imu", rate_hz=50))
+    run = VirtualRun(device, core_settings(Config(), policy=policy), step_s=0.1)
+    assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 10.0), run.notes
+    run.run(3.0)
+    return run
+
+
+def test_the_check_before_a_write_finds_it_and_the_calibration_begins_anew(observing):
+    run = observing
+    run.emulator.memory.ram[23, 0] = OTHER
+    run.emulator.sensor.changed()
+    planted = PlantedCalibrator(run.core.calibrator, estimate())
+    run.core.calibrator = planted
+    assert run.until(lambda: run.core.calibrator is not planted, 20.0), run.states
+    assert ("warning", "somebody changed registers [23]: calibrated anew") in run.notes
+    assert run.writes == 0
+    assert run.core.registers[23] == pytest.approx(OTHER)
+    run.run(3.0)
+    assert run.core.calibrator.started
+
+
+def test_a_restart_of_the_device_explains_what_changed(observing):
+    run = observing
+    before = run.core.calibrator
+    run.emulator.memory.ram[23, 0] = OTHER
+    run.emulator.restart(run.now_s)
+    run.run(10.0)
+    assert run.core.calibrator is before
+    assert not [text for _, text in run.notes if "somebody" in text]
+
+
+def test_what_differs_only_as_the_device_prints_it_is_the_same():
+    roll = Rollcall()
+    written = (1.0569499731063843, *IDENTITY[1:])
+    printed = (1.05695, *IDENTITY[1:])
+    assert roll.registers({23: written}, {}, 1) == []
+    assert roll.registers({23: printed, 84: IDENTITY}, {23: written}, 1) == []
+    assert roll.registers({23: OTHER}, {23: printed}, 1) == [23]
+    assert roll.registers({23: IDENTITY}, {23: OTHER}, 2) == []  # the link was lost meanwhile

@@ -1,0 +1,130 @@
+"""A trial tells right registers from wrong ones by a statistic of its own noise, with a margin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.calibration import Affine
+from ahrsd.samples import SampleBlock
+from ahrsd.writeback.leftover_error import Leftover, LeftoverError
+from ahrsd.writeback.policy import TrialPolicy
+from ahrsd.writeback.trial import Finding, Trial, TrialMetrics
+from ahrsd.writeback.trial_metrics import LiveTrial
+
+FIELD_N = np.array([0.24, 0.0, 0.42])
+TRUE = Affine(np.diag([1.05, 1.0, 0.95]), np.array([0.05, -0.03, 0.02]))
+OLD = Affine.identity()
+NOISES = (0.0005, 0.002, 0.005, 0.01)  # gauss, each axis: 0.1 to 2 % of the field
+SEEDS = range(6)
+
+
+def lived(seed: int, noise_gauss: float, motion: str, *, places: bool = False) -> SampleBlock:
+    """Four minutes at 10 Hz: level circles, or a tumble; with places whose fields differ by 2 %."""
+    draw = np.random.default_rng(seed)
+    time_s = 0.1 * np.arange(2400)
+    yaw = 0.35 * time_s + draw.uniform(0, 6)
+    tilt = (0.1 if motion == "level" else 0.8) * np.column_stack(
+        [np.sin(0.9 * time_s + draw.uniform(0, 6)), np.sin(0.6 * time_s + draw.uniform(0, 6))]
+    )
+    R_nb = so3.exp(np.column_stack([0 * yaw, 0 * yaw, yaw])) @ so3.exp(
+        np.column_stack([tilt, 0 * yaw])
+    )
+    strength = np.ones(len(time_s))
+    if places:  # another place for each half circle, so that heading and place go together
+        strength += 0.02 * np.sign(np.sin(yaw)) * (np.floor(time_s / 30.0) % 2)
+    true = strength[:, None] * np.einsum("kji,j->ki", R_nb, FIELD_N)
+    raw = true @ np.linalg.inv(TRUE.matrix).T + TRUE.offset
+    raw += noise_gauss * draw.normal(size=raw.shape)
+    # some noise is slow: passing steel, the vehicle's own currents
+    slow = np.convolve(draw.normal(size=len(time_s) + 19), np.ones(20) / np.sqrt(20), "valid")
+    raw += 0.5 * noise_gauss * slow[:, None] * draw.normal(size=3)
+    accel = np.einsum("kji,j->ki", R_nb, np.array([0.0, 0.0, -9.81]))
+    dt_s = np.full(len(time_s), 0.1)
+    gyro = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:]) / 0.1
+    return SampleBlock(time_s, dt_s, time_s, raw, np.vstack([gyro[:1], gyro]), accel)
+
+
+def judged(written: Affine, block: SampleBlock) -> tuple[float, list[Finding]]:
+    """Sigmas at the end, and every finding on the way."""
+    policy = TrialPolicy(duration_s=1e9, turns=1e9)
+    limit, trial = 0.01 * policy.max_wrong_percent, Trial(policy, 180.0)
+    error, findings, left = LeftoverError(), [], Leftover()
+    for k, (time_s, field) in enumerate(zip(block.time_s, block.raw_b_gauss, strict=True)):
+        error.add(float(time_s), written.apply(field[None])[0])
+        if k % 20 == 19:
+            left = error.leftover(limit)
+            figures = {"wrong": left.share, "wrong_sigmas": left.sigmas}
+            findings.append(trial.judge(TrialMetrics(time_s, 9.0, 0.01, 0.02, 0.01, **figures))[0])
+    return left.sigmas, findings
+
+
+def test_the_live_trial_says_it():
+    block = lived(3, 0.002, "tumble")
+    off = Affine(TRUE.matrix, TRUE.offset + np.array([0.02, 0.015, 0.0]))
+    for written, wrong in ((TRUE, False), (off, True)):
+        live = LiveTrial(written, OLD, np.zeros(3))
+        for at in range(0, len(block), 20):
+            names = ("time_s", "dt_s", "host_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2")
+            metrics = live.take(SampleBlock(*(getattr(block, n)[at : at + 20] for n in names)))
+        assert (metrics.wrong > 0.01) is wrong
+        assert (metrics.wrong_sigmas > 6.0) is wrong
+        assert metrics.old_wrong > 0.03
+
+
+@pytest.mark.parametrize("motion", ["level", "tumble"])
+@pytest.mark.parametrize("noise_gauss", NOISES)
+def test_right_and_wrong_are_far_apart_at_every_level_of_noise(noise_gauss, motion):
+    """25 mG, some 6 deg of heading, or six times a larger noise; the limit is 2.5."""
+    right, wrong = [], []
+    for seed in SEEDS:
+        block = lived(seed, noise_gauss, motion)
+        off = np.random.default_rng(1000 + seed).normal(size=3) * [1, 1, 0]  # what heading needs
+        off *= max(0.025, 6.0 * noise_gauss) / np.linalg.norm(off)
+        sigmas, findings = judged(TRUE, block)
+        right.append(sigmas)
+        assert Finding.FAILED not in findings
+        sigmas, findings = judged(Affine(TRUE.matrix, TRUE.offset + off), block)
+        wrong.append(sigmas)
+        assert Finding.FAILED in findings
+    print(
+        f"{noise_gauss} {motion}: right at most {max(right):.1f}, wrong at least {min(wrong):.1f}"
+    )
+    assert max(right) < 0.0
+    assert min(wrong) > (3.5 if noise_gauss > 0.005 else 6.0)
+
+
+@pytest.mark.parametrize("motion", ["level", "tumble"])
+def test_places_with_other_fields_do_not_make_right_registers_wrong(motion):
+    for seed in SEEDS:
+        sigmas, findings = judged(TRUE, lived(seed, 0.002, motion, places=True))
+        assert sigmas < 2.0
+        assert Finding.FAILED not in findings
+
+
+def test_a_soft_iron_that_is_wrong_shows_as_well():
+    for seed in SEEDS:
+        block = lived(seed, 0.002, "tumble")
+        sigmas, findings = judged(Affine(np.diag([1.10, 1.0, 0.95]), TRUE.offset), block)
+        assert sigmas > 6.0
+        assert Finding.FAILED in findings
+
+
+def test_an_error_below_the_limit_is_none_however_clear():
+    for seed in SEEDS:
+        block = lived(seed, 0.0005, "tumble")
+        small = Affine(TRUE.matrix, TRUE.offset + np.array([0.002, 0.0, 0.0]))
+        sigmas, _ = judged(small, block)
+        assert sigmas < 0.0
+
+
+def test_a_vehicle_that_does_not_turn_says_nothing():
+    block = lived(1, 0.002, "level")
+    still = SampleBlock(
+        block.time_s, block.dt_s, block.host_s, np.tile(block.raw_b_gauss[0], (len(block), 1)),
+        0 * block.gyro_b_rad_s, np.tile(block.accel_b_m_s2[0], (len(block), 1)),
+    )  # fmt: skip
+    sigmas, findings = judged(Affine(TRUE.matrix, TRUE.offset + 0.05), still)
+    assert np.isnan(sigmas)
+    assert set(findings) <= {Finding.GOES_ON}

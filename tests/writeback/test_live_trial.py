@@ -1,0 +1,189 @@
+"""Figures of a trial: the new registers against the old ones on the same raw samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ahrsd import so3
+from ahrsd.calibration import Affine
+from ahrsd.samples import SampleBlock
+from ahrsd.writeback.trial_metrics import LiveTrial
+
+RATE_HZ = 40.0
+FIELD_N = np.array([0.24, 0.0, 0.42])
+RIGHT = Affine(np.eye(3), np.array([0.05, -0.03, 0.02]))
+IDENTITY = Affine.identity()
+NO_BIAS = np.zeros(3)
+
+
+def circle(
+    seconds: float, turns: float, *, start_s: float = 0.0, force: bool = True
+) -> SampleBlock:
+    """A level turn to the right of a sensor with hard iron `RIGHT.offset` and no noise."""
+    count = round(seconds * RATE_HZ)
+    time_s = start_s + np.arange(count) / RATE_HZ
+    rate = 2 * np.pi * turns / seconds
+    yaw = rate * (time_s - start_s)
+    R_nb = so3.exp(np.column_stack([np.zeros((count, 2)), yaw]))
+    accel = np.tile([0.0, 0.0, -9.81], (count, 1)) if force else np.full((count, 3), np.nan)
+    return SampleBlock(
+        time_s=time_s,
+        dt_s=np.full(count, 1.0 / RATE_HZ),
+        host_s=time_s,
+        raw_b_gauss=FIELD_N @ R_nb + RIGHT.offset,
+        gyro_b_rad_s=np.tile([0.0, 0.0, rate], (count, 1)),
+        accel_b_m_s2=accel,
+    )
+
+
+def pieces(block: SampleBlock, rows: int = 10) -> list[SampleBlock]:
+    return [
+        SampleBlock(*(getattr(block, name)[at : at + rows] for name in (
+            "time_s", "dt_s", "host_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2",
+        )))
+        for at in range(0, len(block), rows)
+    ]  # fmt: skip
+
+
+def run(trial: LiveTrial, block: SampleBlock):
+    for piece in pieces(block):
+        metrics = trial.take(piece)
+    return metrics
+
+
+def test_right_registers_show_no_spread_and_wrong_ones_theirs():
+    block = circle(30.0, 2.0)
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), block)
+    assert metrics.new_figure == pytest.approx(0.0, abs=1e-12)
+    norms = np.linalg.norm(block.raw_b_gauss[::4], axis=1)
+    assert metrics.old_figure == pytest.approx(norms.std() / norms.mean(), rel=0.02)
+    assert metrics.old_figure > 0.03
+    assert metrics.field_spread == metrics.new_figure
+    assert metrics.finite
+
+
+def test_turns_and_duration_are_those_of_the_motion():
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0))
+    assert metrics.turns == pytest.approx(2.0, rel=1e-6)
+    assert metrics.duration_s == pytest.approx(30.0 - 1 / RATE_HZ)
+
+
+def test_a_gyro_bias_is_no_turn():
+    still = circle(30.0, 0.0)
+    biased = SampleBlock(
+        still.time_s, still.dt_s, still.host_s, still.raw_b_gauss,
+        still.gyro_b_rad_s + np.array([0.0, 0.0, 0.05]), still.accel_b_m_s2,
+    )  # fmt: skip
+    known = run(LiveTrial(RIGHT, IDENTITY, np.array([0.0, 0.0, 0.05])), biased)
+    assert known.turns == pytest.approx(0.0, abs=1e-9)
+    assert run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), biased).turns == pytest.approx(0.2387, rel=1e-3)
+
+
+def test_the_jump_is_the_difference_of_the_headings_at_the_change():
+    """Nose north: hard iron (0.05, -0.03) turns the heading of 0.24 G by atan2(0.03, 0.29)."""
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(5.0, 0.0))
+    assert metrics.heading_jump_deg == pytest.approx(-np.degrees(np.arctan2(0.03, 0.29)), abs=1e-9)
+
+
+def test_the_jump_is_of_the_first_seconds_only():
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    early = run(trial, circle(3.0, 0.0)).heading_jump_deg
+    later = run(trial, circle(20.0, 0.5, start_s=3.0)).heading_jump_deg
+    assert later == pytest.approx(early)
+
+
+def gapped(yaws_deg: list[float], seconds: float, gap_s: float) -> SampleBlock:
+    """Samples at rest at these headings for some seconds each, with a gap before every one."""
+    parts = []
+    for k, yaw in enumerate(yaws_deg):
+        part = circle(seconds, 0.0, start_s=100.0 + k * (seconds + gap_s))
+        R_nb = so3.exp(np.array([[0.0, 0.0, np.radians(yaw)]]))[0]
+        raw = np.tile(FIELD_N @ R_nb + RIGHT.offset, (len(part), 1))
+        parts.append(replace(part, raw_b_gauss=raw))
+    names = ("time_s", "dt_s", "host_s", "raw_b_gauss", "gyro_b_rad_s", "accel_b_m_s2")
+    return SampleBlock(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+def jump_deg(yaw_deg: float) -> float:
+    """Of one heading: with the right registers and with the factory's."""
+    x, y = 0.24 * np.cos(np.radians(yaw_deg)), -0.24 * np.sin(np.radians(yaw_deg))
+    old_deg = np.degrees(np.arctan2(-(y - 0.03), x + 0.05))
+    return float((yaw_deg - old_deg + 180.0) % 360.0 - 180.0)
+
+
+@pytest.mark.parametrize("rows", [5, 40, 10_000])
+def test_a_gap_and_a_late_reader_are_no_jump_of_the_heading(rows):
+    """However the samples are cut into blocks: over a turn the mean field is none of the vehicle's.
+
+    Four headings a quarter turn apart: their mean field has the hard iron alone left, of which the
+    old registers make a heading that is anything.
+    """
+    yaws = [0.0, 90.0, 180.0, 270.0]
+    block = gapped(yaws, 0.5, 8.0)
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    for piece in pieces(block, rows):
+        metrics = trial.take(piece)
+    expected = float(np.mean([jump_deg(yaw) for yaw in yaws]))
+    assert metrics.heading_jump_deg == pytest.approx(expected, abs=0.05)
+    assert max(abs(jump_deg(yaw)) for yaw in yaws) < 15.0
+
+
+def test_a_gap_behind_the_write_does_not_use_up_the_seconds_of_the_jump():
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    trial.take(circle(0.5, 0.0))  # at rest to the north
+    far = gapped([180.0], 10.0, 0.0)  # and half a minute later to the south
+    metrics = run(trial, far)
+    expected = (0.5 * jump_deg(0.0) + 2.5 * jump_deg(180.0)) / 3.0
+    assert metrics.heading_jump_deg == pytest.approx(expected, abs=0.2)
+
+
+def test_on_its_side_a_vehicle_shows_no_jump_until_it_is_level():
+    """There the hard iron of z turns the heading too, and only for level was the jump predicted."""
+    level = circle(5.0, 0.0)
+    side = so3.exp(np.array([[np.radians(70.0), 0.0, 0.0]]))[0]
+    rolled = replace(
+        level, raw_b_gauss=FIELD_N @ side + np.tile(RIGHT.offset, (len(level), 1)),
+        accel_b_m_s2=level.accel_b_m_s2 @ side,
+    )  # fmt: skip
+    trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
+    assert run(trial, rolled).heading_jump_deg is None
+    jump = run(trial, circle(5.0, 0.0, start_s=5.0)).heading_jump_deg
+    assert jump == pytest.approx(-np.degrees(np.arctan2(0.03, 0.29)), abs=1e-9)
+
+
+@pytest.mark.parametrize("roll_deg", [-14.0, 0.0, 14.0])
+@pytest.mark.parametrize("yaw_deg", [0.0, 70.0, 200.0])
+def test_a_tilt_within_what_counts_as_level_changes_no_jump(roll_deg, yaw_deg):
+    """The jump was predicted for level: a hard iron along the vertical adds none of its own."""
+    iron = Affine(np.eye(3), np.array([0.05, -0.03, 0.25]))
+    still = circle(5.0, 0.0)
+    yaw, roll = np.radians(yaw_deg), np.radians(roll_deg)
+    R_nb = so3.exp(np.array([[0.0, 0.0, yaw]]))[0] @ so3.exp(np.array([[roll, 0.0, 0.0]]))[0]
+    rolled = replace(
+        still,
+        raw_b_gauss=np.tile(FIELD_N @ R_nb + iron.offset, (len(still), 1)),
+        accel_b_m_s2=np.tile(np.array([0.0, 0.0, -9.81]) @ R_nb, (len(still), 1)),
+    )
+    jump = run(LiveTrial(iron, IDENTITY, NO_BIAS), rolled).heading_jump_deg
+    assert jump == pytest.approx(jump_deg(yaw_deg), abs=1e-6)
+
+
+def test_without_a_specific_force_there_is_no_jump_and_no_turn_but_a_figure():
+    metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0, force=False))
+    assert metrics.heading_jump_deg is None
+    assert metrics.turns == 0.0
+    assert metrics.new_figure == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_figure_is_of_the_newest_minute():
+    trial = LiveTrial(IDENTITY, RIGHT, NO_BIAS)
+    assert run(trial, circle(60.0, 2.0)).new_figure > 0.03
+    assert run(trial, circle(61.0, 0.0, start_s=60.0)).new_figure < 1e-12
+
+
+def test_one_sample_says_nothing_of_a_spread():
+    metrics = LiveTrial(RIGHT, IDENTITY, NO_BIAS).take(pieces(circle(1.0, 0.0), 1)[0])
+    assert not metrics.finite

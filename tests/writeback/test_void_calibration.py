@@ -1,0 +1,168 @@
+"""A calibration that holds no more never gets to flash, whenever that is found out.
+
+Judged by the unit's own record of what it was sent (`cabled_units`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cabled_run import FIRST, IRON, CabledRun, estimate, lenient_gates, two_units
+from planted_calibrator import PlantedCalibrator
+
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import check_config
+from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.events import GateResult
+from ahrsd.gates.table import GATES
+
+STEP = np.array([0.06, 0.0, 0.0])
+OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
+
+
+def undone(run: CabledRun) -> None:
+    """Nothing was saved and the old values are back in RAM."""
+    unit = run.cable.units[FIRST]
+    assert unit.saves == []
+    assert unit.held("flash") == OLD
+    assert unit.held() == OLD
+
+
+def voided(run: CabledRun, words: str = "the hard iron changed: the calibration in force is void"):
+    """What the calibrator says when it sees a step."""
+    run.core.calibrator._void = words
+
+
+@pytest.mark.parametrize("when", ["trial", "proven"])
+def test_a_step_of_the_iron_ends_what_is_not_saved_yet(when):
+    run = CabledRun(two_units())
+    if when == "trial":
+        run.approve()
+        assert run.until("TRIAL")
+    else:
+        run.proven()
+    voided(run)
+    assert run.until("ROLLED_BACK", 20.0)
+    run.park()
+    undone(run)
+    assert run.journal[FIRST][-2]["facts"]["cause"] == "void"
+    assert run.core.writeback.history.rollbacks == 0  # the values were right when they were written
+
+
+@pytest.mark.parametrize("at", range(1, 36, 5))
+def test_at_every_command_of_the_save(at):
+    run, heard = CabledRun(two_units()), []
+    run.proven()
+
+    def step(line: str) -> None:
+        if run.state == "SAVING":
+            heard.append(line)
+            if len(heard) == at:
+                run.core._errands.add(run.core.writeback.on_void("a step", 0.0, run.now_s))
+
+    run.cable.unit.before = step
+    run.park(30.0)
+    assert len(heard) >= at
+    undone(run)
+
+
+def test_an_estimate_that_clearly_asks_for_something_else_ends_it():
+    run = CabledRun(two_units())
+    run.proven()
+    run.core.calibrator = PlantedCalibrator(
+        run.core.calibrator, estimate(hard_iron_gauss=IRON + STEP)
+    )
+    run.run(10.0)
+    assert any("asks for another" in text for text in run.core.writeback.holds())
+    run.park(120.0)
+    undone(run)
+
+
+def test_one_that_differs_a_little_only_holds_the_save():
+    run = CabledRun(two_units())
+    run.proven()
+    slightly = PlantedCalibrator(
+        run.core.calibrator, estimate(hard_iron_gauss=IRON + np.array([0.003, 0.0, 0.0]))
+    )
+    run.core.calibrator = slightly
+    run.park(120.0)
+    assert run.state == "PROVEN"
+    assert run.cable.unit.saves == []
+    run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
+    run.run(5.0)
+    assert run.state == "COMMITTED"
+
+
+class Red(PlantedCalibrator):
+    """One gate is red."""
+
+    def judged(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
+        super().judged(at_s)
+        bad = GateResult(GATES[0].gate, 2.0, 1.0, False, at_s, "", "look at the wire")
+        self.gates = (bad, *self.gates[1:])
+        return self.gates
+
+
+def test_a_gate_that_went_red_holds_the_save_and_ends_the_proof_when_it_stays_red():
+    run = CabledRun(two_units())
+    run.proven()
+    green, red = run.core.calibrator, Red(run.core.calibrator, estimate())
+    run.core.calibrator = red
+    run.park(30.0)
+    assert run.state == "PROVEN"
+    run.safe = False
+    run.core.calibrator = green
+    run.run(30.0)
+    assert run.state == "PROVEN"
+    run.core.calibrator = red
+    run.park(100.0)
+    undone(run)
+
+
+def test_a_jump_of_the_readings_at_rest_is_proven_again_before_it_is_saved():
+    """A magnet that is mounted while the vehicle stands: no motion tells the estimator."""
+    run = CabledRun(two_units())
+    run.proven()
+    run.cable.moving = False
+    run.run(3.0)
+    run.cable.iron = STEP
+    run.park(15.0)
+    assert run.cable.unit.saves == []
+    assert run.told("jumped")
+    again = any("on trial again" in text for text in run.core.writeback.holds())
+    assert again or "ROLLED_BACK" in run.states  # or the trial has found it worse already
+
+
+def test_a_proof_that_nothing_was_heard_of_for_long_is_undone():
+    run = CabledRun(two_units())
+    run.proven()
+    run.cable.unit.ram[6] = "0"
+    measure, run.cable.unit.measure = run.cable.unit.measure, lambda *_: b""
+    run.run(620.0)
+    assert run.cable.unit.saves == []
+    assert run.cable.unit.held() == OLD, run.notes[-5:]
+    run.cable.unit.measure = measure
+
+
+@pytest.mark.timeout(300)
+def test_the_estimator_itself_sees_the_step_and_the_old_values_are_not_saved():
+    """The real estimator from the first sample; the vehicle says safe after it is sure again."""
+    config = check_config({"gates": lenient_gates()}, "test")
+    run = CabledRun(two_units(binary=True), planted=False)
+    run.core.calibrator = Calibrator(
+        core_settings(config).calibrator, run.core.calibrator.present, np.zeros(3)
+    )
+    run.cable.moving = False
+    run.run(15.0)
+    run.cable.moving = True
+    assert run.until("QUALIFIED", 400.0), run.core.writeback.holds()
+    run.proven()
+    written = run.cable.unit.held()
+    assert written != OLD
+    run.cable.iron = STEP
+    assert run.until(lambda: run.told("void") or run.told("iron changed"), 200.0)
+    run.run(1.0)
+    assert run.state in ("ROLLING_BACK", "ROLLED_BACK", "CANDIDATE"), run.states
+    run.run(100.0)
+    run.park()
+    undone(run)

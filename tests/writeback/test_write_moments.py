@@ -1,0 +1,86 @@
+"""Every event at every moment of a write, each judged by the observer outside.
+
+A moment is before or after a command that the device carries out, or a record of the journal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import write_histories
+from scripted_world import POLICY, fitted
+from write_events import ORIGIN_SERIAL
+
+PLACES = [
+    "after PREPARED", "before VNWRG,23", "after VNWRG,23", "before VNWRG,84", "after VNWRG,84",
+    "before RAM_VERIFIED", "after RAM_VERIFIED", "before PROVEN", "after PROVEN",
+    "before FLASH_SENT", "after FLASH_SENT", "before VNWNV", "after VNWNV", "after FLASH_ACKED",
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _cheap_estimator():
+    with fitted():
+        yield
+
+
+def wrong(event: str, places: list[str], **options: object) -> list[str]:
+    """Violations of this event at these moments, on one stream and another by turns."""
+    tally = write_histories.HistoriesTally()
+    streams = options.pop("streams", ("binary", "imu"))
+    for number, place in enumerate(places):
+        stream = streams[number % len(streams)]
+        seed = number // len(streams)  # a factory's unit and a user's by turns
+        write_histories.run_at(event, place, tally, stream=stream, seed=seed, **options)
+    assert tally.histories == len(places)
+    assert tally.seen["PREPARED"] > 0
+    return tally.wrong
+
+
+@pytest.mark.parametrize("stream", ["binary", "imu"])
+@pytest.mark.parametrize("event", ["swap", "swap and back"])
+def test_another_unit_at_every_moment(event, stream):
+    assert wrong(event, PLACES, streams=(stream,)) == []
+
+
+def test_another_unit_at_every_moment_where_the_first_is_bound():
+    assert wrong("swap", PLACES, policy=replace(POLICY, serial=ORIGIN_SERIAL)) == []
+
+
+@pytest.mark.parametrize("event", ["other writes", "other writes and saves", "other saves"])
+def test_a_second_master_at_every_moment(event):
+    assert wrong(event, PLACES) == []
+
+
+@pytest.mark.parametrize("event", ["restart", "other resets"])
+def test_a_restart_seen_or_unseen_at_every_moment(event):
+    assert wrong(event, PLACES) == []
+
+
+@pytest.mark.parametrize("wall_s", write_histories.WALLS_S)
+@pytest.mark.parametrize("event", ["clock", "kill and time is set", "host reboots"])
+def test_the_hosts_clock_at_every_moment(event, wall_s):
+    places = [*PLACES[::3], "after PROVEN", "after VNWNV", "after FLASH_ACKED"]
+    assert wrong(event, places, wall_s=wall_s, streams=("binary",)) == []
+
+
+@pytest.mark.parametrize("event", ["iron", "iron for a while", "iron while unsafe"])
+def test_a_calibration_that_becomes_void_at_every_moment(event):
+    proven_on = PLACES[PLACES.index("before PROVEN") :]
+    assert wrong(event, ["after RAM_VERIFIED", *proven_on]) == []
+
+
+@pytest.mark.parametrize("event", ["kill", "kill and swap", "kill and other writes"])
+def test_a_killed_program_at_every_moment(event):
+    assert wrong(event, PLACES) == []
+
+
+@pytest.mark.parametrize("event", ["stop and start", "unsafe for a while", "disk full", "person"])
+def test_ordinary_trouble_at_every_moment(event):
+    assert wrong(event, PLACES[::2]) == []
+
+
+@pytest.mark.parametrize("event", ["lie", "bad line", "silence", "journal lost"])
+def test_a_device_and_a_disk_that_lie_at_every_moment(event):
+    assert wrong(event, PLACES) == []

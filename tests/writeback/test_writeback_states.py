@@ -1,0 +1,137 @@
+"""Properties of the table: nothing hangs, nothing skips the rollback, the docs show it."""
+
+from pathlib import Path
+
+import pytest
+
+from ahrsd.writeback.reconcile import TABLE as RECONCILE
+from ahrsd.writeback.reconcile import Found, Kind
+from ahrsd.writeback.states import (
+    CHANGED_IN_RAM,
+    ON_TIMEOUT,
+    TABLE,
+    WITHOUT_TRANSACTION,
+    Signal,
+    State,
+    after,
+    mermaid,
+)
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "design" / "write-back.md"
+
+# States that end by themselves only by a person, the device or a verdict, and may last for ever.
+RESTING = {
+    State.OBSERVING,
+    State.CANDIDATE,
+    State.COMMITTED,
+    State.CONFIRMED,
+    State.ROLLED_BACK,
+    State.FAULT,
+    State.FLASH_TORN,
+    State.LOCKED,
+}
+
+
+def reachable(start: State, without: frozenset[State] = frozenset()) -> set[State]:
+    seen, queue = {start}, [start]
+    while queue:
+        for target in TABLE[queue.pop()].values():
+            if target not in seen and target not in without:
+                seen.add(target)
+                queue.append(target)
+    return seen
+
+
+def test_total_over_states_and_signals() -> None:
+    assert set(TABLE) == set(State)
+    for state in State:
+        for signal in Signal:
+            assert after(state, signal) in State
+    used = {signal for row in TABLE.values() for signal in row}
+    assert used == set(Signal)
+
+
+def test_every_state_is_reachable_and_none_is_a_trap() -> None:
+    assert reachable(State.RECONCILING) == set(State)
+    for state in State:
+        assert State.OBSERVING in reachable(state)
+
+
+def test_every_waiting_state_handles_silence() -> None:
+    assert set(ON_TIMEOUT) == set(State) - RESTING
+    for state, (seconds, target) in ON_TIMEOUT.items():
+        assert TABLE[state][Signal.TIMEOUT] is target
+        assert 0.0 < seconds <= 600.0
+
+
+@pytest.mark.parametrize("state", State)
+def test_link_loss_reset_and_doubt_lead_to_reconciling_everywhere(state: State) -> None:
+    assert TABLE[state][Signal.LINK_LOST] is State.RECONCILING
+    assert TABLE[state][Signal.DEVICE_RESET] is State.RECONCILING
+    assert TABLE[state][Signal.IN_DOUBT] is State.RECONCILING
+
+
+@pytest.mark.parametrize("state", [State.STAGING, State.STAGED, State.TRIAL, State.PROVEN])
+def test_nothing_leads_from_changed_ram_to_rest_without_undoing_or_saving(state: State) -> None:
+    """RECONCILING and FAULT end in a comparison with the device; ROLLING_BACK undoes."""
+    ways_out = frozenset({State.RECONCILING, State.FAULT, State.ROLLING_BACK, State.SAVING})
+    assert not reachable(state, without=ways_out) & (WITHOUT_TRANSACTION | {State.LOCKED})
+
+
+def test_a_reconciling_device_never_goes_straight_into_a_write() -> None:
+    assert not {State.PREPARING, State.CHECKING, State.STAGING, State.SAVING} & set(
+        TABLE[State.RECONCILING].values()
+    )
+
+
+def test_only_an_approval_leads_into_a_transaction() -> None:
+    into = {
+        (state, signal)
+        for state, row in TABLE.items()
+        for signal, target in row.items()
+        if target is State.PREPARING
+    }
+    assert into == {(State.QUALIFIED, Signal.APPROVED)}
+
+
+@pytest.mark.parametrize("state", [State.FAULT, State.FLASH_TORN, State.LOCKED])
+def test_only_a_person_or_the_device_ends_an_alarm(state: State) -> None:
+    away = {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT}
+    assert set(TABLE[state]) - away <= {Signal.ROLL_BACK, Signal.UNLOCK}
+
+
+def test_flash_is_reached_only_from_proven_through_the_journal() -> None:
+    into = {state for state, row in TABLE.items() if State.SAVING in row.values()}
+    assert into == {State.SAVE_PREPARING}
+    assert {s for s, row in TABLE.items() if State.SAVE_PREPARING in row.values()} == {State.PROVEN}
+    assert TABLE[State.SAVE_PREPARING][Signal.JOURNALLED] is State.SAVING
+
+
+def test_states_with_changed_ram_can_all_be_undone_or_are_undoing() -> None:
+    for state in CHANGED_IN_RAM - {State.ROLLING_BACK, State.SAVING}:
+        assert TABLE[state][Signal.ROLL_BACK] is State.ROLLING_BACK
+
+
+def test_the_document_shows_this_table() -> None:
+    assert f"```mermaid\n{mermaid()}\n```" in DOCUMENT.read_text()
+
+
+@pytest.mark.parametrize("state", ON_TIMEOUT)
+def test_the_document_shows_every_timeout(state: State) -> None:
+    seconds, target = ON_TIMEOUT[state]
+    assert f"| {state.value} | {seconds:.0f} s | {target.value} |\n" in DOCUMENT.read_text()
+
+
+@pytest.mark.parametrize("last", RECONCILE)
+def test_the_document_shows_what_follows_an_interruption(last: Kind) -> None:
+    cells = [
+        f"`{row.record.value}`, {row.signal.value}" if row.record else row.signal.value
+        for row in (RECONCILE[last][held] for held in Found)
+    ]
+    assert f"| `{last.value}` | {' | '.join(cells)} |\n" in DOCUMENT.read_text()
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_the_document_says_what_each_record_means(kind: Kind) -> None:
+    rows = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("| `")]
+    assert any(f"`{kind.value}`" in row.split("|")[1] for row in rows)
