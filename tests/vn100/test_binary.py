@@ -88,7 +88,7 @@ def test_all_that_a_vn100_can_send_fits() -> None:
         ("FA 81 08 01 00 01 00", 0),  # group 11
         ("FA 80 20 20 00", 31),  # GNSS3, behind a second group byte
         ("FA 81 20 01 00 20 00", 41),
-        ("FA 60 B9 00 61 79", 310),  # found in a payload
+        ("FA 60 B9 00 61 79", 162),  # INS 50 bytes, GNSS2 104 and more for each satellite
         ("FA 49 FF 7F FF 3F FF 3F", 198 + 142 + 142 + 10),
         ("FA 69 FF 7F FF 3F FF 1F FF 3F", 198 + 142 + 262 + 142 + 12),
         ("FA 29 FF 7F 10 02 0C 00", 8 + 198 + 13 + 36 + 2),
