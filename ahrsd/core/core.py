@@ -36,6 +36,7 @@ from ahrsd.core.session_events import (
 )
 from ahrsd.core.settings import CoreSettings
 from ahrsd.core.stream_watch import StreamWatch
+from ahrsd.core.unconfirmed_samples import UnconfirmedSamples
 from ahrsd.core.warm_start import Present, WarmStart
 from ahrsd.evidence.values import BasisFacts
 from ahrsd.gates import GateLimits, Level, for_level
@@ -89,6 +90,7 @@ class Core:
         self._closing = self._unread = False
         self._unit: Unit | None = None
         self._watch = StreamWatch()
+        self.unconfirmed: UnconfirmedSamples[Circumstances] = UnconfirmedSamples()
         self._rollcall = Rollcall()
         self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
@@ -163,6 +165,7 @@ class Core:
         self._note("warning", f"link lost: {item.reason}")
         self.take(self.conversation.lost(self._host_s))
         self.stream.forget()
+        self.unconfirmed.drop()
         self._errands.forget_procedure()
         self._errands.add(self.writeback.on_link_lost(self._host_s))
 
@@ -214,7 +217,8 @@ class Core:
         skipped = deque(self.conversation.session.deframer.take_skipped())
         if any(isinstance(event, Measurement) for event in found):
             silence = self._watch.heard(self._host_s, self.stream.facts.rate_hz)
-            if not self.stream.carries_time:  # where it does, a gap shows in its own time
+            if silence and not self.stream.carries_time:  # where it does, its time shows a gap
+                self._flush()
                 self._doubt(silence)
         for event in found:
             if isinstance(event, Measurement):
@@ -246,6 +250,9 @@ class Core:
         """Whose samples these are is not sure any more; empty: it is."""
         if reason and self.conversation.listening and self.conversation.identity is not None:
             self.warm.doubt()
+            if not jumped:
+                restarted = not self.stream.carries_time  # else its time would have fallen
+                self.unconfirmed.doubt(self._host_s, perhaps_restarted=restarted)
             more = self.writeback.on_doubt(reason, self._host_s, jumped=jumped)
             self._errands.add(more)
             if jumped and self._trial is not None:
@@ -260,6 +267,7 @@ class Core:
     def _device_reset(self, why: str, uptime_s: float | None = None) -> None:
         self._note("warning", f"the device restarted ({why})")
         self._breaks += 1
+        self.unconfirmed.drop()
         if self.conversation.identity is None:
             return
         self.epochs.begin(self._host_s, None)
@@ -309,6 +317,7 @@ class Core:
                 self._identified(identity.unit)
             case ConfigurationRead(values):
                 self._flush()
+                self.unconfirmed.drop()  # it was asked for because something is not sure
                 believed = {} if self.writeback.history.open else self.registers
                 if others := self._rollcall.registers(values, believed, self._breaks):
                     self._note("warning", f"somebody changed registers {others}: calibrated anew")
@@ -319,8 +328,11 @@ class Core:
                 self._out.append(events.RegistersRead(self._host_s, values))
                 self._device_known()
             case Looked(seen, error):
-                more = self.writeback.on_looked(seen, str(error or ""), self._host_s)
-                self._errands.add(more)
+                back = self.writeback
+                self._errands.add(back.on_looked(seen, str(error or ""), self._host_s))
+                if back.confirmed_s is not None:
+                    for block, when in self.unconfirmed.confirm(back.confirmed_s):
+                        self._examine(block, when)
             case StreamChanged(text, level):
                 self._flush()
                 self._watch.resumed(self._host_s)
@@ -418,6 +430,7 @@ class Core:
         ):
             self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
         if self.stream.take_replaced():
+            self.unconfirmed.drop()
             self.calibrator = self.calibrator.anew()
             self._begin(self._desk.compare(self.calibrator, *self._compared))
             self.warm.again()
@@ -432,13 +445,21 @@ class Core:
             if self._trial is not None:
                 metrics = self._trial.take(free)
                 self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-            if self.estimator.takes(free):
-                free = self._recall(free)
-                self.warm.live(free)
-                how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
-                now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
-                self._begin(self._desk.examine(self.calibrator, free, now))
+            how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
+            now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
+            if self.conversation.identity is None or self.conversation.mode is Mode.PASSIVE:
+                self._examine(free, now)  # there is nobody to ask
+            else:
+                self.unconfirmed.hold(free, self._host_s, now)
+                self._errands.add(self.writeback.on_waiting(self.unconfirmed.span_s, self._host_s))
         self._errands.let_out(self)
+
+    def _examine(self, block: SampleBlock, when: Circumstances) -> None:
+        """Samples of the device that was read: for the calibrator."""
+        if self.estimator.takes(block):
+            block = self._recall(block)
+            self.warm.live(block)
+            self._begin(self._desk.examine(self.calibrator, block, when))
 
     def _recall(self, block: SampleBlock) -> SampleBlock:
         """The block, after the calibrator was given the samples of an earlier run, if any."""
@@ -491,12 +512,12 @@ class Core:
             self._proposed = found.proposed
             self._out += found.notes
             back, when = self.writeback, found.when
-            self._errands.add(back.on_examined(when.host_s, self._host_s))
             if found.void:
                 self.warm.doubt()
                 self._errands.add(back.on_void(found.void, when.at_s, self._host_s))
             if found.estimate is not None:
                 self._judged(found, found.estimate)
+            self._errands.add(back.on_examined(when.host_s, self._host_s))
 
     def _estimator_failed(self, reason: str) -> None:
         """Nothing is written from what it made, and it begins anew after a pause."""

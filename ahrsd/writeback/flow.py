@@ -60,6 +60,8 @@ class Flow:
         self.approver = ""
         self.trial = Trial(policy.trial, 0.0)
         self.passed = ""  # why the trial is passed, until the device was asked again
+        self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
+        self.waits_for_look = False  # all that a save lacks is that the device is asked again
         self._cause = "device"
         self._from_fault = self._resumed = False
         self._against_since_s: float | None = None
@@ -110,17 +112,24 @@ class Flow:
     def watch(self) -> None:
         """Take the step that waits for nothing but a condition, if it holds now."""
         now = (self.desk.history, self.desk.host_s, self.desk.now)
+        self.waits_for_look = False
         if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
             self.signal(Signal.APPROVED, f"approved: {self.approver}")
-        elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
-            self.roll_back("void", self.safe.void)
-        elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
-            if not self.safe.save_holds(*now):
-                self.signal(Signal.SAVE_DUE, "proven, safe and still")
         elif self.watches_interlock and (
             word := self.safe.interlock_broken(self.desk.host_s, self._since_s)
         ):
             self.roll_back("interlock", word)
+        elif self.state is State.TRIAL and self.proven_to_s is not None:
+            if self.safe.examined(self.proven_to_s) and not self.safe.disagrees:
+                self.safe.proof_waits = ""
+                self.desk.record(Kind.PROVEN, reason=self.passed)
+                self.signal(Signal.TRIAL_PASSED, self.passed)
+        elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
+            self.roll_back("void", self.safe.void)
+        elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
+            if not (holds := self.safe.save_holds(*now)):
+                self.signal(Signal.SAVE_DUE, "proven, safe and still")
+            self.waits_for_look = bool(holds) and holds == self.safe.unexamined()
 
     @property
     def watches_interlock(self) -> bool:
@@ -254,7 +263,7 @@ class Flow:
         """What was proven was so before a doubt."""
         if self.state in LIVED_WITH:
             self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
-            self.passed = ""
+            self.passed, self.proven_to_s = "", None
             self.safe.proof_waits = f"{reason}: what is in force is on trial again"
 
     def judge_proof(self, finding: Verdict, reason: str) -> None:
@@ -343,7 +352,7 @@ class Flow:
         self.desk.record(Kind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
-        self.passed = ""
+        self.passed, self.proven_to_s = "", None
         self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
 
     def _enter_proven(self, reason: str) -> None:

@@ -77,6 +77,8 @@ class WriteBack:
         self._restarts = RestartWatch()
         self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
         self._recheck = Recheck(policy.recheck_s)
+        self._sampled_to_s = float("-inf")  # when the device was asked
+        self.confirmed_s: float | None = None  # see `on_looked`
 
     # -- what others ask ---------------------------------------------------------------------------
 
@@ -234,8 +236,12 @@ class WriteBack:
         return self._answer()
 
     def on_looked(self, seen: Seen | None, error: str, host_s: float) -> list[Action]:
-        """Who answered and what it holds, or why nobody did."""
-        self._desk.host_s, flow = host_s, self._flow
+        """Who answered and what it holds, or why nobody did.
+
+        Where all is as it ought to be, `confirmed_s` is the host's time at which it was asked;
+        else None.
+        """
+        self._desk.host_s, flow, self.confirmed_s = host_s, self._flow, None
         if flow.identity is None or self.state is State.RECONCILING or self._desk.running:
             return self._answer()  # overtaken
         if seen is None:
@@ -247,10 +253,19 @@ class WriteBack:
             flow.another(seen.unit)
         elif changed := differences(flow.expected(seen.values), seen.values):
             flow.changed(tuple(changed))
-        elif self.state is State.TRIAL and self._flow.passed and not self._safe.disagrees:
-            self._safe.proof_waits = ""
-            self._desk.record(Kind.PROVEN, reason=self._flow.passed)
-            flow.signal(Signal.TRIAL_PASSED, self._flow.passed)
+        else:
+            self.confirmed_s = self._recheck.asked_s
+            flow.proven_to_s = self._sampled_to_s if flow.passed else None
+        return self._answer()
+
+    def on_waiting(self, span_s: float, host_s: float) -> list[Action]:
+        """So many seconds of samples are not used before the device was asked again.
+
+        A stream that is played faster than it was recorded fills them up sooner than the clock.
+        """
+        self._desk.host_s = host_s
+        if span_s >= self.policy.recheck_s:
+            self._recheck.soon(host_s)
         return self._answer()
 
     def on_doubt(self, reason: str, host_s: float, *, jumped: bool = False) -> list[Action]:
@@ -261,6 +276,7 @@ class WriteBack:
         self._desk.host_s = host_s
         self._desk.note("debug", f"{reason}: the device is asked again who it is")
         self._safe.doubt(host_s)
+        self._flow.proven_to_s = None
         if jumped:
             self._flow.prove_again(reason)
         self._recheck.soon(host_s)
@@ -369,6 +385,8 @@ class WriteBack:
                 self._ask_again()
             if self.state is State.TRIAL:
                 self._flow.passed = reason if finding is Finding.PASSED else ""
+                if not self._flow.passed:
+                    self._flow.proven_to_s = None
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:
@@ -419,6 +437,8 @@ class WriteBack:
         """Have the device say who it is and what it holds, unless something else runs."""
         flow, now_s = self._flow, self._desk.host_s
         self._recheck.begin(now_s)
+        if self._safe.sampled_s is not None:
+            self._sampled_to_s = self._safe.sampled_s
         if flow.identity is None or self._desk.running or self.state in _NOT_ASKED:
             self._recheck.soon(now_s)
             return
@@ -437,4 +457,6 @@ class WriteBack:
     def _answer(self) -> list[Action]:
         """Take the steps that are due now, then hand over everything that was asked for."""
         self._flow.watch()
+        if self._flow.waits_for_look:
+            self._recheck.soon(self._desk.host_s)
         return self._desk.take()

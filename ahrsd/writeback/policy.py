@@ -79,7 +79,7 @@ class WriteBackPolicy:
     rollbacks_to_lock: so many in a row lock the write-back [2]
     interlock_max_age_s: an older word of the vehicle counts as no [1]
     recheck_s:         who answers and what it holds is read again so often, beside the running
-                       output, in every mode but passive [30 s]
+                       output, in every mode but passive [10 s]
     """
 
     mode: Mode = Mode.OBSERVE
@@ -100,7 +100,7 @@ class WriteBackPolicy:
     margin_after_rollback: float = 2.0
     rollbacks_to_lock: int = 2
     interlock_max_age_s: float = 1.0
-    recheck_s: float = 30.0
+    recheck_s: float = 10.0
     trial: TrialPolicy = field(default_factory=TrialPolicy)
     still: StillPolicy = field(default_factory=StillPolicy)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-LEAST_S = 5.0  # between two that doubts ask for: a poor link must not be filled with reads
+LEAST_S = 2.0  # between two that something waits for: a poor link must not be filled with reads
 
 
 @dataclass(slots=True)
@@ -18,11 +18,11 @@ class Recheck:
 
     interval_s: float
     due_s: float | None = None
-    _last_s: float = float("-inf")
+    asked_s: float = float("-inf")  # the newest time
 
     def begin(self, host_s: float) -> None:
         """The device was read, or is being read."""
-        self._last_s, self.due_s = host_s, host_s + self.interval_s
+        self.asked_s, self.due_s = host_s, host_s + self.interval_s
 
     def off(self) -> None:
         """Nobody is there to be asked."""
@@ -31,7 +31,7 @@ class Recheck:
     def soon(self, host_s: float) -> None:
         """Something is doubtful, or there was no answer."""
         if self.due_s is not None:
-            self.due_s = min(self.due_s, max(host_s, self._last_s + LEAST_S))
+            self.due_s = min(self.due_s, max(host_s, self.asked_s + LEAST_S))
 
     def now(self, host_s: float) -> None:
         """Something waits for it."""

@@ -149,11 +149,20 @@ class Safeguards:
         reasons = [word for word in (self.void, self.disagrees, self.proof_waits) if word]
         if host_s - self.judged_s > VERDICT_AGE_S:
             reasons.append(f"the newest verdict is {host_s - self.judged_s:.0f} s old")
-        if self.sampled_s is not None and self.examined_s is not None:
-            late_s = self.sampled_s - self.examined_s
-            if late_s > UNEXAMINED_S:
-                reasons.append(f"the newest {late_s:.0f} s of samples are not judged yet")
-        return reasons
+        return reasons + self.unexamined()
+
+    def examined(self, to_s: float) -> bool:
+        """Whether the estimate has taken the samples up to this host time into account."""
+        return self.examined_s is None or self.examined_s >= to_s
+
+    def unexamined(self) -> list[str]:
+        """Whether the estimate lags behind the samples, which wait for the device's answer."""
+        if self.sampled_s is None or self.examined_s is None:
+            return []
+        late_s = self.sampled_s - self.examined_s
+        if late_s <= UNEXAMINED_S:
+            return []
+        return [f"the newest {late_s:.0f} s of samples are not judged yet"]
 
     def allow(self, command: Command, purpose: Purpose, host_s: float) -> bool:
         """The gate in front of every command of the write-back.

@@ -19,7 +19,7 @@ from ahrsd.samples import Array, SampleBlock
 
 EVERY_S = 1.0
 LEAST_SAMPLES, LEAST_AXIS_GAUSS = 24, 0.12
-STEP_GAUSS, MISFIT_GAUSS, STILL_GAUSS, STILL_RAD_S = 0.008, 0.003, 0.005, 0.003
+STEP_GAUSS, MISFIT_GAUSS, STILL_GAUSS, STILL_RAD_S = 0.008, 0.0015, 0.005, 0.003
 
 
 class FittingCalibrator(Calibrator):

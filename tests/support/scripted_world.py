@@ -36,7 +36,7 @@ CHUNK_S, INTERLOCK_S = 0.2, 0.3
 POLICY = WriteBackPolicy(
     mode=Mode.COMMIT, approval="auto", armed_at_start=True, commit_unattended=True,
     max_change_auto_deg=180.0, min_interval_s=0.0, cooldown_s=0.0, ram_writes_per_day=10**6,
-    flash_writes_per_day=10**6, flash_writes_lifetime=10**6, rollbacks_to_lock=10**6,
+    flash_writes_per_day=10**6, flash_writes_lifetime=10**6, rollbacks_to_lock=10**6, recheck_s=3.0,
     trial=TrialPolicy(duration_s=2.0, turns=100.0), still=StillPolicy(duration_s=1.0),
 )  # fmt: skip
 _CANDIDATE = re.compile(r"candidate ([0-9a-f]{8}),")

@@ -8,7 +8,7 @@ not_judged_here    a value in a unit that was not judged on that unit: neither i
                    and right for the iron that it felt
 other_journal      a value of a candidate, journaled under another unit's number
 void_save          a save of values that the iron, as it had been for `GRACE_S`, made wrong
-foreign_save       a save of what another program wrote
+foreign_save       a save of what another program wrote and did not save itself
 half_save          a save while the device does not hold all of the transaction's new values
 foreign_replaced   a write over another program's value that the journal knows nothing of
 proven_not_held    PROVEN of values that the device does not hold
@@ -171,7 +171,8 @@ class Observer:
         for number in _REGISTERS:
             text = ram[number]
             who, since_s = seen.author[number]
-            if who == "other" and at_s - since_s > RACE_S and text != new.get(number):
+            theirs = who == "other" and seen.flash_author[number] != (who, since_s)
+            if theirs and at_s - since_s > RACE_S and text != new.get(number):
                 self._wrong("foreign_save", at_s, f"unit {unit.serial} register {number}: {text}")
             if number in new and text != new[number] and at_s - self._since_s(seen) > RACE_S:
                 self._wrong("half_save", at_s, f"unit {unit.serial} register {number}: {text}")

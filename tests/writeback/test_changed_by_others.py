@@ -29,10 +29,8 @@ def estimate() -> Estimate:
 
 @pytest.fixture
 def observing() -> VirtualRun:
-    """A run that would write what its calibrator says, as soon as it says it."""
-    policy = WriteBackPolicy(
-        mode=Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=180.0
-    )
+    """A run that would write what its calibrator says, as soon as a person approves it."""
+    policy = WriteBackPolicy(mode=Mode.STAGE, armed_at_start=True, max_change_auto_deg=180.0)
     device = build(Setup("rov", seed=3, output="imu", rate_hz=50))
     run = VirtualRun(device, core_settings(Config(), policy=policy), step_s=0.1)
     assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 10.0), run.notes
@@ -42,15 +40,18 @@ def observing() -> VirtualRun:
 
 def test_the_check_before_a_write_finds_it_and_the_calibration_begins_anew(observing):
     run = observing
-    run.emulator.memory.ram[23, 0] = OTHER
-    run.emulator.sensor.changed()
     planted = PlantedCalibrator(run.core.calibrator, estimate())
     run.core.calibrator = planted
+    assert run.until(lambda: run.core.writeback.state.value == "QUALIFIED", 20.0), run.states
+    run.emulator.memory.ram[23, 0] = OTHER
+    run.emulator.sensor.changed()
+    run.operate("approve", run.core.writeback.proposal.id)
+    assert "CHECKING" in run.states
     assert run.until(lambda: run.core.calibrator is not planted, 20.0), run.states
     assert ("warning", "somebody changed registers [23]: calibrated anew") in run.notes
     assert run.writes == 0
     assert run.core.registers[23] == pytest.approx(OTHER)
-    run.run(3.0)
+    run.run(15.0)  # the device is asked again before its samples count
     assert run.core.calibrator.started
 
 

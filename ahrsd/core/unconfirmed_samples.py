@@ -1,0 +1,108 @@
+"""Samples wait here until the device has said, after them, that it is the one that was read.
+
+Who sends and which registers act is known only at the moments at which the device is asked. Between
+two of them the cable may have been moved to another unit and back, or another program may have
+written a register that a restart took away again: then both answers are right and the samples
+between them are not. So the estimator is given a sample only after an answer that came behind it,
+and never one from between two doubts of which nobody was asked anything.
+
+A doubt in a stream with the device's own time is a time that ran ahead: it may be another unit, no
+restart (its time would fall). What came before it is still of the unit that answered last, unless a
+doubt was there already. In a stream without that time a silence may be a restart as well: nothing
+from before it counts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from ahrsd.samples import SampleBlock
+
+MOST_ROWS = 200_000  # that wait; a device that answers nothing any more must not fill the memory
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiting(Generic[T]):
+    number: int
+    block: SampleBlock
+    came_s: float
+    how: T
+
+
+class UnconfirmedSamples(Generic[T]):
+    """Blocks, each with `how` things stood when it came. Times are the host's, in seconds."""
+
+    def __init__(self) -> None:
+        self._sure: deque[_Waiting[T]] = deque()  # an answer before them, and a doubt behind
+        self._open: deque[_Waiting[T]] = deque()  # since the newest doubt
+        self._came = self._released = 0  # numbers of the newest blocks
+        self._doubt_s = float("-inf")
+        self._in_doubt = False  # nothing was confirmed since the newest doubt
+        self._rows = 0
+        self.dropped = 0  # samples that nobody vouched for
+        self.span_s = 0.0  # of the samples that wait
+
+    def hold(self, block: SampleBlock, came_s: float, how: T) -> None:
+        """A block came."""
+        self._came += 1
+        self._open.append(_Waiting(self._came, block, came_s, how))
+        self._count(block, 1)
+        while self._rows > MOST_ROWS:
+            self._drop(self._sure if self._sure else self._open, 1)
+
+    def doubt(self, host_s: float, *, perhaps_restarted: bool) -> None:
+        """What comes from now on may be of another unit, or of one that restarted."""
+        if perhaps_restarted:
+            self.drop()
+        elif self._in_doubt:
+            self._drop(self._open)
+        self._sure += self._open
+        self._open.clear()
+        self._doubt_s, self._in_doubt = host_s, True
+
+    def confirm(self, asked_s: float) -> list[tuple[SampleBlock, T]]:
+        """The device that was asked then is the one that was read, and holds what it ought to.
+
+        Returns the blocks that may be used now, oldest first.
+        """
+        if asked_s <= self._doubt_s:
+            return []  # it may have answered before the doubt
+        self._in_doubt = False
+        released = []
+        for line in (self._sure, self._open):
+            while line and line[0].came_s <= asked_s:
+                one = line.popleft()
+                self._count(one.block, -1)
+                follows = one.number == self._released + 1
+                released.append((one.block if follows else _after_a_gap(one.block), one.how))
+                self._released = one.number
+        return released
+
+    def drop(self) -> None:
+        """Nothing of what waits may be used."""
+        self._drop(self._sure)
+        self._drop(self._open)
+
+    def _drop(self, line: deque[_Waiting[T]], most: int | None = None) -> None:
+        for _ in range(len(line) if most is None else min(most, len(line))):
+            one = line.popleft()
+            self.dropped += len(one.block)
+            self._count(one.block, -1)
+
+    def _count(self, block: SampleBlock, sign: int) -> None:
+        self._rows += sign * len(block)
+        self.span_s += sign * float(np.nansum(block.dt_s))
+        if not self._rows:
+            self.span_s = 0.0
+
+
+def _after_a_gap(block: SampleBlock) -> SampleBlock:
+    """What came before it is not used: its first step is not known."""
+    if block.gap_before or not len(block):
+        return block
+    return replace(block, dt_s=np.concatenate([[np.nan], block.dt_s[1:]]), gap_before=True)
