@@ -39,10 +39,10 @@ from ahrsd.writeback.states import (
     Signal,
     State,
 )
-from ahrsd.writeback.transaction import Outcome
+from ahrsd.writeback.transaction import HSI_RESULT, Outcome
 from ahrsd.writeback.trial import Finding, TrialMetrics
 from drivers.vn100.procedures import Identity, Seen, differences
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
 
 RESTS = frozenset(  # states in which a proven restart since the newest record has it read again
     {
@@ -78,6 +78,7 @@ class WriteBack:
         self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
         self._recheck = Recheck(policy.recheck_s)
         self._sampled_to_s = float("-inf")  # when the device was asked
+        self._theirs: dict[int, frozenset[int]] = {}  # by serial number; see `_changed_by_others`
         self.confirmed_s: float | None = None  # see `on_looked`
 
     # -- what others ask ---------------------------------------------------------------------------
@@ -172,6 +173,7 @@ class WriteBack:
         self._recheck.begin(host_s)
         self._desk.bind(identity.serial, journal)
         restarted = self._restarts.bind(identity.serial, read_from_s)
+        self._safe.theirs = self._changed_by_others(identity, registers, session_keys, restarted)
         self._safe.bind(identity, registers, journal is not None)
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
         self._desk.in_force(registers)
@@ -432,6 +434,27 @@ class WriteBack:
             self._flow.on_failure(str(error))
             self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()
+
+    def _changed_by_others(
+        self,
+        identity: Identity,
+        registers: Mapping[int, Values],
+        session_keys: frozenset[int],
+        restarted: bool,
+    ) -> frozenset[int]:
+        """Registers that changed in this run without us; only a restart shows what flash holds.
+
+        What an open transaction writes is judged by `reconcile`.
+        """
+        before = self._flow.identity
+        theirs = frozenset() if restarted else self._theirs.get(identity.serial, frozenset())
+        if before is not None and before.serial == identity.serial and not restarted:
+            known = self._flow.registers
+            written = set() if self.history.open is None else set(self.history.open.new)
+            compared = known.keys() & registers.keys() - session_keys - written - {HSI_RESULT}
+            theirs |= {n for n in compared if not same(n, known[n], registers[n])}
+        self._theirs[identity.serial] = theirs
+        return theirs
 
     def _ask_again(self) -> None:
         """Have the device say who it is and what it holds, unless something else runs."""

@@ -41,6 +41,7 @@ class Safeguards:
         self.proof_waits = ""  # why they must be proven again
         self.sampled_s: float | None = None  # host time of the newest sample
         self.examined_s: float | None = None  # and of the newest one in the estimate
+        self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
         self._is_ours = False
@@ -147,6 +148,12 @@ class Safeguards:
     def _not_as_judged(self, host_s: float) -> list[str]:
         """Why what is in force may not be what was judged, or not be right any more."""
         reasons = [word for word in (self.void, self.disagrees, self.proof_waits) if word]
+        if self.theirs:
+            which = ", ".join(map(str, sorted(self.theirs)))
+            reasons.append(
+                f"somebody else changed register {which} in this run, and a save would make it "
+                "permanent; once it is right, switch the device off and on"
+            )
         if host_s - self.judged_s > VERDICT_AGE_S:
             reasons.append(f"the newest verdict is {host_s - self.judged_s:.0f} s old")
         return reasons + self.unexamined()
@@ -180,7 +187,7 @@ class Safeguards:
             return (
                 self.armed
                 and self.journal_ok
-                and not (self.void or self.disagrees or self.proof_waits)
+                and not (self.void or self.disagrees or self.proof_waits or self.theirs)
                 and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
             )
         return True

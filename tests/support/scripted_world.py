@@ -166,6 +166,7 @@ class World:
 
     def start(self) -> None:
         """The program begins."""
+        self.observer.begun(self.now_s)
         self.core = Core(self.settings)
         keeper = _Keeper(journal_in(self.folder), lambda: self.clocks.ns(self.now_s))
         keeper.world = self  # type: ignore[misc]

@@ -8,7 +8,7 @@ not_judged_here    a value in a unit that was not judged on that unit: neither i
                    and right for the iron that it felt
 other_journal      a value of a candidate, journaled under another unit's number
 void_save          a save of values that the iron, as it had been for `GRACE_S`, made wrong
-foreign_save       a save of what another program wrote and did not save itself
+foreign_save       a save of what another program wrote while this one listened, and did not save
 half_save          a save while the device does not hold all of the transaction's new values
 foreign_replaced   a write over another program's value that the journal knows nothing of
 proven_not_held    PROVEN of values that the device does not hold
@@ -66,9 +66,14 @@ class Observer:
         self.violations: list[tuple[str, str]] = []
         self.counts: Counter[str] = Counter()
         self.newest_prepared: int | None = None
+        self.begun_s = 0.0
         self.attached_s: dict[int, list[float]] = defaultdict(list)
 
     # -- what it is told ---------------------------------------------------------------------------
+
+    def begun(self, at_s: float) -> None:
+        """The program was started: what it reads first in a unit is that unit's own, for it."""
+        self.begun_s = at_s
 
     def look(self, at_s: float) -> None:
         """Take what is new in the units' logs up to this time."""
@@ -172,6 +177,7 @@ class Observer:
             text = ram[number]
             who, since_s = seen.author[number]
             theirs = who == "other" and seen.flash_author[number] != (who, since_s)
+            theirs &= since_s > self._first_read_s(unit, number)
             if theirs and at_s - since_s > RACE_S and text != new.get(number):
                 self._wrong("foreign_save", at_s, f"unit {unit.serial} register {number}: {text}")
             if number in new and text != new[number] and at_s - self._since_s(seen) > RACE_S:
@@ -180,6 +186,16 @@ class Observer:
                 times = np.linspace(at_s - GRACE_S, at_s, 7)
                 if not any(self._right(unit, number, text, float(t)) for t in times):
                     self._wrong("void_save", at_s, f"unit {unit.serial} register {number}: {text}")
+
+    def _first_read_s(self, unit: Unit, number: int) -> float:
+        """When this run of the program read a register of this unit first."""
+        label = f"VNRRG,{number}"
+        times = (
+            at_s
+            for at_s, serial, heard in self.cable.heard
+            if at_s >= self.begun_s and (serial, heard) == (unit.serial, label)
+        )
+        return next(times, float("inf"))
 
     def _confirmed(self, unit: Unit, seen: Seen, at_s: float) -> None:
         new = self._new(seen)

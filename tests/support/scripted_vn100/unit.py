@@ -142,8 +142,9 @@ class Unit:
         text, before = stored(number, tokens), self.memory.ram[number]
         if port == ["2"]:  # the other port's own setting, which nobody here reads
             return ",".join([text, *port])
-        if number not in self.lies.not_held:
+        if number not in self.lies.not_held or who != "host":  # it lies to one side only
             self.memory.ram[number] = text
+            self._told.pop(number, None)
         else:
             self._told[number] = text
         held = self.memory.ram[number]
