@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.diagnosis.aligned import align, differing
 from ahrsd.diagnosis.dead import dead_axes, possible
 from ahrsd.diagnosis.diagnosis import Diagnosis
@@ -96,7 +97,7 @@ def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
         return None, []
     if missing > _FEW_MISSING * len(track):
         return None, [f"the acceleration was left out: {missing} of {len(track)} rows have none"]
-    notes = [f"{missing} rows without acceleration were filled"] if missing else []
+    notes = [f"no acceleration in {counted(missing, 'row')}: filled"] if missing else []
     if missing:
         time_s = track.time_s
         accel = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])

@@ -25,6 +25,7 @@ import pyarrow
 from numpy.typing import NDArray
 
 from ahrsd import so3
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
@@ -228,9 +229,9 @@ class _Rows:
         """Rows that have the same time and readings as the row before."""
         doubles = _doubles(list(self.values.values()))
         if doubles.any():
-            words = f"{np.count_nonzero(doubles)} rows repeat the row before them, time and all"
+            count = counted(np.count_nonzero(doubles), "row")
             first = self.numbers[np.flatnonzero(doubles)[0]]
-            self.notes.append(f"{words}: left out, first row {first}")
+            self.notes.append(f"left out as repeated, time and all: {count}, first row {first}")
             self._keep(~doubles)
             _check_length(self.path, len(self.numbers))
 
@@ -251,7 +252,7 @@ class _Rows:
         if ties := np.count_nonzero(np.diff(time_s) == 0.0):
             spread = ties_spread(time_s)
             if spread is not None:
-                self.notes.append(f"{ties} rows have the time of the row before: put behind it")
+                self.notes.append(f"put behind the row of the same time: {counted(ties, 'row')}")
                 time_s = spread
         _check_time(self.path, time_s, self.numbers)
         refuse_beyond(
@@ -321,12 +322,13 @@ class _Rows:
         filled = self._carried(accel, known, far)
         if filling := count - int(np.count_nonzero(far)):
             self.notes.append(
-                f"{filling} rows have no acceleration: the gyro carried it over from those beside"
+                f"no acceleration in {counted(filling, 'row')}: the gyro carried it over from those "
+                "beside"
             )
         if far.any():
             self.notes.append(
-                f"{np.count_nonzero(far)} rows without acceleration for more than {_HOLE_S:g} s "
-                "were left out"
+                f"left out, without acceleration for more than {_HOLE_S:g} s: "
+                f"{counted(np.count_nonzero(far), 'row')}"
             )
             kept = ~far
             place = np.cumsum(kept) - 1

@@ -15,6 +15,7 @@ from pathlib import Path
 import pyarrow
 import pyarrow.csv
 
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.bytestream import read_chunks, utf16_of
@@ -256,7 +257,9 @@ def _parsed(path: Path, text: _Text, notes: list[str]) -> pyarrow.Table:
         words = f"{wrong[0].actual_columns} cells where {wrong[0].expected_columns} are named"
         if count > max(_WRONG_FEW, _WRONG_SHARE * (table.num_rows + count)):
             raise RecordingError(path, f"row {row} has {words} ({count} such rows)", "repair them")
-        notes.append(f"{count} rows have another number of cells: left out, first row {row}")
+        notes.append(
+            f"left out for another number of cells: {counted(count, 'row')}, first row {row}"
+        )
     if decimal == ",":
         notes.append("the numbers have decimal commas: read as such")
     keep = [k for k, name in enumerate(names) if name or table.column(k).null_count < len(table)]

@@ -23,6 +23,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import psutil
@@ -116,6 +117,16 @@ def listen(path: Path, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times), np.array(latency)
 
 
+@contextlib.contextmanager
+def running(command: list[str], log: BinaryIO) -> Iterator[subprocess.Popen[bytes]]:
+    """The daemon; killed where what is measured breaks off."""
+    with subprocess.Popen(command, stdout=log, stderr=log) as daemon:
+        try:
+            yield daemon
+        finally:
+            daemon.kill()
+
+
 def measure(rate_hz: int, seconds: float, folder: Path, disk: Path) -> Figures:
     """One siege."""
     setup = Setup("rov", seed=1, output="binary", rate_hz=rate_hz, baud=BAUD)
@@ -128,7 +139,7 @@ def measure(rate_hz: int, seconds: float, folder: Path, disk: Path) -> Figures:
         )
         command = [sys.executable, "-m", "ahrsd", "-v", "run", "--config", str(config)]
         log = (folder / "log").open("wb")
-        with log, subprocess.Popen(command, stdout=log, stderr=log) as daemon:
+        with log, running(command, log) as daemon:
             viewer = _viewer_of(daemon.pid, folder / "log")
             viewer.suspend()
             full = fill(disk)
@@ -161,7 +172,7 @@ def _viewer_of(pid: int, log: Path) -> psutil.Process:
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         children = psutil.Process(pid).children(recursive=True)
-        viewers = [p for p in children if any("rerun_process" in part for part in p.cmdline())]
+        viewers = [p for p in children if "ahrsd.viewer.process" in p.cmdline()]
         if viewers and b"OBSERVING" in log.read_bytes():
             return viewers[0]
         time.sleep(0.1)

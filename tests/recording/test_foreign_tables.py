@@ -144,7 +144,7 @@ def test_few_rows_with_another_number_of_cells_are_left_out_and_many_are_not(tmp
     path.write_text("\n".join(rows) + "\n")
     table = read_table(path)
     assert (len(table.rows), table.starts) == (COUNT - 1, (0, 99))
-    assert "1 rows have another number of cells: left out, first row 101" in table.notes
+    assert "left out for another number of cells: 1 row, first row 101" in table.notes
     path.write_text("\n".join(row.rsplit(",", k % 2)[0] for k, row in enumerate(rows)) + "\n")
     with pytest.raises(RecordingError, match=r"row 2 has 9 cells where 10 are named|no number"):
         read_table(path)
@@ -454,7 +454,7 @@ def test_holes_of_the_acceleration_are_carried_over(tmp_path, rows):
     true = np.column_stack([sensor()[name] for name in ACCEL])
     assert len(table.rows) == COUNT
     np.testing.assert_allclose(table.rows.accel_b_m_s2, true, atol=0.15)
-    assert "rows have no acceleration: the gyro carried it" in table.notes[0]
+    assert ": the gyro carried it over from those beside" in table.notes[0]
 
 
 def test_a_long_hole_is_left_out_and_too_many_leave_the_acceleration_out(tmp_path):

@@ -147,7 +147,7 @@ def test_rows_written_twice_are_left_out_and_said(tmp_path):
     table = read_table(save(tmp_path / "t.csv", values))
     np.testing.assert_allclose(table.rows.time_s, 0.02 * np.arange(ROWS))
     np.testing.assert_allclose(table.rows.covariates["temperature_c"], 0.11 * np.arange(1, 51))
-    assert "3 rows repeat the row before them, time and all: left out, first row 10" in table.notes
+    assert "left out as repeated, time and all: 3 rows, first row 10" in table.notes
 
 
 def test_a_row_after_doubled_ones_is_named_by_its_number_in_the_file(tmp_path):
