@@ -322,8 +322,8 @@ class _Rows:
         filled = self._carried(accel, known, far)
         if filling := count - int(np.count_nonzero(far)):
             self.notes.append(
-                f"no acceleration in {counted(filling, 'row')}: the gyro carried it over from those "
-                "beside"
+                f"no acceleration in {counted(filling, 'row')}: the gyro carried it over from "
+                "those beside"
             )
         if far.any():
             self.notes.append(

@@ -199,7 +199,7 @@ def test_time_going_backwards(tmp_path, seed, row, back):
         assert f"row {row + 2}, column time_s: time goes back" in result
         return
     said = " ".join(result.said())
-    assert f"at row {row + 2} (" in said or "have the time of the row before" in said
+    assert f"at row {row + 2} (" in said or "put behind the row of the same time" in said
 
 
 @FEW
