@@ -143,10 +143,18 @@ def look(unit: Unit, expected: Mapping[int, Values]) -> Procedure[Seen]:
 
     What is not as expected is read once more, for a reply may be altered on its way.
     """
-    seen = Seen((yield from read_unit()), (yield from read_registers(expected)))
+    seen = yield from _seen(expected)
     if seen.unit == unit and not differences(expected, seen.values):
         return seen
-    return Seen((yield from read_unit()), (yield from read_registers(expected)))
+    return (yield from _seen(expected))
+
+
+def _seen(expected: Mapping[int, Values]) -> Procedure[Seen]:
+    """The serial number is asked at both ends: the cable may be moved between two questions."""
+    unit = yield from read_unit()
+    values = yield from read_registers(expected)
+    last = int((yield from read(3))[0])
+    return Seen(unit if last == unit.serial else replace(unit, serial=last), values)
 
 
 def read_registers(ids: Iterable[int]) -> Procedure[dict[int, Values]]:

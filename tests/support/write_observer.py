@@ -11,7 +11,7 @@ void_save          a save of values that the iron, as it had been for `GRACE_S`,
 foreign_save       a save of what another program wrote while this one listened, and did not save
 half_save          a save while the device does not hold all of the transaction's new values
 foreign_replaced   a write over another program's value that the journal knows nothing of
-proven_not_held    PROVEN of values that the device does not hold
+proven_not_held    PROVEN of values that the device, when asked, does not show
 false_confirmed    CONFIRMED although that unit did not restart with the values in its flash
 """
 
@@ -109,7 +109,7 @@ class Observer:
             seen.sent_s = at_s
         elif kind == "PROVEN" and not facts.get("unsent"):
             new = self._new(seen)
-            held = all(unit.memory.ram[n] == text for n, text in new.items())
+            held = all(unit.shown(n) == text for n, text in new.items())
             if not (held and self.cable.unit is unit) and at_s - self._since_s(seen) > RACE_S:
                 self._wrong("proven_not_held", at_s, f"unit {serial} holds {unit.memory.ram[23]}")
         elif kind == "CONFIRMED":

@@ -97,7 +97,7 @@ class Unit:
     def _obey(self, word: str, tokens: list[str], at_s: float, who: str) -> tuple[str, float]:
         if word == "VNRRG":
             number, port = self._register(tokens)
-            return ",".join([f"VNRRG,{number:02d}", self._shown(number), *port]), 0.0
+            return ",".join([f"VNRRG,{number:02d}", self.shown(number), *port]), 0.0
         if word == "VNWRG":
             number, _ = self._register(tokens[:1])
             return f"VNWRG,{number:02d}," + self._write(number, tokens[1:], at_s, who), 0.0
@@ -128,7 +128,8 @@ class Unit:
             raise BadLine(0x08)
         return number, tokens[1:2] if number in PER_PORT else []
 
-    def _shown(self, number: int) -> str:
+    def shown(self, number: int) -> str:
+        """What it says that a register holds."""
         if self.lies.reads_told and number in self._told:
             return self._told[number]
         return self.memory.ram[number]
