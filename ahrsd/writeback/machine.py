@@ -244,6 +244,7 @@ class WriteBack:
         else None.
         """
         self._desk.host_s, flow, self.confirmed_s = host_s, self._flow, None
+        self._recheck.unanswered = False
         if flow.identity is None or self.state is State.RECONCILING or self._desk.running:
             return self._answer()  # overtaken
         if seen is None:
@@ -266,7 +267,7 @@ class WriteBack:
         A stream that is played faster than it was recorded fills them up sooner than the clock.
         """
         self._desk.host_s = host_s
-        if span_s >= self.policy.recheck_s:
+        if span_s >= self.policy.recheck_s and not self._recheck.unanswered:
             self._recheck.soon(host_s)
         return self._answer()
 
@@ -466,6 +467,7 @@ class WriteBack:
             self._recheck.soon(now_s)
             return
         expected = {n: flow.registers[n] for n in RECHECKED if n in flow.registers}
+        self._recheck.unanswered = True
         self._desk.ask(Look(flow.identity.unit, expected))
 
     def _arm(self, armed: bool) -> Answer:

@@ -19,10 +19,12 @@ class Recheck:
     interval_s: float
     due_s: float | None = None
     asked_s: float = float("-inf")  # the newest time
+    unanswered: bool = False
 
     def begin(self, host_s: float) -> None:
         """The device was read, or is being read."""
         self.asked_s, self.due_s = host_s, host_s + self.interval_s
+        self.unanswered = False
 
     def off(self) -> None:
         """Nobody is there to be asked."""

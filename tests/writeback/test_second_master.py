@@ -142,7 +142,7 @@ def test_the_reads_are_rare_and_the_stream_goes_on():
     heard, samples = len(run.cable.unit.log), run.core.stream.facts.samples
     run.run(300.0)
     reads = run.cable.unit.log[heard:]
-    assert 60 <= len(reads) <= 8 * 11
+    assert 28 * 9 <= len(reads) <= 32 * 9  # who, what it holds, and again who; every 10 s
     assert {line.split(",")[0] for line in reads} == {"VNRRG"}
     assert run.core.stream.facts.samples - samples >= 300.0 * 20 - 20
     assert run.core.stream.gaps == []
