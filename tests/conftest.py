@@ -156,7 +156,8 @@ class LiveDaemon:
 
         self.port = folder / "vn100"
         device = {"baud": 115200, "port": str(self.port), **tables.pop("device", {})}
-        body = {"state_directory": str(folder), **tables, "device": device}
+        back = {"recheck_s": 5.0, **tables.pop("write_back", {})}  # samples count the sooner
+        body = {"state_directory": str(folder), **tables, "device": device, "write_back": back}
         self.emulator = build(Setup(**setup))
         self.before = dict(self.emulator.memory.ram)
         self.heard = bytearray()

@@ -51,6 +51,7 @@ class Calibrator:
         self.gates: tuple[GateResult, ...] = ()
         self._gap = True
         self.started = False
+        self.broken = False  # something broke off in it: it may be anything now
         self.steps = StepDetector()
         self.step: Step | None = None  # the newest one that was told
         self.step_open = False  # the estimate still rests on data from before it

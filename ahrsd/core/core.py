@@ -331,8 +331,8 @@ class Core:
                 back = self.writeback
                 self._errands.add(back.on_looked(seen, str(error or ""), self._host_s))
                 if back.confirmed_s is not None:
-                    for block, when in self.unconfirmed.confirm(back.confirmed_s):
-                        self._examine(block, when)
+                    for blocks, when in self.unconfirmed.confirm(back.confirmed_s):
+                        self._examine(blocks, when)
             case StreamChanged(text, level):
                 self._flush()
                 self._watch.resumed(self._host_s)
@@ -448,18 +448,19 @@ class Core:
             how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
             now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
             if self.conversation.identity is None or self.conversation.mode is Mode.PASSIVE:
-                self._examine(free, now)  # there is nobody to ask
+                self._examine([free], now)  # there is nobody to ask
             else:
                 self.unconfirmed.hold(free, self._host_s, now)
                 self._errands.add(self.writeback.on_waiting(self.unconfirmed.span_s, self._host_s))
         self._errands.let_out(self)
 
-    def _examine(self, block: SampleBlock, when: Circumstances) -> None:
+    def _examine(self, blocks: list[SampleBlock], when: Circumstances) -> None:
         """Samples of the device that was read: for the calibrator."""
-        if self.estimator.takes(block):
-            block = self._recall(block)
-            self.warm.live(block)
-            self._begin(self._desk.examine(self.calibrator, block, when))
+        if taken := [block for block in blocks if self.estimator.takes(block)]:
+            taken[0] = self._recall(taken[0])
+            for block in taken:
+                self.warm.live(block)
+            self._begin(self._desk.examine(self.calibrator, taken, when))
 
     def _recall(self, block: SampleBlock) -> SampleBlock:
         """The block, after the calibrator was given the samples of an earlier run, if any."""

@@ -87,9 +87,11 @@ class Piece:
         self._failure: Failure | None = None
 
     def work(self) -> Failure | None:
-        """Do it; how it broke off, None where it did not."""
+        """Do it; how it broke off, None where it did not, or a piece before it has."""
         self._begun = True
-        self._finding, self._failure = supervised(self._make)
+        if not self.calibrator.broken:
+            self._finding, self._failure = supervised(self._make)
+            self.calibrator.broken = self._failure is not None
         return self._failure
 
     def finding(self) -> Finding | Broken | None:
@@ -153,10 +155,10 @@ class Desk:
         self._pieces: deque[Piece] = deque()
 
     def examine(
-        self, calibrator: Calibrator, block: SampleBlock, circumstances: Circumstances
+        self, calibrator: Calibrator, blocks: list[SampleBlock], circumstances: Circumstances
     ) -> Piece:
-        """Let the calibrator take the block and judge."""
-        return self._put(calibrator, partial(_examined, calibrator, block, circumstances))
+        """Let the calibrator take the blocks and judge; how things stood when the last one came."""
+        return self._put(calibrator, partial(_examined, calibrator, blocks, circumstances))
 
     def recall(
         self, calibrator: Calibrator, block: SampleBlock, circumstances: Circumstances
@@ -184,6 +186,8 @@ class Desk:
         """
         taken = [self._pieces.popleft() for _ in range(min(pieces, len(self._pieces)))]
         last = [Broken(taken.pop().calibrator, broken)] if broken and taken else []
+        if last:
+            last[0].calibrator.broken = True
         found = [one for piece in taken if (one := piece.finding()) is not None]
         return [*found, *last]
 
@@ -194,10 +198,12 @@ def _recalled(calibrator: Calibrator, block: SampleBlock, now: Circumstances) ->
     return Finding(calibrator, now, None, notes, void=void)
 
 
-def _examined(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> Finding:
-    new = calibrator.take(block)
+def _examined(calibrator: Calibrator, blocks: list[SampleBlock], now: Circumstances) -> Finding:
+    new, void = False, ""
+    for block in blocks:
+        new |= calibrator.take(block)
+        void = calibrator.take_void() or void
     proposed, notes = calibrator.proposed, tuple(calibrator.take_notes(now.host_s))
-    void = calibrator.take_void()
     if not new:
         return Finding(calibrator, now, proposed, notes, void=void)
     gates = calibrator.judged(now.at_s, now.health, now.basis, now.margin)

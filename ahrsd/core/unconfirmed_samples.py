@@ -23,6 +23,7 @@ import numpy as np
 from ahrsd.samples import SampleBlock
 
 MOST_ROWS = 200_000  # that wait; a device that answers nothing any more must not fill the memory
+GROUP_S = 2.0  # examined in one go: it costs less, and nothing waits for it for long
 T = TypeVar("T")
 
 
@@ -65,22 +66,30 @@ class UnconfirmedSamples(Generic[T]):
         self._open.clear()
         self._doubt_s, self._in_doubt = host_s, True
 
-    def confirm(self, asked_s: float) -> list[tuple[SampleBlock, T]]:
+    def confirm(self, asked_s: float) -> list[tuple[list[SampleBlock], T]]:
         """The device that was asked then is the one that was read, and holds what it ought to.
 
-        Returns the blocks that may be used now, oldest first.
+        Returns the blocks that may be used now, oldest first, in groups of about `GROUP_S` of
+        samples, with how things stood when the last one of the group came.
         """
         if asked_s <= self._doubt_s:
             return []  # it may have answered before the doubt
         self._in_doubt = False
-        released = []
+        released: list[tuple[list[SampleBlock], T]] = []
+        span_s = GROUP_S
         for line in (self._sure, self._open):
             while line and line[0].came_s <= asked_s:
                 one = line.popleft()
                 self._count(one.block, -1)
                 follows = one.number == self._released + 1
-                released.append((one.block if follows else _after_a_gap(one.block), one.how))
+                block = one.block if follows else _after_a_gap(one.block)
                 self._released = one.number
+                if span_s >= GROUP_S:
+                    released.append(([], one.how))
+                    span_s = 0.0
+                group = [*released[-1][0], block]
+                released[-1] = (group, one.how)
+                span_s += float(np.nansum(block.dt_s))
         return released
 
     def drop(self) -> None:

@@ -15,7 +15,7 @@ from queue import SimpleQueue
 from ahrsd.events import Failure
 
 SWITCH_S = 0.0005
-MOST_WAITING = 40  # pieces, of a quarter of a second each: older verdicts are of no use
+MOST_WAITING = 40  # pieces, of up to two seconds of samples each: older verdicts are of no use
 _STUCK_S = 5.0  # no piece takes so long; the service manager's watchdog then goes hungry
 _MOST_REASONS = 16  # whose traceback is logged, once each
 

@@ -229,7 +229,7 @@ class _Rows:
         """Rows that have the same time and readings as the row before."""
         doubles = _doubles(list(self.values.values()))
         if doubles.any():
-            count = counted(np.count_nonzero(doubles), "row")
+            count = counted(int(np.count_nonzero(doubles)), "row")
             first = self.numbers[np.flatnonzero(doubles)[0]]
             self.notes.append(f"left out as repeated, time and all: {count}, first row {first}")
             self._keep(~doubles)
@@ -249,7 +249,7 @@ class _Rows:
             )
         if not np.any(np.diff(time_s) < 0.0) and is_bunched(time_s):
             time_s = self._evened(time_s)
-        if ties := np.count_nonzero(np.diff(time_s) == 0.0):
+        if ties := int(np.count_nonzero(np.diff(time_s) == 0.0)):
             spread = ties_spread(time_s)
             if spread is not None:
                 self.notes.append(f"put behind the row of the same time: {counted(ties, 'row')}")
@@ -328,7 +328,7 @@ class _Rows:
         if far.any():
             self.notes.append(
                 f"left out, without acceleration for more than {_HOLE_S:g} s: "
-                f"{counted(np.count_nonzero(far), 'row')}"
+                f"{counted(int(np.count_nonzero(far)), 'row')}"
             )
             kept = ~far
             place = np.cumsum(kept) - 1

@@ -21,7 +21,7 @@ def block(number: int, rows: int = 4) -> SampleBlock:
 
 
 def numbers(released) -> list[int]:
-    return [int(one.covariates["temperature_c"][0]) for one, _ in released]
+    return [int(one.covariates["temperature_c"][0]) for group, _ in released for one in group]
 
 
 def holding(*came: int) -> UnconfirmedSamples[str]:
@@ -35,10 +35,16 @@ def test_what_came_before_the_question_counts_and_what_came_behind_it_waits():
     line = holding(1, 2, 3)
     released = line.confirm(2.0)
     assert numbers(released) == [1, 2]
-    assert [how for _, how in released] == ["how 1", "how 2"]
+    assert [how for _, how in released] == ["how 2"]
     assert line.span_s == 1.0
     assert numbers(line.confirm(9.0)) == [3]
     assert line.span_s == 0.0
+
+
+def test_what_is_released_at_once_comes_in_groups():
+    released = holding(1, 2, 3, 4, 5).confirm(9.0)
+    assert [len(group) for group, _ in released] == [2, 2, 1]
+    assert [how for _, how in released] == ["how 2", "how 4", "how 5"]
 
 
 def test_an_answer_to_a_question_from_before_the_doubt_counts_for_nothing():
@@ -59,9 +65,11 @@ def test_between_two_doubts_without_an_answer_nothing_counts():
     released = line.confirm(4.0)
     assert numbers(released) == [1, 3]
     assert line.dropped == 4
-    assert released[1][0].gap_before
-    assert np.isnan(released[1][0].dt_s[0])
-    assert np.isfinite(released[1][0].dt_s[1:]).all()
+    first, after = released[0][0]
+    assert np.isfinite(first.dt_s).all()
+    assert after.gap_before
+    assert np.isnan(after.dt_s[0])
+    assert np.isfinite(after.dt_s[1:]).all()
 
 
 def test_where_the_doubt_may_be_a_restart_nothing_from_before_it_counts():

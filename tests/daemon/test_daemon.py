@@ -143,7 +143,7 @@ def test_after_a_reset_to_silence_the_session_is_set_up_again(live):
 
 
 def test_another_device_begins_anew_and_nothing_is_written_to_it(live):
-    with live({"output": "imu", "faults": ("replug_other_serial@4+1",)}, mode="stage") as daemon:
+    with live({"output": "imu", "faults": ("replug_other_serial@9+1",)}, mode="stage") as daemon:
         daemon.until(lambda: daemon.core.calibrator.started)
         first = daemon.core.calibrator
         daemon.until(lambda: daemon.noted("another device"), 20.0)
@@ -227,7 +227,7 @@ def test_samples_go_on_while_the_estimator_is_at_it(live):
             free.wait(20.0)
 
         daemon.core.calibrator.take = search
-        daemon.until(busy.is_set)
+        daemon.until(busy.is_set)  # once the device was asked who it is
         seen = [e for e in list(daemon.events) if isinstance(e, SamplesSeen)]
         daemon.until(
             lambda: len([e for e in daemon.events if isinstance(e, SamplesSeen)]) > len(seen) + 3

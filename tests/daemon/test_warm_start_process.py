@@ -98,7 +98,8 @@ def test_a_kill_does_not_lose_the_drive(tmp_path):
     assert "no warm start: there is no earlier capture" in cold.said
     assert f"from {cold.capture.name}" in warm.said
     needed_s = warm.qualified_s() - warm.warm_s()
-    assert needed_s + 1.0 >= CONFIRM_S
+    # the samples that were the first to count had waited for the device's answer
+    assert needed_s + 5.0 * SPEED + 1.0 >= CONFIRM_S
     assert needed_s < 0.8 * cold.qualified_s()
     done = replay(warm.capture, warm.config)  # the samples are inputs: nothing else is needed
     assert done.core.warm.text.endswith("this run agrees")

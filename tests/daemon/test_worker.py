@@ -133,6 +133,7 @@ class BesideRun(VirtualRun):
             armed_at_start=True,
             commit_unattended=True,
             max_change_auto_deg=180.0,
+            recheck_s=0.5,
         )
         settings = replace(core_settings(Config(), policy=policy), beside=True)
         device = build(Setup("rov", seed=3, output="imu", rate_hz=50))

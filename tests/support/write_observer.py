@@ -9,7 +9,9 @@ not_judged_here    a value in a unit that was not judged on that unit: neither i
 other_journal      a value of a candidate, journaled under another unit's number
 void_save          a save of values that the iron, as it had been for `GRACE_S`, made wrong
 foreign_save       a save of what another program wrote while this one listened, and did not save
-half_save          a save while the device does not hold all of the transaction's new values
+half_save          a save while the device does not hold all of the transaction's new values; one
+                   that shows them in every reading and does not apply them is for the trial on
+                   samples to find, and that lasts two seconds in these histories
 foreign_replaced   a write over another program's value that the journal knows nothing of
 proven_not_held    PROVEN of values that the device, when asked, does not show
 false_confirmed    CONFIRMED although that unit did not restart with the values in its flash
@@ -177,10 +179,11 @@ class Observer:
             text = ram[number]
             who, since_s = seen.author[number]
             theirs = who == "other" and seen.flash_author[number] != (who, since_s)
-            theirs &= since_s > self._first_read_s(unit, number)
+            theirs &= since_s > max(self._first_read_s(unit, number), self.begun_s + RACE_S)
             if theirs and at_s - since_s > RACE_S and text != new.get(number):
                 self._wrong("foreign_save", at_s, f"unit {unit.serial} register {number}: {text}")
-            if number in new and text != new[number] and at_s - self._since_s(seen) > RACE_S:
+            half = number in new and new[number] not in (text, unit.shown(number))
+            if half and at_s - self._since_s(seen) > RACE_S:
                 self._wrong("half_save", at_s, f"unit {unit.serial} register {number}: {text}")
             if who == "host" and text not in seen.own[number]:
                 times = np.linspace(at_s - GRACE_S, at_s, 7)

@@ -190,7 +190,7 @@ def planted_run(
 def on_trial(*arguments: Any, **more: Any) -> VirtualRun:
     """A run in which the planted values have just been written to the device."""
     run = planted_run(*arguments, **more)
-    assert run.until(lambda: state(run) == "TRIAL", 10.0), (run.states, run.notes[-5:])
+    assert run.until(lambda: state(run) == "TRIAL", 20.0), (run.states, run.notes[-5:])
     return run
 
 
@@ -241,7 +241,7 @@ def test_a_better_gyro_bias_alone_is_proven_on_a_calibrated_device():
     run = on_trial("calibrated", good, gyro=good.gyro + 0.02)
     assert run.sent["VNWRG 23"] == 0
     assert run.until(lambda: state(run) != "TRIAL", TRIAL_S)
-    assert state(run) == "PROVEN", run.states
+    assert run.states[run.states.index("TRIAL") + 1] == "PROVEN", run.states
 
 
 GATED = {

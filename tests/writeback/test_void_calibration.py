@@ -72,7 +72,7 @@ def test_an_estimate_that_clearly_asks_for_something_else_ends_it():
     run.core.calibrator = PlantedCalibrator(
         run.core.calibrator, estimate(hard_iron_gauss=IRON + STEP)
     )
-    run.run(10.0)
+    run.run(15.0)
     assert any("asks for another" in text for text in run.core.writeback.holds())
     run.park(120.0)
     undone(run)
@@ -89,7 +89,7 @@ def test_one_that_differs_a_little_only_holds_the_save():
     assert run.state == "PROVEN"
     assert run.cable.unit.saves == []
     run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
-    run.run(5.0)
+    run.run(15.0)
     assert run.state == "COMMITTED"
 
 

@@ -144,14 +144,30 @@ def test_a_save_of_half_and_of_somebodys_values():
     story.now_s += 5.0
     story.say("VNWNV")
     assert story.kinds == ["half_save"]
+    for saved_by_them in (False, True):
+        story = Story()
+        story.say("VNRRG,23")  # from here on somebody listens
+        story.announce()
+        story.prepare()
+        story.write()
+        story.cable.other_master(f"VNWRG,23,{FOREIGN}", story.now_s)
+        if saved_by_them:
+            story.cable.other_master("VNWNV", story.now_s)
+        story.now_s += 5.0
+        story.say("VNWNV")
+        assert sorted(story.kinds) == ["foreign_save"] * (not saved_by_them) + ["half_save"]
+
+
+def test_what_was_there_before_anybody_listened_is_the_units_own():
     story = Story()
-    story.announce()
-    story.prepare()
-    story.write()
-    story.cable.other_master(f"VNWRG,23,{FOREIGN}", story.now_s)
+    story.cable.other_master(f"VNWRG,84,{FOREIGN}", story.now_s)
     story.now_s += 5.0
+    story.say("VNRRG,84")
+    story.announce({23: GOOD[23]})
+    story.prepare(values={23: GOOD[23]})
+    story.write({23: GOOD[23]})
     story.say("VNWNV")
-    assert sorted(story.kinds) == ["foreign_save", "half_save"]
+    assert story.kinds == []
 
 
 def test_somebodys_values_are_not_replaced_unseen():
