@@ -1,9 +1,10 @@
-"""The shape of the code: who imports whom, what is pure, how long things are."""
+"""The shape of the code: who imports whom, what is pure, how much one part needs to know."""
 
 from __future__ import annotations
 
 import ast
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import grimp
@@ -48,6 +49,29 @@ SHELL = (
     "drivers.vn100.emulator.pty",
 )
 
+# What a reader has to hold in mind. The figures are printed by `pytest -s -k figures`; those of a
+# module or a chain that is over its limit today may only fall. The diagnosis has its own plan.
+ENGINE = "ahrsd.diagnosis"
+MOST_AT_THE_ROOT = 14  # modules beside the packages of ahrsd
+MOST_LINES_OF_A_FUNCTION = 60
+MOST_ENTRIES_OF_A_FOLDER = 15  # longer listings are printed
+MOST_IMPORTS = 15  # other modules of the project that one module imports
+IMPORTS_OVER_THE_LIMIT = {
+    "ahrsd.core.core": 30,
+    "ahrsd.demo": 28,
+    "ahrsd.daemon.service": 23,
+    "ahrsd.offline.calibrate": 19,
+    "ahrsd.offline.diagnose": 19,
+    "ahrsd.daemon.daemon": 18,
+    "ahrsd.writeback.machine": 18,
+    "ahrsd.offline.replay": 17,
+    "ahrsd.baselines.registry": 16,
+    "ahrsd.cli.simulate": 16,
+    "ahrsd.offline.convert": 16,
+    "ahrsd.recording.earlier_run": 16,
+}
+LONGEST_CHAIN = 22  # modules, each of which imports the next; the aim is 12
+
 
 @cache
 def graph() -> grimp.ImportGraph:
@@ -85,17 +109,18 @@ def test_the_driver_never_imports_the_daemon():
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PROJECT)))
-def test_files_and_functions_are_short_and_catch_what_they_name(path):
-    text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text)
-    assert text.count("\n") <= 900
+def test_functions_are_short_and_catch_what_they_name(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     assert path.stem not in ("utils", "helpers", "common", "misc")
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            length = (node.end_lineno or 0) - node.lineno + 1
-            assert length <= 60, f"{node.name} has {length} lines"
+            assert lines_of(node) <= 60, f"{node.name} has {lines_of(node)} lines"
         if isinstance(node, ast.ExceptHandler) and path.stem != SUPERVISOR:
             assert not is_broad(node), f"broad except in line {node.lineno}"
+
+
+def lines_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    return (node.end_lineno or 0) - node.lineno + 1
 
 
 def is_broad(handler: ast.ExceptHandler) -> bool:
@@ -125,3 +150,73 @@ def test_no_machine_path_in_what_is_published():
     wrong = ["/" + "work/", "/" + "root/", "/tmp/" + "dev"]
     found = [path.name for path in published if any(w in path.read_text() for w in wrong)]
     assert found == []
+
+
+def imports() -> dict[str, set[str]]:
+    """What each module outside the diagnosis imports of the project."""
+    own = {name for name in graph().modules if name.split(".")[0] in ("ahrsd", "drivers")}
+    return {
+        name: graph().find_modules_directly_imported_by(name) & own
+        for name in own
+        if not f"{name}.".startswith(f"{ENGINE}.")
+    }
+
+
+def longest_chain(imported: dict[str, set[str]]) -> list[str]:
+    """From the module at the top down to the last one; CycleError where imports run in a circle."""
+    chains: dict[str, list[str]] = {}
+    for name in TopologicalSorter(imported).static_order():
+        below = [chains[other] for other in sorted(imported.get(name, ()))]
+        chains[name] = [name, *max(below, key=len, default=[])]
+    return max(chains.values(), key=len)
+
+
+def entries(folder: Path) -> list[str]:
+    return [
+        path.name for path in folder.iterdir() if not path.name.startswith(("__pycache__", "."))
+    ]
+
+
+def test_figures_of_modules_at_the_root_and_of_functions():
+    modules = sorted(path.name for path in (PROJECT / "ahrsd").glob("*.py"))
+    print(f"\n{len(modules)} modules at the root of ahrsd: {', '.join(modules)}")
+    longest = max(
+        (lines_of(node), f"{path.relative_to(PROJECT)}: {node.name}")
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    )
+    print("longest function: {} lines, {}".format(*longest))
+    folders = [PROJECT / top for top in ("ahrsd", "drivers", "tests", "docs")]
+    listings = sorted(
+        ((len(entries(folder)), str(folder.relative_to(PROJECT)))
+         for top in folders for folder in [top, *(path for path in top.rglob("*") if path.is_dir())]
+         if folder.name != "__pycache__"),
+        reverse=True,
+    )  # fmt: skip
+    print(f"folders with more than {MOST_ENTRIES_OF_A_FOLDER} entries:")
+    for number, folder in listings:
+        if number > MOST_ENTRIES_OF_A_FOLDER:
+            print(f"  {number} {folder}")
+    assert len(modules) <= MOST_AT_THE_ROOT
+    assert longest[0] <= MOST_LINES_OF_A_FUNCTION
+
+
+def test_figures_of_imports_outside_the_diagnosis():
+    numbers = {name: len(others) for name, others in imports().items()}
+    over = {name: number for name, number in numbers.items() if number > MOST_IMPORTS}
+    print(f"\n{len(numbers)} modules; {len(over)} import more than {MOST_IMPORTS} of the project:")
+    for name, number in sorted(over.items(), key=lambda item: -item[1]):
+        print(f"  {number} {name}")
+    assert over == IMPORTS_OVER_THE_LIMIT  # one that fell: write its new number there
+
+
+def test_figures_of_the_longest_chain_outside_the_diagnosis():
+    known = imports()
+    chain = longest_chain({name: others & known.keys() for name, others in known.items()})
+    print(f"\nlongest chain of imports, {len(chain)} modules: {' > '.join(chain)}")
+    assert len(chain) <= LONGEST_CHAIN
+
+
+def test_the_longest_chain_is_the_longest():
+    assert longest_chain({"a": {"b", "d"}, "b": {"c"}, "c": {"d"}, "d": set()}) == list("abcd")

@@ -11,8 +11,7 @@ from ahrsd.counting import counted
 if TYPE_CHECKING:
     from ahrsd.challenge.answers import Finding
     from ahrsd.challenge.judge import Verdict
-    from ahrsd.challenge.scores import Score
-    from ahrsd.challenge.scoring import Result
+    from ahrsd.challenge.scores import Result, Score
 
 _Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
 _CASES = (

@@ -31,6 +31,16 @@ class Score:
         return asdict(self)
 
 
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A tool's verdicts, misses first, and its scores."""
+
+    tool: str
+    verdicts: list[Verdict]
+    scores: list[Score]
+    mistakes: Score
+
+
 def wilson(hits: int, cases: int) -> tuple[float, float]:
     """95 % interval of a share."""
     if cases == 0:

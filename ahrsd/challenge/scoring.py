@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ahrsd.challenge.answers import Answer, read_answer
-from ahrsd.challenge.judge import ORDER, Verdict, judge
+from ahrsd.challenge.judge import ORDER, judge
 from ahrsd.challenge.report import html, markdown
 from ahrsd.challenge.running import OURS, could_not_run
-from ahrsd.challenge.scores import Score, error_rate, scores
+from ahrsd.challenge.scores import Result, error_rate, scores
 from ahrsd.challenge.sealing import Json, Round, open_key, read_object, write_object
 from ahrsd.errors import AhrsdError
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """A tool's verdicts, misses first, and its scores."""
-
-    tool: str
-    verdicts: list[Verdict]
-    scores: list[Score]
-    mistakes: Score
 
 
 def unable(trial: Round) -> dict[str, str]:
