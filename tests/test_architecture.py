@@ -57,7 +57,7 @@ MOST_LINES_OF_A_FUNCTION = 60
 MOST_ENTRIES_OF_A_FOLDER = 15  # longer listings are printed
 MOST_IMPORTS = 15  # other modules of the project that one module imports
 IMPORTS_OVER_THE_LIMIT = {
-    "ahrsd.core.core": 30,
+    "ahrsd.core.core": 29,
     "ahrsd.demo": 28,
     "ahrsd.daemon.service": 23,
     "ahrsd.offline.calibrate": 19,
@@ -68,7 +68,6 @@ IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.baselines.registry": 16,
     "ahrsd.cli.simulate": 16,
     "ahrsd.offline.convert": 16,
-    "ahrsd.recording.earlier_run": 16,
 }
 LONGEST_CHAIN = 22  # modules, each of which imports the next; the aim is 12
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 from ahrsd import events
-from ahrsd.core.device_session import Conversation
+from ahrsd.core.device_session import DeviceSession
 from ahrsd.inputs import Journalled
 from ahrsd.writeback.actions import (
     Action,
@@ -31,8 +31,8 @@ from drivers.vn100.registers import Values
 from drivers.vn100.session import Event as SessionEvent
 
 
-class Office(Protocol):
-    """The core, as far as errands concern it."""
+class CoreCallbacks(Protocol):
+    """The core, as far as the queue calls it back."""
 
     def emit(self, event: events.Event) -> None:
         """Let the event out."""
@@ -47,13 +47,13 @@ class Office(Protocol):
         """What was estimated until now rests on samples that prove nothing."""
 
 
-class Errands:
-    """A line of actions. `pausing` is called before a procedure that may pause the output."""
+class ActionQueue:
+    """Actions in order. `pausing` is called before a procedure that may pause the output."""
 
     def __init__(
-        self, conversation: Conversation, writeback: WriteBack, pausing: Callable[[], None]
+        self, device_session: DeviceSession, writeback: WriteBack, pausing: Callable[[], None]
     ) -> None:
-        self._conversation, self._writeback = conversation, writeback
+        self._device_session, self._writeback = device_session, writeback
         self._pausing = pausing
         self._todo: deque[Action] = deque()
         self._procedure: RunProcedure | None = None
@@ -69,8 +69,8 @@ class Errands:
             and self._procedure is None
             and not self._awaiting_journal
             and self._writeback.idle
-            and self._conversation.may_close
-        ) or not self._conversation.limit.patient(self._now_s)
+            and self._device_session.may_close
+        ) or not self._device_session.limit.patient(self._now_s)
 
     @property
     def awaiting_journal(self) -> bool:
@@ -83,7 +83,7 @@ class Errands:
 
     def stop(self, host_s: float) -> None:
         """The run is to end: what is only in RAM is undone, within a limit."""
-        self._conversation.limit.begin(host_s)
+        self._device_session.limit.begin(host_s)
         self.add(self._writeback.on_stop(host_s))
 
     def forget_procedure(self) -> None:
@@ -95,65 +95,65 @@ class Errands:
         self._awaiting_journal = False
         kind = Kind(item.kind)
         if kind in OF_OUTPUTS:
-            self._conversation.journalled(kind, item.error, host_s)
+            self._device_session.journalled(kind, item.error, host_s)
         if item.error:
             first = self._writeback.on_journal_failed(kind, item.error, host_s)
         else:
             first = self._writeback.on_journal_ok(kind, host_s)
         self._todo.extendleft(reversed(first))
 
-    def let_out(self, office: Office) -> None:
+    def let_out(self, core: CoreCallbacks) -> None:
         """Facts at the head of the line, at once: when they are told must not depend on chunks."""
         while self._todo and not self._awaiting_journal:
             action = self._todo[0]
             if not isinstance(action, Emit):
                 return
             self._todo.popleft()
-            office.emit(action.event)
+            core.emit(action.event)
 
-    def work(self, office: Office, host_s: float) -> bool:
+    def work(self, core: CoreCallbacks, host_s: float) -> bool:
         """As far as it goes now; whether anything was done."""
         done, self._now_s = False, host_s
-        self._todo.extend(self._conversation.outputs.take_actions())
+        self._todo.extend(self._device_session.outputs.take_actions())
         while self._todo and not self._awaiting_journal:
-            self._act(self._todo.popleft(), office, host_s)
+            self._act(self._todo.popleft(), core, host_s)
             done = True
         if self._procedure is not None:  # goes before a look, which only wants to know
             self._look = None
-            office.take(self._conversation.stop_looking(host_s))
-        if self._procedure is not None and self._conversation.idle:
+            core.take(self._device_session.stop_looking(host_s))
+        if self._procedure is not None and self._device_session.idle:
             run, self._procedure = self._procedure, None
             self._pausing()
-            office.take(self._conversation.run(run.name, run.make(), run.purpose, host_s, run.gate))
+            core.take(self._device_session.run(run.name, run.make(), run.purpose, host_s, run.gate))
             done = True
-        if self._look is not None and self._conversation.idle:
+        if self._look is not None and self._device_session.idle:
             wanted, self._look = self._look, None
-            office.take(self._conversation.look(wanted.unit, wanted.expected, host_s))
+            core.take(self._device_session.look(wanted.unit, wanted.expected, host_s))
             done = True
         return done
 
-    def _act(self, action: Action, office: Office, host_s: float) -> None:
+    def _act(self, action: Action, core: CoreCallbacks, host_s: float) -> None:
         match action:
             case Emit(event):
-                office.emit(event)
+                core.emit(event)
             case JournalAppend(kind, facts):
                 self._awaiting_journal = True
-                office.emit(events.JournalAppend(kind.value, dict(facts)))
+                core.emit(events.JournalAppend(kind.value, dict(facts)))
             case RunProcedure():
                 self._procedure = action
             case CancelProcedure(name):
                 if self._procedure is not None and self._procedure.name == name:
                     self._procedure = None
-                office.take(self._conversation.cancel(name, host_s))
+                core.take(self._device_session.cancel(name, host_s))
             case InForce(registers):
-                office.in_force(registers)
+                core.in_force(registers)
             case Look():
                 self._look = action
             case CalibrateAnew(reason):
-                office.calibrate_anew(reason)
+                core.calibrate_anew(reason)
             case SetUpStream():
                 self._pausing()
-                office.take(self._conversation.set_up_again(host_s))
+                core.take(self._device_session.set_up_again(host_s))
             case IdentifyAgain():
                 self._look = None
-                office.take(self._conversation.identify_again(host_s))
+                core.take(self._device_session.identify_again(host_s))

@@ -1,6 +1,6 @@
 """The pure core: inputs in, events out. `run` and `replay` feed it the same way.
 
-It joins the parts and decides nothing itself: `conversation` talks to the device, `stream` makes
+It joins the parts and decides nothing itself: `device_session` talks to the device, `stream` makes
 samples, `calibrator` estimates and judges, `writeback` says what may be written. Its time is that
 of the inputs. Whatever it answers depends on the list of inputs alone, which is why a replay takes
 the same decisions; `decisions` holds them and their hash.
@@ -16,24 +16,32 @@ import numpy as np
 
 from ahrsd import events, inputs
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.core.action_queue import Errands
+from ahrsd.core.action_queue import ActionQueue
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.decision_log import DecisionLog
-from ahrsd.core.device_record import Rollcall
-from ahrsd.core.device_session import ECHOES, Conversation
-from ahrsd.core.estimation_queue import Broken, Circumstances, Desk, EstimatorState, Finding, Piece
-from ahrsd.core.sensor_checks import SensorChecks
-from ahrsd.core.session_events import (
+from ahrsd.core.device_record import DeviceRecord
+from ahrsd.core.device_session import (
+    ECHOES,
     Closed,
     Completed,
     ConfigurationRead,
+    DeviceEvent,
+    DeviceSession,
     Identified,
     Looked,
-    Said,
     StreamChanged,
     Unanswered,
 )
+from ahrsd.core.estimation_queue import (
+    Circumstances,
+    EstimationFailure,
+    EstimationQueue,
+    EstimationResult,
+    EstimationTask,
+    EstimatorState,
+)
+from ahrsd.core.sensor_checks import SensorChecks
 from ahrsd.core.settings import CoreSettings
 from ahrsd.core.stream_watch import StreamWatch
 from ahrsd.core.unconfirmed_samples import UnconfirmedSamples
@@ -67,7 +75,7 @@ class Core:
         rate, source = settings.stream_rate_hz, settings.stream_rate_source
         self.stream = Stream(self.epochs, rate, source, keep_gaps=settings.keep)
         self.vehicle = VehicleTerms(self.stream.warnings.setdefault, settings.columns_max_age_s)
-        self.conversation = Conversation(
+        self.device_session = DeviceSession(
             settings.policy.mode,
             change_stream=settings.policy.configure_stream,
             rate_hz=settings.output_rate_hz,
@@ -78,7 +86,7 @@ class Core:
         self._compared: tuple[Affine, Array] = (Affine.identity(), np.zeros(3))
         self._from_scratch = (settings.calibrator, *self._compared)
         self.calibrator = Calibrator(*self._from_scratch)
-        self._desk = Desk()
+        self._estimation_queue = EstimationQueue()
         self.estimator, self.sensors = EstimatorState(), SensorChecks()
         self._proposed: Affine | None = None
         passive = settings.policy.mode is Mode.PASSIVE
@@ -91,17 +99,17 @@ class Core:
         self._unit: Unit | None = None
         self._watch = StreamWatch()
         self.unconfirmed: UnconfirmedSamples[Circumstances] = UnconfirmedSamples()
-        self._rollcall = Rollcall()
-        self._errands = Errands(self.conversation, self.writeback, self.stream.forgive)
+        self._device_record = DeviceRecord()
+        self._action_queue = ActionQueue(self.device_session, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
         self._out: list[events.Event] = []
         self._answers: list[events.Answered] = []  # due once nothing waits for the journal
         if settings.policy.mode is Mode.PASSIVE:
             self._no_device()
-        talk, back, add = self.conversation, self.writeback, self._errands.add
+        device, back, add = self.device_session, self.writeback, self._action_queue.add
         self._handlers: dict[type, Callable[..., None]] = {
-            inputs.Received: lambda it: self.take(talk.received(it.data, self._host_s)),
-            inputs.Tick: lambda _: self.take(talk.tick(self._host_s)),
+            inputs.Received: lambda it: self.take(device.received(it.data, self._host_s)),
+            inputs.Tick: lambda _: self.take(device.tick(self._host_s)),
             inputs.WallClock: self._wall_clock,
             inputs.LinkOpened: self._link_opened,
             inputs.LinkLost: self._link_lost,
@@ -114,7 +122,7 @@ class Core:
             inputs.EarlierRun: lambda it: self._say_warm(self.warm.ended(it)),
             inputs.JournalOpened: self._journal_opened,
             inputs.Journalled: self._journalled,
-            inputs.Examined: lambda it: self._take_findings(it.pieces, it.failure),
+            inputs.Examined: lambda it: self._take_results(it.pieces, it.failure),
             inputs.LimitsChanged: self._limits_changed,
             inputs.Stop: self._stop,
         }
@@ -124,12 +132,12 @@ class Core:
     def handle(self, item: inputs.Input) -> list[events.Event]:
         """Take one input; everything that follows from it, in order."""
         self._host_s = max(self._host_s, item.host_ns * 1e-9)
-        self._errands.let_out(self)
+        self._action_queue.let_out(self)
         # first of all: what is sent next is judged by how old the vehicle's word is *now*
-        self._errands.add(self.writeback.tick(self._host_s))
+        self._action_queue.add(self.writeback.tick(self._host_s))
         self._handlers[type(item)](item)
         self._drive()
-        if self._answers and not self._errands.awaiting_journal:
+        if self._answers and not self._action_queue.awaiting_journal:
             self._out += self._answers
             self._answers = []
         out, self._out = self._out, []
@@ -138,14 +146,14 @@ class Core:
     @property
     def deadline_ns(self) -> int | None:
         """When a `Tick` is wanted if nothing else arrives before, on the host's clock."""
-        due = [self.conversation.deadline_s, self.writeback.deadline_s]
+        due = [self.device_session.deadline_s, self.writeback.deadline_s]
         known = [d for d in due if d is not None]
         return int(min(known) * 1e9) + 1 if known else None
 
     # -- inputs ------------------------------------------------------------------------------------
 
     def _wall_clock(self, item: inputs.WallClock) -> None:
-        add, back = self._errands.add, self.writeback
+        add, back = self._action_queue.add, self.writeback
         self.warm.clock(item)
         add(back.on_clock(item.wall_s, item.boot_id, item.boot_s, self._host_s))
 
@@ -153,30 +161,30 @@ class Core:
         latency = "" if item.latency_ms is None else f", USB latency {item.latency_ms} ms"
         self._note("info", f"{item.port} open at {item.baud} baud{latency}")
         self.stream.forget()
-        if self.conversation.mode is Mode.PASSIVE:
+        if self.device_session.mode is Mode.PASSIVE:
             self._no_device()
         else:
             self.epochs.begin_anew()  # nothing is un-mapped before it is known how, late or not
-        self.take(self.conversation.opened(item.baud, self._host_s))
+        self.take(self.device_session.opened(item.baud, self._host_s))
 
     def _link_lost(self, item: inputs.LinkLost) -> None:
         self._flush()
         self._breaks += 1
         self._note("warning", f"link lost: {item.reason}")
-        self.take(self.conversation.lost(self._host_s))
+        self.take(self.device_session.lost(self._host_s))
         self.stream.forget()
         self.unconfirmed.drop()
-        self._errands.forget_procedure()
-        self._errands.add(self.writeback.on_link_lost(self._host_s))
+        self._action_queue.forget_procedure()
+        self._action_queue.add(self.writeback.on_link_lost(self._host_s))
 
     def _operator(self, item: inputs.Operator) -> None:
         self._note("info", f"operator: {item.verb} {item.argument}".strip())
         back = self.writeback
-        self._errands.add(back.on_operator(item.verb, item.argument, self._host_s))
+        self._action_queue.add(back.on_operator(item.verb, item.argument, self._host_s))
         self._answers.append(events.Answered(item.word, *back.operator_answer))
 
     def _journalled(self, item: inputs.Journalled) -> None:
-        self._errands.journalled(item, self._host_s)
+        self._action_queue.journalled(item, self._host_s)
         if item.error and item.kind in (Kind.LOCKED, Kind.UNLOCKED):
             text = f"not in the journal: {item.error}; it holds for this run only"
             self._answers = [replace(a, accepted=False, text=text) for a in self._answers]
@@ -192,7 +200,7 @@ class Core:
         self._block(item.block)
 
     def _journal_opened(self, item: inputs.JournalOpened) -> None:
-        if error := self._rollcall.journal(item):
+        if error := self._device_record.journal_read(item):
             self._note("error", f"journal: {error}; nothing can be written")
         self._device_known()
 
@@ -202,19 +210,19 @@ class Core:
         self._from_scratch = (calibrator, *self._from_scratch[1:])
         self._judged_anew += 1
         self._note("info", "the limits of the gates were changed")
-        self._begin(self._desk.adopt(self.calibrator, calibrator))
-        self._errands.add(self.writeback.on_limits_changed(self._host_s))
+        self._begin(self._estimation_queue.adopt(self.calibrator, calibrator))
+        self._action_queue.add(self.writeback.on_limits_changed(self._host_s))
 
     def _stop(self, item: inputs.Stop) -> None:
         self._flush()
         self._stopping = item.reason
-        self._errands.stop(self._host_s)
+        self._action_queue.stop(self._host_s)
 
     # -- the device --------------------------------------------------------------------------------
 
     def take(self, found: list[SessionEvent]) -> None:
         """Measurements to the stream, with what was damaged between them; the rest is counted."""
-        skipped = deque(self.conversation.session.deframer.take_skipped())
+        skipped = deque(self.device_session.session.deframer.take_skipped())
         if any(isinstance(event, Measurement) for event in found):
             silence = self._watch.heard(self._host_s, self.stream.facts.rate_hz)
             if silence and not self.stream.carries_time:  # where it does, its time shows a gap
@@ -248,13 +256,13 @@ class Core:
 
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
         """Whose samples these are is not sure any more; empty: it is."""
-        if reason and self.conversation.listening and self.conversation.identity is not None:
+        if reason and self.device_session.listening and self.device_session.identity is not None:
             self.warm.doubt()
             if not jumped:
                 restarted = not self.stream.carries_time  # else its time would have fallen
                 self.unconfirmed.doubt(self._host_s, perhaps_restarted=restarted)
             more = self.writeback.on_doubt(reason, self._host_s, jumped=jumped)
-            self._errands.add(more)
+            self._action_queue.add(more)
             if jumped and self._trial is not None:
                 self._begin_trial()  # it is judged by what comes after the jump
 
@@ -268,20 +276,22 @@ class Core:
         self._note("warning", f"the device restarted ({why})")
         self._breaks += 1
         self.unconfirmed.drop()
-        if self.conversation.identity is None:
+        if self.device_session.identity is None:
             return
         self.epochs.begin(self._host_s, None)
-        self._errands.add(self.writeback.on_reset(self._host_s, uptime_s))
-        self._errands.forget_procedure()
-        self.take(self.conversation.identify_again(self._host_s))
+        self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s))
+        self._action_queue.forget_procedure()
+        self.take(self.device_session.identify_again(self._host_s))
 
     def _no_device(self) -> None:
-        """Passive, or a recording without a conversation: the stream is taken as it is."""
-        self._errands.add(self.writeback.on_no_device(self.registers or None, self._host_s))
+        """Passive, or a recording without commands: the stream is taken as it is."""
+        self._action_queue.add(self.writeback.on_no_device(self.registers or None, self._host_s))
 
     def _device_known(self) -> None:
         """Identity, registers and journal may all be there now."""
-        self._errands.add(self._rollcall.told(self.conversation, self.writeback, self._host_s))
+        self._action_queue.add(
+            self._device_record.report(self.device_session, self.writeback, self._host_s)
+        )
 
     def _in_force(self, values: dict[int, Values]) -> None:
         """These registers act on what follows; the first ones are the estimator's prior."""
@@ -294,12 +304,12 @@ class Core:
         trial = self.writeback.history.open
         users = values if trial is None else {**values, **trial.old}
         self._compared = user_compensation(users)
-        self._begin(self._desk.compare(self.calibrator, *self._compared))
+        self._begin(self._estimation_queue.compare(self.calibrator, *self._compared))
 
     def _identified(self, unit: Unit) -> None:
         """A device said who it is; what was estimated of another one is not for it."""
         self._note("info", str(unit))
-        self._rollcall.identified()
+        self._device_record.identified()
         if self._unit not in (None, unit):
             self._flush()
             self.stream.forget()
@@ -311,15 +321,15 @@ class Core:
         self._unit = unit
         self._out.append(events.OpenJournal(unit.serial))
 
-    def _digest(self, said: Said) -> None:
-        match said:
+    def _on_device(self, event: DeviceEvent) -> None:
+        match event:
             case Identified(identity):
                 self._identified(identity.unit)
             case ConfigurationRead(values):
                 self._flush()
                 self.unconfirmed.drop()  # it was asked for because something is not sure
                 believed = {} if self.writeback.history.open else self.registers
-                if others := self._rollcall.registers(values, believed, self._breaks):
+                if others := self._device_record.registers_read(values, believed, self._breaks):
                     self._note("warning", f"somebody changed registers {others}: calibrated anew")
                 if self._unread or others:  # as it came does not mix with what is un-mapped
                     self.calibrator, self._unread = Calibrator(*self._from_scratch), False
@@ -329,7 +339,7 @@ class Core:
                 self._device_known()
             case Looked(seen, error):
                 back = self.writeback
-                self._errands.add(back.on_looked(seen, str(error or ""), self._host_s))
+                self._action_queue.add(back.on_looked(seen, str(error or ""), self._host_s))
                 if back.confirmed_s is not None:
                     for blocks, when in self.unconfirmed.confirm(back.confirmed_s):
                         self._examine(blocks, when)
@@ -352,7 +362,7 @@ class Core:
                     more = self.writeback.on_procedure_finished(name, result, self._host_s)
                 else:
                     more = self.writeback.on_procedure_failed(name, error, self._host_s)
-                self._errands.add(more)
+                self._action_queue.add(more)
             case Closed(error):
                 if error is not None:
                     self._note("error", f"not everything was put back: {error}")
@@ -361,18 +371,18 @@ class Core:
     # -- what the write-back wants -----------------------------------------------------------------
 
     def _drive(self) -> None:
-        """Let conversation and write-back answer each other until neither has more to say."""
+        """Let device session and write-back answer each other until neither has anything left."""
         while True:
-            said = self.conversation.take_said()
-            for one in said:
-                self._digest(one)
-            acted = self._errands.work(self, self._host_s)
-            if self._stopping and not self._closing and self._errands.at_rest:
+            found = self.device_session.take_events()
+            for event in found:
+                self._on_device(event)
+            acted = self._action_queue.work(self, self._host_s)
+            if self._stopping and not self._closing and self._action_queue.at_rest:
                 self._closing = acted = True
-                self.take(self.conversation.restore_and_close(self._host_s))
-            if not said and not acted:
+                self.take(self.device_session.restore_and_close(self._host_s))
+            if not found and not acted:
                 break
-        if output := self.conversation.session.take_output():
+        if output := self.device_session.session.take_output():
             self._out.append(events.Send(output))
 
     def emit(self, event: events.Event) -> None:
@@ -428,31 +438,33 @@ class Core:
             self.stream.facts.rate_source == "device time"
             and self.stream.restarts == self._restarts
         ):
-            self._errands.add(self.writeback.on_uptime(self.at_s, self._host_s))
+            self._action_queue.add(self.writeback.on_uptime(self.at_s, self._host_s))
         if self.stream.take_replaced():
             self.unconfirmed.drop()
             self.calibrator = self.calibrator.anew()
-            self._begin(self._desk.compare(self.calibrator, *self._compared))
+            self._begin(self._estimation_queue.compare(self.calibrator, *self._compared))
             self.warm.again()
         reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
         self._doubt(reason, jumped=jumped)
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
         self._out.append(events.SamplesSeen(block, present, self._proposed))
-        self._errands.add(self.writeback.on_samples(block))
+        self._action_queue.add(self.writeback.on_samples(block))
         for text in self.sensors.take(block):
             self._note("warning", text)
         if (free := self.vehicle.without(block)) is not None:
             if self._trial is not None:
                 metrics = self._trial.take(free)
-                self._errands.add(self.writeback.on_trial_metrics(metrics, self._host_s))
+                self._action_queue.add(self.writeback.on_trial_metrics(metrics, self._host_s))
             how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
             now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
-            if self.conversation.identity is None or self.conversation.mode is Mode.PASSIVE:
+            if self.device_session.identity is None or self.device_session.mode is Mode.PASSIVE:
                 self._examine([free], now)  # there is nobody to ask
             else:
                 self.unconfirmed.hold(free, self._host_s, now)
-                self._errands.add(self.writeback.on_waiting(self.unconfirmed.span_s, self._host_s))
-        self._errands.let_out(self)
+                self._action_queue.add(
+                    self.writeback.on_waiting(self.unconfirmed.span_s, self._host_s)
+                )
+        self._action_queue.let_out(self)
 
     def _examine(self, blocks: list[SampleBlock], when: Circumstances) -> None:
         """Samples of the device that was read: for the calibrator."""
@@ -460,13 +472,13 @@ class Core:
             taken[0] = self._recall(taken[0])
             for block in taken:
                 self.warm.live(block)
-            self._begin(self._desk.examine(self.calibrator, taken, when))
+            self._begin(self._estimation_queue.examine(self.calibrator, taken, when))
 
     def _recall(self, block: SampleBlock) -> SampleBlock:
         """The block, after the calibrator was given the samples of an earlier run, if any."""
         if not self.warm.pending or self.writeback.state is State.RECONCILING:
             return block
-        identity, read = self.conversation.identity, self.epochs.now.compensation is not None
+        identity, read = self.device_session.identity, self.epochs.now.compensation is not None
         present = Present(
             identity.unit if identity is not None and read else None,
             self.registers,
@@ -482,13 +494,13 @@ class Core:
         if not blocks:
             return block
         self.calibrator = Calibrator(*self._from_scratch)
-        self._begin(self._desk.compare(self.calibrator, *self._compared))
+        self._begin(self._estimation_queue.compare(self.calibrator, *self._compared))
         how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
         now = Circumstances(self.at_s, self._host_s, *how)
         for old in blocks:
             old = replace(old, epoch=self.epochs.now.number)
-            self._begin(self._desk.recall(self.calibrator, old, now))
-        self._errands.add(self.writeback.on_doubt("samples of an earlier run", self._host_s))
+            self._begin(self._estimation_queue.recall(self.calibrator, old, now))
+        self._action_queue.add(self.writeback.on_doubt("samples of an earlier run", self._host_s))
         unknown = np.concatenate([[np.nan], block.dt_s[1:]])
         return replace(block, dt_s=unknown, gap_before=True)
 
@@ -496,18 +508,18 @@ class Core:
         if text:
             self._note("info", text)
 
-    def _begin(self, piece: Piece) -> None:
+    def _begin(self, piece: EstimationTask) -> None:
         """Have it done beside the core, or do it now."""
         if self.settings.beside:
             self._out.append(events.Examine(piece.work))
         else:
-            self._take_findings(1)
+            self._take_results(1)
 
-    def _take_findings(self, pieces: int, failure: str = "") -> None:
-        for found in self._desk.take(pieces, failure):
+    def _take_results(self, pieces: int, failure: str = "") -> None:
+        for found in self._estimation_queue.take(pieces, failure):
             if found.calibrator is not self.calibrator:
                 continue  # another device or other quantities since
-            if isinstance(found, Broken):
+            if isinstance(found, EstimationFailure):
                 self._estimator_failed(found.reason)
                 continue
             self._proposed = found.proposed
@@ -515,10 +527,10 @@ class Core:
             back, when = self.writeback, found.when
             if found.void:
                 self.warm.doubt()
-                self._errands.add(back.on_void(found.void, when.at_s, self._host_s))
+                self._action_queue.add(back.on_void(found.void, when.at_s, self._host_s))
             if found.estimate is not None:
                 self._judged(found, found.estimate)
-            self._errands.add(back.on_examined(when.host_s, self._host_s))
+            self._action_queue.add(back.on_examined(when.host_s, self._host_s))
 
     def _estimator_failed(self, reason: str) -> None:
         """Nothing is written from what it made, and it begins anew after a pause."""
@@ -529,9 +541,9 @@ class Core:
         left_s = self.estimator.left_s
         self._note("error", f"ESTIMATOR FAILED: {reason}; it begins anew in {left_s:.0f} s")
         self.decisions.add(self.at_s, "ESTIMATOR FAILED")
-        self._errands.add(self.writeback.on_estimator_failed(self._host_s))
+        self._action_queue.add(self.writeback.on_estimator_failed(self._host_s))
 
-    def _judged(self, found: Finding, estimate: Estimate) -> None:
+    def _judged(self, found: EstimationResult, estimate: Estimate) -> None:
         at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates
         self._out += [events.Estimated(at_s, host_s, estimate), events.Judged(at_s, host_s, gates)]
         self.decisions.judged(at_s, self.writeback.state.value, gates, estimate)
@@ -539,7 +551,7 @@ class Core:
             return  # it judged what is in force no more; nothing may be written by it
         if not self.warm.confirms(estimate):
             return  # it rests on an earlier run: nothing is written before this one agrees
-        self._errands.add(
+        self._action_queue.add(
             self.writeback.on_verdict(
                 estimate,
                 for_level(gates, self.settings.level),
@@ -556,7 +568,7 @@ class Core:
 
     def _basis(self) -> BasisFacts:
         """What is known of where the samples come from."""
-        identity, applied = self.conversation.identity, self.epochs.now.compensation
+        identity, applied = self.device_session.identity, self.epochs.now.compensation
         return BasisFacts(
             registers_read=bool(self.registers),
             changed=applied is None,

@@ -1,4 +1,4 @@
-"""What the core says to the device, and when: identify, read, set up the stream, put it back.
+"""One device, from the open port to the closed one: identify, read, set up the stream, put it back.
 
 ```
  CLOSED -> IDENTIFYING -> READING -> [KEEPING -> SETTING_UP] -> READY -> RESTORING -> DONE
@@ -6,8 +6,8 @@
                                                                 READY <-> LOOKING (who answers?)
 ```
 Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_outputs`).
-A device that falls silent though it may be told to talk is asked for its output (`silence`), and
-a stop ends within `STOP_S`, whatever the device does.
+A device that stops sending although its output may be switched on is asked for it
+(`OutputWatchdog`), and a stop ends within `STOP_S`, whatever the device does (`StopLimit`).
 
 In mode `passive` the port goes from CLOSED to READY at once and no byte is ever sent. A device that
 answers nothing is listened to and asked again now and then: it stays IDENTIFYING, without an
@@ -16,40 +16,38 @@ identity, so nothing can be written to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
 
-from ahrsd.core import closing
-from ahrsd.core.closing import OutOfTime, StopLimit, WrongDevice
 from ahrsd.core.kept_outputs import KeptOutputs
-from ahrsd.core.session_events import (
-    Closed,
-    Completed,
-    ConfigurationRead,
-    Identified,
-    Looked,
-    Phase,
-    Said,
-    StreamChanged,
-    Unanswered,
-)
-from ahrsd.core.silence import Silence
 from ahrsd.writeback.journal_history import JournalRecord
 from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
 from ahrsd.writeback.reconcile import Kind
-from drivers.vn100.calibration_stream import CalibrationStream, configure_stream
-from drivers.vn100.commands import RESUME, Command, LinkGone, Procedure
+from drivers.vn100.calibration_stream import (
+    CalibrationStream,
+    DoesNotFit,
+    NoStream,
+    NotPutBack,
+    configure_stream,
+)
+from drivers.vn100.commands import RESUME, Command, LinkGone, Pause, Procedure, SessionError
 from drivers.vn100.decode import Measurement
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
     Seen,
     Unit,
+    identify,
     look,
     quiet,
+    read,
+    read_configuration,
+    read_unit,
     restore,
     resume,
 )
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, format_command, same
 from drivers.vn100.session import Event, Failed, Finished, Session
 
 ECHOES = (
@@ -59,11 +57,197 @@ ECHOES = (
 ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
 RESTORE_AGAIN_S = 0.1
 _FOREIGN = 20  # messages without one of the session's own output: it is gone
+FIRST_S, LONGEST_S = 2.0, 5.0  # outputs have 1 Hz at least, so 2 s without one is a silence
+# First and longest wait: after the journal refused the user's outputs; where they could not be put
+# back; where they were, but the session's not be set up (a trial fits into the last one)
+KEEP_AGAIN_S, PUT_BACK_AGAIN_S, SET_UP_AGAIN_S = (30.0, 30.0), (0.5, 5.0), (5.0, 1800.0)
+USUAL_REPLY_S = 0.4  # where replies may take longer, so may all of this
+PATIENCE_S, STOP_S = 1.0, 1.5  # after a stop: for the write-back to end, and for everything
+
+
+class Phase(Enum):
+    """Where the session with the device stands."""
+
+    CLOSED = "closed"
+    IDENTIFYING = "identifying"
+    READING = "reading registers"
+    KEEPING = "keeping the user's outputs"
+    SETTING_UP = "setting up the stream"
+    READY = "ready"
+    RUNNING = "running a procedure"
+    LOOKING = "asking who answers and what it holds"
+    RESTORING = "restoring"
+    CLOSING = "noting that all is put back"
+    DONE = "done"
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """The device said who it is."""
+
+    identity: Identity
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigurationRead:
+    """All registers, as they were read."""
+
+    values: dict[int, Values]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamChanged:
+    """Outputs were set up or put back: samples before and after do not follow each other."""
+
+    text: str
+    level: str = "info"
+
+
+@dataclass(frozen=True, slots=True)
+class Unanswered:
+    """The device does not say who it is; it is only listened to, and asked again now and then."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Completed:
+    """A procedure that was asked for with `run` ended: `error` None where it did what it should."""
+
+    name: str
+    result: object
+    error: Exception | None
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """Who answered and what it holds; None where there was no answer, and why."""
+
+    seen: Seen | None
+    error: Exception | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Closed:
+    """Everything is put back; `error` says what is not."""
+
+    error: Exception | None
+
+
+DeviceEvent = (
+    Identified | ConfigurationRead | StreamChanged | Unanswered | Completed | Looked | Closed
+)
 _ENDING = (Phase.RESTORING, Phase.CLOSING, Phase.DONE)
 
 
-class Conversation:
-    """Owns the session. `said` collects what the core must know; measurements come back at once."""
+class WrongDevice(SessionError):
+    """Another device than the one whose outputs were to be put back."""
+
+
+class Unsteady(SessionError):
+    """A register does not read the same twice."""
+
+
+class OutOfTime(SessionError):
+    """A stop took too long; the journal tells the next run what is to be put back."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"{why}; the next run with device.configure_stream puts it back")
+
+
+@dataclass(slots=True)
+class StopLimit:
+    """The two times that a stop sets; None before it. `closing`: the first one is over."""
+
+    scale: float = 1.0
+    patience_s: float | None = None
+    end_s: float | None = None
+    closing: bool = False
+
+    @property
+    def due_s(self) -> float | None:
+        """When to look next."""
+        return self.end_s if self.closing else self.patience_s
+
+    def begin(self, now_s: float) -> None:
+        """A stop was asked for; a second one changes nothing."""
+        if self.end_s is None:
+            self.patience_s = now_s + self.scale * PATIENCE_S
+            self.end_s = now_s + self.scale * STOP_S
+
+    def patient(self, now_s: float) -> bool:
+        """Whether others may still end what they have under way."""
+        return self.patience_s is None or now_s < self.patience_s
+
+    def over(self, now_s: float) -> bool:
+        """Whether nothing more may be waited for."""
+        return self.end_s is not None and now_s >= self.end_s
+
+
+@dataclass(slots=True)
+class OutputWatchdog:
+    """When a device that ought to stream is asked for its output: again and again, for ever.
+
+    Two things call for it: no measurement came for a while (the output was paused for a command
+    and not resumed, because the reply or the command got lost), or a change of the outputs failed
+    (the user's could not be put back, or the session's not be set up). A retry of such a change
+    does not wait for silence and, where the device streams by itself, may wait longer.
+    """
+
+    scale: float = 1.0  # of all waits
+    times_asked: int = 0  # since the newest measurement
+    _silent_until_s: float | None = None
+    _retry_at_s: float | None = None
+    _retry_wait_s: float = 0.0
+
+    @property
+    def due_s(self) -> float | None:
+        """When to ask; None where nothing is waited for."""
+        due = [time_s for time_s in (self._silent_until_s, self._retry_at_s) if time_s is not None]
+        return min(due, default=None)
+
+    @property
+    def retrying(self) -> bool:
+        """Whether the newest change of the outputs failed."""
+        return self._retry_wait_s > 0.0
+
+    def start(self, now_s: float) -> None:
+        """From now on the device ought to stream."""
+        wait_s = min(FIRST_S * 2 ** max(0, self.times_asked - 1), LONGEST_S)
+        self._silent_until_s = now_s + self.scale * wait_s
+
+    def heard(self, now_s: float) -> None:
+        """A measurement came."""
+        self.times_asked = 0
+        self.start(now_s)
+
+    def schedule_retry(self, now_s: float, first_s: float, longest_s: float) -> None:
+        """Retry after `first_s`, then double the wait up to `longest_s`, also while it streams."""
+        self._retry_wait_s = min(max(2.0 * self._retry_wait_s, first_s), longest_s)
+        self._retry_at_s = now_s + self.scale * self._retry_wait_s
+
+    def cancel_retry(self) -> None:
+        """The change succeeded."""
+        self._retry_at_s, self._retry_wait_s = None, 0.0
+
+    def retry_due(self, now_s: float) -> bool:
+        """Whether to retry now; then `schedule_retry` or `cancel_retry` says how that went."""
+        due = self._retry_at_s is not None and now_s >= self._retry_at_s
+        if due:
+            self._retry_at_s = None
+        return due
+
+    def expired(self, now_s: float) -> bool:
+        """Whether no measurement came for too long; then the next wait is longer."""
+        if self._silent_until_s is None or now_s < self._silent_until_s:
+            return False
+        self.times_asked += 1
+        self.start(now_s)
+        return True
+
+
+class DeviceSession:
+    """Owns the driver's session. Calls return measurements; what else happened, `take_events`."""
 
     def __init__(
         self,
@@ -71,7 +255,7 @@ class Conversation:
         *,
         change_stream: bool = False,
         rate_hz: float = 100.0,
-        reply_timeout_s: float = closing.USUAL_REPLY_S,
+        reply_timeout_s: float = USUAL_REPLY_S,
     ) -> None:
         self.mode = mode
         self.change_stream = change_stream and mode is not Mode.PASSIVE
@@ -81,8 +265,8 @@ class Conversation:
         self.phase = Phase.CLOSED
         self.identity: Identity | None = None
         self.outputs = KeptOutputs()
-        scale = max(1.0, reply_timeout_s / closing.USUAL_REPLY_S)
-        self.silence, self.limit = Silence(scale), StopLimit(scale)
+        scale = max(1.0, reply_timeout_s / USUAL_REPLY_S)
+        self.watchdog, self.limit = OutputWatchdog(scale), StopLimit(scale)
         self.session = Session(self._allowed, reply_timeout_s=reply_timeout_s)
         self._purpose = Purpose.READ
         self._extra_gate: Callable[[Command], bool] | None = None
@@ -93,7 +277,7 @@ class Conversation:
         self._failure = "no answer in time"  # why something was not put back
         self._ask_again_s = ASK_AGAIN_S[0]
         self._own, self._foreign = "", 0  # layout of the session's output; others without it
-        self._said: list[Said] = []
+        self._events: list[DeviceEvent] = []
 
     def _allowed(self, command: Command) -> bool:
         if not permitted(command, self.mode, self.change_stream, self._purpose):
@@ -120,7 +304,7 @@ class Conversation:
         """When `tick` wants to be called if nothing arrives before."""
         due = [self.session.deadline_s, self.limit.due_s]
         if self.idle and self._may_ask and self._writable:
-            due.append(self.silence.due_s)
+            due.append(self.watchdog.due_s)
         return min((d for d in due if d is not None), default=None)
 
     @property
@@ -129,10 +313,10 @@ class Conversation:
         theirs = bool(self.outputs.left)
         return frozenset(SESSION_SETTINGS) if self.change_stream or theirs else frozenset()
 
-    def take_said(self) -> list[Said]:
+    def take_events(self) -> list[DeviceEvent]:
         """What happened since the last call."""
-        said, self._said = self._said, []
-        return said
+        events, self._events = self._events, []
+        return events
 
     def opened(self, baud: int, now_s: float) -> list[Event]:
         """The port is open."""
@@ -167,7 +351,7 @@ class Conversation:
             if not self._unkept:
                 self._warn("the user's outputs cannot be journalled, so no others are set up")
             self.phase, self._unkept = Phase.READY, True
-            self.silence.owe(now_s, *closing.KEEP_AGAIN_S)
+            self.watchdog.schedule_retry(now_s, *KEEP_AGAIN_S)
 
     def identify_again(self, now_s: float) -> list[Event]:
         """The device may be another one, or itself after a reset: ask it everything again."""
@@ -175,9 +359,7 @@ class Conversation:
             return []
         events = self._abandon(now_s)
         self.phase = Phase.IDENTIFYING
-        return events + self._digest(
-            self._start(closing.identify_surely(), Purpose.READ, now_s), now_s
-        )
+        return events + self._digest(self._start(identify_surely(), Purpose.READ, now_s), now_s)
 
     def received(self, data: bytes, now_s: float) -> list[Event]:
         """Bytes came; returns measurements, faults and strays, in order."""
@@ -186,7 +368,7 @@ class Conversation:
             self._warn("the session's output is gone: the device restarted, or somebody changed it")
             events += self.identify_again(now_s)
         if any(isinstance(event, Measurement) for event in events):
-            self.silence.heard(now_s)
+            self.watchdog.heard(now_s)
         return events + self._on_time(now_s)
 
     def tick(self, now_s: float) -> list[Event]:
@@ -263,18 +445,18 @@ class Conversation:
             return events
         return events + self._restore(0.0, now_s)
 
-    def amends(self) -> Procedure[object] | None:
+    def cleanup(self) -> Procedure[object] | None:
         """What puts the device's output back after this program broke down; None: nothing need be.
 
-        Not for `run`: whoever calls this trusts no state of the conversation but what was saved.
+        Not for `run`: whoever calls this trusts no state of this object but what was saved.
         """
         if self._must_restore and self.identity is not None:
             return quiet(restore(self.outputs.users, SESSION_SETTINGS))
         paused = self.phase in (Phase.RUNNING, Phase.RESTORING) and self.mode >= Mode.STAGE
         return resume() if paused else None
 
-    def allows_amends(self, command: Command) -> bool:
-        """The gate of `amends`."""
+    def allows_cleanup(self, command: Command) -> bool:
+        """The gate of `cleanup`."""
         return permitted(command, self.mode, self.change_stream, self._asking)
 
     @property
@@ -294,17 +476,17 @@ class Conversation:
             return [] if self.phase is Phase.DONE else self._give_up(now_s)
         if not (self.idle and self._may_ask and self._writable):
             return []
-        if self.silence.pays(now_s):
+        if self.watchdog.retry_due(now_s):
             if not self._unkept:
                 return self.identify_again(now_s)
             self.phase = Phase.KEEPING
             self.outputs.keep()
             return []
-        if not self.silence.breaks(now_s):
+        if not self.watchdog.expired(now_s):
             return []
-        if self.silence.asked == 1:
+        if self.watchdog.times_asked == 1:
             self._warn("the device is silent: it is asked for its output, again and again")
-        if self.silence.asked > 1 and self.change_stream:
+        if self.watchdog.times_asked > 1 and self.change_stream:
             return self.identify_again(now_s)
         self._resume_blindly()  # costs nothing, should the device only be slow
         return []
@@ -324,15 +506,15 @@ class Conversation:
         return events
 
     def _warn(self, text: str) -> None:
-        self._said.append(StreamChanged(text, "warning"))
+        self._events.append(StreamChanged(text, "warning"))
 
     def _done(self, error: Exception | None) -> None:
         self.phase = Phase.DONE
-        self._said.append(Closed(error))
+        self._events.append(Closed(error))
 
     def _restore(self, wait_s: float, now_s: float) -> list[Event]:
         self.phase = Phase.RESTORING
-        procedure = closing.put_back_to(self._serial, self.outputs.users, wait_s)
+        procedure = put_back_to(self._serial, self.outputs.users, wait_s)
         return self._digest(self._start(procedure, Purpose.STREAM, now_s), now_s)
 
     def _own_is_gone(self, events: list[Event]) -> bool:
@@ -363,11 +545,11 @@ class Conversation:
         if phase is Phase.RUNNING:
             self._extra_gate = None
             self._ready(now_s)
-            self._said.append(Completed(self._name, result, error))
+            self._events.append(Completed(self._name, result, error))
             return []
         if phase is Phase.LOOKING:
             self._ready(now_s)
-            self._said.append(Looked(result if isinstance(result, Seen) else None, error))
+            self._events.append(Looked(result if isinstance(result, Seen) else None, error))
             return []
         if phase is Phase.CLOSED:
             return []
@@ -376,10 +558,10 @@ class Conversation:
         if phase is Phase.SETTING_UP and error is not None:
             return self._not_set_up(error, now_s)
         if error is not None:
-            self._say_unanswered(f"{phase.value}: {error}")
+            self._report_unanswered(f"{phase.value}: {error}")
             self.phase = Phase.IDENTIFYING
             later, self._ask_again_s = self._ask_again_s, min(2 * self._ask_again_s, ASK_AGAIN_S[1])
-            return self._start(closing.identify_in(later), Purpose.READ, now_s)
+            return self._start(identify_in(later), Purpose.READ, now_s)
         return self._next(phase, result, now_s)
 
     def _restored(self, error: Exception | None, now_s: float) -> list[Event]:
@@ -391,31 +573,31 @@ class Conversation:
             return self._restore(RESTORE_AGAIN_S, now_s)
         else:
             self._touched, self.phase = False, Phase.CLOSING
-            self._said.append(StreamChanged("outputs put back as they were"))
+            self._events.append(StreamChanged("outputs put back as they were"))
             self.outputs.give_back()
         return []
 
     def _not_set_up(self, error: Exception, now_s: float) -> list[Event]:
-        again = closing.again_after(error)
-        own = "" if again is closing.PUT_BACK_AGAIN_S else ", the device's own stays"
-        if not self.silence.owed:
+        again = again_after(error)
+        own = "" if again is PUT_BACK_AGAIN_S else ", the device's own stays"
+        if not self.watchdog.retrying:
             self._warn(f"the session's output cannot be set up{own}: {error}")
         else:
-            self._said.append(StreamChanged(""))
+            self._events.append(StreamChanged(""))
         if again is not None:
-            self.silence.owe(now_s, *again)
+            self.watchdog.schedule_retry(now_s, *again)
         self._ready(now_s)
         return []
 
     def _ready(self, now_s: float) -> None:
         self.phase = Phase.READY
-        self.silence.begin(now_s)
+        self.watchdog.start(now_s)
 
-    def _say_unanswered(self, text: str) -> None:
+    def _report_unanswered(self, text: str) -> None:
         """Once. What a device that was known sends now is not used: its registers will be read."""
         if not self._unanswered:
             known = StreamChanged(f"{text}; asking again", "warning")
-            self._said.append(Unanswered(text) if self._serial is None else known)
+            self._events.append(Unanswered(text) if self._serial is None else known)
         self._unanswered = True
 
     def _next(self, phase: Phase, result: object, now_s: float) -> list[Event]:
@@ -423,23 +605,80 @@ class Conversation:
             if result.serial != self._serial:
                 self._touched = False  # nothing of another device's is put back to this one
             self.identity, self._serial = result, result.serial
-            self._said.append(Identified(result))
+            self._events.append(Identified(result))
             self.phase = Phase.READING
             twice = (*CALIBRATION, *(SESSION_SETTINGS if self.change_stream else ()))
-            return self._start(closing.read_surely(result, twice), Purpose.READ, now_s)
+            return self._start(read_surely(result, twice), Purpose.READ, now_s)
         if phase is Phase.READING and isinstance(result, dict) and self.identity is not None:
             self._unanswered, self._ask_again_s = False, ASK_AGAIN_S[0]
             self.identity = self.identity.observed_without(result)
             if not self._writable:
                 why = self.identity.profile.observed_for
                 self._warn(f"observed only, nothing is written to it: {why}")
-            self._said.append(ConfigurationRead(result))
+            self._events.append(ConfigurationRead(result))
             if self.change_stream and self._writable:
                 self.phase = Phase.KEEPING
                 return []
         if isinstance(result, CalibrationStream):
             self._own, self._foreign = result.layout, 0
-            self.silence.settle()
-            self._said.append(StreamChanged(f"output set up for the session: {result}"))
+            self.watchdog.cancel_retry()
+            self._events.append(StreamChanged(f"output set up for the session: {result}"))
         self._ready(now_s)
         return []
+
+
+def again_after(error: Exception) -> tuple[float, float] | None:
+    """The waits after a set-up that failed with `error`; None where it would fail for ever."""
+    if isinstance(error, NotPutBack):
+        return PUT_BACK_AGAIN_S
+    return None if isinstance(error, DoesNotFit | NoStream) else SET_UP_AGAIN_S
+
+
+def identify_in(seconds: float) -> Procedure[Identity]:
+    """`identify_surely` after a while."""
+    yield Pause(seconds)
+    return (yield from identify_surely())
+
+
+def identify_surely() -> Procedure[Identity]:
+    """Who answers, asked twice: an altered reply must not pass for another device.
+
+    Raises Unsteady.
+    """
+    identity = yield from identify()
+    again = yield from read_unit()
+    if again != identity.unit:
+        raise Unsteady(f"the device says that it is {identity.unit}, then {again}")
+    return identity
+
+
+def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """The configuration of this device, and at the end it still is this device that answers.
+
+    Some registers are read `twice`; those that will be put back can be written.
+
+    A reading that was altered on the way would else become what the user had. Raises Unsteady,
+    RegisterValueError.
+    """
+    values = yield from read_configuration(identity.profile)
+    for number in (n for n in twice if n in values):
+        again = yield from read(number)
+        if not same(number, values[number], again):
+            raise Unsteady(f"register {number} reads {values[number]}, then {again}")
+        if number in SESSION_SETTINGS:
+            format_command(number, again, held=True)
+    if (unit := (yield from read_unit())) != identity.unit:
+        raise Unsteady(f"{unit} answers, and a moment ago it was {identity.unit}")
+    return values
+
+
+def put_back_to(
+    serial: int | None, users: Mapping[int, Values], wait_s: float
+) -> Procedure[object]:
+    """The user's outputs, to the device with this serial number and to no other."""
+    if wait_s:
+        yield Pause(wait_s)
+    answered = int((yield from read(3))[0])
+    if answered != serial:
+        raise WrongDevice(f"the device has the serial number {answered}, not {serial}")
+    return (yield from quiet(restore(users, SESSION_SETTINGS)))

@@ -2,9 +2,9 @@
 
 The calibrator takes samples and judges; now and then that takes a good part of a second, in which
 the port, the vehicle's word and an operator would wait. So the core makes a piece of work of each
-block and takes its finding later: in a run another thread does the pieces in their order
-(`worker`), and the input `Examined` says how many are done. A replay does them when it comes to
-that input, and so takes the same decisions from the same findings at the same place.
+block and takes its result later: in a run another thread does the pieces in their order
+(`estimation_worker`), and the input `Examined` says how many are done. A replay does them when it
+comes to that input, and so takes the same decisions from the same results at the same place.
 
 A calibrator belongs to its pieces: only they may change it.
 
@@ -53,7 +53,7 @@ class Circumstances:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finding:
+class EstimationResult:
     """What a block brought. `estimate` is None where there is nothing new to judge.
 
     void: why a calibration from before this block holds no more, empty where it may hold
@@ -69,38 +69,38 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Broken:
+class EstimationFailure:
     """A piece that broke off: `calibrator` may be anything now and is used no more."""
 
     calibrator: Calibrator
     reason: str
 
 
-class Piece:
+class EstimationTask:
     """Work that is done once, by whoever comes first."""
 
-    def __init__(self, calibrator: Calibrator, make: Callable[[], Finding | None]) -> None:
+    def __init__(self, calibrator: Calibrator, make: Callable[[], EstimationResult | None]) -> None:
         self.calibrator = calibrator
         self._make = make
         self._begun = False
-        self._finding: Finding | None = None
+        self._result: EstimationResult | None = None
         self._failure: Failure | None = None
 
     def work(self) -> Failure | None:
         """Do it; how it broke off, None where it did not, or a piece before it has."""
         self._begun = True
         if not self.calibrator.broken:
-            self._finding, self._failure = supervised(self._make)
+            self._result, self._failure = supervised(self._make)
             self.calibrator.broken = self._failure is not None
         return self._failure
 
-    def finding(self) -> Finding | Broken | None:
+    def result(self) -> EstimationResult | EstimationFailure | None:
         """What it brought."""
         if not self._begun:
             self.work()
         if self._failure is not None:
-            return Broken(self.calibrator, self._failure.reason)
-        return self._finding
+            return EstimationFailure(self.calibrator, self._failure.reason)
+        return self._result
 
 
 def supervised(make: Callable[[], T | None]) -> tuple[T | None, Failure | None]:
@@ -148,63 +148,69 @@ class EstimatorState:
         return False
 
 
-class Desk:
-    """The pieces that nobody has taken the finding of yet, oldest first."""
+class EstimationQueue:
+    """The pieces that nobody has taken the result of yet, oldest first."""
 
     def __init__(self) -> None:
-        self._pieces: deque[Piece] = deque()
+        self._pieces: deque[EstimationTask] = deque()
 
     def examine(
         self, calibrator: Calibrator, blocks: list[SampleBlock], circumstances: Circumstances
-    ) -> Piece:
+    ) -> EstimationTask:
         """Let the calibrator take the blocks and judge; how things stood when the last one came."""
         return self._put(calibrator, partial(_examined, calibrator, blocks, circumstances))
 
     def recall(
         self, calibrator: Calibrator, block: SampleBlock, circumstances: Circumstances
-    ) -> Piece:
+    ) -> EstimationTask:
         """Let the calibrator take a block of an earlier run; nothing is judged by it."""
         return self._put(calibrator, partial(_recalled, calibrator, block, circumstances))
 
-    def compare(self, calibrator: Calibrator, present: Affine, bias_b_rad_s: Array) -> Piece:
+    def compare(
+        self, calibrator: Calibrator, present: Affine, bias_b_rad_s: Array
+    ) -> EstimationTask:
         """Tell the calibrator what a candidate must be better than."""
         return self._put(calibrator, partial(calibrator.compare_with, present, bias_b_rad_s))
 
-    def adopt(self, calibrator: Calibrator, settings: CalibratorSettings) -> Piece:
+    def adopt(self, calibrator: Calibrator, settings: CalibratorSettings) -> EstimationTask:
         """Let the calibrator judge by other limits from now on."""
         return self._put(calibrator, partial(calibrator.adopt, settings))
 
-    def _put(self, calibrator: Calibrator, make: Callable[[], Finding | None]) -> Piece:
-        piece = Piece(calibrator, make)
+    def _put(
+        self, calibrator: Calibrator, make: Callable[[], EstimationResult | None]
+    ) -> EstimationTask:
+        piece = EstimationTask(calibrator, make)
         self._pieces.append(piece)
         return piece
 
-    def take(self, pieces: int, broken: str = "") -> list[Finding | Broken]:
-        """The findings of the oldest pieces; a record that lost some of them may ask for more.
+    def take(self, pieces: int, broken: str = "") -> list[EstimationResult | EstimationFailure]:
+        """The results of the oldest pieces; a record that lost some of them may ask for more.
 
         broken: how the last one of them broke off; it is not tried again
         """
         taken = [self._pieces.popleft() for _ in range(min(pieces, len(self._pieces)))]
-        last = [Broken(taken.pop().calibrator, broken)] if broken and taken else []
+        last = [EstimationFailure(taken.pop().calibrator, broken)] if broken and taken else []
         if last:
             last[0].calibrator.broken = True
-        found = [one for piece in taken if (one := piece.finding()) is not None]
+        found = [one for piece in taken if (one := piece.result()) is not None]
         return [*found, *last]
 
 
-def _recalled(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> Finding:
+def _recalled(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> EstimationResult:
     calibrator.take(block)
     notes, void = tuple(calibrator.take_notes(now.host_s)), calibrator.take_void()
-    return Finding(calibrator, now, None, notes, void=void)
+    return EstimationResult(calibrator, now, None, notes, void=void)
 
 
-def _examined(calibrator: Calibrator, blocks: list[SampleBlock], now: Circumstances) -> Finding:
+def _examined(
+    calibrator: Calibrator, blocks: list[SampleBlock], now: Circumstances
+) -> EstimationResult:
     new, void = False, ""
     for block in blocks:
         new |= calibrator.take(block)
         void = calibrator.take_void() or void
     proposed, notes = calibrator.proposed, tuple(calibrator.take_notes(now.host_s))
     if not new:
-        return Finding(calibrator, now, proposed, notes, void=void)
+        return EstimationResult(calibrator, now, proposed, notes, void=void)
     gates = calibrator.judged(now.at_s, now.health, now.basis, now.margin)
-    return Finding(calibrator, now, proposed, notes, calibrator.estimate, gates, void)
+    return EstimationResult(calibrator, now, proposed, notes, calibrator.estimate, gates, void)

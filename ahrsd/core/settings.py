@@ -23,7 +23,7 @@ class CoreSettings:
         those of everything.
     columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
     warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
-    beside: the slow part of the work is done beside the core (`examination`), not at once
+    beside: the slow part of the work is done beside the core (`estimation_queue`), not at once
     """
 
     calibrator: CalibratorSettings

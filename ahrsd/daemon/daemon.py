@@ -42,7 +42,7 @@ _LONGEST_WAIT_S = 0.2
 _BEHIND_S = 0.05
 _SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
 _STOP_S = 1.6  # for putting things back; a service manager's patience is limited
-_AMENDS_S = 2.0
+_CLEANUP_S = 2.0
 _INTERLOCK_S = 0.2
 _COLUMNS_S = 0.04
 _WATCH_S = 1.0
@@ -176,7 +176,7 @@ class Daemon:
     def _after_a_bug(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """On the way out: whatever it was, the device is put back; what was raised goes on."""
         if isinstance(error, Exception) and not isinstance(error, PortError):
-            self._make_amends(error)
+            self._clean_up(error)
 
     def _turn(self, longest_s: float) -> None:
         """One wait and what it brought."""
@@ -362,7 +362,7 @@ class Daemon:
 
     @property
     def _messages(self) -> int:
-        return self.shell.core.conversation.session.deframer.counters.valid
+        return self.shell.core.device_session.session.deframer.counters.valid
 
     def _lost(self, host_ns: int, reason: str, *, heard: bool = True) -> None:
         for item in self._link.close():
@@ -404,16 +404,16 @@ class Daemon:
             text = f"stopped ({self._stop_reason}) without having put everything back"
             self.shell.say(logging.ERROR, text, self.clock.now_ns())
 
-    def _make_amends(self, bug: Exception) -> None:
+    def _clean_up(self, bug: Exception) -> None:
         """After a bug of ours: the device streams again as before, whatever the core believes."""
         log.error("internal error; putting the device's output back", exc_info=bug)
-        talk = self.shell.core.conversation
-        procedure, port = talk.amends(), self._link.take_port()
+        talk = self.shell.core.device_session
+        procedure, port = talk.cleanup(), self._link.take_port()
         if port is None:
             return
         try:
-            with Device(port, talk.allows_amends) as device:
+            with Device(port, talk.allows_cleanup) as device:
                 if procedure is not None:
-                    device.run(procedure, _AMENDS_S)
+                    device.run(procedure, _CLEANUP_S)
         except DriverError as error:
             log.error("the device's output is not as it was: %s", error)

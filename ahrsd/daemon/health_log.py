@@ -78,7 +78,7 @@ class Watch:
 
     def _reason(self, core: Core, now_s: float, is_open: bool) -> str:
         """What is amiss with the stream; empty where nothing is."""
-        counters = core.conversation.session.deframer.counters
+        counters = core.device_session.session.deframer.counters
         silent_s = self._bytes.stuck_s(counters.fed_bytes, now_s)
         deaf_s = self._messages.stuck_s(counters.valid, now_s)
         idle_s = self._taken.stuck_s(core.stream.facts.samples, now_s)

@@ -86,7 +86,7 @@ def replay(
         if progress is not None:
             progress(share(item))
         refuse_beyond(path, core.stream.facts.samples, most_samples, "samples", _CUT)
-        counters = core.conversation.session.deframer.counters
+        counters = core.device_session.session.deframer.counters
         if counters.valid == 0 and counters.fed_bytes > GARBAGE_BYTES:
             break
     _refuse_empty(core, path)
@@ -162,12 +162,12 @@ def _paced(items: Iterator[Input], core: Core, speed: float) -> Iterator[Input]:
 
 def _cut_off(core: Core) -> bool:
     """Whether bytes were left that begin a message; silence cannot cut one in a byte stream."""
-    deframer = core.conversation.session.deframer
+    deframer = core.device_session.session.deframer
     return deframer.pending > 0 or Cause.CUT in deframer.counters.damage
 
 
 def _refuse_empty(core: Core, path: Path) -> None:
-    counters = core.conversation.session.deframer.counters
+    counters = core.device_session.session.deframer.counters
     try:
         core.stream.check()
     except NoSamplesError as error:

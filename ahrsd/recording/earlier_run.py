@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.core.device_record import COMPENSATING
 from ahrsd.core.warm_start import MOST_ROWS, too_old
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.steps import StepAverager, samples_per_step
@@ -43,7 +42,7 @@ from ahrsd.writeback.clocks import Stamp
 from drivers.vn100.decode import Measurement, Reply, Undecodable, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import Values, parse, same
+from drivers.vn100.registers import COMPENSATING, Values, parse, same
 
 RUNS = 4  # captures that are looked at
 FIRST_S = 2.0  # of a capture that is read for its clocks, however long ago it began

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.core.device_record import RecordRead
 from ahrsd.inputs import (
     Columns,
     EarlierRun,
@@ -41,6 +40,7 @@ from ahrsd.inputs import (
     WallClock,
 )
 from ahrsd.samples import SampleBlock
+from ahrsd.writeback.journal_history import StoredRecord
 from ahrsd.writeback.reconcile import Kind
 
 _TYPES = {
@@ -162,7 +162,7 @@ def _check(kind: type, body: dict[str, Any]) -> None:
             _check_register(number, values)
     elif kind is JournalOpened and not body.get("error"):
         for record in body.get("records", []):
-            RecordRead.of(record)
+            StoredRecord.of(record)
     elif kind is Journalled:
         Kind(body["kind"])
 

@@ -30,7 +30,7 @@ _DIGITS = 6  # of times in the summary: microseconds
 
 def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> dict[str, object]:
     """The contract's `ahrsd.replay/1`."""
-    counters = core.conversation.session.deframer.counters
+    counters = core.device_session.session.deframer.counters
     facts = core.stream.facts
     return {
         "schema": "ahrsd.replay/1",
@@ -69,7 +69,7 @@ def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> di
 
 def serial_of(core: Core) -> int | None:
     """Serial number of the device that the recording is of; None where it does not say."""
-    identity = core.conversation.identity
+    identity = core.device_session.identity
     return None if identity is None else identity.serial
 
 
@@ -97,7 +97,7 @@ def _finite(value: float) -> float | None:
 
 def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> list[str]:
     """What a person wants to know first."""
-    counters = core.conversation.session.deframer.counters
+    counters = core.device_session.session.deframer.counters
     facts, stream = core.stream.facts, core.stream
     rate = f"{facts.rate_hz:.4g} Hz" if math.isfinite(facts.rate_hz) else "unknown rate"
     source = f", {facts.rate_source}" if facts.rate_source else ""

@@ -41,9 +41,9 @@ class StatusMaker:
 
     def make(self, core: Core, link: LinkFacts, now_s: float) -> dict[str, object]:
         """The status at `now_s`."""
-        counters = core.conversation.session.deframer.counters
+        counters = core.device_session.session.deframer.counters
         self._tally(now_s, counters.fed_bytes, core.stream.facts.samples)
-        identity = core.conversation.identity
+        identity = core.device_session.identity
         return {
             "schema": SCHEMA,
             "host_s": now_s,
@@ -91,7 +91,7 @@ class StatusMaker:
             self._mark = (now_s, fed_bytes, samples)
 
     def _stream(self, core: Core) -> dict[str, object]:
-        counters, facts = core.conversation.session.deframer.counters, core.stream.facts
+        counters, facts = core.device_session.session.deframer.counters, core.stream.facts
         return {
             "samples": facts.samples,
             "samples_per_s": self._rates[1],

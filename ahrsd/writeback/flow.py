@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from ahrsd.calibration import Affine, Estimate
+from ahrsd.writeback.action_outbox import ActionOutbox
 from ahrsd.writeback.actions import CalibrateAnew, IdentifyAgain, SetUpStream
 from ahrsd.writeback.composition import (
     GYRO,
@@ -19,7 +20,6 @@ from ahrsd.writeback.composition import (
     compose,
     register_lines,
 )
-from ahrsd.writeback.desk import Desk
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
@@ -50,7 +50,7 @@ class Flow:
     def __init__(self, policy: WriteBackPolicy) -> None:
         self.policy = policy
         self.safe = Safeguards(policy)
-        self.desk = Desk(self.safe.allow)
+        self.outbox = ActionOutbox(self.safe.allow)
         self.state = State.RECONCILING
         self.deadline_s: float | None = None
         self.identity: Identity | None = None
@@ -78,7 +78,7 @@ class Flow:
             State.STAGED: self._enter_staged,
             State.TRIAL: self._enter_trial,
             State.PROVEN: self._enter_proven,
-            State.SAVE_PREPARING: lambda _: self.desk.record(Kind.FLASH_SENT),
+            State.SAVE_PREPARING: lambda _: self.outbox.record(Kind.FLASH_SENT),
             State.SAVING: self._enter_saving,
             State.COMMITTED: self._enter_rest,
             State.CONFIRMED: self._enter_rest,
@@ -93,40 +93,40 @@ class Flow:
         """Something happened: move where the table says; what it does not name is ignored."""
         target = TABLE[self.state].get(signal)
         if target is None:
-            self.desk.note("debug", f"{signal.value} is ignored in {self.state.value}: {reason}")
+            self.outbox.note("debug", f"{signal.value} is ignored in {self.state.value}: {reason}")
         elif target is not self.state:
             self.enter(target, reason)
 
     def enter(self, state: State, reason: str) -> None:
-        """Arrive in a state. A conversation of the old one ends."""
-        self.desk.stop_running()
+        """Arrive in a state. A procedure of the old one ends."""
+        self.outbox.stop_running()
         old, self.state = self.state, state
         self._from_fault, self._resumed = old is State.FAULT, old is State.RECONCILING
-        self._since_s = self.desk.host_s
+        self._since_s = self.outbox.host_s
         wait = ON_TIMEOUT.get(state)
-        self.deadline_s = None if wait is None else self.desk.host_s + wait[0]
-        self.desk.changed(old.value, state.value, reason)
+        self.deadline_s = None if wait is None else self.outbox.host_s + wait[0]
+        self.outbox.changed(old.value, state.value, reason)
         if state in self._on_entry:
             self._on_entry[state](reason)
 
     def watch(self) -> None:
         """Take the step that waits for nothing but a condition, if it holds now."""
-        now = (self.desk.history, self.desk.host_s, self.desk.now)
+        now = (self.outbox.history, self.outbox.host_s, self.outbox.now)
         self.waits_for_look = False
         if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
             self.signal(Signal.APPROVED, f"approved: {self.approver}")
         elif self.watches_interlock and (
-            word := self.safe.interlock_broken(self.desk.host_s, self._since_s)
+            word := self.safe.interlock_broken(self.outbox.host_s, self._since_s)
         ):
             self.roll_back("interlock", word)
         elif self.state is State.TRIAL and self.proven_to_s is not None:
             if self.safe.examined(self.proven_to_s) and not self.safe.disagrees:
                 self.safe.proof_waits = ""
-                self.desk.record(Kind.PROVEN, reason=self.passed)
+                self.outbox.record(Kind.PROVEN, reason=self.passed)
                 self.signal(Signal.TRIAL_PASSED, self.passed)
         elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
             self.roll_back("void", self.safe.void)
-        elif self.state is State.PROVEN and self.desk.host_s >= self._save_from_s:
+        elif self.state is State.PROVEN and self.outbox.host_s >= self._save_from_s:
             if not (holds := self.safe.save_holds(*now)):
                 self.signal(Signal.SAVE_DUE, "proven, safe and still")
             self.waits_for_look = bool(holds) and holds == self.safe.unexamined()
@@ -140,12 +140,12 @@ class Flow:
         """What was waited for did not come."""
         if self.state is State.RECONCILING:  # there is nothing to do but to wait on
             self.deadline_s = None
-            if self.desk.history.open is not None:
-                self.desk.note("error", "a transaction is open and the device does not come back")
+            if self.outbox.history.open is not None:
+                self.outbox.note("error", "a transaction is open and the device does not come back")
             return
         self._cause = "device"
         if self.state is State.STAGING:
-            self.desk.record(Kind.RAM_FAILED, reason="no end")
+            self.outbox.record(Kind.RAM_FAILED, reason="no end")
         self.signal(Signal.TIMEOUT, "nothing came in time")
 
     def roll_back(self, cause: str, reason: str) -> None:
@@ -174,7 +174,7 @@ class Flow:
         estimate has moved away from it by the smallest change that is worth a write.
         """
         fresh = self._compose(estimate, gyro_is_raw)
-        if fresh is None or not worth_writing(self.policy, self.desk.history, fresh):
+        if fresh is None or not worth_writing(self.policy, self.outbox.history, fresh):
             self.signal_if(Signal.NOT_WORTH_WRITING, "the registers are right as they are")
             return
         self.signal_if(
@@ -205,8 +205,8 @@ class Flow:
             return False, self.mode_forbids
         self.approver, self.safe.armed = "operator", True
         said = f"{self.proposal.id} approved"
-        self.desk.note("info", said)
-        held = self.safe.write_holds(self.desk.history, self.desk.host_s, self.desk.now)
+        self.outbox.note("info", said)
+        held = self.safe.write_holds(self.outbox.history, self.outbox.host_s, self.outbox.now)
         waits = f"; it is written once this is over: {'; '.join(held)}" if held else ""
         return True, f"{said}{waits}"
 
@@ -221,7 +221,7 @@ class Flow:
         try:
             return compose(estimate, self.registers, gyro_is_raw=gyro_is_raw)
         except UnwritableError as error:
-            self.desk.note("warning", f"this estimate cannot be written: {error}")
+            self.outbox.note("warning", f"this estimate cannot be written: {error}")
             return None
 
     # -- what is in force, judged by what comes in ------------------------------------------------
@@ -237,7 +237,7 @@ class Flow:
             reason = clear = f"gates not met: {', '.join(red)}"
         elif (fresh := self._compose(estimate, gyro_is_raw)) is None:
             reason = "there is no present estimate to compare with what was written"
-        elif worth_writing(self.policy, self.desk.history, fresh):
+        elif worth_writing(self.policy, self.outbox.history, fresh):
             reason = (
                 f"the present estimate asks for another {fresh.heading_change_deg:.1f} deg and "
                 f"{fresh.gyro_change_rad_s:.4f} rad/s"
@@ -247,8 +247,8 @@ class Flow:
         if not clear:
             self._against_since_s = None
         elif self._against_since_s is None:
-            self._against_since_s = self.desk.host_s
-        elif self.desk.host_s - self._against_since_s >= self.policy.trial.worse_for_s:
+            self._against_since_s = self.outbox.host_s
+        elif self.outbox.host_s - self._against_since_s >= self.policy.trial.worse_for_s:
             self.void(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
 
     def void(self, reason: str) -> None:
@@ -277,7 +277,7 @@ class Flow:
 
     def lock(self, reason: str) -> Answer:
         """No writes from now on; what is only in RAM is undone first."""
-        self.desk.record(Kind.LOCKED, reason=reason)
+        self.outbox.record(Kind.LOCKED, reason=reason)
         if Signal.ROLL_BACK in TABLE[self.state] and self.state is not State.FAULT:
             self.roll_back("operator", reason)
         self.signal_if(Signal.LOCK, reason)
@@ -285,9 +285,9 @@ class Flow:
 
     def unlock(self, reason: str) -> Answer:
         """A person looked and found it right. In FAULT: look again."""
-        self.desk.record(Kind.UNLOCKED, reason=reason)
+        self.outbox.record(Kind.UNLOCKED, reason=reason)
         if self.state is State.FAULT:
-            self.desk.ask(IdentifyAgain())
+            self.outbox.ask(IdentifyAgain())
         self.signal_if(Signal.UNLOCK, reason)
         return True, f"unlocked: {reason}"
 
@@ -300,10 +300,10 @@ class Flow:
     def _enter_rest(self, reason: str) -> None:
         """Nothing under way. A transaction that never sent a write ends here."""
         self.proposal, self.approver = None, ""
-        if self.desk.history.last is Kind.PREPARED:
-            self.desk.record(Kind.ABORTED, reason=reason)
-        if self.desk.history.locked is not None:
-            self.signal(Signal.LOCK, self.desk.history.locked)
+        if self.outbox.history.last is Kind.PREPARED:
+            self.outbox.record(Kind.ABORTED, reason=reason)
+        if self.outbox.history.locked is not None:
+            self.signal(Signal.LOCK, self.outbox.history.locked)
 
     def _enter_candidate(self, reason: str) -> None:
         self.proposal, self.approver = None, ""
@@ -313,7 +313,7 @@ class Flow:
         small = proposal.heading_change_deg <= self.policy.max_change_auto_deg
         self.approver = "auto" if self.policy.approval == "auto" and small else ""
         may = self.safe.mode >= Mode.STAGE
-        self.desk.note(
+        self.outbox.note(
             "info",
             f"candidate {proposal.id}, heading changes by up to {proposal.heading_change_deg:.1f} "
             f"deg; {'to write' if may else 'would write'}: {' '.join(proposal.lines)}",
@@ -324,7 +324,7 @@ class Flow:
         self._against_since_s = None
         proposal, identity = self._the_proposal(), self._the_identity()
         transaction = Transaction(
-            id=f"{proposal.id}-{self.desk.wall_s:.0f}",
+            id=f"{proposal.id}-{self.outbox.wall_s:.0f}",
             serial=identity.serial,
             firmware=identity.firmware,
             old=proposal.old,
@@ -335,21 +335,23 @@ class Flow:
             model=identity.model,
         )
         gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
-        self.desk.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
+        self.outbox.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
 
     def _enter_checking(self, reason: str) -> None:
-        self.desk.run("check", Purpose.STAGE, partial(check, self.transaction(), self.session_keys))
+        self.outbox.run(
+            "check", Purpose.STAGE, partial(check, self.transaction(), self.session_keys)
+        )
 
     def _enter_staging(self, reason: str) -> None:
         self._cause = "device"
-        self.desk.in_force(None)
-        self.desk.run("write", Purpose.STAGE, partial(stage, self.transaction()))
+        self.outbox.in_force(None)
+        self.outbox.run("write", Purpose.STAGE, partial(stage, self.transaction()))
 
     def _enter_staged(self, reason: str) -> None:
         transaction = self.transaction()
         self._now_in_force(transaction.new)
-        self.desk.written(transaction.old, transaction.new, "verified")
-        self.desk.record(Kind.RAM_VERIFIED, serial=transaction.serial)
+        self.outbox.written(transaction.old, transaction.new, "verified")
+        self.outbox.record(Kind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
         self.passed, self.proven_to_s = "", None
@@ -363,36 +365,38 @@ class Flow:
         """
         if self._resumed:
             self.prove_again(reason)
-        if self.desk.history.last is Kind.FLASH_SENT:
-            self._save_from_s = self.desk.host_s + RETRY_SAVE_S
-            self.desk.record(Kind.PROVEN, reason=reason, unsent=True)
+        if self.outbox.history.last is Kind.FLASH_SENT:
+            self._save_from_s = self.outbox.host_s + RETRY_SAVE_S
+            self.outbox.record(Kind.PROVEN, reason=reason, unsent=True)
 
     def _enter_saving(self, reason: str) -> None:
         make = partial(save, self.transaction(), self.session_keys)
-        self.desk.run("save", Purpose.SAVE, make)
+        self.outbox.run("save", Purpose.SAVE, make)
 
     def _enter_rolling_back(self, reason: str) -> None:
         # what was read back as ours and holds something else by now is somebody else's; out of a
         # FAULT a person has looked, and after a write that failed it is what that write left
-        last = self.desk.history.last
+        last = self.outbox.history.last
         only_ours = last is not Kind.RAM_FAILED and not self._from_fault
         if last is not Kind.ROLLBACK:
-            self.desk.record(
+            self.outbox.record(
                 Kind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
             )
-        self.desk.in_force(None)
+        self.outbox.in_force(None)
         make = partial(roll_back, self.transaction(), only_ours=only_ours)
-        self.desk.run("roll back", Purpose.ROLL_BACK, make)
+        self.outbox.run("roll back", Purpose.ROLL_BACK, make)
 
     def _enter_fault(self, reason: str) -> None:
-        transaction = self.desk.history.open
+        transaction = self.outbox.history.open
         by_hand = "" if transaction is None else f": {' '.join(register_lines(transaction.old))}"
-        self.desk.note("error", f"{reason}; the old values, to type in by hand if need be{by_hand}")
+        self.outbox.note(
+            "error", f"{reason}; the old values, to type in by hand if need be{by_hand}"
+        )
 
-    # -- conversations end -------------------------------------------------------------------------
+    # -- procedures end -------------------------------------------------------------------------
 
     def on_outcome(self, outcome: Outcome) -> None:
-        """A conversation came to its end and says how it found the device."""
+        """A procedure came to its end and says how it found the device."""
         if outcome.other is not None:
             self._another(outcome.other, outcome.written)
             return
@@ -407,13 +411,15 @@ class Flow:
     def another(self, unit: Unit) -> None:
         """Another device has the cable: nothing that was judged here is for it."""
         wanted = "nobody knew" if self.identity is None else str(self.identity.unit)
-        self.desk.note("error", f"another device answers: {unit}, not {wanted}; nothing is written")
+        self.outbox.note(
+            "error", f"another device answers: {unit}, not {wanted}; nothing is written"
+        )
         self.look_closer(f"another device answers: {unit}")
 
     def look_closer(self, reason: str) -> None:
         """What the device is or holds is not what it ought to: identify it, read it, compare."""
-        self.desk.in_force(None)
-        self.desk.ask(IdentifyAgain())
+        self.outbox.in_force(None)
+        self.outbox.ask(IdentifyAgain())
         self.signal(Signal.IN_DOUBT, reason)
 
     def expected(self, read: Mapping[int, Values]) -> dict[int, Values]:
@@ -424,25 +430,25 @@ class Flow:
         """The device holds something else than it was left with, nobody knows since when."""
         which = f"register{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
         reason = f"{which} changed: the device restarted unseen, or somebody else wrote"
-        self.desk.note("warning", reason)
-        self.desk.ask(CalibrateAnew(reason))
+        self.outbox.note("warning", reason)
+        self.outbox.ask(CalibrateAnew(reason))
         self.look_closer(reason)
 
     def _another(self, unit: Unit, written: bool) -> None:
-        """In the middle of a conversation; the journal that is open is still the first device's."""
+        """In the middle of a procedure; the journal that is open is still the first device's."""
         reason = f"another device answers: {unit}"
         if self.state is State.SAVING:
-            self.desk.record(Kind.PROVEN, reason=reason, unsent=True)
+            self.outbox.record(Kind.PROVEN, reason=reason, unsent=True)
         elif self.state in (State.CHECKING, State.STAGING) and not written:
-            self.desk.record(Kind.ABORTED, reason=reason)
+            self.outbox.record(Kind.ABORTED, reason=reason)
         self.another(unit)
 
     def _checked(self, outcome: Outcome) -> None:
         if outcome.as_expected:
             self.signal(Signal.DONE, "the device holds what the journal says")
             return
-        self.desk.in_force(None)
-        self.desk.ask(IdentifyAgain())
+        self.outbox.in_force(None)
+        self.outbox.ask(IdentifyAgain())
         self.signal(Signal.DIFFERS, f"somebody else changed the device: {outcome}")
 
     def _written(self, outcome: Outcome) -> None:
@@ -455,22 +461,22 @@ class Flow:
 
     def _saved(self, outcome: Outcome) -> None:
         if outcome.as_expected:
-            self.desk.record(Kind.FLASH_ACKED, serial=self.transaction().serial)
+            self.outbox.record(Kind.FLASH_ACKED, serial=self.transaction().serial)
             self.signal(Signal.DONE, "the device acknowledged the save")
         else:
-            self.desk.note("warning", f"not saved: {outcome}")
+            self.outbox.note("warning", f"not saved: {outcome}")
             self.signal(Signal.NOT_SENT, str(outcome))
             if outcome.differing:
-                self.desk.ask(IdentifyAgain())
+                self.outbox.ask(IdentifyAgain())
         self._set_up_stream()
 
     def on_failure(self, reason: str) -> None:
-        """A conversation broke off: the device may be anywhere between old and new."""
+        """A procedure broke off: the device may be anywhere between old and new."""
         saving = self.state is State.SAVING
         if self.state is State.STAGING:
             transaction = self.transaction()
-            self.desk.written(transaction.old, transaction.new, "failed")
-            self.desk.record(Kind.RAM_FAILED, reason=reason)
+            self.outbox.written(transaction.old, transaction.new, "failed")
+            self.outbox.record(Kind.RAM_FAILED, reason=reason)
         self.signal(Signal.FAILED, reason)
         if saving:
             self._set_up_stream()
@@ -478,7 +484,7 @@ class Flow:
     def _set_up_stream(self) -> None:
         """A save put the user's outputs back."""
         if self.session_keys:
-            self.desk.ask(SetUpStream())
+            self.outbox.ask(SetUpStream())
 
     def _rolled_back(self, outcome: Outcome) -> None:
         transaction = self.transaction()
@@ -486,18 +492,18 @@ class Flow:
             self.look_closer(f"not rolled back: {outcome}")
             return
         self._now_in_force(transaction.old)
-        self.desk.written(transaction.new, transaction.old, "undone")
-        self.desk.record(Kind.ROLLED_BACK, serial=transaction.serial)
-        history = self.desk.history
+        self.outbox.written(transaction.new, transaction.old, "undone")
+        self.outbox.record(Kind.ROLLED_BACK, serial=transaction.serial)
+        history = self.outbox.history
         if history.rollbacks >= self.policy.rollbacks_to_lock and history.locked is None:
-            self.desk.record(Kind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
+            self.outbox.record(Kind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
         self.signal(Signal.DONE, "the old values were read back")
 
     # -- after an interruption ---------------------------------------------------------------------
 
     def reconcile(self, restarted: bool) -> None:
         """Compare journal and device, say what follows, and go there."""
-        history = self.desk.history
+        history = self.outbox.history
         if history.torn:
             self.signal(Signal.TORN, "the flash was torn and nobody unlocked it yet")
         elif history.open is None or history.last is None:
@@ -506,28 +512,28 @@ class Flow:
         else:
             holds = found(history.open.old, history.open.new, self.registers, restarted)
             resolution = RECONCILE[history.last][holds]
-            self.desk.note(resolution.level, resolution.text)
+            self.outbox.note(resolution.level, resolution.text)
             undoable = self.safe.mode >= Mode.STAGE
             if resolution.signal in (Signal.UNDO, Signal.RESUME_TRIAL) and not undoable:
                 self.signal(Signal.UNRESOLVED, f"{resolution.text}, and this mode may not write")
                 return
             if resolution.record is Kind.FOREIGN:
-                self.desk.record(Kind.LOCKED, reason=resolution.text)
+                self.outbox.record(Kind.LOCKED, reason=resolution.text)
             if resolution.record is not None:
-                self.desk.record(resolution.record, reason=resolution.text)
+                self.outbox.record(resolution.record, reason=resolution.text)
             self.signal(resolution.signal, resolution.text)
 
     def _compare_with_the_last(self) -> None:
         """No transaction is open: does the device still hold what the last one left in it?"""
-        held = self.desk.history.holds or {}
+        held = self.outbox.history.holds or {}
         changed = [n for n, v in held.items() if not same(n, v, self.registers.get(n, ()))]
         if changed:
-            self.desk.note(
+            self.outbox.note(
                 "error",
                 f"register {', '.join(map(str, changed))} changed since the journal's last record: "
                 "somebody else wrote or saved it",
             )
-        factory, history = Affine.identity().to_register(), self.desk.history
+        factory, history = Affine.identity().to_register(), self.outbox.history
         strange = [
             number
             for number in (MAG, GYRO)
@@ -537,7 +543,7 @@ class Flow:
             and not history.knows(number, values)
         ]
         if strange and self.safe.journal_ok:
-            self.desk.note(
+            self.outbox.note(
                 "warning",
                 f"register {', '.join(map(str, strange))} holds values that are neither the "
                 "factory's nor in the journal: somebody calibrated the device before, or a journal "
@@ -546,9 +552,9 @@ class Flow:
 
     def transaction(self) -> Transaction:
         """The open transaction; the table has no way into the states that ask without one."""
-        if self.desk.history.open is None:
+        if self.outbox.history.open is None:
             raise AssertionError(f"{self.state.value} without a transaction")
-        return self.desk.history.open
+        return self.outbox.history.open
 
     def _the_proposal(self) -> Proposal:
         if self.proposal is None:
@@ -562,4 +568,4 @@ class Flow:
 
     def _now_in_force(self, values: dict[int, Values]) -> None:
         self.registers = {**self.registers, **values}
-        self.desk.in_force(self.registers)
+        self.outbox.in_force(self.registers)

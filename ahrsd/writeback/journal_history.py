@@ -36,6 +36,19 @@ class JournalRecord(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class StoredRecord:
+    """A journal record as an input brings it."""
+
+    kind: str
+    facts: dict[str, Any]
+
+    @staticmethod
+    def of(body: Mapping[str, Any]) -> StoredRecord:
+        """From `JournalOpened.records`."""
+        return StoredRecord(str(body["kind"]), dict(body["facts"]))
+
+
+@dataclass(frozen=True, slots=True)
 class History:
     """A journal, summed up.
 

@@ -42,7 +42,7 @@ from ahrsd.writeback.states import (
 from ahrsd.writeback.transaction import HSI_RESULT, Outcome
 from ahrsd.writeback.trial import Finding, TrialMetrics
 from drivers.vn100.procedures import Identity, Seen, differences
-from drivers.vn100.registers import Values, same
+from drivers.vn100.registers import COMPENSATING, Values, same
 
 RESTS = frozenset(  # states in which a proven restart since the newest record has it read again
     {
@@ -55,7 +55,6 @@ RESTS = frozenset(  # states in which a proven restart since the newest record h
         State.LOCKED,
     }
 )
-RECHECKED = (23, 25, 26, 44, 84)  # what a sample went through depends on them
 
 _AWAITED = {
     State.PREPARING: Kind.PREPARED,
@@ -71,7 +70,7 @@ class WriteBack:
     def __init__(self, policy: WriteBackPolicy) -> None:
         self.policy = policy
         self._flow = Flow(policy)
-        self._desk = self._flow.desk
+        self._outbox = self._flow.outbox
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._restarts = RestartWatch()
@@ -96,7 +95,7 @@ class WriteBack:
     @property
     def history(self) -> History:
         """The device's journal, summed up."""
-        return self._desk.history
+        return self._outbox.history
 
     @property
     def mode(self) -> Mode:
@@ -111,19 +110,19 @@ class WriteBack:
     @property
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
-        deadlines = [self._flow.deadline_s, self._desk.journal_again_s, self._recheck.due_s]
+        deadlines = [self._flow.deadline_s, self._outbox.journal_again_s, self._recheck.due_s]
         if self._flow.watches_interlock:
-            deadlines.append(self._desk.host_s + self.policy.interlock_max_age_s)
+            deadlines.append(self._outbox.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
 
     @property
     def idle(self) -> bool:
         """Nothing of ours is under way; a daemon that stops may go."""
-        return not self._desk.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
+        return not self._outbox.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
-        now = (self.history, self._desk.host_s, self._desk.now)
+        now = (self.history, self._outbox.host_s, self._outbox.now)
         if self.state is State.PROVEN:
             return self._safe.save_holds(*now)
         reasons = self._safe.write_holds(*now)
@@ -135,11 +134,11 @@ class WriteBack:
 
     def tick(self, host_s: float) -> list[Action]:
         """Time passed: silence, an interlock that went stale, a write or save that may go now."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         if self._flow.deadline_s is not None and host_s >= self._flow.deadline_s:
             self._flow.on_timeout()
-        if (again_s := self._desk.journal_again_s) is not None and host_s >= again_s:
-            self._desk.journal_again()
+        if (again_s := self._outbox.journal_again_s) is not None and host_s >= again_s:
+            self._outbox.journal_again()
         if self._recheck.is_due(host_s):
             self._ask_again()
         return self._answer()
@@ -148,8 +147,8 @@ class WriteBack:
         self, wall_s: float, boot_id: str, boot_s: float | None, host_s: float
     ) -> list[Action]:
         """The host's other clocks; the wall clock may have been set."""
-        self._desk.host_s = host_s
-        self._desk.set_clocks(wall_s, boot_id, boot_s)
+        self._outbox.host_s = host_s
+        self._outbox.set_clocks(wall_s, boot_id, boot_s)
         return self._answer()
 
     def on_device(
@@ -169,14 +168,14 @@ class WriteBack:
         read_from_s:  when the reading of them began; see `on_uptime`
         journal:      this device's records, oldest first; None where they cannot be trusted
         """
-        flow, self._desk.host_s = self._flow, host_s
+        flow, self._outbox.host_s = self._flow, host_s
         self._recheck.begin(host_s)
-        self._desk.bind(identity.serial, journal)
+        self._outbox.bind(identity.serial, journal)
         restarted = self._restarts.bind(identity.serial, read_from_s)
         self._safe.theirs = self._changed_by_others(identity, registers, session_keys, restarted)
         self._safe.bind(identity, registers, journal is not None)
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
-        self._desk.in_force(registers)
+        self._outbox.in_force(registers)
         if self.state is not State.RECONCILING:
             flow.enter(State.RECONCILING, "the device was read again")
         unfinished = self.history.open
@@ -186,7 +185,7 @@ class WriteBack:
 
     def on_no_device(self, registers: Mapping[int, Values] | None, host_s: float) -> list[Action]:
         """There is nobody to ask: mode passive, or a recording. Registers where they are known."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         self._restarts.lost()
         self._recheck.off()
         identity = Affine.identity().to_register()
@@ -197,7 +196,7 @@ class WriteBack:
 
     def on_link_lost(self, host_s: float) -> list[Action]:
         """The port went away."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         self._restarts.lost()
         self._flow.signal(Signal.LINK_LOST, "the link was lost")
         return self._answer()
@@ -207,8 +206,8 @@ class WriteBack:
 
         uptime_s: its time since then, where that is what tells; then it must agree with the journal
         """
-        self._desk.host_s = host_s
-        self._restarts.seen(self.history.last_at, self._desk.stamp, host_s, uptime_s)
+        self._outbox.host_s = host_s
+        self._restarts.seen(self.history.last_at, self._outbox.stamp, host_s, uptime_s)
         self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
@@ -218,23 +217,23 @@ class WriteBack:
         One since the registers were read makes that reading void. And only a restart shows what a
         save left in flash, so it is asked again then.
         """
-        desk, record = self._desk, self.history.last_at
-        desk.host_s = host_s
+        outbox, record = self._outbox, self.history.last_at
+        outbox.host_s = host_s
         reason = self._restarts.heard(uptime_s, host_s)
         if reason:
-            self._restarts.seen(record, desk.stamp, host_s, uptime_s)
+            self._restarts.seen(record, outbox.stamp, host_s, uptime_s)
         elif (
             self.history.open is not None
             and self.state in RESTS
-            and self._restarts.proven(record, desk.stamp, host_s)
+            and self._restarts.proven(record, outbox.stamp, host_s)
         ):
             self._restarts.concluded()
             reason = "the device restarted since the journal's newest record"
         else:
-            desk.device_s = uptime_s
+            outbox.device_s = uptime_s
         if reason:
             self._flow.signal(Signal.DEVICE_RESET, reason)
-            desk.ask(IdentifyAgain())
+            outbox.ask(IdentifyAgain())
         return self._answer()
 
     def on_looked(self, seen: Seen | None, error: str, host_s: float) -> list[Action]:
@@ -243,12 +242,12 @@ class WriteBack:
         Where all is as it ought to be, `confirmed_s` is the host's time at which it was asked;
         else None.
         """
-        self._desk.host_s, flow, self.confirmed_s = host_s, self._flow, None
+        self._outbox.host_s, flow, self.confirmed_s = host_s, self._flow, None
         self._recheck.unanswered = False
-        if flow.identity is None or self.state is State.RECONCILING or self._desk.running:
+        if flow.identity is None or self.state is State.RECONCILING or self._outbox.running:
             return self._answer()  # overtaken
         if seen is None:
-            self._desk.note(
+            self._outbox.note(
                 "warning", f"the device does not say who it is and what it holds: {error}"
             )
             self._recheck.soon(host_s)
@@ -266,7 +265,7 @@ class WriteBack:
 
         A stream that is played faster than it was recorded fills them up sooner than the clock.
         """
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         if span_s >= self.policy.recheck_s and not self._recheck.unanswered:
             self._recheck.soon(host_s)
         return self._answer()
@@ -276,8 +275,8 @@ class WriteBack:
 
         jumped: its readings did, so what was proven before must be proven again.
         """
-        self._desk.host_s = host_s
-        self._desk.note("debug", f"{reason}: the device is asked again who it is")
+        self._outbox.host_s = host_s
+        self._outbox.note("debug", f"{reason}: the device is asked again who it is")
         self._safe.doubt(host_s)
         self._flow.proven_to_s = None
         if jumped:
@@ -294,7 +293,7 @@ class WriteBack:
 
     def on_interlock(self, safe: bool, host_s: float) -> list[Action]:
         """The vehicle's word."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         self._safe.hear_interlock(safe, host_s)
         return self._answer()
 
@@ -314,7 +313,7 @@ class WriteBack:
         gyro_is_raw: see `composition.compose`.
         sampled_s:   host time of the newest sample that was judged; None: now
         """
-        self._desk.host_s, self._desk.at_s = host_s, at_s
+        self._outbox.host_s, self._outbox.at_s = host_s, at_s
         self._safe.judged_s = host_s if sampled_s is None else sampled_s
         fresh = sampled_s is None or sampled_s > self._safe.doubt_s
         self._safe.gates, self._safe.flash_gates = gates, flash_gates if fresh else ()
@@ -328,19 +327,19 @@ class WriteBack:
 
     def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
         """What was calibrated until now holds no more: something on the vehicle changed."""
-        self._desk.host_s, self._desk.at_s = host_s, at_s
+        self._outbox.host_s, self._outbox.at_s = host_s, at_s
         self._safe.doubt(host_s)
         self._flow.void(reason)
         return self._answer()
 
     def on_examined(self, sampled_s: float, host_s: float) -> list[Action]:
         """The estimate has taken the samples up to this host time into account."""
-        self._desk.host_s, self._safe.examined_s = host_s, sampled_s
+        self._outbox.host_s, self._safe.examined_s = host_s, sampled_s
         return self._answer()
 
     def on_estimator_failed(self, host_s: float) -> list[Action]:
         """There is no estimate, nor what the gates said of it: what rests on it ends."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         self._safe.gates = self._safe.flash_gates = ()
         self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the estimator failed")
         self._flow.roll_back("estimator", "the estimator failed: nobody judges the new values")
@@ -348,14 +347,14 @@ class WriteBack:
 
     def on_limits_changed(self, host_s: float) -> list[Action]:
         """The gates have other limits: what they said before allows nothing."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         self._safe.gates = self._safe.flash_gates = ()
         self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the limits of the gates were changed")
         return self._answer()
 
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
         """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         reason = argument or "no reason given"
         verbs: dict[str, Callable[[], Answer]] = {
             "arm": partial(self._arm, True),
@@ -370,12 +369,12 @@ class WriteBack:
         else:
             self.operator_answer = False, f"{verb!r} is no command; possible: {', '.join(verbs)}"
         if not self.operator_answer[0]:
-            self._desk.note("warning", f"operator: {verb} refused: {self.operator_answer[1]}")
+            self._outbox.note("warning", f"operator: {verb} refused: {self.operator_answer[1]}")
         return self._answer()
 
     def on_trial_metrics(self, metrics: TrialMetrics, host_s: float) -> list[Action]:
         """The new registers against the old ones on live samples."""
-        self._desk.host_s = host_s
+        self._outbox.host_s = host_s
         if self.state in (State.TRIAL, State.PROVEN) and metrics.finite:
             self._flow.deadline_s = host_s + ON_TIMEOUT[self.state][0]
             finding, reason = self._flow.trial.judge(metrics)
@@ -394,44 +393,44 @@ class WriteBack:
 
     def on_stop(self, host_s: float) -> list[Action]:
         """The daemon ends: what is only in RAM is undone, unless it is proven and to be kept."""
-        self._desk.host_s, self._safe.stopping = host_s, True
-        self._desk.journal_again()
+        self._outbox.host_s, self._safe.stopping = host_s, True
+        self._outbox.journal_again()
         if not (self.policy.keep_on_stop and self.state is State.PROVEN):
             self._flow.roll_back("stop", "the daemon stops")
         return self._answer()
 
     def on_journal_ok(self, kind: Kind, host_s: float) -> list[Action]:
         """The record is on the disk."""
-        self._desk.host_s = host_s
-        self._safe.journal_ok = self._desk.journaled(kind)
+        self._outbox.host_s = host_s
+        self._safe.journal_ok = self._outbox.journaled(kind)
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNALLED, f"{kind.value} is in the journal")
         return self._answer()
 
     def on_journal_failed(self, kind: Kind, error: str, host_s: float) -> list[Action]:
         """The record is not on the disk. What waited for it does not happen."""
-        self._desk.host_s, self._safe.journal_ok = host_s, False
-        self._desk.not_journaled(kind)
-        self._desk.note("error", f"{kind.value} could not be journalled: {error}")
+        self._outbox.host_s, self._safe.journal_ok = host_s, False
+        self._outbox.not_journaled(kind)
+        self._outbox.note("error", f"{kind.value} could not be journalled: {error}")
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNAL_FAILED, error)
         return self._answer()
 
     def on_procedure_finished(self, name: str, result: object, host_s: float) -> list[Action]:
-        """A conversation ended and returned an Outcome."""
-        self._desk.host_s = host_s
-        if name == self._desk.running and isinstance(result, Outcome):
-            self._desk.running = ""
+        """A procedure ended and returned an Outcome."""
+        self._outbox.host_s = host_s
+        if name == self._outbox.running and isinstance(result, Outcome):
+            self._outbox.running = ""
             self._flow.on_outcome(result)
             if not result.as_expected:
                 self._recheck.now(host_s)
         return self._answer()
 
     def on_procedure_failed(self, name: str, error: Exception, host_s: float) -> list[Action]:
-        """A conversation broke off: the device may be anywhere between old and new."""
-        self._desk.host_s = host_s
-        if name == self._desk.running:
-            self._desk.running = ""
+        """A procedure broke off: the device may be anywhere between old and new."""
+        self._outbox.host_s = host_s
+        if name == self._outbox.running:
+            self._outbox.running = ""
             self._flow.on_failure(str(error))
             self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()
@@ -459,22 +458,22 @@ class WriteBack:
 
     def _ask_again(self) -> None:
         """Have the device say who it is and what it holds, unless something else runs."""
-        flow, now_s = self._flow, self._desk.host_s
+        flow, now_s = self._flow, self._outbox.host_s
         self._recheck.begin(now_s)
         if self._safe.sampled_s is not None:
             self._sampled_to_s = self._safe.sampled_s
-        if flow.identity is None or self._desk.running or self.state in _NOT_ASKED:
+        if flow.identity is None or self._outbox.running or self.state in _NOT_ASKED:
             self._recheck.soon(now_s)
             return
-        expected = {n: flow.registers[n] for n in RECHECKED if n in flow.registers}
+        expected = {n: flow.registers[n] for n in COMPENSATING if n in flow.registers}
         self._recheck.unanswered = True
-        self._desk.ask(Look(flow.identity.unit, expected))
+        self._outbox.ask(Look(flow.identity.unit, expected))
 
     def _arm(self, armed: bool) -> Answer:
         """Whether this run may begin a write or a save; what is under way is not undone."""
         self._safe.armed = armed
         text = "armed: this run may write" if armed else NOT_ARMED
-        self._desk.note("info", text)
+        self._outbox.note("info", text)
         if armed and self.policy.mode < Mode.STAGE:
             return False, f"{self._flow.mode_forbids}"
         return True, text if armed else "disarmed: this run writes nothing by itself"
@@ -483,5 +482,5 @@ class WriteBack:
         """Take the steps that are due now, then hand over everything that was asked for."""
         self._flow.watch()
         if self._flow.waits_for_look:
-            self._recheck.soon(self._desk.host_s)
-        return self._desk.take()
+            self._recheck.soon(self._outbox.host_s)
+        return self._outbox.take()

@@ -14,7 +14,7 @@ before the device does: nothing is sent until the record of what the device held
     PROVEN        was better, or not worse, for long enough, and goes on being judged; what voids a
                   trial ends it too; in mode `stage` it rests here
     SAVE_PREPARING waits for the journal to say that the flash is about to be written
-    SAVING        session settings put back, every register compared, then VNWNV: one conversation
+    SAVING        session settings put back, every register compared, then VNWNV: one procedure
     COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
 
 "verified", "proven", "committed" and "confirmed" are different words on purpose.

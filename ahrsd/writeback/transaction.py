@@ -1,10 +1,10 @@
-"""One transaction: what it changes, its record in the journal, and its conversations with a device.
+"""One transaction: what it changes, its record in the journal, and its procedures on a device.
 
-Each conversation keeps the device's output paused while it lasts and returns whether the device
+Each procedure keeps the device's output paused while it lasts and returns whether the device
 was as expected; everything else is an error that the session reports. None of them undoes what it
-did: that is a conversation of its own, so that the gate knows a rollback from a write.
+did: that is a procedure of its own, so that the gate knows a rollback from a write.
 
-A cable can be moved to another device between any two commands. So each conversation asks who
+A cable can be moved to another device between any two commands. So each procedure asks who
 answers before it compares, before every attempt to write a register, and before the save; what is
 judged of one device is never written into another.
 """
@@ -111,7 +111,7 @@ def _from_json(registers: Mapping[str, list[float | int | str]]) -> dict[int, Va
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a conversation ended: as expected, or which registers were not, or what was refused.
+    """How a procedure ended: as expected, or which registers were not, or what was refused.
 
     other:   who answered, where it was not the transaction's device
     written: whether a write may have gone out
@@ -179,7 +179,7 @@ def _other(transaction: Transaction) -> Procedure[Unit | None]:
 
 
 def _stranger(transaction: Transaction) -> Procedure[Unit | None]:
-    """The same within a conversation that has asked already: the serial number is enough."""
+    """The same within a procedure that has asked already: the serial number is enough."""
     if int((yield from read(3))[0]) == transaction.serial:
         return None
     return (yield from _other(transaction))

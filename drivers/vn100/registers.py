@@ -4,7 +4,7 @@ Source: VN-100 user manual UM001, the chapter named in each row (section), for f
 The default values of registers 32, 36, 38, 48 and 85 are one sensor's dump or the manual's
 examples, not confirmed factory values; those of register 50 are "no aiding".
 
-Conversation, as the device speaks it::
+Commands and replies, as the device speaks them::
 
     $VNWRG,23,1.02,0.01,...*6F   format_command(23, values), written behind "VNWRG,"
     $VNRRG,23,1.02,0.01,...      format_reply(23, values), printed behind "VNRRG," or "VNWRG,"
@@ -53,6 +53,7 @@ __all__ = [
     "ASYNC_OUTPUT_RATES_HZ",
     "BINARY_OUTPUTS",
     "BINARY_OUTPUT_OFF",
+    "COMPENSATING",
     "REGISTERS",
     "SAMPLE_RATE_HZ",
     "SUPPORTED_BAUD",
@@ -69,6 +70,8 @@ __all__ = [
 ]
 
 ORTHONORMAL_WITHIN = 1e-5  # register 26: what the device still accepts
+
+COMPENSATING = (23, 25, 26, 44, 84)  # what the device computes of a reading depends on them
 
 
 def check_rotation(values: Values) -> None:

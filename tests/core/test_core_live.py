@@ -180,7 +180,7 @@ def test_through_replugs_resets_and_damage(tmp_path):
         run = Run(config, tmp_path, port, end)()
     live = same_decisions(run, config)
     assert live.stream.restarts >= 1
-    assert live.conversation.session.deframer.counters.rejected > 0
+    assert live.device_session.session.deframer.counters.rejected > 0
     assert [name for _, name in run.states].count("RECONCILING") >= 2
 
 

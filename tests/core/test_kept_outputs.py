@@ -15,11 +15,11 @@ from writeback_rig import estimate
 
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core.device_record import RecordRead
+from ahrsd.core.device_session import Phase
 from ahrsd.core.kept_outputs import KeptOutputs, open_record
-from ahrsd.core.session_events import Phase
 from ahrsd.events import Send
 from ahrsd.offline.replay import replay
+from ahrsd.writeback.journal_history import StoredRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
 from drivers.vn100.calibration_stream import left_by_session
@@ -55,7 +55,7 @@ def end(run):
 
 
 def records(*facts):
-    return [RecordRead(kind, body) for kind, body in facts]
+    return [StoredRecord(kind, body) for kind, body in facts]
 
 
 KEPT = ("OUTPUTS_KEPT", {"serial": 5, "old": {str(n): list(v) for n, v in USERS.items()}})
@@ -144,7 +144,7 @@ def test_a_kill_at_any_moment_of_the_set_up_leaves_the_users_outputs(output):
         run.restart()
         if steps % 4 == 0:  # else killed twice
             run.run(0.1)
-            assert run.until(lambda: run.core.conversation.phase is Phase.READY, 3.0)
+            assert run.until(lambda: run.core.device_session.phase is Phase.READY, 3.0)
             end(run)
             assert outputs(run.emulator.memory.ram) == users, steps
             assert kinds(run)[-1:] == ["OUTPUTS_BACK"]

@@ -150,7 +150,7 @@ def test_another_device_begins_anew_and_nothing_is_written_to_it(live):
         daemon.flowing()
         assert daemon.core.calibrator is not first
         daemon.stop()
-        assert daemon.core.conversation.identity.serial == daemon.emulator.serial
+        assert daemon.core.device_session.identity.serial == daemon.emulator.serial
         assert b"VNWRG" not in daemon.heard
 
 
@@ -166,7 +166,7 @@ def test_a_stalled_device_is_named_once_and_comes_back(live, caplog):
 def test_a_device_that_did_not_answer_is_asked_again(live):
     with live({"output": "imu", "faults": ("lost_reply@0+4",)}) as daemon:
         daemon.until(lambda: daemon.noted("listening only"))
-        daemon.until(lambda: daemon.core.conversation.identity, 20.0)
+        daemon.until(lambda: daemon.core.device_session.identity, 20.0)
         daemon.until(lambda: daemon.states and daemon.states[-1] == "OBSERVING")
         assert daemon.stop() < LIMIT_S
 
@@ -186,7 +186,7 @@ def test_a_bug_in_a_transaction_leaves_the_output_on(live):
     with live({"output": "imu"}, mode="stage") as daemon:
 
         def breakdown():
-            daemon.core.conversation.received = None
+            daemon.core.device_session.received = None
 
         Operator(daemon, "STAGING", breakdown)
         daemon.until(lambda: "STAGING" in daemon.states)
@@ -305,10 +305,10 @@ def test_a_host_clock_that_is_set_moves_no_sample(live, monkeypatch):
     monkeypatch.setattr(time, "time", lambda: real() + step[0])
     with live({"output": "binary"}) as daemon:
         daemon.flowing()
-        desk = daemon.core.writeback._desk
+        outbox = daemon.core.writeback._outbox
         for days in (-1, 7):
-            was_s, step[0] = desk.wall_s, 86400.0 * days
-            daemon.until(lambda was_s=was_s: abs(desk.wall_s - was_s) > 80_000.0)
+            was_s, step[0] = outbox.wall_s, 86400.0 * days
+            daemon.until(lambda was_s=was_s: abs(outbox.wall_s - was_s) > 80_000.0)
             daemon.flowing()
         daemon.stop()
         facts = daemon.core.stream.facts

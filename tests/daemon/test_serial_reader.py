@@ -98,7 +98,7 @@ def test_a_core_that_falls_behind_loses_the_link_and_no_byte(live):
     (lost,) = [k for k, item in enumerate(items) if isinstance(item, LinkLost)]
     waited = [len(item.data) + 128 for item in items[:lost] if isinstance(item, Received)]
     assert sum(waited) > 2_000
-    fed = daemon.core.conversation.session.deframer.counters.fed_bytes
+    fed = daemon.core.device_session.session.deframer.counters.fed_bytes
     assert fed == sum(len(item.data) for item in items if isinstance(item, Received))
     assert daemon.core.stream.facts.damaged == 0
 
@@ -122,7 +122,7 @@ def test_half_a_message_is_not_given_up_while_the_rest_waits_to_be_read(live):
     with live({"output": "imu"}) as daemon:
         daemon.flowing()
         daemon.stop()
-    one, deframer = daemon.daemon, daemon.core.conversation.session.deframer
+    one, deframer = daemon.daemon, daemon.core.device_session.session.deframer
     cut = deframer.counters.damage.get(Cause.CUT, 0)
     one._link = Starved(one._link)
     one._feed(Received(one.clock.now_ns(), b"$VNIMU,-00.1"))

@@ -17,7 +17,7 @@ from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
-from ahrsd.core.estimation_queue import EstimatorState, Piece
+from ahrsd.core.estimation_queue import EstimationTask, EstimatorState
 from ahrsd.daemon.estimation_worker import MOST_WAITING, Worker
 from ahrsd.events import Examine
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
@@ -349,7 +349,7 @@ def fail_waiting(run: BesideRun) -> None:
 def test_the_worker_goes_on_after_what_broke_off_and_logs_it_once(worker, caplog):
     done = []
     for k in range(6):
-        piece = Piece(None, broken if k in (1, 3) else lambda k=k: done.append(k))
+        piece = EstimationTask(None, broken if k in (1, 3) else lambda k=k: done.append(k))
         worker.put(piece.work)
     batches = []
     wait(lambda: batches.extend(worker.take_done()) or sum(n for n, _ in batches) == 6)

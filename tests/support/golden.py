@@ -133,7 +133,7 @@ def found_in(name: str) -> dict[str, object]:
 
 def facts_of(core: Core) -> dict[str, object]:
     """Counts, gates and estimate at the end, and the hash of the way there."""
-    counters, estimate = core.conversation.session.deframer.counters, core.calibrator.estimate
+    counters, estimate = core.device_session.session.deframer.counters, core.calibrator.estimate
     numbers: dict[str, object] = {}
     if estimate is not None:
         numbers = {

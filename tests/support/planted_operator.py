@@ -31,7 +31,8 @@ class Operator:
             self.proposed = core.writeback.state is State.OBSERVING
             if self.proposed:
                 green = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
-                core._errands.add(core.writeback.on_verdict(estimate(), green, 1.0, core._host_s))
+                actions = core.writeback.on_verdict(estimate(), green, 1.0, core._host_s)
+                core._action_queue.add(actions)
                 core._judged = lambda *_: None  # what the gates truly say would end it
         elif isinstance(event, StateChanged) and event.new == State.QUALIFIED:
             self.live.daemon.operate("approve", core.writeback.proposal.id)

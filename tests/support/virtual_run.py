@@ -143,7 +143,7 @@ class VirtualRun:
     def describe(self) -> str:
         """Where it stands, in a line."""
         core = self.core
-        phase = core.conversation.phase.value
+        phase = core.device_session.phase.value
         return f"{self.now_s:.1f} s, {core.writeback.state.value}, {phase}: {self.notes[-2:]}"
 
     def stop(self) -> None:

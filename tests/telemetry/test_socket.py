@@ -46,7 +46,7 @@ def test_status_explain_and_watch_of_a_running_daemon(served):
     live, path = served
     status = until_status(path)
     assert status["schema"] == "ahrsd.status/1"
-    assert status["device"]["serial"] == live.core.conversation.identity.serial
+    assert status["device"]["serial"] == live.core.device_session.identity.serial
     assert status["stream"]["rejected"] == 0
     assert status["mode"] == "observe"
     assert any(line.startswith("device: VN-100") for line in status_lines(status))

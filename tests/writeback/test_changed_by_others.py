@@ -10,7 +10,7 @@ from virtual_run import VirtualRun
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core.device_record import Rollcall
+from ahrsd.core.device_record import DeviceRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.emulator.scenarios import Setup, build
@@ -66,10 +66,12 @@ def test_a_restart_of_the_device_explains_what_changed(observing):
 
 
 def test_what_differs_only_as_the_device_prints_it_is_the_same():
-    roll = Rollcall()
+    record = DeviceRecord()
     written = (1.0569499731063843, *IDENTITY[1:])
     printed = (1.05695, *IDENTITY[1:])
-    assert roll.registers({23: written}, {}, 1) == []
-    assert roll.registers({23: printed, 84: IDENTITY}, {23: written}, 1) == []
-    assert roll.registers({23: OTHER}, {23: printed}, 1) == [23]
-    assert roll.registers({23: IDENTITY}, {23: OTHER}, 2) == []  # the link was lost meanwhile
+    assert record.registers_read({23: written}, {}, 1) == []
+    assert record.registers_read({23: printed, 84: IDENTITY}, {23: written}, 1) == []
+    assert record.registers_read({23: OTHER}, {23: printed}, 1) == [23]
+    assert (
+        record.registers_read({23: IDENTITY}, {23: OTHER}, 2) == []
+    )  # the link was lost meanwhile

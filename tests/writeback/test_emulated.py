@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.core.closing import identify_surely, read_surely
+from ahrsd.core.device_session import identify_surely, read_surely
 from ahrsd.writeback.actions import IdentifyAgain, JournalAppend, RunProcedure
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode, Purpose

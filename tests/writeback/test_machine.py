@@ -441,7 +441,7 @@ def test_a_move_at_the_last_moment_holds_vnwnv(make_rig):
     rig = proven(make_rig)
 
     def slow(command):
-        if "save" in rig.wb._desk.running and isinstance(command, Word):
+        if "save" in rig.wb._outbox.running and isinstance(command, Word):
             rig.now_s += 2.5
 
     rig.device.refuse = slow

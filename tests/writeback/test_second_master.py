@@ -161,5 +161,5 @@ def test_a_capture_replays_to_the_same_decisions(binary):
     for item in run.taken:
         again.handle(item)
     assert again.decisions.sha256 == run.core.decisions.sha256
-    assert again.conversation.identity == run.core.conversation.identity
-    assert again.conversation.identity.serial == SPARE
+    assert again.device_session.identity == run.core.device_session.identity
+    assert again.device_session.identity.serial == SPARE

@@ -58,7 +58,7 @@ def test_at_every_command_of_the_save(at):
         if run.state == "SAVING":
             heard.append(line)
             if len(heard) == at:
-                run.core._errands.add(run.core.writeback.on_void("a step", 0.0, run.now_s))
+                run.core._action_queue.add(run.core.writeback.on_void("a step", 0.0, run.now_s))
 
     run.cable.unit.before = step
     run.park(30.0)

@@ -27,7 +27,7 @@ JOURNAL_AGAIN_S = 30.0
 _ANNOUNCED = (Kind.PREPARED, Kind.RAM_VERIFIED, Kind.FLASH_SENT)  # not on the disk: not done
 
 
-class Desk:
+class ActionOutbox:
     """Outgoing actions in order, each stamped with the newest time; the history beside them.
 
     A record that says what was done (a rollback) and that the disk did not take is kept and asked
@@ -191,7 +191,7 @@ class Desk:
         self.ask(InForce(None if registers is None else dict(registers)))
 
     def run(self, what: str, purpose: Purpose, make: Callable[[], Procedure[object]]) -> None:
-        """Begin a conversation; its commands pass the gate at the newest time that was told."""
+        """Begin a procedure; its commands pass the gate at the newest time that was told."""
         self._runs += 1
         self.running = f"{what} {self._runs}"
         self.ask(
@@ -204,7 +204,7 @@ class Desk:
         )
 
     def stop_running(self) -> None:
-        """End the conversation that runs, if any."""
+        """End the procedure that runs, if any."""
         if self.running:
             self.ask(CancelProcedure(self.running))
         self.running = ""

@@ -1,4 +1,4 @@
-"""What is said to the device, and when: the conversation against the emulated device, no port."""
+"""What is said to the device, and when: the session against the emulated device, no port."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import re
 
 import pytest
 
-from ahrsd.core.closing import STOP_S, WrongDevice
-from ahrsd.core.device_record import RecordRead as Record
-from ahrsd.core.device_session import ASK_AGAIN_S, Conversation
-from ahrsd.core.session_events import (
+from ahrsd.core.device_session import (
+    ASK_AGAIN_S,
+    STOP_S,
     Closed,
     Completed,
     ConfigurationRead,
+    DeviceSession,
     Identified,
     Phase,
     StreamChanged,
     Unanswered,
+    WrongDevice,
 )
 from ahrsd.writeback.actions import SetUpStream
+from ahrsd.writeback.journal_history import StoredRecord
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.reconcile import Kind
 from drivers.vn100.commands import LinkGone, Read, Word, Write
@@ -29,64 +31,64 @@ STEP_S = 0.01
 
 
 class Talk:
-    """A conversation, an emulated device and one clock for both."""
+    """A device session, an emulated device and one clock for both."""
 
     def __init__(self, mode=Mode.OBSERVE, change_stream=False, **setup):
         self.device = build(Setup(output=setup.pop("output", "imu"), **setup))
         self.before = dict(self.device.memory.ram)
-        self.conversation = Conversation(mode, change_stream=change_stream, rate_hz=50.0)
+        self.device_session = DeviceSession(mode, change_stream=change_stream, rate_hz=50.0)
         self.now_s = 1.0
         self.device.advance(self.now_s)
         self.said, self.sent, self.events = [], b"", []
         self.journal, self.disk_full = [], False
-        self.conversation.opened(115200, self.now_s)
+        self.device_session.opened(115200, self.now_s)
 
     def step(self):
-        output = self.conversation.session.take_output()
+        output = self.device_session.session.take_output()
         self.sent += output
         self.device.receive(output, self.now_s)
         self.now_s += STEP_S
         data = self.device.advance(self.now_s)
         if data:
-            self.events += self.conversation.received(data, self.now_s)
-        due = self.conversation.deadline_s
+            self.events += self.device_session.received(data, self.now_s)
+        due = self.device_session.deadline_s
         if due is not None and self.now_s >= due:
-            self.events += self.conversation.tick(self.now_s)
+            self.events += self.device_session.tick(self.now_s)
         self.hear()
 
     def hear(self):
         """What the core does with what was said; the journal answers at once."""
-        said = self.conversation.take_said()
+        said = self.device_session.take_events()
         self.said += said
         for one in said:
             if isinstance(one, ConfigurationRead):
-                self.conversation.known(one.values, self.journal)
-        actions = self.conversation.outputs.take_actions()
+                self.device_session.known(one.values, self.journal)
+        actions = self.device_session.outputs.take_actions()
         while actions:
             action = actions.pop(0)
             if isinstance(action, SetUpStream):
-                self.conversation.set_up_again(self.now_s)
+                self.device_session.set_up_again(self.now_s)
                 continue
             if not self.disk_full:
-                self.journal.append(Record(action.kind.value, dict(action.facts)))
+                self.journal.append(StoredRecord(action.kind.value, dict(action.facts)))
             error = "no space left" if self.disk_full else ""
-            self.conversation.journalled(action.kind, error, self.now_s)
-            actions += self.conversation.outputs.take_actions()
+            self.device_session.journalled(action.kind, error, self.now_s)
+            actions += self.device_session.outputs.take_actions()
 
     def until(self, condition, seconds=20.0):
         end_s = self.now_s + seconds
         while not condition():
-            assert self.now_s < end_s, (self.conversation.phase, self.said)
+            assert self.now_s < end_s, (self.device_session.phase, self.said)
             self.step()
         return self
 
     def in_phase(self, phase):
-        return self.until(lambda: self.conversation.phase is phase)
+        return self.until(lambda: self.device_session.phase is phase)
 
     def close(self, seconds=3.0):
-        self.conversation.limit.begin(self.now_s)
-        self.conversation.restore_and_close(self.now_s)
-        self.until(lambda: self.conversation.phase is Phase.DONE, seconds)
+        self.device_session.limit.begin(self.now_s)
+        self.device_session.restore_and_close(self.now_s)
+        self.until(lambda: self.device_session.phase is Phase.DONE, seconds)
         self.hear()
         return next(one for one in self.said if isinstance(one, Closed))
 
@@ -105,13 +107,13 @@ def test_the_device_is_known_before_its_samples_count():
 
 def test_passive_says_nothing():
     talk = Talk(Mode.PASSIVE, change_stream=True)
-    assert talk.conversation.phase is Phase.READY
+    assert talk.device_session.phase is Phase.READY
     talk.until(lambda: len(talk.events) > 20)
     assert talk.close() == Closed(None)
     assert talk.sent == b""
-    assert talk.conversation.amends() is None
+    assert talk.device_session.cleanup() is None
     assert not any(
-        talk.conversation.allows_amends(c)
+        talk.device_session.allows_cleanup(c)
         for c in (Read(1), Write(6, (0,)), Word("VNASY", (1,)), Word("VNWNV"))
     )
 
@@ -128,10 +130,10 @@ def test_closed_in_any_phase_the_device_is_as_it_was(phase):
         talk.in_phase(Phase.READY)
     elif phase is Phase.CLOSED:
         talk.in_phase(Phase.READY)
-        talk.conversation.lost(talk.now_s)
+        talk.device_session.lost(talk.now_s)
     else:
         talk.in_phase(phase)
-    closed = talk.until(lambda: talk.conversation.may_close).close()
+    closed = talk.until(lambda: talk.device_session.may_close).close()
     if phase is Phase.CLOSED:
         assert isinstance(closed.error, LinkGone)
         return
@@ -142,8 +144,8 @@ def test_closed_in_any_phase_the_device_is_as_it_was(phase):
 def test_reading_need_not_end_before_closing():
     talk = Talk(faults=("off@1",))
     talk.until(lambda: talk.sent)
-    assert talk.conversation.phase is Phase.IDENTIFYING
-    assert talk.conversation.may_close
+    assert talk.device_session.phase is Phase.IDENTIFYING
+    assert talk.device_session.may_close
     assert talk.close(0.1) == Closed(None)
 
 
@@ -159,7 +161,7 @@ def test_of_a_known_device_nothing_is_used_before_it_answers_again():
     """`Unanswered` makes the core take the stream as it is: not where the registers are known."""
     talk = Talk(faults=("lost_reply@3+8",)).in_phase(Phase.READY)
     talk.until(lambda: talk.now_s > 3.1)
-    talk.conversation.identify_again(talk.now_s)
+    talk.device_session.identify_again(talk.now_s)
     talk.until(lambda: StreamChanged in talk.kinds())
     assert talk.said[-1].level == "warning"
     talk.in_phase(Phase.READY)
@@ -169,14 +171,14 @@ def test_of_a_known_device_nothing_is_used_before_it_answers_again():
 
 def test_another_device_is_not_given_the_first_ones_settings():
     talk = Talk(change_stream=True).in_phase(Phase.READY)
-    talk.conversation.lost(talk.now_s)
+    talk.device_session.lost(talk.now_s)
     other = build(Setup(output="binary", rate_hz=20))
     other.replace_unit(7)
     talk.device, talk.before = other, dict(other.memory.ram)
     other.advance(talk.now_s)
-    talk.conversation.opened(115200, talk.now_s)
+    talk.device_session.opened(115200, talk.now_s)
     talk.in_phase(Phase.READY)
-    assert talk.conversation.identity.serial == 7
+    assert talk.device_session.identity.serial == 7
     before = {key: other.memory.ram[key] for key in other.memory.ram if key[0] in SESSION_SETTINGS}
     assert talk.close() == Closed(None)
     after = {key: other.memory.ram[key] for key in before}
@@ -187,9 +189,9 @@ def test_another_device_is_not_given_the_first_ones_settings():
 def test_a_device_that_cannot_be_asked_is_not_written_to_at_the_end():
     """Plugged in again it may be another one: what is not known is not put back."""
     talk = Talk(change_stream=True).in_phase(Phase.READY)
-    talk.conversation.lost(talk.now_s)
-    talk.conversation.opened(115200, talk.now_s)
-    talk.conversation.lost(talk.now_s)
+    talk.device_session.lost(talk.now_s)
+    talk.device_session.opened(115200, talk.now_s)
+    talk.device_session.lost(talk.now_s)
     sent = len(talk.sent)
     assert isinstance(talk.close().error, LinkGone)
     assert b"VNWRG" not in talk.sent[sent:]
@@ -200,7 +202,7 @@ def test_what_is_put_back_is_put_back_to_the_same_device_only():
     talk = Talk(change_stream=True).in_phase(Phase.READY)
     talk.device.replace_unit(7)
     before = dict(talk.device.memory.ram)
-    talk.conversation.identify_again(talk.now_s)
+    talk.device_session.identify_again(talk.now_s)
     assert isinstance(talk.close().error, WrongDevice)
     assert talk.device.memory.ram == before
 
@@ -248,13 +250,13 @@ def test_the_gate_is_asked_for_every_command_of_the_write_back():
         asked.append(command)
         return not isinstance(command, Write)
 
-    talk.conversation.run("write", write_23(new), Purpose.STAGE, talk.now_s, gate)
+    talk.device_session.run("write", write_23(new), Purpose.STAGE, talk.now_s, gate)
     talk.until(lambda: Completed in talk.kinds())
     assert "VNWRG" not in talk.sent.decode()
     assert any(isinstance(command, Write) for command in asked)
     assert talk.device.memory.ram == talk.before
     talk.said.clear()
-    talk.conversation.run("write", write_23(new), Purpose.STAGE, talk.now_s)
+    talk.device_session.run("write", write_23(new), Purpose.STAGE, talk.now_s)
     talk.until(lambda: Completed in talk.kinds())
     assert talk.said[-1].error is None
     assert talk.device.memory.get(23)[9:] == pytest.approx((0.1, 0.2, 0.3), abs=1e-7)
@@ -262,32 +264,32 @@ def test_the_gate_is_asked_for_every_command_of_the_write_back():
 
 def test_a_lost_link_ends_a_procedure_with_the_reason():
     talk = Talk(Mode.STAGE).in_phase(Phase.READY)
-    talk.conversation.run("look", read(23), Purpose.STAGE, talk.now_s)
-    talk.conversation.lost(talk.now_s)
-    (done,) = [one for one in talk.conversation.take_said() if isinstance(one, Completed)]
+    talk.device_session.run("look", read(23), Purpose.STAGE, talk.now_s)
+    talk.device_session.lost(talk.now_s)
+    (done,) = [one for one in talk.device_session.take_events() if isinstance(one, Completed)]
     assert (done.name, type(done.error)) == ("look", LinkGone)
-    assert talk.conversation.may_close
+    assert talk.device_session.may_close
 
 
 @pytest.mark.parametrize("phase", [Phase.SETTING_UP, Phase.READY])
-def test_amends_put_back_what_the_session_changed(phase):
+def test_cleanup_puts_back_what_the_session_changed(phase):
     talk = Talk(change_stream=True).in_phase(phase)
-    procedure = talk.conversation.amends()
-    fresh = Conversation(Mode.STAGE, change_stream=True)
+    procedure = talk.device_session.cleanup()
+    fresh = DeviceSession(Mode.STAGE, change_stream=True)
     fresh.phase = Phase.READY
-    talk.conversation, broken = fresh, talk.conversation
-    fresh.run("amends", procedure, Purpose.STREAM, talk.now_s, broken.allows_amends)
+    talk.device_session, broken = fresh, talk.device_session
+    fresh.run("cleanup", procedure, Purpose.STREAM, talk.now_s, broken.allows_cleanup)
     talk.until(lambda: Completed in talk.kinds())
     assert talk.said[-1].error is None
     assert talk.device.memory.ram == talk.before
 
 
-def test_amends_of_a_transaction_turn_the_output_on_and_write_nothing():
+def test_cleanup_of_a_transaction_turns_the_output_on_and_writes_nothing():
     talk = Talk(Mode.STAGE).in_phase(Phase.READY)
-    assert talk.conversation.amends() is None
-    talk.conversation.run("look", quiet(read(23)), Purpose.STAGE, talk.now_s)
-    procedure = talk.conversation.amends()
+    assert talk.device_session.cleanup() is None
+    talk.device_session.run("look", quiet(read(23)), Purpose.STAGE, talk.now_s)
+    procedure = talk.device_session.cleanup()
     assert next(procedure) == Word("VNASY", (1,))
-    assert talk.conversation.allows_amends(Word("VNASY", (1,)))
-    assert not talk.conversation.allows_amends(Word("VNWNV"))
-    assert not talk.conversation.allows_amends(Write(6, (0,)))
+    assert talk.device_session.allows_cleanup(Word("VNASY", (1,)))
+    assert not talk.device_session.allows_cleanup(Word("VNWNV"))
+    assert not talk.device_session.allows_cleanup(Write(6, (0,)))
