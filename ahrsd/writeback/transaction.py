@@ -11,13 +11,14 @@ judged of one device is never written into another.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from ahrsd.writeback.composition import register_lines
-from drivers.vn100.commands import QUIET, NoReply, NotPermitted, Procedure, Write
+from drivers.vn100.commands import QUIET, NoReply, NotPermitted, Procedure, TooLate, Write
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.firmware import Profile, profile_of
 from drivers.vn100.procedures import (
@@ -38,6 +39,7 @@ from drivers.vn100.procedures import (
 )
 from drivers.vn100.registers import Values, same
 
+BEHIND_TRIES = 5  # to have a serial number and the command right behind it
 HSI_RESULT = 47  # changes by itself while the on-board estimator runs; nobody's setting
 
 
@@ -257,15 +259,43 @@ def _write(
     """
     back: Values = ()
     for _ in range(WRITE_TRIES):
-        if (other := (yield from _stranger(transaction))) is not None:
+        command = _written_once(number, values)
+        if (other := (yield from _right_behind(transaction, command))) is not None:
             return Outcome(False, other=other, written=written)
         written = True
-        with suppress(NoReply):  # carried out or not: the read says which
-            yield Write(number, values, once=True)
         back = yield from read(number)
         if same(number, values, back[: len(values)]):
             return None
     raise VerifyFailed(number, values, back)
+
+
+def _written_once(number: int, values: Values) -> Callable[[], Procedure[None]]:
+    def write() -> Procedure[None]:
+        with suppress(NoReply):  # carried out or not: a read says which
+            yield Write(number, values, once=True)
+
+    return write
+
+
+def _right_behind(
+    transaction: Transaction, make: Callable[[], Procedure[None]]
+) -> Procedure[Unit | None]:
+    """Carry out what changes the device right behind its serial number; the unit that is another.
+
+    On a line that loses answers the number may be old by then: TooLate, and it is asked again.
+    Raises TooLate where no answer comes soon enough.
+    """
+    for left in reversed(range(BEHIND_TRIES)):
+        if (other := (yield from _stranger(transaction))) is not None:
+            return other
+        try:
+            yield from make()
+        except TooLate:
+            if not left:
+                raise
+        else:
+            return None
+    return None
 
 
 def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
@@ -279,7 +309,7 @@ def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
         try:
             if not same(number, values, (yield from read(number))):
                 refused = yield from _write(transaction, number, values, True)
-        except (DeviceRefused, NoReply, VerifyFailed) as error:
+        except (DeviceRefused, NoReply, TooLate, VerifyFailed) as error:
             errors[number] = error
         if refused is not None:
             return refused
@@ -313,7 +343,9 @@ def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[O
         return Outcome(False, why=str(error))
     if outcome.as_expected:
         try:
-            yield from save_settings()
-        except NotPermitted as error:
+            other = yield from _right_behind(transaction, partial(save_settings, behind=True))
+        except (NotPermitted, TooLate) as error:
             return Outcome(False, why=str(error))
+        if other is not None:
+            return Outcome(False, other=other)
     return outcome

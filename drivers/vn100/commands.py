@@ -63,6 +63,14 @@ class Cancelled(SessionError):
         super().__init__("the command sequence was cancelled")
 
 
+class TooLate(SessionError):
+    """`command` is only sent right behind an answer, and the question before it is too old."""
+
+    def __init__(self, command: Command) -> None:
+        super().__init__(f"{command} was held back: the answers before it come too slowly")
+        self.command = command
+
+
 class NotPermitted(SessionError):
     """The gate of this session (its mode) does not let `command` out; nothing was sent."""
 
@@ -106,7 +114,8 @@ class Write:
     """Write a register in RAM. RegisterValueError where the device would refuse the values.
 
     held: the device itself held these values, so they may go back whatever the manual says of them
-    once: not repeated after a silence, in which another device may have taken over the cable
+    once: not repeated after a silence, in which another device may have taken over the cable, and
+          only sent right behind an answer (see `Session`); else TooLate
     """
 
     register: int
@@ -133,10 +142,14 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """A command that is no register access, such as ``Word("VNASY", (0,))``."""
+    """A command that is no register access, such as ``Word("VNASY", (0,))``.
+
+    behind: only sent right behind an answer (see `Session`); else TooLate
+    """
 
     word: str
     arguments: tuple[int, ...] = ()
+    behind: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.arguments not in WORDS.get(self.word, ()):
@@ -208,6 +221,13 @@ def patience(command: Speech) -> Patience:
     if isinstance(command, Write) and command.once:
         return Patience(tries=1)
     return _PATIENCE.get(command.word, Patience()) if isinstance(command, Word) else Patience()
+
+
+def must_follow(command: Speech) -> bool:
+    """Whether it is only sent right behind an answer of the device."""
+    return (isinstance(command, Write) and command.once) or (
+        isinstance(command, Word) and command.behind
+    )
 
 
 def reply_time_s(baud: int) -> float:

@@ -247,13 +247,15 @@ def resume() -> Procedure[None]:
         yield RESUME
 
 
-def save_settings() -> Procedure[None]:
+def save_settings(*, behind: bool = False) -> Procedure[None]:
     """VNWNV: all of RAM to flash; raises DeviceRefused also for an error shortly behind the echo.
+
+    behind: only right behind an answer of the device; else TooLate and nothing is sent
 
     Sent once: after NoReply nobody knows whether it was carried out, and flash wears. Keep the
     sensor still, its filter is hardly served for half a second.
     """
-    yield Word("VNWNV")
+    yield Word("VNWNV", behind=behind)
     yield Pause(ERROR_WINDOW_S, watch_errors=True)
 
 

@@ -46,8 +46,11 @@ from drivers.vn100.commands import (
     Pause,
     Procedure,
     Read,
+    SessionError,
     Speech,
+    TooLate,
     confusable,
+    must_follow,
     patience,
 )
 from drivers.vn100.decode import (
@@ -112,6 +115,7 @@ class _Flight:
 
     command: Speech
     attempts: int = 0
+    sent_s: float = 0.0
     due_s: float = 0.0
     waiting: Speech | None = None  # set in a barrier: the command that goes out behind it
 
@@ -123,7 +127,11 @@ class _Ghost:
 
 
 class Session:
-    """See the module. `allow` decides for each command whether it may be sent."""
+    """See the module. `allow` decides for each command whether it may be sent.
+
+    A command that must be right behind an answer is sent while the question before it is no older
+    than a quarter of the reply timeout (0.1 s): no hand moves a cable in so short a time.
+    """
 
     def __init__(
         self,
@@ -134,6 +142,7 @@ class Session:
         self.deframer = deframer or Deframer()
         self._allow = allow
         self._reply_timeout_s = reply_timeout_s
+        self._asked_s = float("-inf")  # when the question was sent that was answered last
         self._procedure: Procedure[object] | None = None
         self._flight: _Flight | None = None
         self._pause: tuple[Pause, float] | None = None
@@ -269,6 +278,7 @@ class Session:
         if flight.waiting is not None:
             self._launch(flight.waiting, now_s, events)
         else:
+            self._asked_s = flight.sent_s
             self._advance(reply, now_s, events)
 
     def _on_error(self, code: int, now_s: float, events: list[Event]) -> None:
@@ -312,9 +322,9 @@ class Session:
                 if not self._barrier(command, 0, now_s):
                     self._without_barrier(command, now_s, events)
                 return
-            if self._transmit(_Flight(command), now_s):
+            outcome = self._transmit(_Flight(command), now_s)
+            if outcome is None:
                 return
-            outcome = NotPermitted(command)
 
     def _resume(self, outcome: Reply | Exception | None, events: list[Event]) -> Command | None:
         """One step of the procedure: its next command, or None and the event of its end."""
@@ -339,7 +349,7 @@ class Session:
         """Ask for what no ghost can answer; false where that is not possible."""
         for probe in _BARRIERS:
             if not any(confusable(ghost.command, probe) for ghost in self._ghosts):
-                return self._transmit(_Flight(probe, attempts, waiting=waiting), now_s)
+                return self._transmit(_Flight(probe, attempts, waiting=waiting), now_s) is None
         return False
 
     def _without_barrier(self, command: Speech, now_s: float, events: list[Event]) -> None:
@@ -353,19 +363,23 @@ class Session:
         self._repeat(_Flight(command), now_s, events)
 
     def _repeat(self, flight: _Flight, now_s: float, events: list[Event]) -> None:
-        if not self._transmit(flight, now_s):
-            self._advance(NotPermitted(flight.command), now_s, events)
+        if (held_back := self._transmit(flight, now_s)) is not None:
+            self._advance(held_back, now_s, events)
 
-    def _transmit(self, flight: _Flight, now_s: float) -> bool:
-        """The one place where a command becomes bytes. False where the gate holds it back."""
+    def _transmit(self, flight: _Flight, now_s: float) -> SessionError | None:
+        """The one place where a command becomes bytes; why it is held back, None if it is not."""
         self._flight = None
+        if must_follow(flight.command) and now_s - self._asked_s > 0.25 * self._reply_timeout_s:
+            return TooLate(flight.command)
         if not self._allow(flight.command):
-            return False
+            return NotPermitted(flight.command)
+        if not flight.attempts:  # a late answer may be to the first of several
+            flight.sent_s = now_s
         flight.attempts += 1
         flight.due_s = now_s + (patience(flight.command).reply_s or self._reply_timeout_s)
         self._flight = flight
         self._say(flight.command)
-        return True
+        return None
 
     def _abandon_flight(self, now_s: float) -> None:
         """Stop waiting; a reply may still come."""

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -349,7 +350,8 @@ def fail_waiting(run: BesideRun) -> None:
 def test_the_worker_goes_on_after_what_broke_off_and_logs_it_once(worker, caplog):
     done = []
     for k in range(6):
-        piece = EstimationTask(None, broken if k in (1, 3) else lambda k=k: done.append(k))
+        one = SimpleNamespace(broken=False)  # a calibrator of its own
+        piece = EstimationTask(one, broken if k in (1, 3) else lambda k=k: done.append(k))
         worker.put(piece.work)
     batches = []
     wait(lambda: batches.extend(worker.take_done()) or sum(n for n, _ in batches) == 6)
@@ -358,3 +360,12 @@ def test_the_worker_goes_on_after_what_broke_off_and_logs_it_once(worker, caplog
     assert [end for end, (_, reason) in zip(ends, batches, strict=True) if reason] == [2, 4]
     assert caplog.text.count("the estimator broke off: LinAlgError: Singular matrix") == 1
     assert ["Traceback" in getattr(r, "trace", "") for r in caplog.records] == [True]
+
+
+def test_behind_a_piece_that_broke_off_its_calibrator_is_worked_no_more():
+    done = []
+    one, other = SimpleNamespace(broken=False), SimpleNamespace(broken=False)
+    assert EstimationTask(one, broken).work().reason == REASON
+    assert EstimationTask(one, lambda: done.append(1)).work() is None
+    assert EstimationTask(other, lambda: done.append(2)).work() is None
+    assert done == [2]

@@ -287,7 +287,9 @@ class World:
 
     def recorded(self, item: events.JournalAppend) -> None:
         """A record is on the disk."""
-        self.observer.record(self._serial, item.kind, dict(item.facts), self.now_s)
+        made_s = float(str(item.facts.get("boot_s", "inf"))) + self.clocks.boot_s
+        late = item.facts.get("boot_id") != self.clocks.boot_id or self.now_s - made_s > 0.5
+        self.observer.record(self._serial, item.kind, dict(item.facts), self.now_s, late=late)
 
     @property
     def kinds(self) -> list[str]:

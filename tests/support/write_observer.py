@@ -96,8 +96,13 @@ class Observer:
             seen.judged[int(number)][printed] = at_s
             self.counts["candidates"] += 1
 
-    def record(self, serial: int, kind: str, facts: dict[str, Any], at_s: float) -> None:
-        """A record that reached the journal of this serial number."""
+    def record(
+        self, serial: int, kind: str, facts: dict[str, Any], at_s: float, *, late: bool = False
+    ) -> None:
+        """A record that reached the journal of this serial number.
+
+        late: the disk was full when it was made, so it says how things stood then
+        """
         self.look(at_s)
         self.counts[kind] += 1
         if serial not in self.cable.units:
@@ -109,7 +114,7 @@ class Observer:
             seen.prepared_s, seen.sent_s = at_s, -1e9
         elif kind == "FLASH_SENT":
             seen.sent_s = at_s
-        elif kind == "PROVEN" and not facts.get("unsent"):
+        elif kind == "PROVEN" and not facts.get("unsent") and not late:
             new = self._new(seen)
             held = all(unit.shown(n) == text for n, text in new.items())
             if not (held and self.cable.unit is unit) and at_s - self._since_s(seen) > RACE_S:

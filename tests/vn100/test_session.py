@@ -15,6 +15,8 @@ from drivers.vn100.commands import (
     NotPermitted,
     Pause,
     Read,
+    TooLate,
+    Word,
     Write,
 )
 from drivers.vn100.decode import Measurement, Reply
@@ -392,3 +394,60 @@ def test_half_a_message_is_given_up_after_a_silence():
     assert s.deadline_s is None
     (event,) = s.receive(YMR, 1.0)
     assert isinstance(event, Measurement)
+
+
+def asked_then(command):
+    """A read, and the command right behind it; how often that came too late."""
+    late = 0
+    while True:
+        yield Read(23)
+        try:
+            yield command
+        except TooLate:
+            late += 1
+        else:
+            return late
+
+
+@pytest.mark.parametrize(
+    ("command", "sent"),
+    [
+        (Write(23, OTHER, once=True), WRITE_23_OTHER),
+        (Word("VNWNV", behind=True), WNV),
+    ],
+    ids=["write", "save"],
+)
+def test_what_must_be_right_behind_an_answer_is_held_back_where_that_is_old(command, sent):
+    talk = session()
+    talk.start(asked_then(command), 0.0)
+    assert talk.take_output() == READ_23
+    talk.receive(REPLY_23, 0.11)  # the cable may have been moved since it was asked
+    assert talk.take_output() == READ_23
+    talk.receive(REPLY_23, 0.20)
+    assert talk.take_output() == sent
+    events = talk.receive(checksum(sent.decode()[1:].split("*")[0]), 0.21)
+    assert events == [Finished(1)]
+
+
+def test_an_answer_to_a_repeated_question_may_be_to_the_first_and_is_old():
+    talk = session()
+    talk.start(asked_then(Word("VNWNV", behind=True)), 0.0)
+    talk.take_output()
+    talk.tick(0.4)
+    assert talk.take_output() == READ_23
+    talk.receive(REPLY_23, 0.42)
+    assert talk.take_output() == READ_1  # a barrier: whether both are answered yet
+    talk.receive(REPLY_1, 0.44)
+    assert talk.take_output() == READ_23
+    talk.receive(REPLY_23, 0.46)
+    assert talk.take_output() == WNV
+
+
+def test_a_barrier_that_lasts_makes_the_answer_before_it_too_old():
+    talk = session()
+    talk.start(asked_then(Word("VNWNV", behind=True)), 0.0)
+    talk.tick(0.4)
+    talk.receive(REPLY_23, 0.45)
+    talk.take_output()
+    talk.receive(REPLY_1, 0.60)
+    assert WNV not in talk.take_output()

@@ -38,6 +38,7 @@ class Cable:
         self.faults = Faults()
         self.attached = [(at_s, unit.serial)]
         self.plugged = True
+        self._nobody_until_s = at_s
         self.moment: Callable[[str], None] = lambda _: None
         self.heard: list[tuple[float, int, str]] = []
         self._input = bytearray()
@@ -48,7 +49,10 @@ class Cable:
     # -- the host's side ---------------------------------------------------------------------------
 
     def receive(self, data: bytes, at_s: float) -> None:
-        """Bytes of the host."""
+        """Bytes of the host; while the unit is exchanged nobody hears them."""
+        if at_s < self._nobody_until_s:
+            self._input.clear()
+            return
         self._input += data
         while (end := self._input.find(b"\n")) >= 0:
             line = bytes(self._input[:end]).strip(b"\r")
@@ -110,6 +114,8 @@ class Cable:
         self.attached.append((at_s, unit.serial))
         self._out.clear()
         self._waiting.clear()
+        self._input.clear()
+        self._nobody_until_s = at_s + silent_s
         unit.asynchronous = True
         unit.silent_until_s = at_s + silent_s
         unit.attach(at_s + silent_s)
