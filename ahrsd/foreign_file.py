@@ -110,7 +110,7 @@ def text_within(path: Path, most_bytes: int, wait_s: float = PATIENCE_S) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class FileState:
     """What was seen of a file.
 
     data:     what it holds; None where it cannot be read, `fault` then says why
@@ -129,23 +129,23 @@ class Changes:
     """Looks at one file, in order, and what follows from each. Reads no clock and no file."""
 
     def __init__(self) -> None:
-        self.sight = Sight()
+        self.sight = FileState()
         self._before: Contents | None = None
         self._before_s = float("-inf")
 
-    def seen(self, contents: Contents, began_s: float) -> Sight:
+    def seen(self, contents: Contents, began_s: float) -> FileState:
         """The file as a look found it that began at `began_s`."""
         sight = self.sight
         changed = self._before is not None and contents != self._before
         since_s = self._before_s if changed else sight.since_s
-        self.sight = Sight(contents.data, sight.writings + changed, since_s)
+        self.sight = FileState(contents.data, sight.writings + changed, since_s)
         self._before, self._before_s = contents, began_s
         return self.sight
 
-    def unreadable(self, fault: str) -> Sight:
+    def unreadable(self, fault: str) -> FileState:
         """A look that failed: what is seen next is seen for the first time."""
         self._before = None
-        self.sight = Sight(None, self.sight.writings, float("-inf"), fault)
+        self.sight = FileState(None, self.sight.writings, float("-inf"), fault)
         return self.sight
 
 
@@ -170,7 +170,7 @@ class FileWatch:
         self._thread.start()
 
     @property
-    def sight(self) -> Sight:
+    def sight(self) -> FileState:
         """The newest one; never waits."""
         return self._changes.sight
 

@@ -76,7 +76,7 @@ class PortUnusable(PortError):
     """The device is there and cannot be opened or configured."""
 
 
-class LinkLost(PortError):
+class PortLost(PortError):
     """An open port went away: unplugged, hung up, or it takes no more bytes."""
 
 
@@ -114,9 +114,9 @@ class SerialPort:
         except BlockingIOError:
             return b""
         except (OSError, serial.SerialException) as error:
-            raise LinkLost(f"{self.path} is gone: {error}") from error
+            raise PortLost(f"{self.path} is gone: {error}") from error
         if not data:  # readable without a byte: the other end hung up
-            raise LinkLost(f"{self.path} is gone: hung up")
+            raise PortLost(f"{self.path} is gone: hung up")
         return data
 
     def write(self, data: bytes, timeout_s: float = WRITE_TIMEOUT_S) -> None:
@@ -128,13 +128,13 @@ class SerialPort:
             except BlockingIOError:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0:
-                    raise LinkLost(
+                    raise PortLost(
                         f"{self.path} took only {len(data) - len(view)} of {len(data)} bytes in "
                         f"{timeout_s:g} s"
                     ) from None
                 select.select([], [self.fileno()], [], left_s)
             except (OSError, serial.SerialException) as error:
-                raise LinkLost(f"{self.path} is gone: {error}") from error
+                raise PortLost(f"{self.path} is gone: {error}") from error
 
     def set_baud(self, baud: int) -> None:
         """Change the host's rate and drop what was received at the old one."""

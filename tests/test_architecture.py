@@ -151,6 +151,16 @@ def test_no_machine_path_in_what_is_published():
     assert found == []
 
 
+def test_no_class_outside_the_diagnosis_shares_its_name():
+    places: dict[str, list[str]] = {}
+    for path in SOURCES:
+        if not path.is_relative_to(PROJECT / "ahrsd" / "diagnosis"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    places.setdefault(node.name, []).append(str(path.relative_to(PROJECT)))
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
 def imports() -> dict[str, set[str]]:
     """What each module outside the diagnosis imports of the project."""
     own = {name for name in graph().modules if name.split(".")[0] in ("ahrsd", "drivers")}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from ahrsd.config.loading import Config, check_config, default_state_directory, load_config
-from ahrsd.config.sections import Device, Gates, Section
+from ahrsd.config.sections import DeviceSection, GatesSection, Section
 from ahrsd.config.text import print_config, reference, to_toml
 from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
@@ -58,8 +58,8 @@ def test_values_arrive_where_they_belong(tmp_path):
         """,
     )
     assert config.mode == "stage"
-    assert config.device == Device(port=Path.home() / "vn100", baud=921600, rate_hz=200.0)
-    assert config.gates == Gates(max_heading_sigma_deg=0.5)
+    assert config.device == DeviceSection(port=Path.home() / "vn100", baud=921600, rate_hz=200.0)
+    assert config.gates == GatesSection(max_heading_sigma_deg=0.5)
     assert config.location.date == datetime.date(2026, 11, 3)
     assert config.captures == Path("/var/lib/ahrsd/captures")
 
@@ -168,8 +168,10 @@ def test_the_estimators_defaults_have_one_source():
 
 def test_the_gates_defaults_have_one_source():
     assert Config().gates.limits() == GateLimits()
-    assert set(Gates.model_fields) == {field.name for field in dataclasses.fields(GateLimits)}
-    assert {str(gate.limit) for gate in GATES} >= set(Gates.model_fields)
+    assert set(GatesSection.model_fields) == {
+        field.name for field in dataclasses.fields(GateLimits)
+    }
+    assert {str(gate.limit) for gate in GATES} >= set(GatesSection.model_fields)
 
 
 def test_the_write_backs_defaults_have_one_source():

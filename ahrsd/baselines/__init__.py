@@ -7,16 +7,16 @@ methods, what they need and what they estimate. Sources and figures: docs/refere
 [L] Lichlyter, thesis, Mississippi State 2022. The theses write m = A (m_t + m_b): b = A m_b.
 """
 
-from ahrsd.baselines.data import Data, MethodError, MethodResult, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodResult, MethodSettings
 from ahrsd.baselines.registry import METHODS, Method, calibrate_with, joined, run
 
 __all__ = [
     "METHODS",
-    "Data",
     "Method",
+    "MethodData",
     "MethodError",
     "MethodResult",
-    "Settings",
+    "MethodSettings",
     "calibrate_with",
     "joined",
     "run",

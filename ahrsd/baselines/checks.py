@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.metrics import corrected
 from ahrsd.samples import Array
 
@@ -29,7 +29,7 @@ _TURN_RAD, _MOST_STEPS = 0.5, 256  # a change is over steps that turn about so f
 _WEAK = 0.1  # the same, below which the answer across that plane rests on little
 
 
-def mag_noise(data: Data, settings: Settings) -> float:
+def mag_noise(data: MethodData, settings: MethodSettings) -> float:
     """Sigma of one reading in gauss: as set, else from third differences: too quick for motion."""
     if settings.sigma_mag_gauss is not None:
         return settings.sigma_mag_gauss
@@ -40,7 +40,7 @@ def mag_noise(data: Data, settings: Settings) -> float:
     return max(sigma, _LEAST_NOISE_GAUSS)
 
 
-def usable(data: Data) -> None:
+def usable(data: MethodData) -> None:
     """MethodError naming the first thing that makes these samples unusable for every method."""
     if len(data) < MINIMUM_SAMPLES:
         raise MethodError(f"{len(data)} samples: at least {MINIMUM_SAMPLES} are needed")
@@ -68,7 +68,7 @@ def spreads(field: Array) -> Array:
     return np.asarray(scales / np.sqrt(len(field)), dtype=np.float64)
 
 
-def moved(data: Data, settings: Settings, axes: int) -> str:
+def moved(data: MethodData, settings: MethodSettings, axes: int) -> str:
     """A remark where the motion is weak, else "".
 
     MethodError unless the field's readings vary along `axes` principal directions (2 or 3).
@@ -101,7 +101,7 @@ def stuck(raw_b_gauss: Array) -> str:
     return ""
 
 
-def agrees_with_gyro(data: Data, fit: Fit) -> None:
+def agrees_with_gyro(data: MethodData, fit: MethodFit) -> None:
     """MethodError where the gyroscope does not explain how the field turns.
 
     Wrong units, axes, signs or times explain nothing, and then no answer of a method that rests on
@@ -145,7 +145,7 @@ def explained(begin: Array, end: Array, turn: Array) -> float:
     return 1.0 - float(np.sum(missed[kept])) / max(float(np.sum(changed[kept])), 1e-300)
 
 
-def _runs(data: Data) -> tuple[NDArray[np.intp], Array]:
+def _runs(data: MethodData) -> tuple[NDArray[np.intp], Array]:
     """First rows (n,) of runs that turn by about half a radian, and turn (steps, n, 3) of each."""
     inner = np.ones(len(data), dtype=bool)
     inner[list(data.starts)] = False

@@ -20,7 +20,7 @@ Halves = tuple[list[SampleBlock], list[SampleBlock]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class ComparisonRow:
     """What one method says.
 
     Without an answer hard_iron_gauss is None and `reason` says why; with one, `reason` is a remark

@@ -19,7 +19,7 @@ class MethodError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Data:
+class MethodData:
     """N samples in the sensor frame, raw, in segments that no gap interrupts.
 
     time_s (N,), dt_s (N,)    instants, and the step that ends at each; dt_s is not used at a start
@@ -70,7 +70,7 @@ def _zero() -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Settings:
+class MethodSettings:
     """What the publications leave to the user; the defaults are theirs.
 
     sigma_mag_gauss:   noise of one reading per axis; None: measured on the data [None]
@@ -118,7 +118,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class MethodFit:
     """An answer: A (3, 3), b (3,) in gauss, w_b (3,) in rad/s; None what is not estimated."""
 
     soft_iron: Array | None

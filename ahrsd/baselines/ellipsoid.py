@@ -4,7 +4,7 @@
 
 is linear once a = -3 - b - c is put in. That constraint rewards a large coefficient along an axis
 in which the readings vary little; Fang's own, 4 a b - (2 h)^2 = 1, does not where that axis is z,
-and can be chosen (`Settings.ellipsoid_constraint`). With Q = [[a h g] [h b f] [g f c]] and
+and can be chosen (`MethodSettings.ellipsoid_constraint`). With Q = [[a h g] [h b f] [g f c]] and
 n = [p q r],
 
     hard iron = -Q^-1 n,    C^T C = Q up to scale and sign
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.soft_iron import answer
 from ahrsd.estimator.chain import upper_triangle
 from ahrsd.samples import Array
@@ -75,7 +75,7 @@ def refuse_other_quadrics(Q: Array, n: Array, d: float) -> None:
         raise MethodError("the quadric that fits is no real ellipsoid: det E is not negative")
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A of unit volume and b.  MethodError where the readings fit no ellipsoid."""
     middle = data.raw_b_gauss.mean(axis=0)
     field = data.raw_b_gauss - middle
@@ -86,4 +86,4 @@ def estimate(data: Data, settings: Settings) -> Fit:
     values, vectors = np.linalg.eigh(Q if Q[0, 0] > 0 else -Q)
     C = vectors @ np.diag(np.sqrt(values)) @ vectors.T
     A, _ = answer(upper_triangle(C), np.zeros(3))
-    return Fit(A, middle - size * np.linalg.solve(Q, n), None, 1)
+    return MethodFit(A, middle - size * np.linalg.solve(Q, n), None, 1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from ahrsd.baselines.data import Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.factors import custom_factor, values_of, variable, vector_of
 from ahrsd.baselines.kinematic import Model
 from ahrsd.baselines.windows import Kinematics
@@ -33,7 +33,7 @@ def factors(model: Model, kin: Kinematics) -> list[gtsam.CustomFactor]:
     return found
 
 
-def batch(model: Model, kin: Kinematics) -> Fit:
+def batch(model: Model, kin: Kinematics) -> MethodFit:
     """All windows at once.  MethodError where it is singular, diverges or does not end."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors(model, kin):
@@ -53,7 +53,9 @@ def batch(model: Model, kin: Kinematics) -> Fit:
     return model.fit(vector_of(found, len(model.nodes)), int(optimizer.iterations()))
 
 
-def incremental(model: Model, kin: Kinematics, settings: Settings, threshold: float) -> Fit:
+def incremental(
+    model: Model, kin: Kinematics, settings: MethodSettings, threshold: float
+) -> MethodFit:
     """Window after window; `threshold` of iSAM2's relinearisation, 0 for never.
 
     MethodError where an update is singular, or the data do not fill one update.
@@ -93,13 +95,15 @@ def _isam_parameters(threshold: float) -> gtsam.ISAM2Params:
     return parameters
 
 
-def _mean(model: Model, history: list[Array]) -> Fit:
+def _mean(model: Model, history: list[Array]) -> MethodFit:
     last = max(1, int(_AVERAGED * len(history)))
     fits = [model.fit(x, len(history)) for x in history[-last:]]
     A = np.mean([fit.soft_iron for fit in fits if fit.soft_iron is not None], axis=0)
     b = np.mean([fit.hard_iron_gauss for fit in fits], axis=0)
     bias = np.mean([x[-3:] for x in history[-last:]], axis=0)
-    return Fit(A, b, bias, len(history), f"mean of the last {last} of {len(history)} estimates")
+    return MethodFit(
+        A, b, bias, len(history), f"mean of the last {last} of {len(history)} estimates"
+    )
 
 
 def _singular(error: RuntimeError) -> MethodError:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.baselines.data import Fit
+from ahrsd.baselines.data import MethodFit
 from ahrsd.baselines.soft_iron import answer
 from ahrsd.baselines.windows import Kinematics
 from ahrsd.estimator.chain import symmetric, symmetric_columns
@@ -66,10 +66,10 @@ class Model:
         J[0, :-6] = twice @ J6 / size
         return np.array([size - 1.0]), J
 
-    def fit(self, x: Array, iterations: int, note: str = "") -> Fit:
+    def fit(self, x: Array, iterations: int, note: str = "") -> MethodFit:
         """The answer at x.  MethodError where it is not one."""
         A, b = answer(self.shape(x[:-6])[0], x[-6:-3])
-        return Fit(A, b, x[-3:].copy(), iterations, note)
+        return MethodFit(A, b, x[-3:].copy(), iterations, note)
 
 
 _COUNTED = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # how often each term stands in the matrix

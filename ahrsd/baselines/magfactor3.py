@@ -10,7 +10,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.factors import custom_factor, values_of, vector_of
 from ahrsd.samples import Array
 
@@ -28,7 +28,7 @@ def residual(x: Array, body: Array, raw: Array) -> tuple[Array, Array]:
     return r.ravel(), J.reshape(-1, 4)
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A = alpha I and b.  MethodError where attitude or field are missing, or alpha <= 0."""
     del settings
     if data.R_nb is None or data.field_n_gauss is None:
@@ -48,4 +48,4 @@ def estimate(data: Data, settings: Settings) -> Fit:
     x = vector_of(optimizer.optimize(), len(NODES))
     if not x[0] > 0:
         raise MethodError(f"the scale that fits best is {x[0]:.3g}: attitude or field are wrong")
-    return Fit(float(x[0]) * np.eye(3), x[1:], None, int(optimizer.iterations()))
+    return MethodFit(float(x[0]) * np.eye(3), x[1:], None, int(optimizer.iterations()))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.baselines.data import Data, Fit, Settings
+from ahrsd.baselines.data import MethodData, MethodFit, MethodSettings
 from ahrsd.baselines.graphs import batch
 from ahrsd.baselines.kinematic import Model
 from ahrsd.baselines.soft_iron import triangle
@@ -26,6 +26,6 @@ def model() -> Model:
     return Model(triangle, start, (12,), norm=True)
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A, b and w_b.  MethodError as `graphs.batch`."""
     return batch(model(), windowed(data, settings))

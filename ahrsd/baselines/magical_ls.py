@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.kinematic import residual
 from ahrsd.baselines.soft_iron import answer, positive, rescaled, unit_volume
 from ahrsd.baselines.windows import per_sample
@@ -26,7 +26,7 @@ _MAX_HALVINGS = 30
 _TOLERANCE = 1e-7  # of a step, in units of A and gauss
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A and b; the note says which gyro bias was taken as known."""
     known = settings.known_gyro_bias_rad_s
     _, phi = residual(per_sample(data, settings), np.zeros(6), np.zeros(3), known)
@@ -40,7 +40,7 @@ def estimate(data: Data, settings: Settings) -> Fit:
         if moved < _TOLERANCE:
             A, b = answer(unit_volume(x[:6])[0], x[6:])
             note = "gyro bias taken as given" if np.any(known) else "gyro bias taken as zero"
-            return Fit(A, b, None, count, note)
+            return MethodFit(A, b, None, count, note)
     raise MethodError(f"no end after {_MAX_STEPS} steps")
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.kinematic import Model
 from ahrsd.baselines.soft_iron import positive, unit_volume
 from ahrsd.baselines.windows import per_sample
@@ -28,7 +28,7 @@ def model() -> Model:
     return Model(unit_volume, start, (12,), norm=False)
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A, b and w_b.  MethodError where the search diverges or does not end."""
     kin, m = per_sample(data, settings), model()
     # the solver asks for the two at the same point one after the other

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.baselines.data import Data, Fit, Settings
+from ahrsd.baselines.data import MethodData, MethodFit, MethodSettings
 from ahrsd.baselines.graphs import batch
 from ahrsd.baselines.kinematic import Model
 from ahrsd.baselines.soft_iron import cholesky
@@ -20,6 +20,6 @@ def model() -> Model:
     return Model(cholesky, np.zeros(11), (5, 3, 3), norm=False)
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A, b and w_b.  MethodError as `graphs.batch`."""
     return batch(model(), windowed(data, settings))

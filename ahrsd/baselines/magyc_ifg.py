@@ -7,7 +7,7 @@ seed does: a gyro bias in rad/s never crosses it, and moves in the linear part o
 
 from __future__ import annotations
 
-from ahrsd.baselines.data import Data, Fit, Settings
+from ahrsd.baselines.data import MethodData, MethodFit, MethodSettings
 from ahrsd.baselines.graphs import incremental
 from ahrsd.baselines.magyc_bfg import model
 from ahrsd.baselines.windows import windowed
@@ -15,7 +15,7 @@ from ahrsd.baselines.windows import windowed
 GTSAM_THRESHOLD = 0.1
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A, b and w_b.  MethodError as `graphs.incremental`."""
     threshold = GTSAM_THRESHOLD if settings.relinearize is None else settings.relinearize
     return incremental(model(), windowed(data, settings), settings, threshold)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.sphere import distances, linear_centre
 from ahrsd.samples import Array
 
@@ -66,9 +66,9 @@ def _matrix(n: Array, a: Array) -> tuple[Array, Array]:
     return np.asarray(n.T @ (n * (1 - q)[:, None]) + np.sum(q) * np.eye(3)), q
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """b.  MethodError where the field's magnitude is not known or the search does not end."""
     del settings
     field, norms = data.raw_b_gauss, data.field_norms()
     b, _, count = solve(field, norms, linear_centre(field))
-    return Fit(None, b, None, count)
+    return MethodFit(None, b, None, count)

@@ -9,8 +9,8 @@ long with rho_k = |B~_k - b| and c_k = s_h^2 / (s_k^2 + s_h^2), and over b, the 
 
 A field less sure than the readings has c_k near 1 and turns that crawl: they are lengthened by
 1 / mean (1 - c_k), which ends at the same place. Where all samples have the same noise, c_k cancels
-and b is FNP's; `Settings.sigma_field_gauss` of every sample makes a difference. The errors of |H_k|
-count as independent; an error common to all of them is not what this model knows.
+and b is FNP's; `MethodSettings.sigma_field_gauss` of every sample makes a difference. The errors of
+|H_k| count as independent; an error common to all of them is not what this model knows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.baselines.checks import mag_noise
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.sphere import linear_centre
 from ahrsd.samples import Array
 
@@ -49,7 +49,7 @@ def solve(field: Array, norms: Array, weights: Array, start: Array) -> tuple[Arr
     raise MethodError(f"no end after {_MAX_TURNS} turns")
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """b.  MethodError where the field's magnitude is not known or the turns do not end."""
     field, norms = data.raw_b_gauss, data.field_norms()
     sigma = np.asarray(settings.sigma_field_gauss, dtype=np.float64)
@@ -58,4 +58,4 @@ def estimate(data: Data, settings: Settings) -> Fit:
     noise = mag_noise(data, settings) ** 2
     weights = np.broadcast_to(noise / (noise + sigma**2), (len(data),))
     b, count = solve(field, norms, weights, linear_centre(field))
-    return Fit(None, b, None, count)
+    return MethodFit(None, b, None, count)

@@ -23,7 +23,7 @@ from ahrsd.baselines import (
     twostep,
 )
 from ahrsd.baselines.checks import agrees_with_gyro, moved, usable
-from ahrsd.baselines.data import Data, Fit, MethodError, MethodResult, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodResult, MethodSettings
 from ahrsd.samples import Array, SampleBlock
 
 
@@ -36,7 +36,7 @@ class Method:
     axes: principal directions in which the field's readings must vary
     """
 
-    function: Callable[[Data, Settings], Fit]
+    function: Callable[[MethodData, MethodSettings], MethodFit]
     needs: tuple[str, ...]
     estimates: tuple[str, ...]
     source: str
@@ -70,8 +70,8 @@ METHODS: dict[str, Method] = {
 
 def run(
     method: str,
-    data: Data,
-    settings: Settings | None = None,
+    data: MethodData,
+    settings: MethodSettings | None = None,
     clock: Callable[[], float] | None = None,
 ) -> MethodResult:
     """One method on these samples; what it cannot do is in the result's `reason`.
@@ -81,7 +81,7 @@ def run(
     row = METHODS[method]
     began = clock() if clock else float("nan")
     try:
-        chosen = settings or Settings()
+        chosen = settings or MethodSettings()
         usable(data)
         remark = moved(data, chosen, row.axes)
         fit = row.function(data, chosen)
@@ -110,7 +110,7 @@ def _reason(error: MethodError | np.linalg.LinAlgError) -> str:
     return str(error)
 
 
-def _finite(fit: Fit) -> None:
+def _finite(fit: MethodFit) -> None:
     for part in (fit.soft_iron, fit.hard_iron_gauss, fit.gyro_bias_rad_s):
         if part is not None and not np.isfinite(part).all():
             raise MethodError("diverged: the answer is not finite")
@@ -122,7 +122,7 @@ def joined(
     R_nb: Array | None = None,
     field_n_gauss: Array | None = None,
     field_norm_gauss: float | Array | None = None,
-) -> Data:
+) -> MethodData:
     """Blocks as one: a new segment wherever a gap is or a step is unknown.
 
     R_nb (N, 3, 3) and a field_norm_gauss of (N,) belong to all the samples, block after block.
@@ -135,7 +135,7 @@ def joined(
     begins = np.cumsum([0, *(len(block) for block in kept[:-1])])
     gaps = {int(k) for k, block in zip(begins, kept, strict=True) if block.gap_before}
     starts = sorted({0, *gaps, *np.flatnonzero(np.isnan(dt)).tolist()})
-    return Data(
+    return MethodData(
         time_s=np.concatenate([block.time_s for block in kept]),
         dt_s=dt,
         raw_b_gauss=np.vstack([block.raw_b_gauss for block in kept]),
@@ -152,7 +152,7 @@ def calibrate_with(
     method: str,
     blocks: Sequence[SampleBlock],
     *,
-    settings: Settings | None = None,
+    settings: MethodSettings | None = None,
     R_nb: Array | None = None,
     field_n_gauss: Array | None = None,
     field_norm_gauss: float | Array | None = None,

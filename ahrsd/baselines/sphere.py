@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
-from ahrsd.baselines.data import Fit, MethodError
+from ahrsd.baselines.data import MethodError, MethodFit
 from ahrsd.samples import Array
 
 Function = Callable[[Array], tuple[Array, Array]]
@@ -35,7 +35,7 @@ def distances(field: Array, b: Array) -> tuple[Array, Array]:
     return rho, np.asarray(d / rho[:, None])
 
 
-def minimise(function: Function, start: Array) -> Fit:
+def minimise(function: Function, start: Array) -> MethodFit:
     """b that minimises the sum of squares of `function`: b -> r (N,), dr/db (N, 3)."""
 
     def value(b: Array) -> Array:
@@ -56,4 +56,4 @@ def minimise(function: Function, start: Array) -> Fit:
     )
     if not found.success:
         raise MethodError(f"no end after {found.nfev} evaluations")
-    return Fit(None, np.asarray(found.x), None, int(found.nfev))
+    return MethodFit(None, np.asarray(found.x), None, int(found.nfev))

@@ -13,7 +13,7 @@ the unit vector from b to B~_k. s_k is the same for all readings here and cancel
 
 from __future__ import annotations
 
-from ahrsd.baselines.data import Data, Fit, Settings
+from ahrsd.baselines.data import MethodData, MethodFit, MethodSettings
 from ahrsd.baselines.sphere import distances, linear_centre, minimise
 from ahrsd.samples import Array
 
@@ -25,7 +25,7 @@ def rows(b: Array, field: Array, norms: Array) -> tuple[Array, Array]:
     return (rho - ratio) / 2, -(1 + ratio / rho)[:, None] / 2 * n
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """b.  MethodError where the field's magnitude is not known."""
     del settings
     field, norms = data.raw_b_gauss, data.field_norms()

@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.baselines.checks import mag_noise
-from ahrsd.baselines.data import Data, Fit, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
 from ahrsd.baselines.soft_iron import answer
 from ahrsd.estimator.chain import upper_triangle
 from ahrsd.samples import Array
@@ -106,7 +106,7 @@ def _halved(theta: Array, step: Array, L: Array, z: Array, weights: Array) -> Ar
     raise MethodError("no step lowers the cost: I + E stays on the edge of positive definite")
 
 
-def estimate(data: Data, settings: Settings) -> Fit:
+def estimate(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A and b.  MethodError where no step is possible any more, or where it does not end."""
     sigma = mag_noise(data, settings)
     field = data.raw_b_gauss
@@ -124,8 +124,8 @@ def estimate(data: Data, settings: Settings) -> Fit:
     raise MethodError(f"no end after {_MAX_ITERATIONS} iterations")
 
 
-def _fit(theta: Array, count: int) -> Fit:
+def _fit(theta: Array, count: int) -> MethodFit:
     root = _root(theta)
     answer(upper_triangle(root), np.zeros(3))  # refuses what no sensor is
     A = np.asarray(np.linalg.inv(root), dtype=np.float64)
-    return Fit(A, A @ np.asarray(np.linalg.solve(root, theta[:3])), None, count)
+    return MethodFit(A, A @ np.asarray(np.linalg.solve(root, theta[:3])), None, count)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import savgol_filter
 
-from ahrsd.baselines.data import Data, MethodError, Settings
+from ahrsd.baselines.data import MethodData, MethodError, MethodSettings
 from ahrsd.samples import Array
 
 MINIMUM_WINDOWS = 12  # three equations each, twelve unknowns, and something left to judge by
@@ -43,7 +43,7 @@ def _join(parts: list[Kinematics]) -> Kinematics:
     )
 
 
-def _segment(data: Data, rows: slice, settings: Settings) -> Kinematics | None:
+def _segment(data: MethodData, rows: slice, settings: MethodSettings) -> Kinematics | None:
     m, w, dt = data.raw_b_gauss[rows], data.gyro_b_rad_s[rows], data.dt_s[rows][1:, None]
     if settings.derivative == "savgol":
         length = settings.savgol_window
@@ -56,12 +56,12 @@ def _segment(data: Data, rows: slice, settings: Settings) -> Kinematics | None:
     return Kinematics(m[1:], np.diff(m, axis=0) / dt, w[1:])
 
 
-def _segments(data: Data, settings: Settings) -> list[Kinematics]:
+def _segments(data: MethodData, settings: MethodSettings) -> list[Kinematics]:
     found = [_segment(data, rows, settings) for rows in data.segments()]
     return [part for part in found if part is not None]
 
 
-def per_sample(data: Data, settings: Settings) -> Kinematics:
+def per_sample(data: MethodData, settings: MethodSettings) -> Kinematics:
     """One row a step.  MethodError where no segment is long enough."""
     parts = _segments(data, settings)
     if sum(len(part) for part in parts) < MINIMUM_WINDOWS:
@@ -69,7 +69,7 @@ def per_sample(data: Data, settings: Settings) -> Kinematics:
     return _join(parts)
 
 
-def windowed(data: Data, settings: Settings) -> Kinematics:
+def windowed(data: MethodData, settings: MethodSettings) -> Kinematics:
     """One row a window of `settings.window` steps; what is left of a segment is not used."""
     average = np.median if settings.derivative == "median" else np.mean
     theta = settings.window

@@ -11,7 +11,7 @@ Span = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class ClaimedParameter:
     """A number of a finding, in the unit it came with."""
 
     name: str
@@ -21,7 +21,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ClaimedEffect:
     """One named effect."""
 
     effect: str
@@ -29,7 +29,7 @@ class Finding:
     alternatives: tuple[str, ...]
     frame: str | None
     spans_s: tuple[Span, ...]
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ClaimedParameter, ...]
     gain: float | None
     separate_from: str | None
     shares: tuple[float, ...] = ()  # confidence of each alternative
@@ -41,14 +41,14 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ToolAnswer:
     """One case's answer; `failure` is why there is none."""
 
     failure: str | None
     said: str
     seconds: float | None  # CPU
     mismatch: bool = False
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[ClaimedEffect, ...] = ()
     unexplained: bool = False
     unexplained_frame: str | None = None
     unexplained_spans_s: tuple[Span, ...] = ()
@@ -65,15 +65,15 @@ class Answer:
         return frozenset(name for finding in self.findings for name in finding.names)
 
 
-def read_answer(record: Json) -> Answer:
+def read_answer(record: Json) -> ToolAnswer:
     """An answer out of what `running` wrote."""
     seconds, said = _number(record.get("cpu_seconds")), str(record.get("said", ""))
     value = record.get("answer")
     if not isinstance(value, dict):
-        return Answer(str(record.get("failure") or "no answer"), said, seconds)
+        return ToolAnswer(str(record.get("failure") or "no answer"), said, seconds)
     unexplained = _object(value.get("unexplained"))
     where = _object(unexplained.get("where"))
-    return Answer(
+    return ToolAnswer(
         failure=None,
         said=said,
         seconds=seconds,
@@ -88,14 +88,14 @@ def read_answer(record: Json) -> Answer:
     )
 
 
-def _finding(entry: Json) -> Finding:
+def _finding(entry: Json) -> ClaimedEffect:
     where, heldout = _object(entry.get("where")), _object(entry.get("heldout"))
     others = [
         other
         for other in _list(entry.get("alternatives"))
         if isinstance(other, dict) and "effect" in other
     ]
-    return Finding(
+    return ClaimedEffect(
         effect=str(entry.get("effect")),
         confidence=_number(entry.get("confidence")),
         alternatives=tuple(str(other["effect"]) for other in others),
@@ -108,13 +108,15 @@ def _finding(entry: Json) -> Finding:
     )
 
 
-def _parameters(value: object) -> list[Parameter]:
+def _parameters(value: object) -> list[ClaimedParameter]:
     out = []
     for entry in _list(value):
         number = _number(_object(entry).get("value"))
         if number is not None:
             unit = str(entry.get("unit") or "1")
-            out.append(Parameter(str(entry.get("name")), number, _number(entry.get("std")), unit))
+            out.append(
+                ClaimedParameter(str(entry.get("name")), number, _number(entry.get("std")), unit)
+            )
     return out
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
-from ahrsd.challenge.answers import Answer, Finding, Parameter, Span
+from ahrsd.challenge.answers import ClaimedEffect, ClaimedParameter, Span, ToolAnswer
 from ahrsd.challenge.units import normal
 
 Json = dict[str, Any]
@@ -40,7 +40,7 @@ class Verdict:
 
     case: str
     truth: Json
-    answer: Answer
+    answer: ToolAnswer
     word: str
     error: bool
     multiple: float | None = None
@@ -68,7 +68,7 @@ class Verdict:
         return findings[0].confidence if findings else None
 
 
-def judge(truth: Json, answer: Answer, control: Answer | None = None) -> Verdict:
+def judge(truth: Json, answer: ToolAnswer, control: ToolAnswer | None = None) -> Verdict:
     """The verdict on one case.  control: the answer to the same recording left as it was."""
     case = str(truth["id"])
     effects = truth["effects"]
@@ -88,7 +88,7 @@ def judge(truth: Json, answer: Answer, control: Answer | None = None) -> Verdict
     return rules[str(truth["kind"])](case, truth, answer)
 
 
-def _refused_rightly(truth: Json, answer: Answer) -> bool:
+def _refused_rightly(truth: Json, answer: ToolAnswer) -> bool:
     """A recording in wrong units may be refused in words that say so."""
     unit = any(effect["effect"] == "unit_error" for effect in truth["effects"])
     return unit and "deg" in answer.said
@@ -98,17 +98,17 @@ def _least(effects: Sequence[Json]) -> float | None:
     return min((float(effect["multiple"]) for effect in effects), default=None)
 
 
-def _null(case: str, truth: Json, answer: Answer) -> Verdict:
+def _null(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
     false = [name for name in answer.names if name not in truth["allowed"]]
     word = FALSE if false else UNKNOWN if answer.unexplained else QUIET
     return Verdict(case, truth, answer, word, error=bool(false), called_unknown=answer.unexplained)
 
 
-def _control(case: str, truth: Json, answer: Answer) -> Verdict:
+def _control(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
     return Verdict(case, truth, answer, QUIET, error=False)
 
 
-def _single(case: str, truth: Json, answer: Answer) -> Verdict:
+def _single(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
     effect = truth["effects"][0]
     right = effect["right"]
     if answer.failure is not None:  # refused, and rightly
@@ -144,7 +144,7 @@ def _single(case: str, truth: Json, answer: Answer) -> Verdict:
     )
 
 
-def _pair(case: str, truth: Json, answer: Answer) -> Verdict:
+def _pair(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
     effects = truth["effects"]
     right = [name for effect in effects for name in effect["right"]]
     hit = [any(name in effect["right"] for name in answer.names) for effect in effects]
@@ -173,7 +173,7 @@ def _pair(case: str, truth: Json, answer: Answer) -> Verdict:
     )
 
 
-def _unknowable(case: str, truth: Json, answer: Answer) -> Verdict:
+def _unknowable(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
     """The cause is in no column or in no library: unknown, here, is the right answer."""
     effect = truth["effects"][0]
     parents = (*effect["parents"], *(n for n in effect["right"] if truth["kind"] == "withheld"))
@@ -203,14 +203,14 @@ def _unknowable(case: str, truth: Json, answer: Answer) -> Verdict:
     )
 
 
-def _unidentifiable(case: str, truth: Json, answer: Answer) -> Verdict:
+def _unidentifiable(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
     effect = truth["effects"][0]
     false = [f.effect for f in answer.findings if f.effect not in effect["right"]]
     word = FALSE if false else RIGHT if answer.findings else QUIET
     return Verdict(case, truth, answer, word, error=bool(false), called_unknown=answer.unexplained)
 
 
-def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) -> Verdict:
+def _semireal(case: str, truth: Json, answer: ToolAnswer, control: ToolAnswer | None) -> Verdict:
     """Judged by what is said beyond the answer to the untouched recording of the same variant.
 
     A name that the control has too, first or among its alternatives, is neither right nor false;
@@ -261,29 +261,29 @@ def _semireal(case: str, truth: Json, answer: Answer, control: Answer | None) ->
     )
 
 
-def _delay(found: Finding, rate_hz: float) -> Finding:
+def _delay(found: ClaimedEffect, rate_hz: float) -> ClaimedEffect:
     """A rate that stands for its interval's middle or end told as the delay that it is."""
     if found.effect != "gyro_integration":
         return found
     half_s = 0.5 / rate_hz
     told = tuple(
-        Parameter("lag", p.value * half_s, None if p.std is None else p.std * half_s, "s")
+        ClaimedParameter("lag", p.value * half_s, None if p.std is None else p.std * half_s, "s")
         for p in found.parameters
         if p.name == "half_steps"
     )
     return replace(found, parameters=told or found.parameters)
 
 
-def _own_delay(truth: Json, effect: Json) -> Finding | None:
+def _own_delay(truth: Json, effect: Json) -> ClaimedEffect | None:
     """The delay that a real recording has of its own, as if the control had said it."""
     delay = truth["noise"].get("own_delay_s")
     if delay is None or effect["effect"] not in DELAYED:
         return None
-    told = (Parameter("lag", float(delay), None, "s"),)
-    return Finding("mag_time_lag", None, (), None, (), told, None, None)
+    told = (ClaimedParameter("lag", float(delay), None, "s"),)
+    return ClaimedEffect("mag_time_lag", None, (), None, (), told, None, None)
 
 
-def _measured(truth: Json, effect: Json, found: Finding | None) -> dict[str, Any]:
+def _measured(truth: Json, effect: Json, found: ClaimedEffect | None) -> dict[str, Any]:
     """Frame, interval, onset, coefficients and gain of a finding that has the right name."""
     if found is None:
         return {}
@@ -332,7 +332,7 @@ def overlap(true: Sequence[Span], said: Sequence[Span]) -> float | None:
     return both / either if either > 0 else 0.0
 
 
-def _onset_error(effect: Json, found: Finding | None) -> float | None:
+def _onset_error(effect: Json, found: ClaimedEffect | None) -> float | None:
     """|t0 - truth| of a step: its own parameter in seconds, or where its first interval begins."""
     if found is None or effect["onset_s"] is None:
         return None
@@ -343,8 +343,8 @@ def _onset_error(effect: Json, found: Finding | None) -> float | None:
 
 def compare(
     true: Sequence[Json],
-    found: Finding | None,
-    earlier: Finding | None = None,
+    found: ClaimedEffect | None,
+    earlier: ClaimedEffect | None = None,
     planted: str | None = None,
 ) -> tuple[tuple[float, ...], float | None]:
     """Pulls of the coefficients that can be compared, and the relative error of them together.
@@ -373,14 +373,14 @@ def compare(
     return tuple(pulls), (miss / size) ** 0.5 if size > 0 else None
 
 
-def _sense(planted: str | None, found: Finding | None) -> float:
+def _sense(planted: str | None, found: ClaimedEffect | None) -> float:
     """-1 where a delay is told of the other sensor than that which was delayed."""
     if planted not in DELAYED or found is None or found.effect not in DELAYED:
         return 1.0
     return 1.0 if DELAYED[planted] == DELAYED[found.effect] else -1.0
 
 
-def _partner(entry: Json, said: Sequence[Parameter]) -> Parameter | None:
+def _partner(entry: Json, said: Sequence[ClaimedParameter]) -> ClaimedParameter | None:
     unit = normal(str(entry["unit"]))[0]
     same = [p for p in said if normal(p.unit)[0] == unit and "onset" not in p.name]
     named = [p for p in same if p.name == entry["name"]]

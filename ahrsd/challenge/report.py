@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from ahrsd.counting import counted
 
 if TYPE_CHECKING:
-    from ahrsd.challenge.answers import Finding
+    from ahrsd.challenge.answers import ClaimedEffect
     from ahrsd.challenge.judge import Verdict
-    from ahrsd.challenge.scores import Result, Score
+    from ahrsd.challenge.scores import RoundScore, ToolResult
 
 _Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
 _CASES = (
@@ -19,7 +19,7 @@ _CASES = (
 )  # fmt: skip
 
 
-def markdown(head: dict[str, Any], results: Sequence[Result]) -> str:
+def markdown(head: dict[str, Any], results: Sequence[ToolResult]) -> str:
     """The report as Markdown."""
     lines = [f"# {_title(head)}", "", _facts(head), ""]
     for heading, words, (columns, rows) in _sections(results):
@@ -28,7 +28,7 @@ def markdown(head: dict[str, Any], results: Sequence[Result]) -> str:
     return "\n".join(lines)
 
 
-def html(head: dict[str, Any], results: Sequence[Result]) -> str:
+def html(head: dict[str, Any], results: Sequence[ToolResult]) -> str:
     """The same as one self-contained page."""
     body = [f"<h1>{escape(_title(head))}</h1><p>{escape(_facts(head))}</p>"]
     for heading, words, (columns, rows) in _sections(results):
@@ -53,7 +53,7 @@ def _facts(head: dict[str, Any]) -> str:
     )
 
 
-def _sections(results: Sequence[Result]) -> Iterable[tuple[str, str, _Table]]:
+def _sections(results: Sequence[ToolResult]) -> Iterable[tuple[str, str, _Table]]:
     if len(results) > 1:
         yield "Tools", _comparison(results), _tools(results)
     for result in results:
@@ -65,7 +65,7 @@ def _sections(results: Sequence[Result]) -> Iterable[tuple[str, str, _Table]]:
         yield f"Cases of {result.tool}", words, (_CASES, [_case(v) for v in result.verdicts])
 
 
-def _comparison(results: Sequence[Result]) -> str:
+def _comparison(results: Sequence[ToolResult]) -> str:
     rates = {result.tool: result.mistakes.value for result in results}
     ours = rates.pop(results[0].tool)
     others = [rate for rate in rates.values() if rate is not None]
@@ -76,7 +76,7 @@ def _comparison(results: Sequence[Result]) -> str:
     return f"The best other tool makes {ratio} the mistakes of {results[0].tool}."
 
 
-def _tools(results: Sequence[Result]) -> _Table:
+def _tools(results: Sequence[ToolResult]) -> _Table:
     columns = ("tool", "mistakes", "95 %", "cases")
     rows: list[tuple[str, ...]] = []
     for result in results:
@@ -85,19 +85,19 @@ def _tools(results: Sequence[Result]) -> _Table:
     return columns, rows
 
 
-def _score(row: Score) -> tuple[str, ...]:
+def _score(row: RoundScore) -> tuple[str, ...]:
     met = "" if row.met is None else "yes" if row.met else "NO"
     value = _number(row.value, row)
     return row.name, value, _interval(row), f"{row.cases}", row.target, met
 
 
-def _number(value: float | None, row: Score) -> str:
+def _number(value: float | None, row: RoundScore) -> str:
     if value is None:
         return ""
     return f"{value:.1%}" if row.low is not None else f"{value:.3g}"
 
 
-def _interval(row: Score) -> str:
+def _interval(row: RoundScore) -> str:
     return "" if row.low is None or row.high is None else f"{row.low:.1%} to {row.high:.1%}"
 
 
@@ -117,7 +117,7 @@ def _case(v: Verdict) -> tuple[str, ...]:
     )
 
 
-def _found(finding: Finding) -> str:
+def _found(finding: ClaimedEffect) -> str:
     sure = "" if finding.confidence is None else f" {finding.confidence:.2f}"
     return "/".join(finding.names) + sure
 

@@ -15,7 +15,7 @@ STRONG = 2.0  # limits
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class RoundScore:
     """A row.  `value` is a share of `cases`, or a median or mean where `low` is None."""
 
     name: str
@@ -32,13 +32,13 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class ToolResult:
     """A tool's verdicts, misses first, and its scores."""
 
     tool: str
     verdicts: list[Verdict]
-    scores: list[Score]
-    mistakes: Score
+    scores: list[RoundScore]
+    mistakes: RoundScore
 
 
 def wilson(hits: int, cases: int) -> tuple[float, float]:
@@ -53,7 +53,7 @@ def wilson(hits: int, cases: int) -> tuple[float, float]:
 
 def share(
     name: str, answers: Sequence[bool], *, least: float | None = None, most: float | None = None
-) -> Score:
+) -> RoundScore:
     """A share with its interval; it should be at least `least` or at most `most`."""
     hits, cases = sum(answers), len(answers)
     value = hits / cases if cases else None
@@ -64,21 +64,23 @@ def share(
     met = None
     if value is not None and target:
         met = value >= least if least is not None else value <= (most or 0.0)
-    return Score(name, value, cases, low if cases else None, high if cases else None, target, met)
+    return RoundScore(
+        name, value, cases, low if cases else None, high if cases else None, target, met
+    )
 
 
-def middle(name: str, values: Sequence[float], *, most: float | None = None) -> Score:
+def middle(name: str, values: Sequence[float], *, most: float | None = None) -> RoundScore:
     """A median that should be at most `most`."""
     value = median(values) if values else None
     met = value <= most if value is not None and most is not None else None
-    return Score(name, value, len(values), None, None, f"<= {most:g}" if most else "", met)
+    return RoundScore(name, value, len(values), None, None, f"<= {most:g}" if most else "", met)
 
 
-def least_median(name: str, values: Sequence[float], least: float) -> Score:
+def least_median(name: str, values: Sequence[float], least: float) -> RoundScore:
     """A median that should be at least `least`."""
     value = median(values) if values else None
     met = value >= least if value is not None else None
-    return Score(name, value, len(values), None, None, f">= {least:g}", met)
+    return RoundScore(name, value, len(values), None, None, f">= {least:g}", met)
 
 
 def calibration_error(pairs: Sequence[tuple[float, bool]], bins: int = 10) -> float | None:
@@ -99,7 +101,7 @@ def _said(verdicts: Sequence[Verdict], of: Callable[[Verdict], bool | None]) -> 
     return [value for v in verdicts if (value := of(v)) is not None]
 
 
-def scores(verdicts: Sequence[Verdict]) -> list[Score]:
+def scores(verdicts: Sequence[Verdict]) -> list[RoundScore]:
     """All rows; those of kinds that the round does not have are left out."""
     by_kind: dict[str, list[Verdict]] = {}
     for verdict in verdicts:
@@ -115,7 +117,7 @@ def scores(verdicts: Sequence[Verdict]) -> list[Score]:
     return [row for row in rows if row.cases]
 
 
-def _of_nulls(nulls: Sequence[Verdict]) -> list[Score]:
+def _of_nulls(nulls: Sequence[Verdict]) -> list[RoundScore]:
     def false(some: Sequence[Verdict]) -> list[bool]:
         return [v.error for v in some]
 
@@ -132,7 +134,7 @@ def _of_nulls(nulls: Sequence[Verdict]) -> list[Score]:
     return [*rows, share("nulls called unknown", unknown, most=0.01)]
 
 
-def _of_singles(singles: Sequence[Verdict]) -> list[Score]:
+def _of_singles(singles: Sequence[Verdict]) -> list[RoundScore]:
     strong = [v for v in singles if (v.multiple or 0.0) >= STRONG]
     known = [v for v in strong if v.detected is not None]
     return [
@@ -176,7 +178,7 @@ def _numbers(verdicts: Sequence[Verdict], name: str) -> list[float]:
     return [value for v in verdicts if (value := getattr(v, name)) is not None]
 
 
-def _of_pairs(pairs: Sequence[Verdict]) -> list[Score]:
+def _of_pairs(pairs: Sequence[Verdict]) -> list[RoundScore]:
     strong = [v for v in pairs if (v.multiple or 0.0) >= STRONG]
     return [
         share("pairs: both named, none added", [v.word == RIGHT for v in pairs]),
@@ -185,7 +187,7 @@ def _of_pairs(pairs: Sequence[Verdict]) -> list[Score]:
     ]
 
 
-def _of_unknowns(by_kind: dict[str, list[Verdict]]) -> list[Score]:
+def _of_unknowns(by_kind: dict[str, list[Verdict]]) -> list[RoundScore]:
     unknown = [*by_kind.get("withheld", []), *by_kind.get("outside", [])]
     blind = by_kind.get("unidentifiable", [])
     return [
@@ -207,7 +209,7 @@ def _of_unknowns(by_kind: dict[str, list[Verdict]]) -> list[Score]:
     ]
 
 
-def _of_semireal(semireal: Sequence[Verdict]) -> list[Score]:
+def _of_semireal(semireal: Sequence[Verdict]) -> list[RoundScore]:
     strong = [v for v in semireal if (v.multiple or 0.0) >= STRONG]
     named, false = [not v.error for v in semireal], (WRONG, ADDED)
     return [
@@ -248,7 +250,7 @@ def _stated(verdict: Verdict, right: dict[str, set[str]]) -> float | None:
     return min(1.0, verdict.confidence + sum(alike))
 
 
-def _of_all(verdicts: Sequence[Verdict]) -> list[Score]:
+def _of_all(verdicts: Sequence[Verdict]) -> list[RoundScore]:
     right = {
         str(effect["effect"]): set(effect["right"])
         for v in verdicts
@@ -265,7 +267,7 @@ def _of_all(verdicts: Sequence[Verdict]) -> list[Score]:
     if error is not None:
         met = error <= 0.02
         rows.append(
-            Score(
+            RoundScore(
                 "calibration error of the confidence",
                 error,
                 len(stated),
@@ -278,7 +280,7 @@ def _of_all(verdicts: Sequence[Verdict]) -> list[Score]:
     return rows
 
 
-def error_rate(verdicts: Sequence[Verdict]) -> Score:
+def error_rate(verdicts: Sequence[Verdict]) -> RoundScore:
     """Mistakes where tools are compared: nulls, strong singles and strong pairs."""
     counted = [
         v

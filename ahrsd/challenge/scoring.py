@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ahrsd.challenge.answers import Answer, read_answer
+from ahrsd.challenge.answers import ToolAnswer, read_answer
 from ahrsd.challenge.judge import ORDER, judge
 from ahrsd.challenge.report import html, markdown
 from ahrsd.challenge.running import OURS, could_not_run
-from ahrsd.challenge.scores import Result, error_rate, scores
+from ahrsd.challenge.scores import ToolResult, error_rate, scores
 from ahrsd.challenge.sealing import Json, Round, open_key, read_object, write_object
 from ahrsd.errors import AhrsdError
 
@@ -25,7 +25,7 @@ def unable(trial: Round) -> dict[str, str]:
     return found
 
 
-def score(trial: Round, key_path: Path, output: Path) -> list[Result]:
+def score(trial: Round, key_path: Path, output: Path) -> list[ToolResult]:
     """Open the key, judge all tools, write score.json, report.md and report.html into `output`.
 
     A tool that could not run is not judged. AhrsdError where seals are broken or nobody answered.
@@ -64,12 +64,12 @@ def score(trial: Round, key_path: Path, output: Path) -> list[Result]:
     return results
 
 
-def _answers(trial: Round, tool: str) -> dict[str, Answer]:
+def _answers(trial: Round, tool: str) -> dict[str, ToolAnswer]:
     folder = trial.answers(tool)
     return {case: read_answer(read_object(folder / f"{case}.json")) for case in trial.cases}
 
 
-def _result(tool: str, truths: list[Json], answers: dict[str, Answer]) -> Result:
+def _result(tool: str, truths: list[Json], answers: dict[str, ToolAnswer]) -> ToolResult:
     controls = {
         str(truth["motion"]): answers[str(truth["id"])]
         for truth in truths
@@ -80,10 +80,10 @@ def _result(tool: str, truths: list[Json], answers: dict[str, Answer]) -> Result
         for truth in truths
     ]
     verdicts.sort(key=lambda v: (not v.error, ORDER.index(v.word), v.kind, -(v.multiple or 0)))
-    return Result(tool, verdicts, scores(verdicts), error_rate(verdicts))
+    return ToolResult(tool, verdicts, scores(verdicts), error_rate(verdicts))
 
 
-def _json(result: Result) -> dict[str, Any]:
+def _json(result: ToolResult) -> dict[str, Any]:
     return {
         "tool": result.tool,
         "mistakes": result.mistakes.json(),

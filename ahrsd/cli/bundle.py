@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from ahrsd.cli.json_output import refuse_unwritable
-from ahrsd.cli.running import Place, place_options
+from ahrsd.cli.running import DaemonPlace, place_options
 from ahrsd.errors import AhrsdError, DeviceError
 
 
@@ -15,7 +15,7 @@ from ahrsd.errors import AhrsdError, DeviceError
 @click.option("-o", "--output", type=click.Path(path_type=Path), default="ahrsd-bundle.tar.gz",
               show_default=True, help="The archive: .tar.gz, .tgz, .tar or .zip.")  # fmt: skip
 @place_options
-def command(output: Path, place: Place) -> None:
+def command(output: Path, place: DaemonPlace) -> None:
     """Collect journal, newest capture, configuration, status and versions into one archive.
 
     It works beside a running daemon and without one. Links, FIFOs and devices are never opened, of

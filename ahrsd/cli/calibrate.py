@@ -15,7 +15,7 @@ from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 
 if TYPE_CHECKING:
-    from ahrsd.baselines.comparison import Row
+    from ahrsd.baselines.comparison import ComparisonRow
     from ahrsd.offline.calibrate import BatchResult
     from ahrsd.recording.column_names import ColumnMap
 
@@ -106,7 +106,7 @@ def _placed(config: Config, position: str | None, date: str | None) -> Config:
         return config
     from pydantic import ValidationError
 
-    from ahrsd.config.sections import Location
+    from ahrsd.config.sections import LocationSection
 
     given = config.location.model_dump()
     if position is not None:
@@ -120,7 +120,9 @@ def _placed(config: Config, position: str | None, date: str | None) -> Config:
     if date is not None:
         given["date"] = date
     try:
-        return config.model_copy(update={"location": Location.model_validate(given, strict=False)})
+        return config.model_copy(
+            update={"location": LocationSection.model_validate(given, strict=False)}
+        )
     except ValidationError as error:
         wrong = error.errors()[0]
         option = "--date" if wrong["loc"][:1] == ("date",) else "--position"
@@ -163,7 +165,7 @@ def _published(
     return EXIT_DONE if rows[0].converged else EXIT_NO
 
 
-def _draw(path: Path, name: str, rows: list[Row]) -> None:
+def _draw(path: Path, name: str, rows: list[ComparisonRow]) -> None:
     from ahrsd.report.methods_figure import write_methods_figure
 
     try:

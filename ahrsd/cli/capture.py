@@ -143,7 +143,7 @@ def _record(serial: SerialPort, writer: CaptureWriter, seconds: float | None) ->
         while not session.reason:
             try:
                 data = serial.read() if serial.wait_readable(_WAIT_S) else b""
-            except serial_port.LinkLost as error:
+            except serial_port.PortLost as error:
                 session.reason, session.unplugged = str(error), True
                 break
             if data:

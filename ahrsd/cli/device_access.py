@@ -13,11 +13,11 @@ from ahrsd.daemon.serial_link import find_device
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, DeviceError
 from drivers.serial_port import (
     BaudNotFound,
-    LinkLost,
     PortAbsent,
     PortBusy,
     PortError,
     PortForbidden,
+    PortLost,
     SerialPort,
 )
 from drivers.vn100.commands import Command
@@ -27,7 +27,7 @@ from drivers.vn100.procedures import Identity, identify, read_configuration
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, LineEchoes
 
-_EXIT = dict.fromkeys((PortAbsent, PortBusy, PortForbidden, BaudNotFound, LinkLost), EXIT_BUSY)
+_EXIT = dict.fromkeys((PortAbsent, PortBusy, PortForbidden, BaudNotFound, PortLost), EXIT_BUSY)
 # Whether it may be opened is for the driver to say: it knows the group that one must join.
 PORT = click.Path(path_type=Path, readable=False)
 

@@ -15,7 +15,7 @@ from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.printable import printable
 
 if TYPE_CHECKING:
-    from ahrsd.evaluation import Evaluation, Fixes, Reference, Track
+    from ahrsd.evaluation import Evaluation, EvaluationTrack, Fixes, HeadingReference
     from ahrsd.recording.column_names import ColumnMap
 
 _TILTS = ("auto", "gravity", "accelerometer", "device")
@@ -138,7 +138,9 @@ def evaluate(
     return found, without
 
 
-def _beside(path: Path | None, track: Track) -> tuple[Track, Fixes | None, str | None]:
+def _beside(
+    path: Path | None, track: EvaluationTrack
+) -> tuple[EvaluationTrack, Fixes | None, str | None]:
     """The track with the columns of another file, or its fixes and the place of the middle one."""
     from ahrsd.cli import evaluate_sources as sources
 
@@ -151,14 +153,14 @@ def _beside(path: Path | None, track: Track) -> tuple[Track, Fixes | None, str |
 
 
 def _references(
-    track: Track, fixes: Fixes | None, heading_column: str | None, least_speed_m_s: float
-) -> tuple[list[Reference], list[str]]:
+    track: EvaluationTrack, fixes: Fixes | None, heading_column: str | None, least_speed_m_s: float
+) -> tuple[list[HeadingReference], list[str]]:
     """What there is to compare with, best first, and why something is not."""
     from ahrsd.evaluation import EvaluationError
     from ahrsd.evaluation.references import column, course, device_heading, optical
 
     said: list[str] = []
-    found: list[Reference] = []
+    found: list[HeadingReference] = []
     if heading_column is not None:
         found.append(column(track, heading_column))
     if fixes is not None:

@@ -16,8 +16,8 @@ from ahrsd.config.loading import Config
 from ahrsd.errors import RecordingError
 from ahrsd.evaluation import (
     EvaluationError,
+    EvaluationTrack,
     StoredCalibration,
-    Track,
     parse_calibration,
     parse_calibrations,
     tracked,
@@ -52,7 +52,7 @@ def read_track(
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
     columns: ColumnMap | None = None,
-) -> tuple[Track, list[str]]:
+) -> tuple[EvaluationTrack, list[str]]:
     """A recording's samples, and what a person should know.  RecordingError as `replay`."""
     recording = open_recording(path, rate_hz, columns=columns or NO_MAP)
     if recording.table is not None:
@@ -130,7 +130,7 @@ def is_gps(path: Path) -> bool:
     return "lat_deg" in _text(path).split("\n", 1)[0]
 
 
-def with_columns_of(track: Track, path: Path) -> Track:
+def with_columns_of(track: EvaluationTrack, path: Path) -> EvaluationTrack:
     """The track with the further columns of a reference table, at its own instants.
 
     Quaternions and angles are taken from the nearest row, not interpolated over a turn.
@@ -143,7 +143,7 @@ def with_columns_of(track: Track, path: Path) -> Track:
     )
     far = np.abs(time_s[near] - track.time_s) > float(np.median(np.diff(time_s)))
     added = {name: np.where(far, np.nan, values[near]) for name, values in other.items()}
-    return Track(
+    return EvaluationTrack(
         track.time_s,
         track.raw_b_gauss,
         track.before_b_gauss,

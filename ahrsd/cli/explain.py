@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
-from ahrsd.cli.running import Place, place_options, tell
+from ahrsd.cli.running import DaemonPlace, place_options, tell
 
 
 @click.command()
 @place_options
 @click.option("--json", "json_path", help="As JSON into this file, - for stdout.")
-def command(place: Place, json_path: str | None) -> None:
+def command(place: DaemonPlace, json_path: str | None) -> None:
     """Say which gate holds a write back, since when, and what to do about it.
 
     Exit 75 where no daemon answers.

@@ -15,7 +15,7 @@ from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 
 if TYPE_CHECKING:
     from ahrsd.montecarlo.runs import Plan
-    from ahrsd.montecarlo.summary import Row
+    from ahrsd.montecarlo.summary import SummaryRow
 
 _ALL = "all"
 _MG, _MRAD = 1e-3, 1e-3
@@ -142,7 +142,7 @@ def _plans(
         raise AhrsdError(str(error)) from None
 
 
-def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[Row]:
+def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[SummaryRow]:
     from ahrsd.montecarlo.runs import run_many
     from ahrsd.montecarlo.summary import summarise
 
@@ -150,7 +150,7 @@ def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[Row]:
         return summarise(run_many(plan, seeds, jobs=jobs, resume=resume, done=done))
 
 
-def _say(plan: Plan, rows: list[Row]) -> None:
+def _say(plan: Plan, rows: list[SummaryRow]) -> None:
     from ahrsd.montecarlo.summary import accuracy_lines, bound_lines, parameter_lines
 
     truth = plan.settings(0).truth
@@ -169,7 +169,7 @@ def _say(plan: Plan, rows: list[Row]) -> None:
         click.echo(line)
 
 
-def _say_headings(sets: list[tuple[Plan, list[Row]]]) -> None:
+def _say_headings(sets: list[tuple[Plan, list[SummaryRow]]]) -> None:
     from ahrsd.montecarlo.summary import heading_lines
 
     click.echo("\nHeading RMSE in deg, of readings with 10 mG of noise (without noise)")
@@ -177,7 +177,7 @@ def _say_headings(sets: list[tuple[Plan, list[Row]]]) -> None:
         click.echo(line)
 
 
-def _json(sets: list[tuple[Plan, list[Row]]], seed: int, runs: int) -> dict[str, object]:
+def _json(sets: list[tuple[Plan, list[SummaryRow]]], seed: int, runs: int) -> dict[str, object]:
     return {
         "schema": "ahrsd.montecarlo/1",
         "runs": runs,
@@ -199,7 +199,7 @@ def _json(sets: list[tuple[Plan, list[Row]]], seed: int, runs: int) -> dict[str,
     }
 
 
-def _draw(path: Path, sets: list[tuple[Plan, list[Row]]]) -> None:
+def _draw(path: Path, sets: list[tuple[Plan, list[SummaryRow]]]) -> None:
     from ahrsd.report.montecarlo_figure import write_montecarlo_figure
 
     try:

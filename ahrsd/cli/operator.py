@@ -31,7 +31,7 @@ def command(verb: str, text: str, directory: Path | None) -> None:
     root may do this, and nobody else: STATE/operator must belong to one of them.
     """
     from ahrsd.config.loading import default_state_directory
-    from ahrsd.daemon.operator_inbox import OperatorBox, OperatorFolderError, Unanswered
+    from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFolderError
     from ahrsd.printable import line
 
     if verb == "approve" and not text:
@@ -41,7 +41,7 @@ def command(verb: str, text: str, directory: Path | None) -> None:
         answer = box.say(verb, text, _WAIT_S)
     except FileNotFoundError:
         raise DeviceError(f"no daemon has been here: {box.folder} is missing", EXIT_BUSY) from None
-    except Unanswered as error:
+    except NoAnswerInTime as error:
         raise DeviceError(f"the daemon {error}; see `ahrsd status`", EXIT_BUSY) from None
     except OperatorFolderError as error:
         raise DeviceError(str(error), EXIT_NO) from None

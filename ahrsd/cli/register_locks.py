@@ -16,11 +16,11 @@ from ahrsd.cli.register_sources import journals
 from ahrsd.config.loading import default_state_directory
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, journal_path
-from ahrsd.daemon.operator_inbox import OperatorBox, OperatorFolderError, Unanswered
+from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFolderError
 from ahrsd.errors import DeviceError, JournalError
-from ahrsd.telemetry.client import Asked, default_socket_path
-from ahrsd.writeback.journal_history import History
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.telemetry.client import DaemonConnection, default_socket_path
+from ahrsd.writeback.journal_history import JournalHistory
+from ahrsd.writeback.reconcile import RecordKind
 
 _WAIT_S = 5.0
 _OPTIONS = (
@@ -43,19 +43,19 @@ def _with_options(function: Callable[..., None]) -> Callable[..., Any]:
 @_with_options
 def lock(reason: str, serial: int | None, state_directory: Path | None) -> None:
     """Forbid every write, but for going back to old values; REASON is for those who come later."""
-    _say(Kind.LOCKED, reason, serial, state_directory or default_state_directory())
+    _say(RecordKind.LOCKED, reason, serial, state_directory or default_state_directory())
 
 
 @click.command()
 @_with_options
 def unlock(reason: str, serial: int | None, state_directory: Path | None) -> None:
     """Allow writes again: REASON says what was found. Also ends FAULT and FLASH_TORN."""
-    _say(Kind.UNLOCKED, reason, serial, state_directory or default_state_directory())
+    _say(RecordKind.UNLOCKED, reason, serial, state_directory or default_state_directory())
 
 
 def refuse_locked(journal: Journal) -> None:
     """Raise JournalError where the newest word in the journal is a lock."""
-    reason = History.of(journal.records()).locked
+    reason = JournalHistory.of(journal.records()).locked
     if reason is not None:
         raise JournalError(
             f"{journal.path}: locked: {reason}; nothing is written until "
@@ -63,14 +63,16 @@ def refuse_locked(journal: Journal) -> None:
         )
 
 
-def _say(kind: Kind, reason: str, serial: int | None, state: Path) -> None:
+def _say(kind: RecordKind, reason: str, serial: int | None, state: Path) -> None:
     elsewhere = serial is not None and _daemons_device(state) not in (None, serial)
-    if not elsewhere and _daemon_heard("lock" if kind is Kind.LOCKED else "unlock", reason, state):
+    if not elsewhere and _daemon_heard(
+        "lock" if kind is RecordKind.LOCKED else "unlock", reason, state
+    ):
         click.echo(f"the daemon heard it; {state} has its journal")
         return
     journal = Journal.open(_journal_of(kind, serial, state))
-    history = History.of(journal.records())
-    if kind is Kind.UNLOCKED and history.locked is None and not history.torn:
+    history = JournalHistory.of(journal.records())
+    if kind is RecordKind.UNLOCKED and history.locked is None and not history.torn:
         click.echo(f"{journal.path}: it is not locked")
         return
     record = journal.append(kind, reason=reason, by="registers", **host_clock.stamp())
@@ -82,7 +84,7 @@ def _daemon_heard(verb: str, reason: str, state: Path) -> bool:
     box = OperatorBox(state)
     try:
         answer = box.say(verb, reason, _WAIT_S) if box.folder.is_dir() else None
-    except Unanswered as error:
+    except NoAnswerInTime as error:
         raise JournalError(f"the daemon {error}; see `ahrsd status`") from None
     except OperatorFolderError as error:
         raise JournalError(str(error)) from None
@@ -99,16 +101,16 @@ def _daemons_device(state: Path) -> int | None:
     if not path.exists():
         return None
     try:
-        with Asked(path) as daemon:
+        with DaemonConnection(path) as daemon:
             device = daemon.ask("status")["device"]
     except DeviceError:
         return None
     return None if device is None else int(device["serial"])
 
 
-def _journal_of(kind: Kind, serial: int | None, state: Path) -> Path:
+def _journal_of(kind: RecordKind, serial: int | None, state: Path) -> Path:
     """The one journal that is meant; a device may be locked before it was ever written."""
-    if serial is not None and kind is Kind.LOCKED:
+    if serial is not None and kind is RecordKind.LOCKED:
         return journal_path(state, serial)
     found = journals(state, None, serial)
     if len(found) > 1:

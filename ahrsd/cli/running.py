@@ -15,7 +15,7 @@ import click
 from ahrsd.cli.json_output import refuse_unwritable, write_json
 from ahrsd.config.loading import Config, load_config
 from ahrsd.printable import line
-from ahrsd.telemetry.client import Asked, find_socket
+from ahrsd.telemetry.client import DaemonConnection, find_socket
 
 _PLACE = click.Path(path_type=Path)
 _SOCKET = click.option("--socket", "socket_path", type=_PLACE, help="The daemon's socket.")
@@ -33,7 +33,7 @@ _HINT = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class DaemonPlace:
     """Where the daemon lives that is meant.
 
     config: the daemon's, or the default; state: its state directory; socket: what was given or is
@@ -45,9 +45,9 @@ class Place:
     socket: Path | None
     given: bool
 
-    def connect(self) -> Asked:
+    def connect(self) -> DaemonConnection:
         """A connection. Raises DeviceError where no daemon answers."""
-        return Asked(self.socket or find_socket(self.state))
+        return DaemonConnection(self.socket or find_socket(self.state))
 
     def pasted(self, text: str) -> str:
         """The text with its hints as they work when they are pasted: for this daemon."""
@@ -91,7 +91,7 @@ def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
         **options: Any,  # noqa: ANN401
     ) -> object:
         config = load_config(config_path) if config_path else Config()
-        place = Place(
+        place = DaemonPlace(
             config,
             directory or config.state,
             socket_path or (config.socket.path if directory is None else None),
@@ -105,7 +105,10 @@ def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def tell(
-    place: Place, what: str, json_path: str | None, lines: Callable[[dict[str, Any]], list[str]]
+    place: DaemonPlace,
+    what: str,
+    json_path: str | None,
+    lines: Callable[[dict[str, Any]], list[str]],
 ) -> None:
     """Ask for `what`; print its `lines`, or the answer itself as JSON where that was asked for."""
     refuse_unwritable(json_path)

@@ -117,7 +117,7 @@ def _simulate_scenario(wanted: _Options) -> None:
 
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
     """The scenario's experiment, and what makes the same one again."""
-    from ahrsd.simulation import Iron, Settings, simulate
+    from ahrsd.simulation import Iron, ScenarioSettings, simulate
     from ahrsd.simulation.disturbance import Disturbances
     from ahrsd.simulation.tabular import settings_json
 
@@ -137,7 +137,7 @@ def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
         if wanted.gyro_path is not None:
             made = _recorded(wanted.gyro_path, wanted, disturbances)
             return made, {"gyro": wanted.gyro_path.name, "seed": wanted.seed}
-        settings = Settings(
+        settings = ScenarioSettings(
             scenario=wanted.scenario,
             motion=wanted.motion,
             seed=wanted.seed,

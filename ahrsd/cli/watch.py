@@ -13,7 +13,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from ahrsd.cli.running import Place, place_options
+from ahrsd.cli.running import DaemonPlace, place_options
 from ahrsd.counting import counted
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import line
@@ -28,7 +28,7 @@ _BESIDE = 28  # lines of everything but the gates
 @place_options
 @click.option("--raw", is_flag=True, help="The records as JSON lines, as they come.")
 @click.option("--samples", is_flag=True, help="With --raw: the samples too.")
-def command(place: Place, raw: bool, samples: bool) -> None:
+def command(place: DaemonPlace, raw: bool, samples: bool) -> None:
     """Rates, errors, what motion is missing, estimates, gates: until Ctrl-C.
 
     Where stdout is not a terminal, one status is printed every time it changes by a line.

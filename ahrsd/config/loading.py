@@ -17,21 +17,21 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ahrsd.config.sections import (
-    Budget,
-    Capture,
-    Device,
-    Estimator,
-    Gates,
-    Interlock,
-    Location,
-    Metrics,
-    Rerun,
+    BudgetSection,
+    CaptureSection,
+    DeviceSection,
+    EstimatorSection,
+    GatesSection,
+    InterlockSection,
+    LocationSection,
+    MetricsSection,
+    RerunSection,
     Section,
-    Socket,
-    Still,
-    Terms,
-    Trial,
-    WriteBack,
+    SocketSection,
+    StillSection,
+    TermsSection,
+    TrialSection,
+    WriteBackSection,
 )
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import ForeignFileError, text_within
@@ -59,20 +59,20 @@ class Config(Section):
     write RAM; commit may write flash."""
     state_directory: Path | None = None
     """Journals and captures; default: $STATE_DIRECTORY (systemd), else ~/.local/state/ahrsd."""
-    device: Device = Device()
-    capture: Capture = Capture()
-    rerun: Rerun = Rerun()
-    socket: Socket = Socket()
-    metrics: Metrics = Metrics()
-    estimator: Estimator = Estimator()
-    gates: Gates = Gates()
-    interlock: Interlock = Interlock()
-    terms: Terms = Terms()
-    location: Location = Location()
-    write_back: WriteBack = WriteBack()
-    trial: Trial = Trial()
-    still: Still = Still()
-    budget: Budget = Budget()
+    device: DeviceSection = DeviceSection()
+    capture: CaptureSection = CaptureSection()
+    rerun: RerunSection = RerunSection()
+    socket: SocketSection = SocketSection()
+    metrics: MetricsSection = MetricsSection()
+    estimator: EstimatorSection = EstimatorSection()
+    gates: GatesSection = GatesSection()
+    interlock: InterlockSection = InterlockSection()
+    terms: TermsSection = TermsSection()
+    location: LocationSection = LocationSection()
+    write_back: WriteBackSection = WriteBackSection()
+    trial: TrialSection = TrialSection()
+    still: StillSection = StillSection()
+    budget: BudgetSection = BudgetSection()
 
     @property
     def state(self) -> Path:

@@ -35,7 +35,7 @@ class Section(BaseModel):
         return Path(value).expanduser() if wants_path and isinstance(value, str) else value
 
 
-class Device(Section):
+class DeviceSection(Section):
     """The VN-100 and its port."""
 
     port: Path | None = None
@@ -53,7 +53,7 @@ class Device(Section):
     """How long a reply may take before the question is asked again. [s]"""
 
 
-class Capture(Section):
+class CaptureSection(Section):
     """The record of everything that came and went, raw."""
 
     enabled: bool = True
@@ -66,7 +66,7 @@ class Capture(Section):
     """The oldest captures are removed beyond this sum. [MB]"""
 
 
-class Rerun(Section):
+class RerunSection(Section):
     """The log for the rerun viewer, written by a process of its own."""
 
     file: Path | None = None
@@ -79,7 +79,7 @@ class Rerun(Section):
     """What the live view keeps for viewers that connect late. [MB]"""
 
 
-class Socket(Section):
+class SocketSection(Section):
     """The Unix socket that `ahrsd status`, `watch` and `explain` ask (docs/reference/socket.md)."""
 
     enabled: bool = True
@@ -88,7 +88,7 @@ class Socket(Section):
     """Its file; default: $RUNTIME_DIRECTORY/socket (systemd), else in the state directory."""
 
 
-class Metrics(Section):
+class MetricsSection(Section):
     """Numbers for Prometheus, over HTTP on 127.0.0.1 only."""
 
     enabled: bool = False
@@ -100,7 +100,7 @@ class Metrics(Section):
 _ESTIMATOR = EstimatorParameters()
 
 
-class Estimator(Section):
+class EstimatorSection(Section):
     """The estimate of iron and gyro bias."""
 
     step_rate_hz: float = Field(default=_ESTIMATOR.step_rate_hz, ge=1.0, le=800.0)
@@ -132,7 +132,7 @@ class Estimator(Section):
     with the same registers that are not older than this; 0: every run begins with nothing. [s]"""
 
     @model_validator(mode="after")
-    def _window_of_epochs(self) -> Estimator:
+    def _window_of_epochs(self) -> EstimatorSection:
         if self.window_steps < self.epoch_steps:
             raise ValueError("window_steps must not be smaller than epoch_steps")
         return self
@@ -153,7 +153,7 @@ _ORDERED = (
 )
 
 
-class Gates(Section):
+class GatesSection(Section):
     """What must hold before anything is written, one limit per gate (docs/reference/gates.md)."""
 
     max_error_rate: float = Field(default=_LIMITS.max_error_rate, ge=0.0, le=1.0)
@@ -264,7 +264,7 @@ class Gates(Section):
     """Gyro bias of the estimate against the mean rate at rest. [sigma]"""
 
     @model_validator(mode="after")
-    def _in_order(self) -> Gates:
+    def _in_order(self) -> GatesSection:
         for low, high in _ORDERED:
             if getattr(self, low) > getattr(self, high):
                 raise ValueError(f"{low} must not be larger than {high}")
@@ -275,7 +275,7 @@ class Gates(Section):
         return GateLimits(**self.model_dump())
 
 
-class Interlock(Section):
+class InterlockSection(Section):
     """The vehicle's word that a write is safe now."""
 
     file: Path | None = None
@@ -287,7 +287,7 @@ class Interlock(Section):
     the host's clock say. [s]"""
 
 
-class Terms(Section):
+class TermsSection(Section):
     """What a repaired model of `ahrsd diagnose --report` names, taken out before calibrating."""
 
     model: Path | None = None
@@ -300,7 +300,7 @@ class Terms(Section):
     """Samples further from the last word than this are not calibrated. [s]"""
 
 
-class Location(Section):
+class LocationSection(Section):
     """Where the vehicle is, for the field that the world magnetic model expects there."""
 
     latitude_deg: float | None = Field(default=None, ge=-90.0, le=90.0)
@@ -313,7 +313,7 @@ class Location(Section):
     """Date of the model; default: today, for a recording the day it was made."""
 
     @model_validator(mode="after")
-    def _both(self) -> Location:
+    def _both(self) -> LocationSection:
         if (self.latitude_deg is None) != (self.longitude_deg is None):
             raise ValueError("latitude_deg and longitude_deg must be given together")
         return self
@@ -324,7 +324,7 @@ _TRIAL = _POLICY.trial
 _STILL = _POLICY.still
 
 
-class WriteBack(Section):
+class WriteBackSection(Section):
     """Who says yes to a write, and what is worth one."""
 
     approval: Literal["operator", "auto"] = _POLICY.approval
@@ -347,7 +347,7 @@ class WriteBack(Section):
     in every mode but passive. [s]"""
 
 
-class Trial(Section):
+class TrialSection(Section):
     """The time in which written registers must prove themselves on live data."""
 
     duration_s: float = Field(default=_TRIAL.duration_s, gt=0.0, le=86400.0)
@@ -376,7 +376,7 @@ class Trial(Section):
         return TrialPolicy(**self.model_dump())
 
 
-class Still(Section):
+class StillSection(Section):
     """Our own proof that the vehicle rests before the flash is written."""
 
     gyro_rad_s: float = Field(default=_STILL.gyro_rad_s, gt=0.0, le=1.0)
@@ -393,7 +393,7 @@ class Still(Section):
         return StillPolicy(**self.model_dump())
 
 
-class Budget(Section):
+class BudgetSection(Section):
     """How often the device may be written."""
 
     min_interval_s: float = Field(default=_POLICY.min_interval_s, ge=0.0, le=10**6)

@@ -15,18 +15,18 @@ from ahrsd.core.device_session import DeviceSession
 from ahrsd.inputs import Journalled
 from ahrsd.writeback.actions import (
     Action,
+    AppendToJournal,
     CalibrateAnew,
     CancelProcedure,
     Emit,
     IdentifyAgain,
     InForce,
-    JournalAppend,
     Look,
     RunProcedure,
     SetUpStream,
 )
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.reconcile import OF_OUTPUTS, Kind
+from ahrsd.writeback.reconcile import OF_OUTPUTS, RecordKind
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event as SessionEvent
 
@@ -93,7 +93,7 @@ class ActionQueue:
     def journalled(self, item: Journalled, host_s: float) -> None:
         """The record that the line waits for is on the disk, or is not."""
         self._awaiting_journal = False
-        kind = Kind(item.kind)
+        kind = RecordKind(item.kind)
         if kind in OF_OUTPUTS:
             self._device_session.journalled(kind, item.error, host_s)
         if item.error:
@@ -136,7 +136,7 @@ class ActionQueue:
         match action:
             case Emit(event):
                 core.emit(event)
-            case JournalAppend(kind, facts):
+            case AppendToJournal(kind, facts):
                 self._awaiting_journal = True
                 core.emit(events.JournalAppend(kind.value, dict(facts)))
             case RunProcedure():

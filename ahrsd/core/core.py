@@ -53,7 +53,7 @@ from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs, user_compensation
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.states import LIVED_WITH, State
 from ahrsd.writeback.trial_metrics import LiveTrial
 from drivers.vn100.decode import Measurement, Undecodable, Unused
@@ -185,7 +185,7 @@ class Core:
 
     def _journalled(self, item: inputs.Journalled) -> None:
         self._action_queue.journalled(item, self._host_s)
-        if item.error and item.kind in (Kind.LOCKED, Kind.UNLOCKED):
+        if item.error and item.kind in (RecordKind.LOCKED, RecordKind.UNLOCKED):
             text = f"not in the journal: {item.error}; it holds for this run only"
             self._answers = [replace(a, accepted=False, text=text) for a in self._answers]
 

@@ -23,7 +23,7 @@ from enum import Enum
 from ahrsd.core.kept_outputs import KeptOutputs
 from ahrsd.writeback.journal_history import JournalRecord
 from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from drivers.vn100.calibration_stream import (
     CalibrationStream,
     DoesNotFit,
@@ -48,7 +48,7 @@ from drivers.vn100.procedures import (
     resume,
 )
 from drivers.vn100.registers import Values, format_command, same
-from drivers.vn100.session import Event, Failed, Finished, Session
+from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
 ECHOES = (
     "the line sends back what is sent (an adapter or terminal that echoes): echoes are told from "
@@ -342,10 +342,10 @@ class DeviceSession:
             self.outputs.keep()
         return {**registers, **self.outputs.users}
 
-    def journalled(self, kind: Kind, error: str, now_s: float) -> None:
+    def journalled(self, kind: RecordKind, error: str, now_s: float) -> None:
         """A record of the user's outputs is on the disk, or is not."""
         kept = self.outputs.journalled(kind, error)
-        if self.phase is Phase.CLOSING and kind is Kind.OUTPUTS_BACK:
+        if self.phase is Phase.CLOSING and kind is RecordKind.OUTPUTS_BACK:
             self._done(None)
         elif self.phase is Phase.KEEPING and not kept:
             if not self._unkept:
@@ -532,9 +532,9 @@ class DeviceSession:
         queue = list(events)
         while queue:
             event = queue.pop(0)
-            if isinstance(event, Finished):
+            if isinstance(event, ProcedureFinished):
                 queue = self._advance(event.result, None, now_s) + queue
-            elif isinstance(event, Failed):
+            elif isinstance(event, ProcedureFailed):
                 queue = self._advance(None, event.error, now_s) + queue
             else:
                 kept.append(event)

@@ -14,10 +14,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ahrsd.writeback.actions import Action, JournalAppend, SetUpStream
+from ahrsd.writeback.actions import Action, AppendToJournal, SetUpStream
 from ahrsd.writeback.composition import register_lines
 from ahrsd.writeback.journal_history import JournalRecord
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from drivers.vn100.calibration_stream import left_by_session
 from drivers.vn100.procedures import SESSION_SETTINGS
 from drivers.vn100.registers import Values
@@ -65,18 +65,18 @@ class KeptOutputs:
         if self.kept:
             self._actions.append(SetUpStream())
         else:
-            self._actions.append(JournalAppend(Kind.OUTPUTS_KEPT, self._facts()))
+            self._actions.append(AppendToJournal(RecordKind.OUTPUTS_KEPT, self._facts()))
 
     def give_back(self) -> None:
         """The user's outputs are in the device again."""
-        self._actions.append(JournalAppend(Kind.OUTPUTS_BACK, {"serial": self._serial}))
+        self._actions.append(AppendToJournal(RecordKind.OUTPUTS_BACK, {"serial": self._serial}))
 
-    def journalled(self, kind: Kind, error: str) -> bool:
+    def journalled(self, kind: RecordKind, error: str) -> bool:
         """A record of this kind is on the disk, or is not; what waited for it follows."""
         if error:
             return False
-        self._kept = dict(self.users) if kind is Kind.OUTPUTS_KEPT else None
-        if kind is Kind.OUTPUTS_KEPT:
+        self._kept = dict(self.users) if kind is RecordKind.OUTPUTS_KEPT else None
+        if kind is RecordKind.OUTPUTS_KEPT:
             self._actions.append(SetUpStream())
         return True
 
@@ -103,8 +103,8 @@ def open_record(journal: Sequence[JournalRecord], serial: int) -> dict[int, Valu
     """The outputs that were kept and not put back; None where nothing is open."""
     kept: dict[int, Values] | None = None
     for record in journal:
-        if record.kind == Kind.OUTPUTS_BACK:
+        if record.kind == RecordKind.OUTPUTS_BACK:
             kept = None
-        elif record.kind == Kind.OUTPUTS_KEPT and record.facts.get("serial") == serial:
+        elif record.kind == RecordKind.OUTPUTS_KEPT and record.facts.get("serial") == serial:
             kept = {int(number): tuple(row) for number, row in record.facts["old"].items()}
     return kept

@@ -12,7 +12,7 @@ Two kinds of statistic, both over the newest samples:
   is linear in g and in the products g_i o_j (9 unknowns). g = 1 is a right gyroscope, 1/57.3 one in
   deg/s, -1 one with the wrong sign. Soft iron and scale errors move g by tens of percent at most.
 
-All limits are in `Limits`. Nothing is decided here: a finding is for a person.
+All limits are in `SensorLimits`. Nothing is decided here: a finding is for a person.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class SensorLimits:
     """Every threshold of this module.
 
     still_s, still_samples: exactly the same for so long, and for so many samples, is no noise
@@ -89,8 +89,8 @@ class _Step:
 class SensorChecks:
     """Takes raw blocks in order, and says what began or ended to be wrong. Deterministic."""
 
-    def __init__(self, limits: Limits | None = None) -> None:
-        self.limits = limits or Limits()
+    def __init__(self, limits: SensorLimits | None = None) -> None:
+        self.limits = limits or SensorLimits()
         self._by_samples: dict[str, str] = {}
         self._by_count: dict[str, str] = {}
         self._counted = (0, 0)

@@ -23,14 +23,14 @@ from ahrsd.daemon import host_clock
 from ahrsd.daemon.columns_file import ColumnsFile
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
-from ahrsd.daemon.operator_inbox import Answer, OperatorInbox
+from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorInbox
 from ahrsd.daemon.recall import Recall
 from ahrsd.daemon.reloading import Change, Reloader
 from ahrsd.daemon.serial_link import Bytes, Lost, SerialLink, find_device
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
 from ahrsd.viewer.sink import RerunSink
-from drivers.serial_port import LinkLost, PortError
+from drivers.serial_port import PortError, PortLost
 from drivers.usb import latency_timer_ms
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
@@ -278,7 +278,7 @@ class Daemon:
         if output:
             try:
                 self._link.write(output)
-            except LinkLost as error:
+            except PortLost as error:
                 self._lost(self.clock.now_ns(), str(error))
 
     def _look(self) -> None:
@@ -331,7 +331,7 @@ class Daemon:
     def _answer(self, event: events.Event) -> None:
         """Tell a person what became of the word."""
         if isinstance(event, events.Answered) and event.word and self._words is not None:
-            self._words.answer(event.word, Answer(event.accepted, event.text))
+            self._words.answer(event.word, OperatorAnswer(event.accepted, event.text))
 
     def _link_facts(self, capture_error: str) -> LinkFacts:
         capture, viewer = self.shell.capture, self.shell.viewer

@@ -47,12 +47,12 @@ class OperatorFolderError(OSError):
     """The folder cannot be trusted, or cannot be used; the text names it and says what helps."""
 
 
-class Unanswered(Exception):
+class NoAnswerInTime(Exception):
     """The daemon took the word and did not say in time what became of it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
+class OperatorCommand:
     """What a person said; `name` is that of its file, for the answer."""
 
     name: str
@@ -61,7 +61,7 @@ class Word:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class OperatorAnswer:
     """What became of a word."""
 
     accepted: bool
@@ -126,7 +126,7 @@ class OperatorBox:
             _write(folder, f"{name}.json", body, (owner.st_uid, owner.st_gid))
         return name
 
-    def say(self, verb: str, argument: str, wait_s: float) -> Answer | None:
+    def say(self, verb: str, argument: str, wait_s: float) -> OperatorAnswer | None:
         """Say a word and wait for the answer; None where nobody took it, then it is gone.
 
         Raises Unanswered, OSError.
@@ -142,9 +142,9 @@ class OperatorBox:
             with suppress(ForeignFileError):
                 body = json.loads(read_regular(answer, 4 * _LARGEST_BYTES, follow=False).data)
                 _removed(answer)
-                return Answer(bool(body["accepted"]), str(body["text"]))
+                return OperatorAnswer(bool(body["accepted"]), str(body["text"]))
             time.sleep(_ASK_S)
-        raise Unanswered(f"took the word and did not answer within {wait_s:.0f} s")
+        raise NoAnswerInTime(f"took the word and did not answer within {wait_s:.0f} s")
 
 
 class OperatorInbox:
@@ -156,8 +156,8 @@ class OperatorInbox:
     def __init__(self, box: OperatorBox, woken: Callable[[], None] = lambda: None) -> None:
         self.box, self.woken = box, woken
         self.fault = ""  # what is wrong with the folder now, in one line
-        self._words: SimpleQueue[Word] = SimpleQueue()
-        self._answers: SimpleQueue[tuple[str, Answer]] = SimpleQueue()
+        self._words: SimpleQueue[OperatorCommand] = SimpleQueue()
+        self._answers: SimpleQueue[tuple[str, OperatorAnswer]] = SimpleQueue()
         self._answered: dict[str, float] = {}
         self._odd: set[str] = set()
         self._looked_s: float | None = None
@@ -165,14 +165,14 @@ class OperatorInbox:
         self._thread = threading.Thread(target=self._work, name="operator", daemon=True)
         self._thread.start()
 
-    def take(self) -> list[Word]:
+    def take(self) -> list[OperatorCommand]:
         """The words since the last time, oldest first."""
         found = []
         while not self._words.empty():
             found.append(self._words.get())
         return found
 
-    def answer(self, name: str, answer: Answer) -> None:
+    def answer(self, name: str, answer: OperatorAnswer) -> None:
         """Tell whoever said the word of this name what became of it."""
         self._answers.put((name, answer))
 
@@ -231,17 +231,17 @@ class OperatorInbox:
             if name not in self._odd and not isinstance(error, FileNotFoundError):
                 text = f"{name} is not a word: {getattr(error, 'strerror', None) or error}"
                 log.warning("operator: %s; use `ahrsd operator`", text)
-                self._tell(folder, stem, Answer(False, text), now_s)
+                self._tell(folder, stem, OperatorAnswer(False, text), now_s)
             self._odd.add(name)
             return
         if late:
             log.warning("operator: %s was dropped: %s", word.verb, late)
-            self._tell(folder, stem, Answer(False, f"dropped: {late}; say it again"), now_s)
+            self._tell(folder, stem, OperatorAnswer(False, f"dropped: {late}; say it again"), now_s)
             return
         self._words.put(word)
         self.woken()
 
-    def _tell(self, folder: int, name: str, answer: Answer, now_s: float) -> None:
+    def _tell(self, folder: int, name: str, answer: OperatorAnswer, now_s: float) -> None:
         body = json.dumps({"accepted": answer.accepted, "text": answer.text}).encode()
         try:
             _write(folder, f"{name}.answer", body, None)
@@ -275,7 +275,7 @@ def _removed(file: Path | str, folder: int | None = None) -> bool:
     return True
 
 
-def _word_of(name: str, data: bytes) -> Word:
+def _word_of(name: str, data: bytes) -> OperatorCommand:
     """The word in a file's bytes. Raises ForeignFileError where it is none."""
     try:
         body = json.loads(data)
@@ -284,4 +284,4 @@ def _word_of(name: str, data: bytes) -> Word:
         verb, argument = None, None
     if verb not in VERBS or not isinstance(argument, str):
         raise ForeignFileError("it does not hold a verb and a text")
-    return Word(name, verb, argument)
+    return OperatorCommand(name, verb, argument)

@@ -23,7 +23,7 @@ from drivers.serial_port import (
     LISTEN_S,
     SCANNED_BAUD,
     BaudFound,
-    LinkLost,
+    PortLost,
     SerialPort,
     detect_baud,
 )
@@ -119,7 +119,7 @@ class SerialReader:
                 data = self._port.read()
                 if data:
                     self._inbox.put(Bytes(self._now_ns(), data))
-        except LinkLost as error:
+        except PortLost as error:
             reason = str(error)
         finally:  # also after a bug: a daemon that hears nothing must know it
             if not self._stopping:

@@ -30,7 +30,7 @@ from ahrsd.daemon.daemon import Daemon, HostClock
 from ahrsd.daemon.journal import Journal
 from ahrsd.daemon.service import close_shell
 from ahrsd.demo.result import LIMIT_DEG, DemoResult, figures, lines, verdict
-from ahrsd.demo.scene import Scene, live_samples
+from ahrsd.demo.scene import DemoScene, live_samples
 from ahrsd.errors import EXIT_BUSY, DeviceError
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.recording.capture import CaptureWriter
@@ -42,7 +42,7 @@ from ahrsd.viewer.sink import RerunSink
 from ahrsd.writeback.states import State
 from drivers.serial_port import PortError, SerialPort
 from drivers.vn100.device import Device
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 from drivers.vn100.emulator.process import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.errors import DriverError
@@ -137,7 +137,7 @@ def run_demo(
     setup = Setup("rov", seed=seed, output="binary", rate_hz=_RATE_HZ, baud=_BAUD, motion=_MOTION)
     truth = build(setup).truth
     config = demo_config(directory, speed)
-    scene = Scene(seconds, say)
+    scene = DemoScene(seconds, say)
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder) / "vn100"
         with _emulated(setup, link, speed) as emulated:
@@ -152,7 +152,7 @@ def run_demo(
     return result
 
 
-def _shell(directory: Path, config: Config, clock: HostClock, scene: Scene) -> Shell:
+def _shell(directory: Path, config: Config, clock: HostClock, scene: DemoScene) -> Shell:
     header = {"program": "ahrsd demo", CONFIG_KEY: print_config(config)}
     return Shell(
         Core(core_settings(config)),
@@ -221,7 +221,7 @@ def _read_back(link: Path) -> dict[int, tuple[float, ...]]:
 
 
 def _conclude(
-    truth: Truth, registers: dict[int, tuple[float, ...]], scene: Scene, core: Core
+    truth: EmulatedTruth, registers: dict[int, tuple[float, ...]], scene: DemoScene, core: Core
 ) -> DemoResult:
     """Judge by the truth."""
     sent = scene.proposed
@@ -247,7 +247,7 @@ def _conclude(
 
 
 def _live_headings(
-    scene: Scene, true: Affine, old: Affine, new: Affine
+    scene: DemoScene, true: Affine, old: Affine, new: Affine
 ) -> tuple[Array, Array, Array]:
     """Heading, error before and error after (deg) of the samples since the write.
 
@@ -262,7 +262,7 @@ def _live_headings(
     return np.degrees(heading), errors[0], errors[1]
 
 
-def _leave(directory: Path, seed: int, result: DemoResult, scene: Scene, core: Core) -> None:
+def _leave(directory: Path, seed: int, result: DemoResult, scene: DemoScene, core: Core) -> None:
     """calibration.json and report.html; the other files are there already."""
     body = calibration_json(
         "capture.mcap",

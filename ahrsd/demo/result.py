@@ -11,7 +11,7 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.report import KeyFigure
 from ahrsd.samples import Array
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 
 LIMIT_DEG: Final = 0.5
 LIMIT_BIAS_RAD_S: Final = 3e-4
@@ -28,7 +28,7 @@ class DemoResult:
     end; estimate: the one that was approved; live_*: (N,) deg, data that it has not seen
     """
 
-    truth: Truth
+    truth: EmulatedTruth
     present: Affine
     written: Affine
     written_gyro: Affine

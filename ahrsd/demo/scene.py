@@ -41,7 +41,7 @@ _HOPELESS = frozenset({State.ROLLED_BACK, State.FAULT, State.LOCKED, State.FLASH
 
 
 @dataclass(slots=True)
-class Scene:
+class DemoScene:
     """Listens to the core's events; `daemon` and `power_cycle` are set before it begins.
 
     seconds: device time at most;  say: takes a line;  live: samples since the write
@@ -164,7 +164,7 @@ class Scene:
         self.daemon.stop(reason)
 
 
-def live_samples(scene: Scene, every: int = 5) -> tuple[Array, Array]:
+def live_samples(scene: DemoScene, every: int = 5) -> tuple[Array, Array]:
     """Raw field (N, 3) in gauss and specific force (N, 3) since the write, thinned."""
     if not scene.live:
         return np.zeros((0, 3)), np.zeros((0, 3))

@@ -145,11 +145,11 @@ def _starts(track: Track, base: NullModel) -> list[NullModel]:
     return out
 
 
-def _epochs(track: Track) -> list[chain.Data]:
+def _epochs(track: Track) -> list[chain.EpochData]:
     """Runs as the estimator's linear start takes them."""
     dt = np.nan_to_num(track.dt_s, nan=0.0)
     return [
-        chain.Data(
+        chain.EpochData(
             track.mag_b_gauss[run],
             track.gyro_b_rad_s[run] * dt[run, None],
             dt[run],

@@ -33,7 +33,7 @@ from ahrsd.estimator.elimination import Interior, eliminated
 from ahrsd.estimator.rows import (
     Averaging,
     Chain,
-    Data,
+    EpochData,
     FieldPart,
     MotionPart,
     Noise,
@@ -50,7 +50,7 @@ from ahrsd.samples import Array
 __all__ = [
     "Averaging",
     "Chain",
-    "Data",
+    "EpochData",
     "Noise",
     "Quadratic",
     "Rows",
@@ -106,7 +106,13 @@ def start_directions(M: Array, b: Array, field: Array) -> Array:
 
 
 def linearise(
-    data: Data, u: Array, x: Array, bias: Array, noise: Noise, *, weights: Array | None = None
+    data: EpochData,
+    u: Array,
+    x: Array,
+    bias: Array,
+    noise: Noise,
+    *,
+    weights: Array | None = None,
 ) -> Quadratic:
     """Quadratic of one epoch at directions u (n, 3), x = [M6, b], bias (3,) in rad/s."""
     return linearise_all([Chain(data, u, bias, noise, weights)], x)[0]

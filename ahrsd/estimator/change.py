@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.estimator import chain
-from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.epoch import WindowEpoch
 from ahrsd.estimator.excitation import spread
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.instrument import Said, believed, disagreement
@@ -42,7 +42,7 @@ def spoken(at_s: float) -> str:
 
 
 def contradicts(
-    epoch: Epoch, c: Array, covariance: Array, usual: chain.Noise, limit_sigma: float
+    epoch: WindowEpoch, c: Array, covariance: Array, usual: chain.Noise, limit_sigma: float
 ) -> bool:
     """Most of its rows are beyond what noise and the covariance (9, 9) of c allow, and b mends it.
 

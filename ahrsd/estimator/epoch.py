@@ -10,7 +10,7 @@ import numpy as np
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.factors import Factor, Node, at_borders, gap_factor
 from ahrsd.estimator.graph import Graph
-from ahrsd.estimator.misfit import Score, scores
+from ahrsd.estimator.misfit import MisfitScore, scores
 from ahrsd.estimator.systematic import Cells
 from ahrsd.samples import Array
 
@@ -18,13 +18,13 @@ _SHORTEST_GAP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class EpochContent:
     """What an epoch is, wherever it is linearised: from node a to the next.
 
     walk: information of the gyro bias's random walk over it; turned: whether it calibrates.
     """
 
-    data: chain.Data
+    data: chain.EpochData
     a: int
     walk: float
     turned: bool
@@ -32,7 +32,7 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class InstrumentInformation:
     """What an epoch says of iron and instrument (`instrument.py`): H (17, 17), g (17,) at c."""
 
     H: Array
@@ -41,36 +41,36 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class LinearisationPlan:
     """Where one is to be linearised: directions, noise, weights of the fields (None for 1)."""
 
-    piece: Piece
+    piece: EpochContent
     u: Array
     used: chain.Noise
     weights: Array | None = None
 
 
 @dataclass(slots=True, eq=False)
-class Epoch:
+class WindowEpoch:
     """One epoch in the window: what it is, directions, noise, and its factor.
 
     used: the noise that it was linearised with; usual: that of the window then; told: known once
     somebody asked.
     """
 
-    piece: Piece
+    piece: EpochContent
     u: Array
     used: chain.Noise
     usual: chain.Noise
     quadratic: chain.Quadratic
     factor: Factor
-    score: Score | None = None
-    told: Told | None = None
+    score: MisfitScore | None = None
+    told: InstrumentInformation | None = None
     _residuals: noise.Residuals | None = None
     _cells: Cells | None = None
 
     @property
-    def data(self) -> chain.Data:
+    def data(self) -> chain.EpochData:
         """What it measured."""
         return self.piece.data
 
@@ -111,7 +111,7 @@ class Epoch:
         return self.quadratic.cost
 
 
-def scores_of(epochs: Sequence[Epoch]) -> list[Score]:
+def scores_of(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
     """What epochs ask for, found once where each was linearised."""
     new = [e for e in epochs if e.score is None]
     for epoch, score in zip(new, scores([e.factor for e in new]) if new else [], strict=True):
@@ -119,7 +119,9 @@ def scores_of(epochs: Sequence[Epoch]) -> list[Score]:
     return [e.score for e in epochs if e.score is not None]
 
 
-def grown(graph: Graph, data: chain.Data, walk: float, *, moving: bool) -> tuple[Piece, Array]:
+def grown(
+    graph: Graph, data: chain.EpochData, walk: float, *, moving: bool
+) -> tuple[EpochContent, Array]:
     """A new epoch, with the nodes that it needs in the graph, and directions to start from.
 
     walk: of the gyro's bias, rad/s/sqrt(s).
@@ -136,10 +138,10 @@ def grown(graph: Graph, data: chain.Data, walk: float, *, moving: bool) -> tuple
     graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
     graph.until_s = float(data.time_s[-1])
     information = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-    return Piece(data, a, information, moving, noise.Typical.of(data)), u
+    return EpochContent(data, a, information, moving, noise.Typical.of(data)), u
 
 
-def place_borders(graph: Graph, begun: Sequence[Epoch]) -> None:
+def place_borders(graph: Graph, begun: Sequence[WindowEpoch]) -> None:
     """Put borders that are at directions of single fields to where their epochs alone want them.
 
     Until then a chain is bent towards the noise of one field and seems that noisy itself; for an
@@ -160,5 +162,5 @@ class Snapshot:
 
     c: Array
     nodes: dict[int, Node]
-    epochs: list[Epoch]
+    epochs: list[WindowEpoch]
     factors: list[Factor]

@@ -54,7 +54,7 @@ _BLIND = 1e-14  # of the largest scaled eigenvalue: what the epoch says nothing 
 class Epoch:
     """Consecutive readings without a gap, ready to be linearised anywhere.  Make it by `of`."""
 
-    data: chain.Data
+    data: chain.EpochData
     noise: Noise
 
     @staticmethod
@@ -87,7 +87,7 @@ class Epoch:
             raise ValueError(f"{noise}: noise must be a positive number")
         steps = np.r_[dt_s[1], dt_s[1:]]
         angle = np.vstack([np.zeros((1, 3)), gyro_b_rad_s[1:] * steps[1:, None]])
-        data = chain.Data(
+        data = chain.EpochData(
             field_b_gauss=np.array(field_b_gauss, dtype=np.float64),
             angle_b_rad=angle,
             dt_s=steps,

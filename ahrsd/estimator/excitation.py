@@ -25,7 +25,7 @@ def spread(field: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(away.T @ away)[-1] / (len(field) - 1)))
 
 
-def turned(data: chain.Data, bias_rad_s: Array) -> bool:
+def turned(data: chain.EpochData, bias_rad_s: Array) -> bool:
     """True where the epoch is worth a factor on the calibration; bias (3,) of the gyro as known."""
     count = len(data) // _SMOOTHED
     field = data.field_b_gauss[: count * _SMOOTHED].reshape(count, _SMOOTHED, 3).mean(axis=1)

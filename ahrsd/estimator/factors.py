@@ -67,7 +67,7 @@ def moved_all(nodes: Sequence[Node], steps: Array) -> list[Node]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Point:
+class LinearisationPoint:
     """Where a factor was linearised."""
 
     c: Array
@@ -87,7 +87,7 @@ class Factor:
     b: int
     H: Array
     g: Array
-    point: Point
+    point: LinearisationPoint
     walk: float = 0.0
 
 
@@ -142,7 +142,7 @@ class Stack:
 def epoch_factor(
     q: chain.Quadratic,
     a: int,
-    point: Point,
+    point: LinearisationPoint,
     walk: float,
     *,
     rest: Array | None = None,
@@ -190,7 +190,7 @@ def chain_step(z: Array, *, calibrates: bool = True) -> Array:
 
 def gap_factor(a: int, c: Array, node_a: Node, node_b: Node, walk: float) -> Factor:
     """Across a gap, between nodes a and a + 1, only the gyro bias is linked."""
-    point = Point(c.copy(), node_a, node_b)
+    point = LinearisationPoint(c.copy(), node_a, node_b)
     return Factor(a, a + 1, np.zeros((SIZE, SIZE)), np.zeros(SIZE), point, walk)
 
 
@@ -198,4 +198,4 @@ def bias_prior(node: int, c: Array, at: Node, sigma_bias: float) -> Factor:
     """Prior on the first node's gyro bias (rad/s)."""
     H = np.zeros((SIZE, SIZE))
     H[9:12, 9:12] = np.eye(3) / sigma_bias**2
-    return Factor(node, node, H, np.zeros(SIZE), Point(c.copy(), at, at))
+    return Factor(node, node, H, np.zeros(SIZE), LinearisationPoint(c.copy(), at, at))

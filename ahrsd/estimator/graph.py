@@ -21,7 +21,18 @@ from operator import is_not
 import gtsam
 import numpy as np
 
-from ahrsd.estimator.factors import NODE, SIZE, Y_A, Y_B, C, Factor, Node, Point, Stack, moved_all
+from ahrsd.estimator.factors import (
+    NODE,
+    SIZE,
+    Y_A,
+    Y_B,
+    C,
+    Factor,
+    LinearisationPoint,
+    Node,
+    Stack,
+    moved_all,
+)
 from ahrsd.estimator.retraction import Moments, moved
 from ahrsd.samples import Array
 
@@ -261,7 +272,7 @@ class Graph:
         ordering.push_back(_y(old))
         H, g = _information(_eliminated(self._linear(factors), ordering)[1])
         node = self.nodes[new]
-        self.prior = Factor(new, new, H, g, Point(self.c.copy(), node, node))
+        self.prior = Factor(new, new, H, g, LinearisationPoint(self.c.copy(), node, node))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]
         del self.nodes[old]
 

@@ -31,7 +31,7 @@ _LOST = 0.03
 _FEWEST = 3  # rows that are never grouped
 
 
-def group_size(data: chain.Data, noise: chain.Noise, size_gauss: float) -> int:
+def group_size(data: chain.EpochData, noise: chain.Noise, size_gauss: float) -> int:
     """How many steps may share a state: odd, 1 where the gyro is poor or the turn fast.
 
     noise: a guess, per step; size_gauss: of the field. The mean of k fields has the variance
@@ -46,7 +46,7 @@ def group_size(data: chain.Data, noise: chain.Noise, size_gauss: float) -> int:
     return max(1, int(most) - 1 + int(most) % 2)
 
 
-def grouped(epochs: Sequence[chain.Data], sizes: Sequence[int]) -> list[chain.Data]:
+def grouped(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
     """Epochs of single steps with as many of them in a state, odd numbers; all at once."""
     out = list(epochs)
     which = [k for k, size in enumerate(sizes) if size > 1 and len(epochs[k]) > _FEWEST]
@@ -57,7 +57,7 @@ def grouped(epochs: Sequence[chain.Data], sizes: Sequence[int]) -> list[chain.Da
     return out
 
 
-def _grouped(epochs: Sequence[chain.Data], sizes: Sequence[int]) -> list[chain.Data]:
+def _grouped(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
     lengths = np.array([len(d) for d in epochs])
     first = np.cumsum(lengths) - lengths
     linked = [np.ones(len(d)) if d.linked is None else d.linked for d in epochs]
@@ -87,7 +87,7 @@ def _grouped(epochs: Sequence[chain.Data], sizes: Sequence[int]) -> list[chain.D
             count[piece].astype(float), P[piece].copy(), own_spread, rate[piece].copy()
         )
         out.append(
-            chain.Data(
+            chain.EpochData(
                 field[piece].copy(),
                 angle[piece].copy(),
                 own_dt,

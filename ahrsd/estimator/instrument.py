@@ -25,7 +25,7 @@ import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.elimination import halfway
-from ahrsd.estimator.epoch import Epoch, Told
+from ahrsd.estimator.epoch import InstrumentInformation, WindowEpoch
 from ahrsd.estimator.factors import Y_A, C, Stack
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.lag import rates
@@ -78,7 +78,7 @@ class Informations:
     def __init__(self) -> None:
         self._kept: tuple[list[object], Said] | None = None
 
-    def of(self, epochs: Sequence[Epoch], graph: Graph) -> Said:
+    def of(self, epochs: Sequence[WindowEpoch], graph: Graph) -> Said:
         """LinAlgError where none has motion, or its directions are not determined."""
         at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
         kept = self._kept
@@ -119,7 +119,7 @@ class Past:
         past._eta[LAG] = lag_s / sigma_s**2
         return past
 
-    def with_epoch(self, told: Told, lag_s: float, sigma_bias: float) -> Past:
+    def with_epoch(self, told: InstrumentInformation, lag_s: float, sigma_bias: float) -> Past:
         """The past with one epoch more, that assumed this lag; sigma_bias in rad/s."""
         bias = slice(9, 12)
         own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
@@ -147,14 +147,14 @@ def _place(c: Array, lag_s: float) -> Array:
     return x
 
 
-def tell(epochs: Sequence[Epoch], graph: Graph) -> None:
+def tell(epochs: Sequence[WindowEpoch], graph: Graph) -> None:
     """Let epochs with motion say what they say of the instrument, where they have not yet."""
     silent = [epoch for epoch in epochs if epoch.turned and epoch.told is None]
     if silent:
         _informations(silent, graph)
 
 
-def lag_known(epochs: Sequence[Epoch], graph: Graph, past: Past, sigma_bias: float) -> Lag:
+def lag_known(epochs: Sequence[WindowEpoch], graph: Graph, past: Past, sigma_bias: float) -> Lag:
     """How well all data tell the lag that is taken out of the field.  LinAlgError: not at all.
 
     The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
@@ -221,7 +221,7 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
     return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def _informations(epochs: Sequence[Epoch], graph: Graph) -> Said:
+def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> Said:
     rows = chain.Rows.of(
         [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
     )
@@ -247,7 +247,7 @@ def _informations(epochs: Sequence[Epoch], graph: Graph) -> Said:
         H[k][_FIELD] += chain.squares(J[:, :, a:b])
         H[k][_MOTION] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
-        epoch.told = Told(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
+        epoch.told = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
 
 

@@ -71,7 +71,7 @@ class Intake:
         """Time covered, gaps left out."""
         return self._earlier_s + (0.0 if self._from_s is None else self._to_s - self._from_s)
 
-    def add(self, block: SampleBlock) -> list[chain.Data]:
+    def add(self, block: SampleBlock) -> list[chain.EpochData]:
         """Take samples that follow the last ones without a gap; return completed epochs."""
         if len(block) == 0:
             return []
@@ -82,7 +82,7 @@ class Intake:
         rows = np.column_stack(
             [block.time_s, block.dt_s, block.raw_b_gauss, block.gyro_b_rad_s, block.accel_b_m_s2]
         )
-        closed: list[chain.Data] = []
+        closed: list[chain.EpochData] = []
         if self._averager is None:
             self._rows.append(rows)
             rows = np.vstack(self._rows)
@@ -107,7 +107,7 @@ class Intake:
             self._waiting.clear()
             self._waiting_count = 0
 
-    def _measure(self, dt_s: Array, length: int) -> list[chain.Data]:
+    def _measure(self, dt_s: Array, length: int) -> list[chain.EpochData]:
         """Measure the rate; steps of another length do not share an epoch.
 
         length: samples for which a reading is held
@@ -127,7 +127,7 @@ class Intake:
             self._pending.append(steps)
             self._pending_count += len(steps)
 
-    def gap(self, next_s: float) -> list[chain.Data]:
+    def gap(self, next_s: float) -> list[chain.EpochData]:
         """The next sample, at `next_s`, does not follow the last one; epochs that end here."""
         self._work_off()
         if self._averager is None and self._pending_count and self._too_short:
@@ -144,7 +144,7 @@ class Intake:
     def _too_short(self) -> bool:
         return 0 < sum(map(len, self._rows)) < _RATE_ROWS
 
-    def _settled(self) -> list[chain.Data]:
+    def _settled(self) -> list[chain.EpochData]:
         """A piece that ends before it is known how long readings are held: as in the one before."""
         if self._averager is not None or not self._rows or self._too_short:
             return []
@@ -160,7 +160,7 @@ class Intake:
         self._averager = None
         self._earlier_s, self._from_s = self.duration_s, None
 
-    def _complete(self) -> list[chain.Data]:
+    def _complete(self) -> list[chain.EpochData]:
         closed = []
         while self._pending_count >= self._parameters.epoch_steps + int(self._fresh):
             closed.append(self._close(self._parameters.epoch_steps + int(self._fresh)))
@@ -181,14 +181,14 @@ class Intake:
         other._held = None if self._held is None else self._held.twin()
         return other
 
-    def interrupt(self) -> chain.Data | None:
+    def interrupt(self) -> chain.EpochData | None:
         """What is pending as a short epoch, if it is worth one; the next one starts anew."""
         self._work_off()
         data = self._closed()
         self._cut()
         return data
 
-    def _closed(self) -> chain.Data | None:
+    def _closed(self) -> chain.EpochData | None:
         enough = self._pending_count >= MIN_EPOCH_STEPS
         data = self._close(self._pending_count) if enough else None
         self._pending.clear()
@@ -196,14 +196,14 @@ class Intake:
         self._fresh = True
         return data
 
-    def _close(self, count: int) -> chain.Data:
+    def _close(self, count: int) -> chain.EpochData:
         steps, rest = split(join(self._pending), count)
         self._pending = [rest] if len(rest) else []
         self._pending_count = len(rest)
         fresh, self._fresh = self._fresh, False
         cut = steps.linked == 0
         angle = np.where(cut[:, None], 0.0, steps.angle_b_rad)
-        return chain.Data(
+        return chain.EpochData(
             steps.field_b_gauss,
             angle,
             np.where(cut, np.median(steps.dt_s[~cut]), steps.dt_s),
@@ -228,9 +228,9 @@ def _down(accel: Array, angle: Array) -> Array:
     return np.asarray(-up / np.maximum(np.sqrt(np.sum(up * up, axis=1, keepdims=True)), 1e-9))
 
 
-def with_border(data: chain.Data, before: chain.Data) -> chain.Data:
+def with_border(data: chain.EpochData, before: chain.EpochData) -> chain.EpochData:
     """Put the previous epoch's last step in front, as the shared border."""
-    return chain.Data(
+    return chain.EpochData(
         np.vstack([before.field_b_gauss[-1:], data.field_b_gauss]),
         np.vstack([np.zeros((1, 3)), data.angle_b_rad]),
         np.r_[data.dt_s[0], data.dt_s],

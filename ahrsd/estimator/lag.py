@@ -17,7 +17,7 @@ from ahrsd.estimator import chain
 from ahrsd.samples import Array
 
 
-def rates(data: chain.Data) -> Array:
+def rates(data: chain.EpochData) -> Array:
     """Rate (n, 3) in rad/s at each row: mean of the steps to it and from it, as far as linked."""
     if data.averaging is not None:
         return data.averaging.rate_b_rad_s
@@ -31,7 +31,7 @@ def rates(data: chain.Data) -> Array:
     return np.asarray(both / np.maximum(sides, 1.0)[:, None])
 
 
-def delayed(data: chain.Data, lag_s: float) -> chain.Data:
+def delayed(data: chain.EpochData, lag_s: float) -> chain.EpochData:
     """The same epoch with its fields taken to be `lag_s` later than before."""
     rate = rates(data)
     turn = so3.exp(lag_s * rate)

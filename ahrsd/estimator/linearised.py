@@ -12,9 +12,16 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.estimator import chain, noise
-from ahrsd.estimator.epoch import Epoch, Place, grown, place_borders, scores_of
+from ahrsd.estimator.epoch import LinearisationPlan, WindowEpoch, grown, place_borders, scores_of
 from ahrsd.estimator.excitation import turned
-from ahrsd.estimator.factors import Node, Point, Stack, bias_prior, chain_step, epoch_factor
+from ahrsd.estimator.factors import (
+    LinearisationPoint,
+    Node,
+    Stack,
+    bias_prior,
+    chain_step,
+    epoch_factor,
+)
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.grouping import group_size, grouped
 from ahrsd.estimator.instrument import Past, tell
@@ -43,7 +50,7 @@ class Linearised:
     ) -> None:
         self.parameters = parameters
         self.usual = usual
-        self.epochs: list[Epoch] = []
+        self.epochs: list[WindowEpoch] = []
         self.misfit = Misfit()
         self.folded = False
         self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
@@ -51,7 +58,9 @@ class Linearised:
         self._folded_cells = Cells()
         self._rest: Array | None = None
         self._work = 0
-        self._waiting: list[tuple[chain.Data, bool]] = []  # not attached yet; with motion or not
+        self._waiting: list[
+            tuple[chain.EpochData, bool]
+        ] = []  # not attached yet; with motion or not
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
         self._guess = usual  # the middle of them
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
@@ -67,7 +76,7 @@ class Linearised:
 
     # -- growing and forgetting ------------------------------------------------------------------
 
-    def take(self, new: Sequence[chain.Data]) -> int:
+    def take(self, new: Sequence[chain.EpochData]) -> int:
         """New epochs of single steps, linked to the one before unless `measures_first`.
 
         They wait to be attached until the answer moves; returns how many have motion.
@@ -89,7 +98,7 @@ class Linearised:
         return sum(moving)
 
     @property
-    def data(self) -> list[chain.Data]:
+    def data(self) -> list[chain.EpochData]:
         """Of all epochs, those that wait too."""
         return [epoch.data for epoch in self.epochs] + [data for data, _ in self._waiting]
 
@@ -104,12 +113,12 @@ class Linearised:
         self._guesses, self._guess = other._guesses.copy(), other._guess
         self.graph.moments = other.graph.moments
 
-    def attach(self, new: Sequence[chain.Data], moving: Sequence[bool]) -> None:
+    def attach(self, new: Sequence[chain.EpochData], moving: Sequence[bool]) -> None:
         """Epochs whose steps are grouped already, and whether they calibrate."""
         walk = self.parameters.bias_walk_rad_s_sqrt_s
         pieces = [grown(self.graph, d, walk, moving=m) for d, m in zip(new, moving, strict=True)]
         self._work = min(self._work + _WORK * len(new), max(_MOST_WORK, _WORK * len(new)))
-        begun = self._linearised([Place(piece, u, self.usual) for piece, u in pieces])
+        begun = self._linearised([LinearisationPlan(piece, u, self.usual) for piece, u in pieces])
         self.epochs += begun
         self.graph.factors += [epoch.factor for epoch in begun]
         place_borders(self.graph, begun)
@@ -129,7 +138,7 @@ class Linearised:
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
 
-    def _remember_lag(self, old: Epoch) -> None:
+    def _remember_lag(self, old: WindowEpoch) -> None:
         """What an epoch that leaves the window said of a lag, if there is one."""
         if not old.turned or self.lag_s == 0.0:
             return
@@ -142,8 +151,8 @@ class Linearised:
     # -- linearisation ---------------------------------------------------------------------------
 
     def _linearised(
-        self, places: Sequence[Place], outlier_sigma: float | None = None
-    ) -> list[Epoch]:
+        self, places: Sequence[LinearisationPlan], outlier_sigma: float | None = None
+    ) -> list[WindowEpoch]:
         """Epochs at the present values; with `outlier_sigma` at weights of their own."""
         self._work -= len(places)
         graph, chains = self.graph, []
@@ -157,10 +166,10 @@ class Linearised:
         out = []
         for at, q in zip(places, found, strict=True):
             a, rest = at.piece.a, None if at.piece.turned else self._resting(at.u)
-            point = Point(graph.c, graph.nodes[a], graph.nodes[a + 1])
+            point = LinearisationPoint(graph.c, graph.nodes[a], graph.nodes[a + 1])
             drawn = (a not in moving, a + 1 not in moving)
             factor = epoch_factor(q, a, point, at.piece.walk, rest=rest, drawn=drawn)
-            out.append(Epoch(at.piece, at.u, at.used, self.usual, q, factor))
+            out.append(WindowEpoch(at.piece, at.u, at.used, self.usual, q, factor))
         return out
 
     def _resting(self, u: Array) -> Array:
@@ -174,7 +183,9 @@ class Linearised:
             self._rest = mean
         return self._rest
 
-    def _replace(self, which: Sequence[int], places: Sequence[Place], **weighing: float) -> None:
+    def _replace(
+        self, which: Sequence[int], places: Sequence[LinearisationPlan], **weighing: float
+    ) -> None:
         if not which:
             return
         factors = self.graph.factors
@@ -198,7 +209,7 @@ class Linearised:
         """Linearise epochs again at the present values, with fresh noise and outlier weights."""
         epochs, p = [self.epochs[k] for k in which], self.parameters
         places = [
-            Place(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
+            LinearisationPlan(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
             for e, u in zip(epochs, self._moved_directions(which), strict=True)
         ]
         self._replace(which, places, outlier_sigma=p.outlier_sigma)
@@ -225,6 +236,8 @@ class Linearised:
                 graph.nodes[epoch.a] = Node.at(graph.nodes[epoch.a].bias, u[0])
             graph.nodes[epoch.a + 1] = Node.at(graph.nodes[epoch.a + 1].bias, u[-1])
             data = delayed(epoch.data, more)
-            places.append(Place(replace(epoch.piece, data=data), u, epoch.used, epoch.weights))
+            places.append(
+                LinearisationPlan(replace(epoch.piece, data=data), u, epoch.used, epoch.weights)
+            )
         self._replace(everyone, places)
         self.lag_s = lag_s

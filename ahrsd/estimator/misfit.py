@@ -22,7 +22,7 @@ _MEMORY = 0.98  # per epoch that left the window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Score:
+class MisfitScore:
     """What an epoch asks of z = [c, bias] (12,) from where it was linearised, its borders at best.
 
     The whitened gradient is `asked` (12,) there and `turning` (12, 12) z more elsewhere.
@@ -35,7 +35,7 @@ class Score:
     freedom: float
 
 
-def scores(factors: Sequence[Factor]) -> list[Score]:
+def scores(factors: Sequence[Factor]) -> list[MisfitScore]:
     """Of several epochs' factors."""
     H, g = np.array([f.H for f in factors]), np.array([f.g for f in factors])
     cross = H[:, _KEEP[:, None], _BORDERS]
@@ -49,7 +49,7 @@ def scores(factors: Sequence[Factor]) -> list[Score]:
     whiten = root[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
     asked = (whiten @ r[:, :, None])[:, :, 0]
     freedom = np.count_nonzero(good, axis=1).astype(float)
-    return [Score(*each) for each in zip(asked, whiten @ S, freedom, strict=True)]
+    return [MisfitScore(*each) for each in zip(asked, whiten @ S, freedom, strict=True)]
 
 
 class Misfit:
@@ -59,14 +59,14 @@ class Misfit:
         self._sum = 0.0
         self._count = 0.0
 
-    def remember(self, factor: Factor, score: Score, graph: Graph) -> None:
+    def remember(self, factor: Factor, score: MisfitScore, graph: Graph) -> None:
         """An epoch leaves the window: keep its score."""
         bias = graph.nodes[factor.a].bias
         s, n = _squares([factor], [score], graph.c, bias[None])
         self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
 
     def value(
-        self, factors: Sequence[Factor], scores: Sequence[Score], graph: Graph, step: Step
+        self, factors: Sequence[Factor], scores: Sequence[MisfitScore], graph: Graph, step: Step
     ) -> tuple[float, float]:
         """Mean square of the scores per degree of freedom, where `step` leads, and its sigma by
         chance were the model right.
@@ -83,7 +83,7 @@ class Misfit:
 
 
 def _squares(
-    factors: Sequence[Factor], scores: Sequence[Score], c: Array, biases: Array
+    factors: Sequence[Factor], scores: Sequence[MisfitScore], c: Array, biases: Array
 ) -> tuple[float, float]:
     """Sum of squares of what is asked for at c and the biases (N, 3), and degrees of freedom."""
     z = np.empty((len(factors), 12))

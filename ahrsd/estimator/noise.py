@@ -52,7 +52,7 @@ def from_differences(values: Array) -> float:
     return float(_MAD * np.median(np.abs(second)) / np.sqrt(6.0))
 
 
-def first_guess(data: chain.Data, parameters: EstimatorParameters) -> chain.Noise:
+def first_guess(data: chain.EpochData, parameters: EstimatorParameters) -> chain.Noise:
     """Noise of an epoch before anything is known about its calibration."""
     rate = data.angle_b_rad[1:] / data.dt_s[1:, None]
     return _floored(from_differences(data.field_b_gauss), from_differences(rate), parameters)
@@ -66,7 +66,7 @@ class Typical:
     spread_s: float
 
     @staticmethod
-    def of(data: chain.Data) -> Typical:
+    def of(data: chain.EpochData) -> Typical:
         """Medians."""
         if data.averaging is None:
             return Typical(1.0, float(np.median(data.dt_s[1:])))
@@ -75,7 +75,7 @@ class Typical:
 
 
 def residuals(
-    q: chain.Quadratic, data: chain.Data, used: chain.Noise, typical: Typical
+    q: chain.Quadratic, data: chain.EpochData, used: chain.Noise, typical: Typical
 ) -> Residuals:
     """What an epoch linearised with the noise levels `used` says about them."""
     a = typical.count * q.seen / used.mag_gauss**2

@@ -66,8 +66,8 @@ class Estimator:
             np.zeros(3) if present_gyro_bias_rad_s is None else present_gyro_bias_rad_s.copy()
         )
         self._at_once = at_once
-        self._new: list[chain.Data] = []  # epochs that are not in the window yet
-        self._last: chain.Data | None = None  # the newest one
+        self._new: list[chain.EpochData] = []  # epochs that are not in the window yet
+        self._last: chain.EpochData | None = None  # the newest one
         self._intake = Intake(self.parameters)
         self._window: Window | None = None
         self._whitening = np.eye(12)
@@ -121,7 +121,7 @@ class Estimator:
                 self._window = self._undivided(self._window)
         return self._answer()
 
-    def _append(self, data: chain.Data) -> None:
+    def _append(self, data: chain.EpochData) -> None:
         if self._last is not None and not data.measures_first:
             data = intake.with_border(data, self._last)
         self._last = data
@@ -202,7 +202,7 @@ class Estimator:
         self._search(window, exactly=True)
         return window
 
-    def _begin(self, data: chain.Data) -> Window:
+    def _begin(self, data: chain.EpochData) -> Window:
         A0 = np.linalg.inv(self._present.matrix)
         A0 = (A0 + A0.T) / 2  # what is not symmetric in the device's register cannot be held here
         size = float(np.median(np.linalg.norm(self._present.apply(data.field_b_gauss), axis=1)))

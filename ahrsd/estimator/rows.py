@@ -67,7 +67,7 @@ class Averaging:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Data:
+class EpochData:
     """What an epoch measured. Row 0 is the border shared with the previous epoch (or a fresh start,
     then `measures_first`); angle and dt of row 0 are not used.
 
@@ -117,7 +117,7 @@ class Chain:
     weights (n,) are those of the field residuals, None for 1.
     """
 
-    data: Data
+    data: EpochData
     u: Array
     bias: Array
     noise: Noise

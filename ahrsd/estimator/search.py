@@ -33,7 +33,7 @@ _LOUD = 2.0  # residual variance over that of the fields' differences that the m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class SearchResult:
     """Best calibration c (9,) and gyro bias (3,).
 
     away:   sigmas between it and the answer as it stands
@@ -66,8 +66,11 @@ class _Reached:
 
 
 def search(
-    parameters: EstimatorParameters, window: Window, present_bias: Array, data: Sequence[chain.Data]
-) -> Found:
+    parameters: EstimatorParameters,
+    window: Window,
+    present_bias: Array,
+    data: Sequence[chain.EpochData],
+) -> SearchResult:
     """Descend from every start on a thinned copy of `data`; `window` itself is not touched."""
     graph = window.graph
     present, information = graph.anchor
@@ -104,7 +107,7 @@ def search(
     away = _distance(graph.c, best, graph.temper * loud if loud > 1.0 else 1.0)
     apart = sorted(_distance(r.c, best, graph.temper * loud) for r in independent)
     gain = (own.cost - best.cost) / loud
-    return Found(best.c, best.bias, away, gain, (*apart, np.inf)[1], loud)
+    return SearchResult(best.c, best.bias, away, gain, (*apart, np.inf)[1], loud)
 
 
 def _positive(c: Array) -> bool:
@@ -136,7 +139,7 @@ def _distance(c: Array, best: _Reached, temper: float) -> float:
     return sigmas(c - best.c, best.information / temper)
 
 
-def thinned(data: chain.Data, k: int) -> chain.Data:
+def thinned(data: chain.EpochData, k: int) -> chain.EpochData:
     """Every k-th row of an epoch, by itself."""
     if k == 1:
         return data
@@ -153,7 +156,7 @@ def thinned(data: chain.Data, k: int) -> chain.Data:
         averaging = chain.Averaging(
             averaging.count[rows], averaging.turn[rows], dt, averaging.rate_b_rad_s[rows]
         )
-    return chain.Data(
+    return chain.EpochData(
         data.field_b_gauss[rows],
         angle,
         dt,
@@ -165,7 +168,7 @@ def thinned(data: chain.Data, k: int) -> chain.Data:
     )
 
 
-def joined(parts: Sequence[chain.Data]) -> chain.Data:
+def joined(parts: Sequence[chain.EpochData]) -> chain.EpochData:
     """Epochs as one chain that is cut between them; each measures its first field."""
     ones = [np.ones(len(p)) for p in parts]
     linked = [
@@ -184,7 +187,7 @@ def joined(parts: Sequence[chain.Data]) -> chain.Data:
             np.concatenate([a.spread_s for a in all_]),
             np.concatenate([a.rate_b_rad_s for a in all_]),
         )
-    return chain.Data(
+    return chain.EpochData(
         np.vstack([p.field_b_gauss for p in parts]),
         np.vstack([p.angle_b_rad for p in parts]),
         np.concatenate([p.dt_s for p in parts]),

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ahrsd.estimator import chain
-from ahrsd.estimator.epoch import Epoch
+from ahrsd.estimator.epoch import WindowEpoch
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import sigmas
 from ahrsd.estimator.retraction import Moments, moved
@@ -25,7 +25,7 @@ _ANOTHER_NOISE, _EXACTLY = 0.1, 0.04  # of the gyro's level, that an epoch may h
 _DRIFTED = 0.3  # of the field's noise: what a bias other than assumed makes of a rest
 
 
-def bends(epochs: Sequence[Epoch], c: Array, moments: Moments, information: Array) -> Array:
+def bends(epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information: Array) -> Array:
     """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest."""
     known: dict[int, float] = {}
     for epoch in epochs:
@@ -35,7 +35,7 @@ def bends(epochs: Sequence[Epoch], c: Array, moments: Moments, information: Arra
     return np.array([known[id(e.factor.point.c)] if e.turned else 0.0 for e in epochs])
 
 
-def drifts(epochs: Sequence[Epoch], nodes: Mapping[int, Node], usual: chain.Noise) -> Array:
+def drifts(epochs: Sequence[WindowEpoch], nodes: Mapping[int, Node], usual: chain.Noise) -> Array:
     """How far directions at rest drift over their epoch by another bias than it assumed, (E,).
 
     In units of the field's noise; 0 with motion.
@@ -52,7 +52,7 @@ def drifts(epochs: Sequence[Epoch], nodes: Mapping[int, Node], usual: chain.Nois
 
 
 def outdated(
-    epochs: Sequence[Epoch],
+    epochs: Sequence[WindowEpoch],
     bent: Array,
     drifted: Array,
     usual: chain.Noise,

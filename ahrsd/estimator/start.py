@@ -26,7 +26,7 @@ _LAGS_S = (0.6, 1.8, 4.5)  # from quick turns to slow ones
 _NOISE_GRAM = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 
 
-def linear_start(epochs: Sequence[chain.Data]) -> Array | None:
+def linear_start(epochs: Sequence[chain.EpochData]) -> Array | None:
     """c = [M (6), b (3)] in gauss, or None where the linear problem has no sound answer."""
     gram = np.zeros((9, 9))
     rows = 0
@@ -59,7 +59,7 @@ def sphere_start(field: Array) -> Array | None:
     return np.concatenate([chain.upper_triangle(np.eye(3) * np.sqrt(r2)), solution[:3] + centre])
 
 
-def _orientation(data: chain.Data) -> Array:
+def _orientation(data: chain.EpochData) -> Array:
     """R_0k of every step against the epoch's first, (n, 3, 3)."""
     return so3.products(so3.exp(np.vstack([np.zeros((1, 3)), data.angle_b_rad[1:]])))
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import Epoch, Place, Snapshot, place_borders, scores_of
+from ahrsd.estimator.epoch import LinearisationPlan, Snapshot, WindowEpoch, place_borders, scores_of
 from ahrsd.estimator.factors import Node, Stack
 from ahrsd.estimator.graph import SingularError, sigmas
 from ahrsd.estimator.instrument import Lag, Past, lag_known
@@ -91,7 +91,7 @@ class Window(Linearised):
         other.attach([first, *(e.data for e in kept[1:])], [e.turned for e in kept])
         return other
 
-    def lag_known(self, epochs: Sequence[Epoch] | None = None) -> Lag | None:
+    def lag_known(self, epochs: Sequence[WindowEpoch] | None = None) -> Lag | None:
         """How well the lag is known by these epochs, all at present, and the past; None: not."""
         asked = self.epochs if epochs is None else epochs
         try:
@@ -120,7 +120,7 @@ class Window(Linearised):
             if epoch.data.measures_first or k == 0:
                 graph.nodes[epoch.a] = Node.at(bias, u[0])
             graph.nodes[epoch.a + 1] = Node.at(bias, u[-1])
-            places.append(Place(epoch.piece, u, self.usual))
+            places.append(LinearisationPlan(epoch.piece, u, self.usual))
         self._replace(range(len(self.epochs)), places)
         place_borders(graph, [epoch for epoch in self.epochs if not epoch.turned])
         self._work = max(self._work, _RESTART_WORK * len(self.epochs))
@@ -197,7 +197,7 @@ class Window(Linearised):
         which = [k for k, e in enumerate(self.epochs) if e.turned]  # others do not depend on c
         epochs = [self.epochs[k] for k in which]
         places = zip(epochs, self._moved_directions(which), strict=True)
-        self._replace(which, [Place(e.piece, u, e.used, e.weights) for e, u in places])
+        self._replace(which, [LinearisationPlan(e.piece, u, e.used, e.weights) for e, u in places])
         return self.cost()
 
     def track(

@@ -8,17 +8,17 @@ Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """
 
 from ahrsd.evaluation.judging import Evaluation, judge
-from ahrsd.evaluation.references import Fixes, Reference
+from ahrsd.evaluation.references import Fixes, HeadingReference
 from ahrsd.evaluation.stored import StoredCalibration, parse_calibration, parse_calibrations
-from ahrsd.evaluation.track import EvaluationError, Track, tracked
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, tracked
 
 __all__ = [
     "Evaluation",
     "EvaluationError",
+    "EvaluationTrack",
     "Fixes",
-    "Reference",
+    "HeadingReference",
     "StoredCalibration",
-    "Track",
     "judge",
     "parse_calibration",
     "parse_calibrations",

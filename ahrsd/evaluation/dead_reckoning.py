@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.evaluation.references import Fixes
-from ahrsd.evaluation.track import Track
+from ahrsd.evaluation.track import EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array
 
@@ -50,7 +50,7 @@ class Velocity:
     speed_m_s: Array | None
 
 
-def velocity_of(track: Track, fixes: Fixes) -> Velocity:
+def velocity_of(track: EvaluationTrack, fixes: Fixes) -> Velocity:
     """The best that the recording has."""
     if all(name in track.covariates for name in DOPPLER):
         v_b = np.column_stack([track.covariates[name] for name in DOPPLER])
@@ -62,7 +62,7 @@ def velocity_of(track: Track, fixes: Fixes) -> Velocity:
     return Velocity(f"speed of {fixes.source}", None, speed)
 
 
-def within(track: Track, fixes: Fixes) -> Fixes | None:
+def within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
     """The fixes during the recording, from the first one; None where they are too few."""
     inside = (fixes.time_s >= track.time_s[0]) & (fixes.time_s <= track.time_s[-1])
     if np.count_nonzero(inside) < _LEAST_FIXES:
@@ -71,7 +71,7 @@ def within(track: Track, fixes: Fixes) -> Fixes | None:
     return Fixes(fixes.time_s[inside], north - north[0], east - east[0], fixes.source)
 
 
-def distance_m(track: Track, velocity: Velocity, fixes: Fixes) -> float | None:
+def distance_m(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> float | None:
     """Way travelled between the first and the last fix; None where it is next to nothing."""
     speed = velocity.speed_m_s
     if velocity.v_b_m_s is not None:
@@ -83,7 +83,12 @@ def distance_m(track: Track, velocity: Velocity, fixes: Fixes) -> float | None:
 
 
 def reckon(
-    track: Track, field_b: Array, up_b: Array, velocity: Velocity, fixes: Fixes, way_m: float
+    track: EvaluationTrack,
+    field_b: Array,
+    up_b: Array,
+    velocity: Velocity,
+    fixes: Fixes,
+    way_m: float,
 ) -> ReckoningFigures:
     """Figures of corrected fields (N, 3), with `fixes` of `within` and `way_m` of `distance_m`."""
     with np.errstate(invalid="ignore", divide="ignore"):  # no heading, no way: looks up or down

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.evaluation.references import Reference
+from ahrsd.evaluation.references import HeadingReference
 from ahrsd.evaluation.track import EvaluationError
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.samples import Array
@@ -40,7 +40,11 @@ class HeadingFigures:
 
 
 def compare(
-    time_s: Array, field_b: Array, up_b: Array, reference: Reference, declination_rad: float = 0.0
+    time_s: Array,
+    field_b: Array,
+    up_b: Array,
+    reference: HeadingReference,
+    declination_rad: float = 0.0,
 ) -> HeadingFigures:
     """Errors of corrected fields (N, 3) at (N,) instants, levelled by up_b (N, 3).
 
@@ -96,7 +100,7 @@ def rms_difference(one: HeadingFigures, other: HeadingFigures) -> tuple[float, f
 
 
 def _mean_at(
-    time_s: Array, heading_rad: Array, reference: Reference
+    time_s: Array, heading_rad: Array, reference: HeadingReference
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Circular mean heading (M,) around each instant, and which of them have samples there."""
     if not len(time_s):

@@ -13,9 +13,9 @@ from ahrsd.evaluation import dead_reckoning, tilt
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.field import FieldFigures, field_figures
 from ahrsd.evaluation.heading import HeadingFigures, compare
-from ahrsd.evaluation.references import Fixes, Reference
+from ahrsd.evaluation.references import Fixes, HeadingReference
 from ahrsd.evaluation.stored import StoredCalibration
-from ahrsd.evaluation.track import EvaluationError, Track
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.samples import Array
 from ahrsd.world_field import WorldField
 
@@ -59,7 +59,7 @@ class Evaluation:
 
     recording: str
     calibration: StoredCalibration
-    track: Track
+    track: EvaluationTrack
     field: Pair[FieldFigures]
     headings: tuple[HeadingJudged, ...]
     reckoned: Reckoned | None
@@ -85,9 +85,9 @@ class Evaluation:
 
 def judge(
     recording: str,
-    track: Track,
+    track: EvaluationTrack,
     calibration: StoredCalibration,
-    references: Sequence[Reference],
+    references: Sequence[HeadingReference],
     *,
     fixes: Fixes | None = None,
     world: WorldField | None = None,
@@ -134,7 +134,10 @@ def _both(fields: Pair[Array], figures: Callable[[Array], T]) -> Pair[T]:
 
 
 def _up(
-    track: Track, source: tilt.Tilt, references: Sequence[Reference], said: list[str]
+    track: EvaluationTrack,
+    source: tilt.Tilt,
+    references: Sequence[HeadingReference],
+    said: list[str],
 ) -> tuple[Array | None, str]:
     try:
         up_b, found = tilt.up_b(track, source)
@@ -150,7 +153,7 @@ def _up(
 
 
 def _reckoned(
-    track: Track, fields: Pair[Array], up_b: Array, fixes: Fixes, said: list[str]
+    track: EvaluationTrack, fields: Pair[Array], up_b: Array, fixes: Fixes, said: list[str]
 ) -> Reckoned | None:
     inside = dead_reckoning.within(track, fixes)
     if inside is None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ahrsd.evaluation.track import EvaluationError, Track
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.samples import Array
 
 _EARTH_M = 6_371_000.0
@@ -47,7 +47,7 @@ class Fixes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class HeadingReference:
     """Headings to compare with.
 
     name, detail: for titles; what else a reader must know
@@ -85,7 +85,7 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
     return Fixes(time_s, north, east_m, "GPS")
 
 
-def fixes_of_track(track: Track) -> Fixes | None:
+def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
     """Positions that the recording holds itself; None without."""
     if not all(name in track.covariates for name in POSITION):
         return None
@@ -101,7 +101,7 @@ def fixes_of_track(track: Track) -> Fixes | None:
     return Fixes(time_s[first], north, east, "position")
 
 
-def course(fixes: Fixes, least_speed_m_s: float) -> Reference:
+def course(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
     """Course over ground where it is faster than that.  EvaluationError where it hardly ever is."""
     time_s, velocity, half_width_s = fixes.velocity()
     fast = np.abs(velocity) > least_speed_m_s
@@ -112,12 +112,12 @@ def course(fixes: Fixes, least_speed_m_s: float) -> Reference:
         )
     heading = np.angle(velocity[fast])
     detail = f"speed > {least_speed_m_s:g} m/s"
-    return Reference(
+    return HeadingReference(
         f"{fixes.source} course", True, time_s[fast], heading, half_width_s, detail=detail
     )
 
 
-def optical(track: Track) -> Reference | None:
+def optical(track: EvaluationTrack) -> HeadingReference | None:
     """The attitude columns ref_q*, sensor to world, scalar first; None without.
 
     Which way is up in that world is measured: the mean specific force, or its z axis without one.
@@ -143,21 +143,21 @@ def optical(track: Track) -> Reference | None:
     up_b = np.full((len(track), 3), np.nan)
     up_b[known] = np.einsum("kji,j->ki", R_wb, up_w)
     heading = np.arctan2(x_w @ right, x_w @ ahead)
-    return Reference("optical attitude", True, track.time_s[known], heading, up_b=up_b)
+    return HeadingReference("optical attitude", True, track.time_s[known], heading, up_b=up_b)
 
 
-def device_heading(track: Track) -> Reference | None:
+def device_heading(track: EvaluationTrack) -> HeadingReference | None:
     """The device's own yaw, which is no truth; None without."""
     attitude = track.device_attitude()
     if attitude is None:
         return None
     known = np.isfinite(attitude[0])
-    return Reference(
+    return HeadingReference(
         "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_OPINION
     )
 
 
-def column(track: Track, name: str) -> Reference:
+def column(track: EvaluationTrack, name: str) -> HeadingReference:
     """A heading column in deg or rad, by its name's end.  EvaluationError where there is none."""
     if name not in track.covariates:
         others = ", ".join(sorted(track.covariates)) or "none"
@@ -170,7 +170,7 @@ def column(track: Track, name: str) -> Reference:
         raise EvaluationError(f"column {name} holds {np.count_nonzero(known)} numbers only")
     device = name in ("vn_yaw_deg", "yaw_rad")
     detail = _OPINION if device else ""
-    return Reference(
+    return HeadingReference(
         f"column {name}", not device, track.time_s[known], values[known], detail=detail
     )
 

@@ -15,14 +15,14 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ahrsd import so3
-from ahrsd.evaluation.track import EvaluationError, Track
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.samples import Array
 
 Tilt = Literal["auto", "gravity", "accelerometer", "device"]
 _MEMORY_S = 10.0
 
 
-def up_b(track: Track, tilt: Tilt) -> tuple[Array, str]:
+def up_b(track: EvaluationTrack, tilt: Tilt) -> tuple[Array, str]:
     """(N, 3) directions, of any length, and which were taken.
 
     auto: gravity, else the device's. Raises EvaluationError where the recording does not have it.
@@ -36,7 +36,7 @@ def up_b(track: Track, tilt: Tilt) -> tuple[Array, str]:
     return (_gravity(track) if tilt == "gravity" else track.accel_b_m_s2), tilt
 
 
-def _of_device(track: Track) -> Array:
+def _of_device(track: EvaluationTrack) -> Array:
     """Up is -z_n: its sensor components by pitch and roll (3-2-1)."""
     attitude = track.device_attitude()
     if attitude is None:
@@ -49,7 +49,7 @@ def _of_device(track: Track) -> Array:
     )
 
 
-def _gravity(track: Track) -> Array:
+def _gravity(track: EvaluationTrack) -> Array:
     out = np.empty((len(track), 3))
     for a, b in zip(track.starts, track.ends(), strict=True):
         dt_s = np.diff(track.time_s[a:b], prepend=track.time_s[a])

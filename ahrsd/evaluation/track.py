@@ -20,7 +20,7 @@ class EvaluationError(AhrsdError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class EvaluationTrack:
     """N samples.
 
     time_s:         (N,) ascending
@@ -64,7 +64,7 @@ class Track:
         return None
 
 
-def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> Track:
+def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
     """Blocks in order, each with the correction of its time.  EvaluationError if too few."""
     kept = [(block, present) for block, present in pieces if len(block)]
     blocks = [block for block, _ in kept]
@@ -76,7 +76,7 @@ def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> Track:
     begins = np.cumsum([0, *(len(block) for block in blocks[:-1])])
     starts = {int(k) for k, block in zip(begins, blocks, strict=True) if block.gap_before}
     shared = set.intersection(*(set(block.covariates) for block in blocks))
-    return Track(
+    return EvaluationTrack(
         time_s=time_s,
         raw_b_gauss=np.vstack([block.raw_b_gauss for block in blocks]),
         before_b_gauss=np.vstack([present.apply(block.raw_b_gauss) for block, present in kept]),

@@ -34,7 +34,7 @@ _CALM_M_S2 = 0.5  # a force that differs from gravity by this much counts half
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class AttitudeTrack:
     """One segment's attitude at nodes of about 5 Hz.
 
     time_s (k,); raw_b_gauss (k, 3); R_0b (k, 3, 3); drift_s (k, 3, 3) is P_k;
@@ -57,7 +57,7 @@ class Track:
         return bool(turned < _REINTEGRATE_RAD)
 
 
-def track(segment: Segment, bias_b_rad_s: Array) -> Track:
+def track(segment: Segment, bias_b_rad_s: Array) -> AttitudeTrack:
     """Integrate a segment."""
     dt_s = np.diff(segment.time_s, prepend=segment.time_s[:1])
     R = so3.products(so3.exp(segment.angle_b_rad - np.outer(dt_s, bias_b_rad_s)))
@@ -69,7 +69,7 @@ def track(segment: Segment, bias_b_rad_s: Array) -> Track:
     nodes = np.arange(stride // 2, len(segment), stride)
     starts = np.arange(len(nodes)) * stride
     counts = np.diff(np.append(starts, len(segment)))
-    return Track(
+    return AttitudeTrack(
         segment=segment,
         time_s=segment.time_s[nodes],
         raw_b_gauss=segment.raw_b_gauss[nodes],
@@ -97,7 +97,7 @@ class Nodes:
     heldout: Bools
     down_0: Array
     rough_m_s2: Array
-    tracks: tuple[Track, ...]
+    tracks: tuple[AttitudeTrack, ...]
 
     @property
     def has_gravity(self) -> bool:
@@ -134,7 +134,7 @@ class Nodes:
         return np.asarray(np.add.reduceat(values, self.starts) / counts.reshape(shape))
 
 
-def nodes_at(tracks: Sequence[Track], bias_b_rad_s: Array) -> Nodes | None:
+def nodes_at(tracks: Sequence[AttitudeTrack], bias_b_rad_s: Array) -> Nodes | None:
     """Put the segments together at a gyro bias; None without segments."""
     if not tracks:
         return None

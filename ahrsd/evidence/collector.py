@@ -11,11 +11,11 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.evidence import comparison
-from ahrsd.evidence.attitude import Nodes, Track, nodes_at, track
+from ahrsd.evidence.attitude import AttitudeTrack, Nodes, nodes_at, track
 from ahrsd.evidence.coverage import UNKNOWN_MOTION, coverage
 from ahrsd.evidence.field import UNKNOWN_FIELD, field_facts
 from ahrsd.evidence.heading import NO_PROOF, field_0, gyro_heading_rad, prove
-from ahrsd.evidence.history import History, HistoryParameters, Role
+from ahrsd.evidence.history import HistoryParameters, Role, SegmentHistory
 from ahrsd.evidence.stillness import rest
 from ahrsd.evidence.values import BasisFacts, EstimateFacts, Evidence, HealthFacts
 from ahrsd.samples import Array, SampleBlock
@@ -28,8 +28,8 @@ class EvidenceCollector:
     """Bounded memory of the stream, and the judgement of an estimate by it.  Deterministic."""
 
     def __init__(self, parameters: HistoryParameters | None = None) -> None:
-        self._history = History(parameters)
-        self._tracks: dict[int, Track] = {}  # again when the gyro bias moves far
+        self._history = SegmentHistory(parameters)
+        self._tracks: dict[int, AttitudeTrack] = {}  # again when the gyro bias moves far
 
     def role(self, block: SampleBlock) -> Role:
         """Role of a block that is about to be added (that of its first sample)."""

@@ -58,7 +58,7 @@ class Segment:
         return len(self.time_s)
 
 
-class History:
+class SegmentHistory:
     """Blocks in, segments out.  Deterministic: depends on device time and on what was added."""
 
     def __init__(self, parameters: HistoryParameters | None = None) -> None:

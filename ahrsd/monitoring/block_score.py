@@ -35,7 +35,7 @@ _KEEP_ROOT = 1.2  # the whitening is kept while the ratio of the noises is withi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class ReferenceCalibration:
     """A calibration to test: theta (12,) and a root (12, 12) of its covariance, and the noises."""
 
     theta: Array
@@ -47,11 +47,11 @@ class Reference:
     noise_gyro_rad_s: float
 
     @staticmethod
-    def of(estimate: Estimate) -> Reference:
+    def of(estimate: Estimate) -> ReferenceCalibration:
         """The estimate, in the order of its covariance."""
         A = estimate.soft_iron
         values, vectors = np.linalg.eigh(estimate.covariance + np.diag(_FLOOR**2))
-        return Reference(
+        return ReferenceCalibration(
             np.r_[A[_ENTRIES], estimate.hard_iron_gauss, estimate.gyro_bias_rad_s],
             vectors * np.sqrt(np.maximum(values, 0.0)),
             np.asarray(np.linalg.inv(A), float),
@@ -73,14 +73,14 @@ class Thinned:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class ScoredBlock:
     """A scored block.
 
     information (15, 15), score (15,): of the columns, the block's own field and lag projected out
     residual (n, 3), lever (n, 3, 3): y - h and how it moves with the hard iron, carried frame
     """
 
-    reference: Reference
+    reference: ReferenceCalibration
     time_s: Array
     information: Array
     score: Array
@@ -95,7 +95,7 @@ class Scorer:
         self._ratio = 0.0
         self._root: Array = np.eye(ROWS)
 
-    def score(self, rows: Thinned, reference: Reference) -> Block:
+    def score(self, rows: Thinned, reference: ReferenceCalibration) -> ScoredBlock:
         """One block of at most ROWS rows against `reference`."""
         n = len(rows.time_s)
         dt_s = np.diff(rows.time_s, prepend=rows.time_s[:1])
@@ -116,9 +116,11 @@ class Scorer:
         G = self._gram(Z, h, reference, float(dt_s[1:].mean()), rows.averaged)
         own = G[15:19, 15:19] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
         G = G - G[:, 15:19] @ np.linalg.solve(own, G[15:19])
-        return Block(reference, rows.time_s, G[:15, :15], G[:15, 19], y - h, lever)
+        return ScoredBlock(reference, rows.time_s, G[:15, :15], G[:15, 19], y - h, lever)
 
-    def _gram(self, Z: Array, h: Array, reference: Reference, dt_s: float, averaged: int) -> Array:
+    def _gram(
+        self, Z: Array, h: Array, reference: ReferenceCalibration, dt_s: float, averaged: int
+    ) -> Array:
         """Along the field nothing but the magnetometer's noise, across it the gyro's walk too."""
         size = float(np.linalg.norm(h))
         sigma = reference.noise_mag_gauss / np.sqrt(averaged)

@@ -27,8 +27,8 @@ from ahrsd.monitoring.block_score import (
     IRON,
     LEAST_ROWS,
     ROWS,
-    Block,
-    Reference,
+    ReferenceCalibration,
+    ScoredBlock,
     Scorer,
     Thinned,
 )
@@ -97,14 +97,14 @@ class StepDetector:
         self.found: Step | None = None
         self._scorer = Scorer()
         self._estimate: Estimate | None = None
-        self._reference: Reference | None = None
+        self._reference: ReferenceCalibration | None = None
         self.scored = 0
         self.restart()
 
     def restart(self) -> None:
         """Forget everything: what follows has another iron, or another calibration."""
         self._estimate = self._reference = self.found = None
-        self._blocks: deque[Block] = deque(maxlen=KEPT)
+        self._blocks: deque[ScoredBlock] = deque(maxlen=KEPT)
         self._single: deque[float] = deque(maxlen=_MOST_USUAL + max(_WINDOWS))
         self._intake = _Intake()
 
@@ -120,7 +120,7 @@ class StepDetector:
         if estimate is not None and estimate is not self._estimate and estimate.converged:
             self._estimate = estimate
             if np.isfinite(estimate.covariance).all():
-                self._reference = Reference.of(estimate)
+                self._reference = ReferenceCalibration.of(estimate)
         for rows in self._intake.add(block):
             step = None if self._reference is None else self._judge(rows, self._reference)
             if step is not None:
@@ -128,7 +128,7 @@ class StepDetector:
                 return step
         return None
 
-    def _judge(self, rows: Thinned, reference: Reference) -> Step | None:
+    def _judge(self, rows: Thinned, reference: ReferenceCalibration) -> Step | None:
         block = self._scorer.score(rows, reference)
         self._blocks.append(block)
         self.scored += 1
@@ -155,7 +155,7 @@ class StepDetector:
         return None if len(older) < _LEAST_USUAL else max(1.0, float(np.mean(older)))
 
     def _decide(
-        self, newest: list[Block], gains: dict[str, tuple[float, Array, Array]], usual: float
+        self, newest: list[ScoredBlock], gains: dict[str, tuple[float, Array, Array]], usual: float
     ) -> Step | None:
         what = max(gains, key=lambda name: gains[name][0])
         gain, size, information = gains[what]
@@ -176,7 +176,7 @@ class StepDetector:
         sigma = np.sqrt(usual * np.diag(np.linalg.inv(information)))
         return Step(what, at_s, float(newest[-1].time_s[-1]), size, sigma, len(newest))
 
-    def _when(self, first: Block, size: Array) -> float:
+    def _when(self, first: ScoredBlock, size: Array) -> float:
         """The time from which on the step explains most, from the first block backwards.
 
         While the vehicle stands only the jump itself shows.
@@ -259,12 +259,12 @@ def _tail(block: SampleBlock, rows: int) -> SampleBlock:
     )
 
 
-def _informative(block: Block) -> bool:
+def _informative(block: ScoredBlock) -> bool:
     """Whether the block alone knows the hard iron in some direction."""
     return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE**-2)
 
 
-def _believed(blocks: list[Block], reference: Reference) -> tuple[Array, Array]:
+def _believed(blocks: list[ScoredBlock], reference: ReferenceCalibration) -> tuple[Array, Array]:
     """Information (12, 12) and score (12,) of what departs from it, less its own error."""
     total = sum((b.information[:12, :12] for b in blocks), np.zeros((12, 12)))
     score = np.zeros(12)
@@ -277,7 +277,7 @@ def _believed(blocks: list[Block], reference: Reference) -> tuple[Array, Array]:
 
 
 def _gains(
-    blocks: list[Block], reference: Reference | None = None
+    blocks: list[ScoredBlock], reference: ReferenceCalibration | None = None
 ) -> dict[str, tuple[float, Array, Array]]:
     """By what steps: T, the step (3,), its information (3, 3), against the first's reference."""
     information, score = _believed(blocks, reference or blocks[0].reference)
@@ -291,14 +291,14 @@ def _gain(information: Array, score: Array, what: str) -> tuple[float, Array, Ar
     return float(score[columns] @ size), size, J
 
 
-def _share(block: Block, reference: Reference, what: str, size: Array) -> float:
+def _share(block: ScoredBlock, reference: ReferenceCalibration, what: str, size: Array) -> float:
     """Of the gain that a step of its own gives the block, what this step gives."""
     information, score = _believed([block], reference)
     most, _, J = _gain(information, score, what)
     return float(2 * size @ score[_COLUMNS[what]] - size @ J @ size) / max(most, 1e-12)
 
 
-def _drift_gain(block: Block, reference: Reference) -> float:
+def _drift_gain(block: ScoredBlock, reference: ReferenceCalibration) -> float:
     """T of a field that changes in the world during the block."""
     score = block.score + block.information[:, :12] @ (block.reference.theta - reference.theta)
     G, K = block.information, block.information[:, :12] @ reference.root
@@ -316,7 +316,7 @@ def _clear_size(size: Array, information: Array) -> float:
     return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _CLEAR]))
 
 
-def _onset_gains(block: Block, size: Array) -> Array:
+def _onset_gains(block: ScoredBlock, size: Array) -> Array:
     """(n,) what a step that begins in row k gains in this block, its own field fitted."""
     moved = block.lever @ size
     residual = block.residual

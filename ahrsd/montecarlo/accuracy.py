@@ -29,7 +29,7 @@ _EVERY = 5  # samples: neighbours say nothing new about a heading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class MethodAnswer:
     """What a method says; None where it does not estimate that part.
 
     soft_iron: A (3, 3), any volume; covariance: (12, 12) as `Estimate.covariance`
@@ -42,9 +42,9 @@ class Answer:
     converged: bool = True
 
     @staticmethod
-    def of(estimate: Estimate) -> Answer:
+    def of(estimate: Estimate) -> MethodAnswer:
         """The estimator's answer."""
-        return Answer(
+        return MethodAnswer(
             estimate.soft_iron,
             estimate.hard_iron_gauss,
             estimate.gyro_bias_rad_s,
@@ -167,7 +167,7 @@ def field_errors(
     return float(np.std(size) / np.mean(size)), rms
 
 
-def figures(answer: Answer, experiment: Experiment) -> dict[str, float | None]:
+def figures(answer: MethodAnswer, experiment: Experiment) -> dict[str, float | None]:
     """All errors of an answer by name; None where the answer does not say that part.
 
     Raises ValueError (LinAlgError is one) where what it says is no calibration.

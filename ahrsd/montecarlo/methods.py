@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ahrsd.baselines import METHODS, MethodError, Settings, calibrate_with
+from ahrsd.baselines import METHODS, MethodError, MethodSettings, calibrate_with
 from ahrsd.estimator.online import WHOLE, Estimator
-from ahrsd.montecarlo.accuracy import Answer
+from ahrsd.montecarlo.accuracy import MethodAnswer
 from ahrsd.simulation import Experiment
 
-Batch = Callable[[Experiment], Answer]
+Batch = Callable[[Experiment], MethodAnswer]
 
 OURS = "magyc"
 STREAM = "magyc-stream"
@@ -42,31 +42,31 @@ def batch_method(name: str) -> Batch:
     return lambda experiment: _published(name, experiment)
 
 
-def _ours(experiment: Experiment) -> Answer:
+def _ours(experiment: Experiment) -> MethodAnswer:
     estimator = Estimator(at_once=WHOLE)
     for block in experiment.blocks(_BLOCK):
         estimator.add(block)
     estimate = estimator.finish()
     if estimate is None:
         raise MethodError("no estimate")
-    return Answer.of(estimate)
+    return MethodAnswer.of(estimate)
 
 
-def present(estimator: Estimator) -> Answer:
+def present(estimator: Estimator) -> MethodAnswer:
     """What a stream's estimator says now.  MethodError before its first estimate."""
     estimate = estimator.estimate()
     if estimate is None:
         raise MethodError("no estimate yet")
-    return Answer.of(estimate)
+    return MethodAnswer.of(estimate)
 
 
-def _published(name: str, experiment: Experiment) -> Answer:
+def _published(name: str, experiment: Experiment) -> MethodAnswer:
     plain = name.removesuffix(SMOOTHED)
     truth = experiment.truth
     result = calibrate_with(
         plain,
         list(experiment.blocks(_BLOCK)),
-        settings=Settings(
+        settings=MethodSettings(
             known_gyro_bias_rad_s=truth.gyro_bias_rad_s,
             derivative="savgol" if plain != name else "median",
         ),
@@ -76,4 +76,4 @@ def _published(name: str, experiment: Experiment) -> Answer:
     )
     if not result.converged:
         raise MethodError(result.reason)
-    return Answer(result.soft_iron, result.hard_iron_gauss, result.gyro_bias_rad_s)
+    return MethodAnswer(result.soft_iron, result.hard_iron_gauss, result.gyro_bias_rad_s)

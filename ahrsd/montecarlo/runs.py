@@ -24,12 +24,18 @@ import numpy as np
 
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.online import Estimator
-from ahrsd.montecarlo.accuracy import HEADINGS, Answer, expected_heading_deg, figures, unit_volume
+from ahrsd.montecarlo.accuracy import (
+    HEADINGS,
+    MethodAnswer,
+    expected_heading_deg,
+    figures,
+    unit_volume,
+)
 from ahrsd.montecarlo.cramer_rao import Trajectory, UnobservableError, cramer_rao
 from ahrsd.montecarlo.methods import OURS, STREAM, batch_method, is_known, known_methods, present
 from ahrsd.montecarlo.summary import BOUNDED
 from ahrsd.samples import Array
-from ahrsd.simulation import Experiment, Iron, Settings, simulate
+from ahrsd.simulation import Experiment, Iron, ScenarioSettings, simulate
 
 Record = dict[str, Any]  # one run, as it stands in the file: see `run_one`
 
@@ -66,9 +72,9 @@ class Plan:
                 raise ValueError(f"no method {name!r}; there are {', '.join(known_methods())}")
         self.settings(0)
 
-    def settings(self, seed: int) -> Settings:
+    def settings(self, seed: int) -> ScenarioSettings:
         """The experiment of a seed."""
-        return Settings(
+        return ScenarioSettings(
             scenario=self.scenario,
             motion=self.motion,
             seed=seed,
@@ -161,7 +167,7 @@ def scored(
     method: str,
     at_s: float,
     experiment: Experiment,
-    ask: Callable[[], Answer],
+    ask: Callable[[], MethodAnswer],
     begun_s: float | None = None,
 ) -> Record:
     """An answer with its errors, or the failure in words; CPU seconds since `begun_s` or now.

@@ -40,7 +40,7 @@ class Ratio:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class SummaryRow:
     """One method at one time, over all runs.
 
     answered: runs with an answer, of `runs`; unconverged: of those, how many the method itself does
@@ -72,7 +72,7 @@ class Row:
         return asdict(self)
 
 
-def summarise(records: Sequence[Record]) -> list[Row]:
+def summarise(records: Sequence[Record]) -> list[SummaryRow]:
     """One row per method and time, in the order in which the runs did them."""
     order = [(r["method"], r["at_s"]) for r in records[0]["results"]] if records else []
     bounds = {b["at_s"]: k for k, b in enumerate(records[0]["bounds"])} if records else {}
@@ -85,14 +85,14 @@ def summarise(records: Sequence[Record]) -> list[Row]:
     ]
 
 
-def _row(results: Sequence[Record], bounds: Sequence[Record]) -> Row:
+def _row(results: Sequence[Record], bounds: Sequence[Record]) -> SummaryRow:
     good = [(r, b) for r, b in zip(results, bounds, strict=True) if r["failure"] is None]
     answers = [r for r, _ in good]
     parameters = _parameters(answers)
     nees = _column(answers, "nees")
     failures = Counter(r["failure"] for r in results if r["failure"] is not None)
     few = len(nees) < 2
-    return Row(
+    return SummaryRow(
         method=results[0]["method"],
         at_s=results[0]["at_s"],
         runs=len(results),
@@ -168,7 +168,7 @@ def _ratio(good: Sequence[tuple[Record, Record]], name: str) -> Ratio:
     return Ratio(_rms(errors), bound, ratio, error, float(np.sqrt(np.mean(e2 / c2))))
 
 
-def accuracy_lines(rows: Sequence[Row]) -> list[str]:
+def accuracy_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """Errors, bound and ratios as text, one line per method and time ([R] Table 5.2 and more)."""
     head = (
         f"{'method':<19} {'at s':>5} {'answers':>9} {'hard iron mG':>13} {'x bound':>13} "
@@ -178,7 +178,7 @@ def accuracy_lines(rows: Sequence[Row]) -> list[str]:
     return [head, *(line for row in rows for line in _lines(row))]
 
 
-def _lines(row: Row) -> list[str]:
+def _lines(row: SummaryRow) -> list[str]:
     hard, soft, gyro = (row.against_bound[name] for name in BOUNDED)
     error = "" if hard.standard_error is None else f"+-{hard.standard_error:.2f}"
     answers = f"{row.answered}/{row.runs}" + (f"-{row.unconverged}" if row.unconverged else "")
@@ -200,7 +200,7 @@ def _text(value: float | None, factor: float = 1.0, digits: int = 3) -> str:
     return "-" if value is None else f"{value * factor:#.{digits + 1}g}".rstrip(".")
 
 
-def bound_lines(rows: Sequence[Row]) -> list[str]:
+def bound_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """The bound at each time, RMS over the runs."""
     out = []
     for at_s in dict.fromkeys(row.at_s for row in rows):
@@ -216,7 +216,7 @@ def bound_lines(rows: Sequence[Row]) -> list[str]:
     return out
 
 
-def parameter_lines(rows: Sequence[Row], truth: Sequence[float]) -> list[str]:
+def parameter_lines(rows: Sequence[SummaryRow], truth: Sequence[float]) -> list[str]:
     """[R] Table 5.1: mean and spread over the runs of every parameter at the last time.
 
     The bound's line is the smallest spread of unbiased answers.
@@ -243,7 +243,7 @@ def parameter_lines(rows: Sequence[Row], truth: Sequence[float]) -> list[str]:
     return table
 
 
-def heading_lines(sets: Sequence[tuple[str, Sequence[Row]]]) -> list[str]:
+def heading_lines(sets: Sequence[tuple[str, Sequence[SummaryRow]]]) -> list[str]:
     """[R] Table 5.2: heading RMSE in degrees by method and set (name, rows) at the last time.
 
     Of readings with 10 mG of noise, behind it of readings without; the bound's line is what a

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS, MethodResult, calibrate_with
 from ahrsd.baselines.checks import stuck
-from ahrsd.baselines.comparison import Row, halves, spread_of
+from ahrsd.baselines.comparison import ComparisonRow, halves, spread_of
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.calibrate import BatchResult
@@ -28,7 +28,7 @@ def run_published(result: BatchResult, method: str) -> MethodResult:
 
 
 def published_json(
-    result: BatchResult, found: MethodResult, row: Row | None = None
+    result: BatchResult, found: MethodResult, row: ComparisonRow | None = None
 ) -> dict[str, object]:
     """The contract's calibration.json of a published method: what it does not estimate is null.
 
@@ -51,7 +51,7 @@ def published_json(
     return body if row is None else with_spread(body, row)
 
 
-def with_spread(body: dict[str, object], row: Row) -> dict[str, object]:
+def with_spread(body: dict[str, object], row: ComparisonRow) -> dict[str, object]:
     """calibration.json with the spreads of the corrected field beside what the contract asks."""
     return body | {"field_spread": {"everything": row.spread, "held_out": row.held_out}}
 
@@ -61,17 +61,17 @@ def all_methods(result: BatchResult) -> list[MethodResult]:
     return [run_published(result, method) for method in METHODS]
 
 
-def row_of(result: BatchResult, found: MethodResult, *, held_out: bool = True) -> Row:
+def row_of(result: BatchResult, found: MethodResult, *, held_out: bool = True) -> ComparisonRow:
     """A published method's row of the table."""
     if found.hard_iron_gauss is None:
-        return Row(found.method, None, None, None, False, found.reason)
+        return ComparisonRow(found.method, None, None, None, False, found.reason)
     answers: list[Answer] = [(found.soft_iron, found.hard_iron_gauss)]
     spread = spread_of([_blocks(result)], answers)
     unseen = _unseen(result, found.method) if held_out else None
     reason = found.reason
     if held_out and unseen is None:
         reason = "; ".join(text for text in (reason, "no answer on half of the data") if text)
-    return Row(
+    return ComparisonRow(
         found.method,
         found.soft_iron,
         found.hard_iron_gauss,
@@ -83,16 +83,16 @@ def row_of(result: BatchResult, found: MethodResult, *, held_out: bool = True) -
     )
 
 
-def our_row(result: BatchResult, *, held_out: bool = True) -> Row:
+def our_row(result: BatchResult, *, held_out: bool = True) -> ComparisonRow:
     """Ours."""
     estimate = result.estimate
     reasons = "; ".join(result.reasons())
     if estimate is None:
-        return Row(OURS, None, None, None, False, reasons)
+        return ComparisonRow(OURS, None, None, None, False, reasons)
     if words := saturated(result):
-        return Row(OURS, None, None, None, False, words)
+        return ComparisonRow(OURS, None, None, None, False, words)
     answers: list[Answer] = [(estimate.soft_iron, estimate.hard_iron_gauss)]
-    return Row(
+    return ComparisonRow(
         OURS,
         estimate.soft_iron,
         estimate.hard_iron_gauss,
@@ -114,7 +114,7 @@ def saturated(result: BatchResult) -> str:
     return stuck(np.vstack([block.raw_b_gauss for block in _blocks(result)]))
 
 
-def table(rows: Sequence[Row]) -> list[str]:
+def table(rows: Sequence[ComparisonRow]) -> list[str]:
     """One line a method: hard iron, gyro bias, spreads of the corrected field, or why it failed."""
     head = f"{'method':20}{'hard iron [mG]':>28}{'gyro bias [mrad/s]':>26}"
     lines = [f"{head}{'spread':>9}{'held out':>10}"]

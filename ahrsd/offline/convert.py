@@ -26,15 +26,15 @@ from ahrsd.recording.column_names import ACCEL, GYRO, MAG, TIME
 from ahrsd.recording.foreign.formats import format_of, ready
 from ahrsd.recording.foreign.sensors import Choice
 from ahrsd.recording.limits import TABLE_ROWS
-from ahrsd.recording.opening import Kind, Recording, open_recording
+from ahrsd.recording.opening import Recording, RecordingKind, open_recording
 from ahrsd.recording.table_writer import write_table
 from ahrsd.samples import Array, SampleBlock
 
 _UNITS = "time_s s, mag gauss, gyro rad/s, accel m/s^2 (specific force); others by their names"
 _CLOCKS = {
-    Kind.TABLE: "time_s of the table",
-    Kind.BYTES: "the device's where it sends one, else even steps at its rate",
-    Kind.CAPTURE: "the device's where it sends one, else the host's times of arrival",
+    RecordingKind.TABLE: "time_s of the table",
+    RecordingKind.BYTES: "the device's where it sends one, else even steps at its rate",
+    RecordingKind.CAPTURE: "the device's where it sends one, else the host's times of arrival",
 }
 _HEAD_BYTES = 4096
 
@@ -85,7 +85,9 @@ def converted(
         "format": f"{recording.kind.value} of ahrsd",
         "frame": "the sensor's own axes, as recorded",
         "clock": _CLOCKS[recording.kind],
-        "undone": "nothing" if recording.kind is Kind.TABLE else "registers 23 and 84, where known",
+        "undone": "nothing"
+        if recording.kind is RecordingKind.TABLE
+        else "registers 23 and 84, where known",
         **recording.facts,
         "file": recording.name,
         "unit": _UNITS,

@@ -29,7 +29,7 @@ from ahrsd.events import Event, SamplesSeen
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS
-from ahrsd.recording.opening import Kind, open_recording
+from ahrsd.recording.opening import RecordingKind, open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
 
@@ -63,7 +63,7 @@ def load_track(
     """
     recording = open_recording(path, rate_hz, check_units=False, columns=columns)
     said_hz = None if spec is None else spec.rate_hz
-    if recording.kind is Kind.TABLE:
+    if recording.kind is RecordingKind.TABLE:
         table = recording.table or read_table(path, check_units=False, columns=columns)
         blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
     else:

@@ -23,7 +23,7 @@ from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
 from ahrsd.recording.bytestream import read_stream, unpacked_size
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
-from ahrsd.recording.opening import Kind, Recording, open_recording
+from ahrsd.recording.opening import Recording, RecordingKind, open_recording
 from ahrsd.stream.assembler import NoSamplesError
 from ahrsd.stream.rate import rate_of
 from ahrsd.writeback.permissions import Mode
@@ -91,7 +91,7 @@ def replay(
             break
     _refuse_empty(core, path)
     done.warnings += [note for note in recording.notes if note not in done.warnings]
-    if recording.kind is Kind.BYTES and _cut_off(core):
+    if recording.kind is RecordingKind.BYTES and _cut_off(core):
         done.warnings.append("the recording ends in the middle of a message")
     return done
 
@@ -103,9 +103,9 @@ def _share_of_file(recording: Recording) -> Callable[[Input], int]:
     """
     scale = 1.0
     on_disk = recording.path.stat().st_size
-    if recording.kind is Kind.TABLE and recording.table is not None:
+    if recording.kind is RecordingKind.TABLE and recording.table is not None:
         scale = on_disk / max(len(recording.table.rows), 1)
-    elif recording.kind is Kind.BYTES:
+    elif recording.kind is RecordingKind.BYTES:
         scale = on_disk / max(unpacked_size(recording.path), 1)
 
     def share(item: Input) -> int:
@@ -128,7 +128,7 @@ def _settings(
         if config not in (Config(), own):
             recording.notes.append("the configuration in the capture was used, not the given one")
         return replace(core_settings(own), beside=BESIDE_KEY in recording.header)
-    if recording.kind is not Kind.BYTES:
+    if recording.kind is not RecordingKind.BYTES:
         return core_settings(config, policy=_PASSIVE, held_out=held_out)
     found = None if rate_hz is not None else rate_of(read_stream(recording.path))
     rate = rate_hz if found is None else found[0]
@@ -138,7 +138,7 @@ def _settings(
 
 def _registers_first(recording: Recording) -> Iterator[Input]:
     """The inputs; registers that were read at the beginning are known from the first byte on."""
-    if recording.kind is not Kind.CAPTURE:
+    if recording.kind is not RecordingKind.CAPTURE:
         yield from recording.inputs()
         return
     found = next((i for i in recording.inputs() if isinstance(i, RegistersKnown)), None)

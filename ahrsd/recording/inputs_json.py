@@ -41,7 +41,7 @@ from ahrsd.inputs import (
 )
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.journal_history import StoredRecord
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 
 _TYPES = {
     kind.__name__: kind
@@ -164,7 +164,7 @@ def _check(kind: type, body: dict[str, Any]) -> None:
         for record in body.get("records", []):
             StoredRecord.of(record)
     elif kind is Journalled:
-        Kind(body["kind"])
+        RecordKind(body["kind"])
 
 
 def _check_register(number: int, values: tuple[Any, ...]) -> None:

@@ -26,7 +26,7 @@ _END = "end of recording"
 _HEAD_BYTES = 4096
 
 
-class Kind(Enum):
+class RecordingKind(Enum):
     """Where the samples of a recording come from."""
 
     CAPTURE = "capture"
@@ -35,9 +35,9 @@ class Kind(Enum):
 
 
 _SUFFIXES = {
-    ".mcap": Kind.CAPTURE,
-    **dict.fromkeys((".vnraw", ".vnbin", ".bin", ".log", ".txt"), Kind.BYTES),
-    **dict.fromkeys((".csv", ".parquet"), Kind.TABLE),
+    ".mcap": RecordingKind.CAPTURE,
+    **dict.fromkeys((".vnraw", ".vnbin", ".bin", ".log", ".txt"), RecordingKind.BYTES),
+    **dict.fromkeys((".csv", ".parquet"), RecordingKind.TABLE),
 }
 
 
@@ -53,7 +53,7 @@ class Recording:
     """
 
     path: Path
-    kind: Kind
+    kind: RecordingKind
     rate_hz: float | None = None
     header: Mapping[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -72,7 +72,7 @@ class Recording:
             return _table_inputs(self.table)
         if self.sent:
             return iter((*self.sent, Stop(self.sent[-1].host_ns, _END)))
-        if self.kind is Kind.CAPTURE:
+        if self.kind is RecordingKind.CAPTURE:
             return self._capture_inputs()
         return _byte_inputs(self)
 
@@ -147,13 +147,15 @@ def open_recording(
     named = _SUFFIXES.get(suffix.lower())
     kind = _in_spite_of_its_name(path, start, named) or named or _by_content(path, start)
     unused = (
-        ["--columns is not used: it is for tables"] if columns and kind is not Kind.TABLE else []
+        ["--columns is not used: it is for tables"]
+        if columns and kind is not RecordingKind.TABLE
+        else []
     )
-    if kind is Kind.BYTES:
+    if kind is RecordingKind.BYTES:
         return Recording(path, kind, rate_hz, notes=unused)
     if rate_hz is not None:
         unused.append(f"--rate is not used: a {kind.value} has its own time")
-    if kind is Kind.CAPTURE:
+    if kind is RecordingKind.CAPTURE:
         from ahrsd.recording.capture import CaptureReader  # a table needs no reader of captures
 
         header = CaptureReader(path).header
@@ -178,7 +180,9 @@ def _of_another(path: Path, other: Format, choice: Choice, rate_hz: float | None
                 notes.append("--columns is not used: the recording holds what the device sent")
             notes += [f"{other.what.removeprefix('is ')}: {note}" for note in found.notes]
             facts = {"format": other.what.removeprefix("is "), **found.facts}
-            return Recording(path, Kind.CAPTURE, notes=notes, sent=found.received, facts=facts)
+            return Recording(
+                path, RecordingKind.CAPTURE, notes=notes, sent=found.received, facts=facts
+            )
         rows = merged(path, found, choice.columns)
     except MemoryError as error:
         raise RecordingError(
@@ -186,7 +190,9 @@ def _of_another(path: Path, other: Format, choice: Choice, rate_hz: float | None
         ) from error
     facts = {"format": other.what.removeprefix("is "), **rows.facts}
     table = table_of(path, rows.columns, [*rows.notes, _said(facts)])
-    return Recording(path, Kind.TABLE, notes=[*notes, *table.notes], table=table, facts=facts)
+    return Recording(
+        path, RecordingKind.TABLE, notes=[*notes, *table.notes], table=table, facts=facts
+    )
 
 
 def _said(facts: Mapping[str, str]) -> str:
@@ -197,19 +203,21 @@ def _said(facts: Mapping[str, str]) -> str:
     )
 
 
-def _in_spite_of_its_name(path: Path, start: bytes, named: Kind | None) -> Kind | None:
+def _in_spite_of_its_name(
+    path: Path, start: bytes, named: RecordingKind | None
+) -> RecordingKind | None:
     """What a file is beyond doubt whatever it is called.  RecordingError where it is packed."""
     from ahrsd.recording import blocks
 
     if blocks.is_mcap(start) or start.startswith(PARQUET):
         if is_gzip(path):
             raise RecordingError(path, "is packed with gzip", f"unpack it: gunzip {path.name}")
-        return Kind.CAPTURE if blocks.is_mcap(start) else Kind.TABLE
+        return RecordingKind.CAPTURE if blocks.is_mcap(start) else RecordingKind.TABLE
     line = _as_utf8(start).lstrip().split(b"\n", 1)[0]
-    if named is Kind.BYTES and _names_columns(line):
-        return Kind.TABLE
-    if named is Kind.TABLE and line.startswith(b"$VN"):
-        return Kind.BYTES
+    if named is RecordingKind.BYTES and _names_columns(line):
+        return RecordingKind.TABLE
+    if named is RecordingKind.TABLE and line.startswith(b"$VN"):
+        return RecordingKind.BYTES
     return None
 
 
@@ -222,12 +230,12 @@ def _as_utf8(start: bytes) -> bytes:
     return start if encoding is None else start.decode(encoding, "ignore").encode("utf-8")
 
 
-def _by_content(path: Path, start: bytes) -> Kind:
+def _by_content(path: Path, start: bytes) -> RecordingKind:
     line = _as_utf8(start).split(b"\n", 1)[0]
     if b"time_s" in line or _names_columns(line):
-        return Kind.TABLE
+        return RecordingKind.TABLE
     if b"$VN" in start or b"\xfa" in start:
-        return Kind.BYTES
+        return RecordingKind.BYTES
     raise RecordingError(
         path,
         "is no recording by its name nor by its content",

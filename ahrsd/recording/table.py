@@ -156,7 +156,7 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     covariates, text_names = _covariates(table, found)
     notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
     numbers = np.arange(len(table)) + first_row
-    rows = _Rows(path, values, covariates, numbers, notes, sources=found.sources)
+    rows = _TableRows(path, values, covariates, numbers, notes, sources=found.sources)
     return _checked(rows, check_units)
 
 
@@ -168,11 +168,11 @@ def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
     refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
     values = {name: columns[name] for name in REQUIRED}
     covariates = {name: column for name, column in columns.items() if name not in REQUIRED}
-    rows = _Rows(path, values, covariates, np.arange(len(columns[TIME])) + 1, list(notes))
+    rows = _TableRows(path, values, covariates, np.arange(len(columns[TIME])) + 1, list(notes))
     return _checked(rows, True)
 
 
-def _checked(columns: _Rows, check_units: bool) -> Table:
+def _checked(columns: _TableRows, check_units: bool) -> Table:
     path = columns.path
     columns.hold_readings()
     columns.drop_doubles()
@@ -186,7 +186,7 @@ def _checked(columns: _Rows, check_units: bool) -> Table:
 
 
 @dataclass(slots=True)
-class _Rows:
+class _TableRows:
     """A table's columns on their way to samples: what is dropped here is dropped in all of them.
 
     numbers (N,): of the rows in the file; sources: the file's columns by canonical name

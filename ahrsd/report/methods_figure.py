@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.baselines.comparison import Row
+from ahrsd.baselines.comparison import ComparisonRow
 from ahrsd.printable import drawn
 from ahrsd.report.figures import AFTER, GREY, SERIES, save_png
 
@@ -20,12 +20,12 @@ _WORDS = 150
 _WORST_SHOWN = 5.0  # times the median length of the bars; a longer one is cut and its number said
 
 
-def write_methods_figure(path: Path, title: str, rows: Sequence[Row]) -> None:
+def write_methods_figure(path: Path, title: str, rows: Sequence[ComparisonRow]) -> None:
     """As PNG, one line a method.  Raises OSError."""
     save_png(lambda: _draw(title, rows), path, _WIDTH_PX, _ROW_PX * len(rows) + 170)
 
 
-def _draw(title: str, rows: Sequence[Row]) -> Figure:
+def _draw(title: str, rows: Sequence[ComparisonRow]) -> Figure:
     figure = Figure(figsize=(12.5, (_ROW_PX * len(rows) + 170) / 120.0), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=[3, 2])
     _hard_iron(left, rows)
@@ -36,7 +36,7 @@ def _draw(title: str, rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _hard_iron(axes: Axes, rows: Sequence[Row]) -> None:
+def _hard_iron(axes: Axes, rows: Sequence[ComparisonRow]) -> None:
     given = [
         (k, row.hard_iron_gauss) for k, row in enumerate(rows) if row.hard_iron_gauss is not None
     ]
@@ -59,7 +59,7 @@ def _hard_iron(axes: Axes, rows: Sequence[Row]) -> None:
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
 
 
-def _spread(axes: Axes, rows: Sequence[Row]) -> None:
+def _spread(axes: Axes, rows: Sequence[ComparisonRow]) -> None:
     shown = [(k, 100 * row.held_out, row) for k, row in enumerate(rows) if row.held_out is not None]
     reach = _reach(np.array([value for _, value, _ in shown]))
     for k, value, row in shown:

@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.montecarlo.summary import BOUNDED, Row
+from ahrsd.montecarlo.summary import BOUNDED, SummaryRow
 from ahrsd.report.figures import GREY, SERIES, TRUTH, save_png
 
 _TITLES = {
@@ -20,13 +20,13 @@ _HONEST = (0.85, 1.20)
 _PANEL_PX, _ROW_PX = 420, 380
 
 
-def write_montecarlo_figure(path: Path, sets: Sequence[tuple[str, Sequence[Row]]]) -> None:
+def write_montecarlo_figure(path: Path, sets: Sequence[tuple[str, Sequence[SummaryRow]]]) -> None:
     """One row of panels per set (name, rows of the summary), as PNG.  Raises OSError."""
     width = _PANEL_PX * (len(BOUNDED) + 1)
     save_png(lambda: _draw(sets), path, width, _ROW_PX * len(sets) + 40)
 
 
-def _draw(sets: Sequence[tuple[str, Sequence[Row]]]) -> Figure:
+def _draw(sets: Sequence[tuple[str, Sequence[SummaryRow]]]) -> Figure:
     columns = len(BOUNDED) + 1
     figure = Figure(figsize=(3.4 * columns, 3.0 * len(sets) + 0.4), layout="constrained")
     grid = figure.subplots(len(sets), columns, squeeze=False)
@@ -42,12 +42,12 @@ def _draw(sets: Sequence[tuple[str, Sequence[Row]]]) -> Figure:
     return figure
 
 
-def _colours(rows: Sequence[Row]) -> dict[str, str]:
+def _colours(rows: Sequence[SummaryRow]) -> dict[str, str]:
     names = dict.fromkeys(row.method for row in rows)
     return {name: SERIES[k % len(SERIES)] for k, name in enumerate(names)}
 
 
-def _errors(axes: Axes, name: str, rows: Sequence[Row], colours: dict[str, str]) -> None:
+def _errors(axes: Axes, name: str, rows: Sequence[SummaryRow], colours: dict[str, str]) -> None:
     title, unit = _TITLES[name]
     first = next(iter(colours), "")
     bound = [(r.at_s, r.against_bound[name].bound) for r in rows if r.method == first]
@@ -63,7 +63,7 @@ def _errors(axes: Axes, name: str, rows: Sequence[Row], colours: dict[str, str])
     axes.set_xlabel("time [s]")
 
 
-def _nees(axes: Axes, rows: Sequence[Row], colours: dict[str, str]) -> None:
+def _nees(axes: Axes, rows: Sequence[SummaryRow], colours: dict[str, str]) -> None:
     axes.axhspan(*_HONEST, color=GREY, alpha=0.2)
     for method, colour in colours.items():
         shown = [r for r in rows if r.method == method and r.nees is not None]

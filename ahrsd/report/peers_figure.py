@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.montecarlo.summary import BOUNDED, Row
+from ahrsd.montecarlo.summary import BOUNDED, SummaryRow
 from ahrsd.report.figures import GREY, SERIES, TRUTH, save_png
 
 _TITLES = {
@@ -20,7 +20,7 @@ _WIDTH_PX, _ROW_PX = 1500, 34
 
 
 def write_peers_figure(
-    path: Path, sets: Sequence[tuple[str, Sequence[Row]]], ours: Sequence[str]
+    path: Path, sets: Sequence[tuple[str, Sequence[SummaryRow]]], ours: Sequence[str]
 ) -> None:
     """One line per method, one mark per set (name, rows at one time), as PNG.  Raises OSError.
 
@@ -30,7 +30,7 @@ def write_peers_figure(
     save_png(lambda: _draw(sets, ours), path, _WIDTH_PX, _ROW_PX * lines + 160)
 
 
-def _draw(sets: Sequence[tuple[str, Sequence[Row]]], ours: Sequence[str]) -> Figure:
+def _draw(sets: Sequence[tuple[str, Sequence[SummaryRow]]], ours: Sequence[str]) -> Figure:
     methods = [row.method for row in sets[0][1]]
     figure = Figure(figsize=(12.5, 0.28 * len(methods) + 1.3), layout="constrained")
     panels = figure.subplots(1, len(BOUNDED), sharey=True)
@@ -46,7 +46,7 @@ def _draw(sets: Sequence[tuple[str, Sequence[Row]]], ours: Sequence[str]) -> Fig
     return figure
 
 
-def _panel(axes: Axes, name: str, sets: Sequence[tuple[str, Sequence[Row]]]) -> None:
+def _panel(axes: Axes, name: str, sets: Sequence[tuple[str, Sequence[SummaryRow]]]) -> None:
     axes.axvline(1.0, color=TRUTH, linewidth=3, alpha=0.5, label="bound")
     for k, (label, rows) in enumerate(sets):
         shown = [

@@ -10,7 +10,7 @@ Pure: nothing here reads or writes a file.
 
 from ahrsd.simulation.experiment import Experiment
 from ahrsd.simulation.motion import MOTIONS, SCENARIOS
-from ahrsd.simulation.scenarios import Settings, simulate
+from ahrsd.simulation.scenarios import ScenarioSettings, simulate
 from ahrsd.simulation.truth import Iron, Truth
 
-__all__ = ["MOTIONS", "SCENARIOS", "Experiment", "Iron", "Settings", "Truth", "simulate"]
+__all__ = ["MOTIONS", "SCENARIOS", "Experiment", "Iron", "ScenarioSettings", "Truth", "simulate"]

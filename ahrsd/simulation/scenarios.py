@@ -13,7 +13,7 @@ from ahrsd.simulation.truth import Iron, Truth
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class ScenarioSettings:
     """One experiment. The same settings give the same samples, bit by bit, on one machine.
 
     scenario: "wam", "mam" or "lam"; motion: "slow" or "rov"
@@ -57,7 +57,7 @@ def generator(seed: int, purpose: int) -> np.random.Generator:
     return np.random.default_rng([seed, purpose])
 
 
-def simulate(settings: Settings) -> Experiment:
+def simulate(settings: ScenarioSettings) -> Experiment:
     """Make the experiment."""
     s = settings
     fine = motion.sinusoids(s.scenario, s.motion, generator(s.seed, 0), s.samples, s.rate_hz)

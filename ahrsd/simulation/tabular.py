@@ -10,7 +10,7 @@ import numpy as np
 from ahrsd.samples import Array
 from ahrsd.simulation.experiment import Experiment
 from ahrsd.simulation.motion import quaternion
-from ahrsd.simulation.scenarios import Settings
+from ahrsd.simulation.scenarios import ScenarioSettings
 from drivers.vn100.sentences import encode_sentence
 
 
@@ -53,7 +53,7 @@ def truth_json(experiment: Experiment, made_from: dict[str, object]) -> dict[str
     }
 
 
-def settings_json(settings: Settings) -> dict[str, object]:
+def settings_json(settings: ScenarioSettings) -> dict[str, object]:
     """The settings by name, the sensor in the theses' terms."""
     iron = settings.iron
     return {

@@ -33,7 +33,7 @@ from ahrsd.stream.decompensation import (
     RegisterValues,
     sample_blocks,
 )
-from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, Steps, StreamTimeline
+from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, StreamTimeline, TimelineSteps
 from ahrsd.stream.output_rates import RateWatch, offered_rate, rate_by_registers, rate_of_arrivals
 from ahrsd.stream.rate import TurnWatch, attitude_columns
 from drivers.vn100.binary import BinaryLayout
@@ -413,7 +413,7 @@ class Stream:
         line = np.minimum(self.clock.to_host(time_s), arrivals)
         return np.asarray(np.maximum.accumulate(np.where(np.isfinite(line), line, arrivals)))
 
-    def _note(self, steps: Steps) -> None:
+    def _note(self, steps: TimelineSteps) -> None:
         facts = self.facts
         kept = int(np.count_nonzero(steps.keep))
         facts.samples += kept

@@ -20,14 +20,15 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.calibration import Affine
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.stream.device_clock import Mask, Steps
+from ahrsd.stream.device_clock import Mask, TimelineSteps
+from drivers.vn100.fields import Layout
 
 MAG, ACCEL, GYRO, ROTATION, HSI_CONTROL, HSI_RESULT = 23, 25, 84, 26, 44, 47
 HSI_APPLIED: Final = 3  # register 44, field Output
@@ -129,7 +130,7 @@ def _hsi(values: RegisterValues, warnings: list[str]) -> Affine | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Epoch:
+class RegisterEpoch:
     """A stretch of time with the same registers; compensation None: nobody knows which."""
 
     number: int
@@ -146,58 +147,38 @@ class RegisterEpochs:
     """Which registers were in force when, on the host's time line; the newest 64 are kept."""
 
     def __init__(self) -> None:
-        self._epochs = [Epoch(0, -np.inf, Compensation.unknown())]
+        self._epochs = [RegisterEpoch(0, -np.inf, Compensation.unknown())]
 
     @property
-    def now(self) -> Epoch:
+    def now(self) -> RegisterEpoch:
         """The newest epoch."""
         return self._epochs[-1]
 
-    def begin(self, since_s: float, compensation: Compensation | None) -> Epoch:
+    def begin(self, since_s: float, compensation: Compensation | None) -> RegisterEpoch:
         """From `since_s` on these registers act; None: they are being changed.
 
         A time before the newest epoch's is moved up to it: time does not run back.
         """
         since_s = max(since_s, self.now.since_s)
-        epoch = Epoch(self.now.number + 1, since_s, compensation)
+        epoch = RegisterEpoch(self.now.number + 1, since_s, compensation)
         self._epochs = [*self._epochs, epoch][-EPOCHS_KEPT:]
         return epoch
 
     def begin_anew(self) -> None:
         """Nobody knows the registers, at whatever instant: the device may be another one."""
-        self._epochs = [Epoch(self.now.number + 1, -np.inf, None)]
+        self._epochs = [RegisterEpoch(self.now.number + 1, -np.inf, None)]
 
-    def at(self, host_s: float) -> Epoch:
+    def at(self, host_s: float) -> RegisterEpoch:
         """The epoch of an instant; before the oldest that is kept, that one."""
         index = bisect_right(self._epochs, host_s, key=lambda epoch: epoch.since_s) - 1
         return self._epochs[max(index, 0)]
 
-    def split(self, host_s: Array) -> list[tuple[slice, Epoch]]:
+    def split(self, host_s: Array) -> list[tuple[slice, RegisterEpoch]]:
         """Runs of (N,) ascending instants with one epoch each."""
         starts = [epoch.since_s for epoch in self._epochs[1:]]
         cuts = np.searchsorted(host_s, np.array(starts, dtype=np.float64), side="left")
         edges = sorted({0, *cuts.tolist(), len(host_s)})
         return [(slice(a, b), self.at(float(host_s[a]))) for a, b in pairwise(edges) if b > a]
-
-
-class Column(Protocol):
-    """One value of a message: its name carries quantity, axis and unit."""
-
-    @property
-    def name(self) -> str:
-        """As in `uncomp_mag_x_gauss`."""
-
-
-class Layout(Protocol):
-    """A message or packet layout of the driver."""
-
-    @property
-    def name(self) -> str:
-        """As in `VNYMR`."""
-
-    @property
-    def columns(self) -> Sequence[Column]:
-        """In the order of the values."""
 
 
 class MissingQuantityError(ValueError):
@@ -320,7 +301,7 @@ def _find(names: list[str], quantity: str, unit: str) -> list[int] | None:
 def sample_blocks(
     extractor: Extractor,
     extracted: Extracted,
-    steps: Steps,
+    steps: TimelineSteps,
     host_s: Array,
     epochs: RegisterEpochs,
 ) -> list[SampleBlock]:

@@ -212,7 +212,7 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Steps:
+class TimelineSteps:
     """What `StreamTimeline` says about N device times `time_s`.
 
     keep:     (N,) false for repeated times and for samples marked unusable
@@ -250,7 +250,7 @@ class StreamTimeline:
         """Median step of late; nan before two samples."""
         return self._period_s
 
-    def extend(self, time_s: Array, usable: Mask | None = None) -> Steps:
+    def extend(self, time_s: Array, usable: Mask | None = None) -> TimelineSteps:
         """Steps of N further samples at device times (N,).
 
         A repeated time is dropped; a time that falls begins a new run; a step over 1.5 periods is
@@ -274,7 +274,7 @@ class StreamTimeline:
             elif not first[k]:
                 dt_s[k] = step_s
             self._last_used_s = now_s
-        return Steps(
+        return TimelineSteps(
             np.asarray(time_s, float),
             keep,
             dt_s,

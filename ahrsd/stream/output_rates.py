@@ -12,11 +12,11 @@ registers may have been changed since they were read, and other models divide an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 
 from drivers.vn100.binary import BinaryLayout, binary_layout
+from drivers.vn100.fields import Layout
 from drivers.vn100.registers import ASYNC_OUTPUT_RATES_HZ, BINARY_OUTPUTS, SAMPLE_RATE_HZ
 from drivers.vn100.sentences import MESSAGES
 
@@ -29,14 +29,6 @@ _WATCHED, _WATCHED_S = 100, 4.0
 _DIFFERS = 0.15  # an adapter's bunches are far below, another divisor is above
 _WINDOWS = 2
 _STANDS_S = 1.0  # so much time of messages with one stamp: the host's clock stands
-
-
-class Layout(Protocol):
-    """A message or packet layout of the driver."""
-
-    @property
-    def name(self) -> str:
-        """As in `VNYMR`."""
 
 
 def rate_by_registers(layout: Layout, registers: RegisterValues) -> tuple[float, str] | None:

@@ -14,8 +14,7 @@ mean rate w over the same step; v = w dt. Two things follow:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Protocol
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from ahrsd import so3
 from ahrsd.samples import Array
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
+from drivers.vn100.fields import Layout
 
 _SOURCE = "from the device's attitude against its rate"
 _LEAST_RATE_RAD_S = 0.1
@@ -42,22 +42,6 @@ _LONGEST_LOSS_S = 10.0
 _SPEED_S = 1.0  # memory of the speed of turning, which says how long a loss was
 _ATTITUDE = ("yaw_rad", "pitch_rad", "roll_rad")
 _GYROS = tuple(tuple(f"{name}_{a}_rad_s" for a in "xyz") for name in ("gyro", "uncomp_gyro"))
-
-
-class Column(Protocol):
-    """A value of a message."""
-
-    @property
-    def name(self) -> str:
-        """As in `yaw_rad`."""
-
-
-class Layout(Protocol):
-    """A message or packet layout of the driver."""
-
-    @property
-    def columns(self) -> Sequence[Column]:
-        """In the order of the values."""
 
 
 def attitude_columns(layout: Layout) -> list[int] | None:

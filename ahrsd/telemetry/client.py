@@ -30,7 +30,7 @@ def find_socket(state_directory: Path) -> Path:
     return own if own.exists() or not _SYSTEM.exists() else _SYSTEM
 
 
-class Asked:
+class DaemonConnection:
     """A connection. Raises DeviceError with one clear line where no daemon answers."""
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +56,7 @@ class Asked:
             self._socket.close()
             raise
 
-    def __enter__(self) -> Asked:
+    def __enter__(self) -> DaemonConnection:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -22,7 +22,7 @@ Samples = list[tuple[tuple[str, ...], float]]  # values of the labels, value
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MetricRow:
     """One metric: name, kind, help, labels, and where its numbers come from."""
 
     name: str
@@ -72,68 +72,68 @@ def _capture(status: Status) -> Samples:
 
 
 METRICS: Final = (
-    Row("ahrsd_link_up", "gauge", "The port is open", (), _number("link", "open")),
-    Row("ahrsd_bytes", "counter", "Bytes from the device", (), _number("link", "bytes")),
-    Row("ahrsd_messages", "counter", "Valid messages", (), _number("stream", "messages")),
-    Row("ahrsd_rejected", "counter", "Messages refused", (), _number("stream", "rejected")),
-    Row(
+    MetricRow("ahrsd_link_up", "gauge", "The port is open", (), _number("link", "open")),
+    MetricRow("ahrsd_bytes", "counter", "Bytes from the device", (), _number("link", "bytes")),
+    MetricRow("ahrsd_messages", "counter", "Valid messages", (), _number("stream", "messages")),
+    MetricRow("ahrsd_rejected", "counter", "Messages refused", (), _number("stream", "rejected")),
+    MetricRow(
         "ahrsd_skipped_bytes",
         "counter",
         "Bytes that were in no message",
         (),
         _number("stream", "skipped_bytes"),
     ),
-    Row("ahrsd_samples", "counter", "Samples taken", (), _number("stream", "samples")),
-    Row("ahrsd_sample_rate_hertz", "gauge", "Sample rate", (), _number("stream", "rate_hz")),
-    Row("ahrsd_gaps", "counter", "Gaps in the stream", (), _number("stream", "gaps")),
-    Row(
+    MetricRow("ahrsd_samples", "counter", "Samples taken", (), _number("stream", "samples")),
+    MetricRow("ahrsd_sample_rate_hertz", "gauge", "Sample rate", (), _number("stream", "rate_hz")),
+    MetricRow("ahrsd_gaps", "counter", "Gaps in the stream", (), _number("stream", "gaps")),
+    MetricRow(
         "ahrsd_device_restarts",
         "counter",
         "Restarts of the device",
         (),
         _number("stream", "restarts"),
     ),
-    Row("ahrsd_device_errors", "counter", "VNERR reported", (), _number("stream", "faults")),
-    Row(
+    MetricRow("ahrsd_device_errors", "counter", "VNERR reported", (), _number("stream", "faults")),
+    MetricRow(
         "ahrsd_heading_sigma_degrees",
         "gauge",
         "Heading, worst 1 sigma",
         (),
         _number("estimate", "heading_sigma_deg"),
     ),
-    Row(
+    MetricRow(
         "ahrsd_converged",
         "gauge",
         "The estimate has converged",
         (),
         _number("estimate", "converged"),
     ),
-    Row(
+    MetricRow(
         "ahrsd_hard_iron_gauss",
         "gauge",
         "Hard iron",
         ("axis",),
         _axes("estimate", "hard_iron_gauss"),
     ),
-    Row(
+    MetricRow(
         "ahrsd_gyro_bias_radians_per_second",
         "gauge",
         "Gyro bias",
         ("axis",),
         _axes("estimate", "gyro_bias_rad_s"),
     ),
-    Row("ahrsd_gate_open", "gauge", "1 where the gate holds nothing back", ("gate",), _gates),
-    Row("ahrsd_state", "gauge", "1 for the write-back's state", ("state",), _states),
-    Row("ahrsd_locked", "gauge", "A person locked the write-back", (), _locked),
-    Row(
+    MetricRow("ahrsd_gate_open", "gauge", "1 where the gate holds nothing back", ("gate",), _gates),
+    MetricRow("ahrsd_state", "gauge", "1 for the write-back's state", ("state",), _states),
+    MetricRow("ahrsd_locked", "gauge", "A person locked the write-back", (), _locked),
+    MetricRow(
         "ahrsd_flash_writes",
         "counter",
         "Flash writes of this device, by its journal",
         (),
         _number("write_back", "flashes"),
     ),
-    Row("ahrsd_capture_failing", "gauge", "Records are being lost", (), _capture),
-    Row(
+    MetricRow("ahrsd_capture_failing", "gauge", "Records are being lost", (), _capture),
+    MetricRow(
         "ahrsd_viewer_dropped",
         "counter",
         "Batches that the viewer did not take",

@@ -25,7 +25,7 @@ LONGEST_REQUEST: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class SocketRequest:
     """What a client wants; `streams` is empty but for `watch`."""
 
     ask: str
@@ -36,7 +36,7 @@ class BadRequest(ValueError):
     """A line that is no request; the text says what is wrong and what is allowed."""
 
 
-def parse_request(line: bytes) -> Request:
+def parse_request(line: bytes) -> SocketRequest:
     """A request out of one line. Raises BadRequest, and nothing else on any bytes."""
     try:
         body = json.loads(line)
@@ -48,13 +48,13 @@ def parse_request(line: bytes) -> Request:
     if ask not in ASKS:
         raise BadRequest(f"ask = {str(ask)[:40]!r}: must be one of {', '.join(ASKS)}")
     if ask != "watch":
-        return Request(ask)
+        return SocketRequest(ask)
     of = body.get("of", ["status", "events"])
     if not isinstance(of, list) or not of or not all(isinstance(one, str) for one in of):
         raise BadRequest(f"of: must be a list of {', '.join(STREAMS)}")
     if wrong := sorted(set(of) - set(STREAMS)):
         raise BadRequest(f"of: {wrong[0][:40]!r} is none of {', '.join(STREAMS)}")
-    return Request(ask, frozenset(of))
+    return SocketRequest(ask, frozenset(of))
 
 
 def line_of(body: Mapping[str, object]) -> bytes:

@@ -24,7 +24,7 @@ from ahrsd.telemetry.protocol import (
     SCHEMA,
     STREAMS,
     BadRequest,
-    Request,
+    SocketRequest,
     line_of,
     parse_request,
 )
@@ -204,7 +204,7 @@ class SocketServer:
             return
         client.outbox.answer(line_of(self._reply(client, request)))
 
-    def _reply(self, client: Client, request: Request) -> dict[str, object]:
+    def _reply(self, client: Client, request: SocketRequest) -> dict[str, object]:
         if request.ask == "watch":
             client.streams = request.streams
             self._wanted = frozenset().union(*(c.streams for c in self._clients.values()))

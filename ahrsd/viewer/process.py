@@ -82,7 +82,7 @@ class Output:
         self._stream = self.recorder = None
 
 
-class Outputs:
+class RerunOutputs:
     """The file, part after part, and the live server."""
 
     def __init__(self, settings: ProcessSettings) -> None:
@@ -221,7 +221,7 @@ def report(fault: str) -> None:
         return
 
 
-def batches(outputs: Outputs) -> Iterator[list[Item]]:
+def batches(outputs: RerunOutputs) -> Iterator[list[Item]]:
     """Batches from standard input until it ends; `outputs` gets its turn about once a second."""
     buffer = bytearray()
     next_tick_s = 0.0
@@ -255,7 +255,7 @@ def main() -> None:
     os.set_blocking(_status, False)
     os.dup2(2, 1)  # whatever a library prints must not look like a report
     os.nice(5)
-    outputs = Outputs(ProcessSettings.from_json(sys.argv[1]))
+    outputs = RerunOutputs(ProcessSettings.from_json(sys.argv[1]))
     for batch in batches(outputs):
         outputs.write(batch)
     outputs.finish()

@@ -10,21 +10,25 @@ from typing import Any
 from ahrsd.events import Noted, RegisterWritten, StateChanged
 from ahrsd.writeback.actions import (
     Action,
+    AppendToJournal,
     CancelProcedure,
     Emit,
     InForce,
-    JournalAppend,
     RunProcedure,
 )
 from ahrsd.writeback.clocks import Now, Stamp, plausible
-from ahrsd.writeback.journal_history import History, JournalRecord
+from ahrsd.writeback.journal_history import JournalHistory, JournalRecord
 from ahrsd.writeback.permissions import Purpose
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from drivers.vn100.commands import Command, Procedure
 from drivers.vn100.registers import Values
 
 JOURNAL_AGAIN_S = 30.0
-_ANNOUNCED = (Kind.PREPARED, Kind.RAM_VERIFIED, Kind.FLASH_SENT)  # not on the disk: not done
+_ANNOUNCED = (
+    RecordKind.PREPARED,
+    RecordKind.RAM_VERIFIED,
+    RecordKind.FLASH_SENT,
+)  # not on the disk: not done
 
 
 class ActionOutbox:
@@ -37,7 +41,7 @@ class ActionOutbox:
     def __init__(self, allow: Callable[[Command, Purpose, float], bool]) -> None:
         self.host_s = self.at_s = 0.0
         self.device_s: float | None = None  # the device's time since its start-up, as last heard
-        self.history = History()
+        self.history = JournalHistory()
         self.running = ""
         self._allow = allow
         self._wall_offset_s: float | None = None
@@ -45,8 +49,8 @@ class ActionOutbox:
         self._boot: tuple[str, float | None] = ("", None)  # and what to add to `host_s`
         self._serial: int | None = None
         self._bound_s = 0.0
-        self._asked: deque[tuple[Kind, dict[str, Any], History]] = deque()
-        self._unjournaled: list[tuple[Kind, dict[str, Any]]] = []
+        self._asked: deque[tuple[RecordKind, dict[str, Any], JournalHistory]] = deque()
+        self._unjournaled: list[tuple[RecordKind, dict[str, Any]]] = []
         self._journal_again_s = 0.0
         self._runs = 0
         self._out: list[Action] = []
@@ -98,7 +102,7 @@ class ActionOutbox:
         self._serial, self._bound_s, self.device_s = serial, self.host_s, None
         remembered = self.history.open
         if journal is not None or remembered is None or remembered.serial != serial:
-            self.history = History.of(journal or ())
+            self.history = JournalHistory.of(journal or ())
             for kind, facts in self._unjournaled:
                 self.history = self.history.with_record(kind, facts)
 
@@ -111,7 +115,7 @@ class ActionOutbox:
         """One action more."""
         self._out.append(action)
 
-    def record(self, kind: Kind, **facts: object) -> None:
+    def record(self, kind: RecordKind, **facts: object) -> None:
         """Append to the journal, behind what it lacks; the history takes it as given."""
         self.journal_again()
         transaction = self.history.open
@@ -123,13 +127,13 @@ class ActionOutbox:
         before, self.history = self.history, self.history.with_record(kind, complete)
         self._append(kind, complete, before)
 
-    def journaled(self, kind: Kind) -> bool:
+    def journaled(self, kind: RecordKind) -> bool:
         """A record of this kind is on the disk; whether nothing is left that is not."""
         self._answered(kind)
         self.journal_again()
         return not self._unjournaled and not self._asked
 
-    def not_journaled(self, kind: Kind) -> None:
+    def not_journaled(self, kind: RecordKind) -> None:
         """A record of this kind is not on the disk: what it announced does not happen."""
         asked = self._answered(kind)
         if asked is None:
@@ -138,7 +142,7 @@ class ActionOutbox:
         if kind not in _ANNOUNCED:
             self._unjournaled.append((kind, facts))
             self._journal_again_s = self.host_s + JOURNAL_AGAIN_S
-        elif kind is Kind.PREPARED:  # nothing was opened
+        elif kind is RecordKind.PREPARED:  # nothing was opened
             self.history = replace(
                 self.history,
                 open=before.open,
@@ -158,11 +162,13 @@ class ActionOutbox:
         for kind, facts in waiting:
             self._append(kind, facts, self.history)
 
-    def _append(self, kind: Kind, facts: dict[str, Any], before: History) -> None:
+    def _append(self, kind: RecordKind, facts: dict[str, Any], before: JournalHistory) -> None:
         self._asked.append((kind, facts, before))
-        self.ask(JournalAppend(kind, facts))
+        self.ask(AppendToJournal(kind, facts))
 
-    def _answered(self, kind: Kind) -> tuple[Kind, dict[str, Any], History] | None:
+    def _answered(
+        self, kind: RecordKind
+    ) -> tuple[RecordKind, dict[str, Any], JournalHistory] | None:
         asked = next((one for one in self._asked if one[0] is kind), None)
         if asked is not None:
             self._asked.remove(asked)

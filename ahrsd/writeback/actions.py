@@ -13,7 +13,7 @@ from typing import Any
 
 from ahrsd.events import Event
 from ahrsd.writeback.permissions import Purpose
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from drivers.vn100.commands import Command, Procedure
 from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import Values
@@ -40,10 +40,10 @@ class CancelProcedure:
 
 
 @dataclass(frozen=True, slots=True)
-class JournalAppend:
+class AppendToJournal:
     """Make this record durable."""
 
-    kind: Kind
+    kind: RecordKind
     facts: Mapping[str, Any]
 
 
@@ -89,7 +89,7 @@ class CalibrateAnew:
 Action = (
     RunProcedure
     | CancelProcedure
-    | JournalAppend
+    | AppendToJournal
     | Emit
     | InForce
     | SetUpStream

@@ -23,7 +23,7 @@ from ahrsd.writeback.composition import (
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
-from ahrsd.writeback.reconcile import Kind, found
+from ahrsd.writeback.reconcile import RecordKind, found
 from ahrsd.writeback.safeguards import Safeguards
 from ahrsd.writeback.states import (
     LIVED_WITH,
@@ -33,9 +33,9 @@ from ahrsd.writeback.states import (
     Signal,
     State,
 )
-from ahrsd.writeback.transaction import Outcome, Transaction, check, roll_back, save, stage
-from ahrsd.writeback.trial import Finding as Verdict
+from ahrsd.writeback.transaction import ProcedureOutcome, Transaction, check, roll_back, save, stage
 from ahrsd.writeback.trial import Trial
+from ahrsd.writeback.trial import TrialVerdict as Verdict
 from drivers.vn100.procedures import Identity, Unit
 from drivers.vn100.registers import Values, same
 
@@ -78,7 +78,7 @@ class Flow:
             State.STAGED: self._enter_staged,
             State.TRIAL: self._enter_trial,
             State.PROVEN: self._enter_proven,
-            State.SAVE_PREPARING: lambda _: self.outbox.record(Kind.FLASH_SENT),
+            State.SAVE_PREPARING: lambda _: self.outbox.record(RecordKind.FLASH_SENT),
             State.SAVING: self._enter_saving,
             State.COMMITTED: self._enter_rest,
             State.CONFIRMED: self._enter_rest,
@@ -122,7 +122,7 @@ class Flow:
         elif self.state is State.TRIAL and self.proven_to_s is not None:
             if self.safe.examined(self.proven_to_s) and not self.safe.disagrees:
                 self.safe.proof_waits = ""
-                self.outbox.record(Kind.PROVEN, reason=self.passed)
+                self.outbox.record(RecordKind.PROVEN, reason=self.passed)
                 self.signal(Signal.TRIAL_PASSED, self.passed)
         elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
             self.roll_back("void", self.safe.void)
@@ -145,7 +145,7 @@ class Flow:
             return
         self._cause = "device"
         if self.state is State.STAGING:
-            self.outbox.record(Kind.RAM_FAILED, reason="no end")
+            self.outbox.record(RecordKind.RAM_FAILED, reason="no end")
         self.signal(Signal.TIMEOUT, "nothing came in time")
 
     def roll_back(self, cause: str, reason: str) -> None:
@@ -277,7 +277,7 @@ class Flow:
 
     def lock(self, reason: str) -> Answer:
         """No writes from now on; what is only in RAM is undone first."""
-        self.outbox.record(Kind.LOCKED, reason=reason)
+        self.outbox.record(RecordKind.LOCKED, reason=reason)
         if Signal.ROLL_BACK in TABLE[self.state] and self.state is not State.FAULT:
             self.roll_back("operator", reason)
         self.signal_if(Signal.LOCK, reason)
@@ -285,7 +285,7 @@ class Flow:
 
     def unlock(self, reason: str) -> Answer:
         """A person looked and found it right. In FAULT: look again."""
-        self.outbox.record(Kind.UNLOCKED, reason=reason)
+        self.outbox.record(RecordKind.UNLOCKED, reason=reason)
         if self.state is State.FAULT:
             self.outbox.ask(IdentifyAgain())
         self.signal_if(Signal.UNLOCK, reason)
@@ -300,8 +300,8 @@ class Flow:
     def _enter_rest(self, reason: str) -> None:
         """Nothing under way. A transaction that never sent a write ends here."""
         self.proposal, self.approver = None, ""
-        if self.outbox.history.last is Kind.PREPARED:
-            self.outbox.record(Kind.ABORTED, reason=reason)
+        if self.outbox.history.last is RecordKind.PREPARED:
+            self.outbox.record(RecordKind.ABORTED, reason=reason)
         if self.outbox.history.locked is not None:
             self.signal(Signal.LOCK, self.outbox.history.locked)
 
@@ -335,7 +335,9 @@ class Flow:
             model=identity.model,
         )
         gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
-        self.outbox.record(Kind.PREPARED, gates=gates, interlock="safe", **transaction.facts())
+        self.outbox.record(
+            RecordKind.PREPARED, gates=gates, interlock="safe", **transaction.facts()
+        )
 
     def _enter_checking(self, reason: str) -> None:
         self.outbox.run(
@@ -351,7 +353,7 @@ class Flow:
         transaction = self.transaction()
         self._now_in_force(transaction.new)
         self.outbox.written(transaction.old, transaction.new, "verified")
-        self.outbox.record(Kind.RAM_VERIFIED, serial=transaction.serial)
+        self.outbox.record(RecordKind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
         self.passed, self.proven_to_s = "", None
@@ -365,9 +367,9 @@ class Flow:
         """
         if self._resumed:
             self.prove_again(reason)
-        if self.outbox.history.last is Kind.FLASH_SENT:
+        if self.outbox.history.last is RecordKind.FLASH_SENT:
             self._save_from_s = self.outbox.host_s + RETRY_SAVE_S
-            self.outbox.record(Kind.PROVEN, reason=reason, unsent=True)
+            self.outbox.record(RecordKind.PROVEN, reason=reason, unsent=True)
 
     def _enter_saving(self, reason: str) -> None:
         make = partial(save, self.transaction(), self.session_keys)
@@ -377,10 +379,10 @@ class Flow:
         # what was read back as ours and holds something else by now is somebody else's; out of a
         # FAULT a person has looked, and after a write that failed it is what that write left
         last = self.outbox.history.last
-        only_ours = last is not Kind.RAM_FAILED and not self._from_fault
-        if last is not Kind.ROLLBACK:
+        only_ours = last is not RecordKind.RAM_FAILED and not self._from_fault
+        if last is not RecordKind.ROLLBACK:
             self.outbox.record(
-                Kind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
+                RecordKind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
             )
         self.outbox.in_force(None)
         make = partial(roll_back, self.transaction(), only_ours=only_ours)
@@ -395,12 +397,12 @@ class Flow:
 
     # -- procedures end -------------------------------------------------------------------------
 
-    def on_outcome(self, outcome: Outcome) -> None:
+    def on_outcome(self, outcome: ProcedureOutcome) -> None:
         """A procedure came to its end and says how it found the device."""
         if outcome.other is not None:
             self._another(outcome.other, outcome.written)
             return
-        endings: dict[State, Callable[[Outcome], None]] = {
+        endings: dict[State, Callable[[ProcedureOutcome], None]] = {
             State.CHECKING: self._checked,
             State.STAGING: self._written,
             State.SAVING: self._saved,
@@ -438,12 +440,12 @@ class Flow:
         """In the middle of a procedure; the journal that is open is still the first device's."""
         reason = f"another device answers: {unit}"
         if self.state is State.SAVING:
-            self.outbox.record(Kind.PROVEN, reason=reason, unsent=True)
+            self.outbox.record(RecordKind.PROVEN, reason=reason, unsent=True)
         elif self.state in (State.CHECKING, State.STAGING) and not written:
-            self.outbox.record(Kind.ABORTED, reason=reason)
+            self.outbox.record(RecordKind.ABORTED, reason=reason)
         self.another(unit)
 
-    def _checked(self, outcome: Outcome) -> None:
+    def _checked(self, outcome: ProcedureOutcome) -> None:
         if outcome.as_expected:
             self.signal(Signal.DONE, "the device holds what the journal says")
             return
@@ -451,7 +453,7 @@ class Flow:
         self.outbox.ask(IdentifyAgain())
         self.signal(Signal.DIFFERS, f"somebody else changed the device: {outcome}")
 
-    def _written(self, outcome: Outcome) -> None:
+    def _written(self, outcome: ProcedureOutcome) -> None:
         if outcome.as_expected:
             self.signal(Signal.DONE, "both registers and the device's identity were read back")
         elif outcome.written:  # a restart, or somebody else, between the writes
@@ -459,9 +461,9 @@ class Flow:
         else:
             self.signal(Signal.DIFFERS, f"read back: {outcome}")
 
-    def _saved(self, outcome: Outcome) -> None:
+    def _saved(self, outcome: ProcedureOutcome) -> None:
         if outcome.as_expected:
-            self.outbox.record(Kind.FLASH_ACKED, serial=self.transaction().serial)
+            self.outbox.record(RecordKind.FLASH_ACKED, serial=self.transaction().serial)
             self.signal(Signal.DONE, "the device acknowledged the save")
         else:
             self.outbox.note("warning", f"not saved: {outcome}")
@@ -476,7 +478,7 @@ class Flow:
         if self.state is State.STAGING:
             transaction = self.transaction()
             self.outbox.written(transaction.old, transaction.new, "failed")
-            self.outbox.record(Kind.RAM_FAILED, reason=reason)
+            self.outbox.record(RecordKind.RAM_FAILED, reason=reason)
         self.signal(Signal.FAILED, reason)
         if saving:
             self._set_up_stream()
@@ -486,17 +488,17 @@ class Flow:
         if self.session_keys:
             self.outbox.ask(SetUpStream())
 
-    def _rolled_back(self, outcome: Outcome) -> None:
+    def _rolled_back(self, outcome: ProcedureOutcome) -> None:
         transaction = self.transaction()
         if not outcome.as_expected:
             self.look_closer(f"not rolled back: {outcome}")
             return
         self._now_in_force(transaction.old)
         self.outbox.written(transaction.new, transaction.old, "undone")
-        self.outbox.record(Kind.ROLLED_BACK, serial=transaction.serial)
+        self.outbox.record(RecordKind.ROLLED_BACK, serial=transaction.serial)
         history = self.outbox.history
         if history.rollbacks >= self.policy.rollbacks_to_lock and history.locked is None:
-            self.outbox.record(Kind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
+            self.outbox.record(RecordKind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
         self.signal(Signal.DONE, "the old values were read back")
 
     # -- after an interruption ---------------------------------------------------------------------
@@ -517,8 +519,8 @@ class Flow:
             if resolution.signal in (Signal.UNDO, Signal.RESUME_TRIAL) and not undoable:
                 self.signal(Signal.UNRESOLVED, f"{resolution.text}, and this mode may not write")
                 return
-            if resolution.record is Kind.FOREIGN:
-                self.outbox.record(Kind.LOCKED, reason=resolution.text)
+            if resolution.record is RecordKind.FOREIGN:
+                self.outbox.record(RecordKind.LOCKED, reason=resolution.text)
             if resolution.record is not None:
                 self.outbox.record(resolution.record, reason=resolution.text)
             self.signal(resolution.signal, resolution.text)

@@ -11,16 +11,22 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 from ahrsd.writeback.clocks import UNKNOWN, Stamp
-from ahrsd.writeback.reconcile import OF_OUTPUTS, OPEN, Kind
+from ahrsd.writeback.reconcile import OF_OUTPUTS, OPEN, RecordKind
 from ahrsd.writeback.transaction import Transaction
 from drivers.vn100.registers import Values, same
 
 TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
 BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
 
-_TOUCHED_RAM: Final = (Kind.RAM_VERIFIED, Kind.RAM_FAILED, Kind.ROLLBACK)
-_HOLDS_NEW: Final = (Kind.FLASH_ACKED, Kind.CONFIRMED)
-_HOLDS_OLD: Final = (Kind.ABORTED, Kind.ROLLED_BACK, Kind.REVERTED, Kind.LOST, Kind.NOT_SAVED)
+_TOUCHED_RAM: Final = (RecordKind.RAM_VERIFIED, RecordKind.RAM_FAILED, RecordKind.ROLLBACK)
+_HOLDS_NEW: Final = (RecordKind.FLASH_ACKED, RecordKind.CONFIRMED)
+_HOLDS_OLD: Final = (
+    RecordKind.ABORTED,
+    RecordKind.ROLLED_BACK,
+    RecordKind.REVERTED,
+    RecordKind.LOST,
+    RecordKind.NOT_SAVED,
+)
 
 
 class JournalRecord(Protocol):
@@ -28,7 +34,7 @@ class JournalRecord(Protocol):
 
     @property
     def kind(self) -> str:
-        """One of `Kind`; others (of other commands) are passed over."""
+        """One of `RecordKind`; others (of other commands) are passed over."""
 
     @property
     def facts(self) -> Mapping[str, Any]:
@@ -49,7 +55,7 @@ class StoredRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class History:
+class JournalHistory:
     """A journal, summed up.
 
     open:      the transaction that no record ended yet, the kind and time of its newest record
@@ -61,7 +67,7 @@ class History:
     """
 
     open: Transaction | None = None
-    last: Kind | None = None
+    last: RecordKind | None = None
     last_at: Stamp = UNKNOWN
     newest_at: Stamp = UNKNOWN
     ram_writes_at: tuple[Stamp, ...] = ()
@@ -76,27 +82,27 @@ class History:
     broken: str | None = None
 
     @staticmethod
-    def of(records: Iterable[JournalRecord]) -> History:
+    def of(records: Iterable[JournalRecord]) -> JournalHistory:
         """The history that these records tell, oldest first."""
-        history = History()
+        history = JournalHistory()
         for record in records:
-            if record.kind in Kind.__members__:
-                history = history.with_record(Kind(record.kind), record.facts)
+            if record.kind in RecordKind.__members__:
+                history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
                 history = history._with_values(record.facts)
         return history
 
-    def with_record(self, kind: Kind, facts: Mapping[str, Any]) -> History:
+    def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
         """The history after one more record."""
         if kind in OF_OUTPUTS:
             return self
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
-        if kind is Kind.LOCKED:
+        if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
-        if kind is Kind.UNLOCKED:
+        if kind is RecordKind.UNLOCKED:
             return replace(now, locked=None, torn=False, rollbacks=0)
-        if kind is Kind.PREPARED:
+        if kind is RecordKind.PREPARED:
             try:
                 transaction = Transaction.from_facts(facts)
             except (KeyError, TypeError, ValueError):
@@ -109,7 +115,7 @@ class History:
         """Whether a record has these values of this register, as found or as meant."""
         return any(n == number and same(n, known, values) for n, known in self.values)
 
-    def _with_values(self, facts: Mapping[str, Any]) -> History:
+    def _with_values(self, facts: Mapping[str, Any]) -> JournalHistory:
         try:
             found = [
                 (int(number), tuple(row))
@@ -120,25 +126,27 @@ class History:
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
 
-    def _counted(self, kind: Kind, facts: Mapping[str, Any], at: Stamp) -> History:
+    def _counted(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
         """Budgets and rollbacks."""
         changes: dict[str, Any] = {}
-        if kind in _TOUCHED_RAM and self.last is Kind.PREPARED:
+        if kind in _TOUCHED_RAM and self.last is RecordKind.PREPARED:
             changes["ram_writes_at"] = (*self.ram_writes_at, at)[-TIMES_KEPT:]
-        if kind is Kind.FLASH_SENT:
+        if kind is RecordKind.FLASH_SENT:
             changes["flashes_at"] = (*self.flashes_at, at)[-TIMES_KEPT:]
             changes["flashes"] = self.flashes + 1
-        if kind is Kind.PROVEN:
+        if kind is RecordKind.PROVEN:
             changes["rollbacks"] = 0
-        if kind is Kind.PROVEN and self.last is Kind.FLASH_SENT:  # it was not sent after all
+        if (
+            kind is RecordKind.PROVEN and self.last is RecordKind.FLASH_SENT
+        ):  # it was not sent after all
             changes["flashes_at"] = self.flashes_at[:-1]
             changes["flashes"] = self.flashes - 1
-        if kind is Kind.ROLLBACK and facts.get("counts"):
+        if kind is RecordKind.ROLLBACK and facts.get("counts"):
             changes["rollbacks"] = self.rollbacks + 1
             changes["rollback_at"] = at
         return replace(self, **changes)
 
-    def _moved(self, kind: Kind, facts: Mapping[str, Any], at: Stamp) -> History:
+    def _moved(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
         """Where the open transaction stands; a record of another one says nothing about it."""
         if self.open is None or facts.get("txn", self.open.id) != self.open.id:
             return self
@@ -146,9 +154,12 @@ class History:
         if kind in _HOLDS_NEW:
             holds = self.open.new
         elif kind in _HOLDS_OLD:
-            saved = kind is Kind.REVERTED and self.last in (Kind.FLASH_SENT, Kind.FLASH_ACKED)
+            saved = kind is RecordKind.REVERTED and self.last in (
+                RecordKind.FLASH_SENT,
+                RecordKind.FLASH_ACKED,
+            )
             holds = None if saved else self.open.old  # the next start may bring either
-        torn = self.torn or kind is Kind.FLASH_TORN
+        torn = self.torn or kind is RecordKind.FLASH_TORN
         still_open = self.open if kind in OPEN else None
         return replace(self, open=still_open, last=kind, last_at=at, holds=holds, torn=torn)
 

@@ -24,11 +24,11 @@ from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.actions import Action, IdentifyAgain, Look
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
 from ahrsd.writeback.flow import Answer, Flow
-from ahrsd.writeback.journal_history import History, JournalRecord
+from ahrsd.writeback.journal_history import JournalHistory, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
 from ahrsd.writeback.recheck import Recheck
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.restarts import RestartWatch
 from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
@@ -39,8 +39,8 @@ from ahrsd.writeback.states import (
     Signal,
     State,
 )
-from ahrsd.writeback.transaction import HSI_RESULT, Outcome
-from ahrsd.writeback.trial import Finding, TrialMetrics
+from ahrsd.writeback.transaction import HSI_RESULT, ProcedureOutcome
+from ahrsd.writeback.trial import TrialMetrics, TrialVerdict
 from drivers.vn100.procedures import Identity, Seen, differences
 from drivers.vn100.registers import COMPENSATING, Values, same
 
@@ -57,9 +57,9 @@ RESTS = frozenset(  # states in which a proven restart since the newest record h
 )
 
 _AWAITED = {
-    State.PREPARING: Kind.PREPARED,
-    State.STAGED: Kind.RAM_VERIFIED,
-    State.SAVE_PREPARING: Kind.FLASH_SENT,
+    State.PREPARING: RecordKind.PREPARED,
+    State.STAGED: RecordKind.RAM_VERIFIED,
+    State.SAVE_PREPARING: RecordKind.FLASH_SENT,
 }
 _NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
@@ -93,7 +93,7 @@ class WriteBack:
         return self._flow.proposal
 
     @property
-    def history(self) -> History:
+    def history(self) -> JournalHistory:
         """The device's journal, summed up."""
         return self._outbox.history
 
@@ -380,13 +380,13 @@ class WriteBack:
             finding, reason = self._flow.trial.judge(metrics)
             if self.state is State.PROVEN:
                 self._flow.judge_proof(finding, reason)
-            elif finding is Finding.FAILED:
+            elif finding is TrialVerdict.FAILED:
                 self._flow.roll_back("trial", reason)
-            elif finding is Finding.PASSED and not self._flow.passed:
+            elif finding is TrialVerdict.PASSED and not self._flow.passed:
                 self._recheck.now(host_s)  # proven is what the device still holds
                 self._ask_again()
             if self.state is State.TRIAL:
-                self._flow.passed = reason if finding is Finding.PASSED else ""
+                self._flow.passed = reason if finding is TrialVerdict.PASSED else ""
                 if not self._flow.passed:
                     self._flow.proven_to_s = None
         return self._answer()
@@ -399,7 +399,7 @@ class WriteBack:
             self._flow.roll_back("stop", "the daemon stops")
         return self._answer()
 
-    def on_journal_ok(self, kind: Kind, host_s: float) -> list[Action]:
+    def on_journal_ok(self, kind: RecordKind, host_s: float) -> list[Action]:
         """The record is on the disk."""
         self._outbox.host_s = host_s
         self._safe.journal_ok = self._outbox.journaled(kind)
@@ -407,7 +407,7 @@ class WriteBack:
             self._flow.signal(Signal.JOURNALLED, f"{kind.value} is in the journal")
         return self._answer()
 
-    def on_journal_failed(self, kind: Kind, error: str, host_s: float) -> list[Action]:
+    def on_journal_failed(self, kind: RecordKind, error: str, host_s: float) -> list[Action]:
         """The record is not on the disk. What waited for it does not happen."""
         self._outbox.host_s, self._safe.journal_ok = host_s, False
         self._outbox.not_journaled(kind)
@@ -417,9 +417,9 @@ class WriteBack:
         return self._answer()
 
     def on_procedure_finished(self, name: str, result: object, host_s: float) -> list[Action]:
-        """A procedure ended and returned an Outcome."""
+        """A procedure ended and returned a ProcedureOutcome."""
         self._outbox.host_s = host_s
-        if name == self._outbox.running and isinstance(result, Outcome):
+        if name == self._outbox.running and isinstance(result, ProcedureOutcome):
             self._outbox.running = ""
             self._flow.on_outcome(result)
             if not result.as_expected:

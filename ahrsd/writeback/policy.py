@@ -8,7 +8,7 @@ from typing import Final, Literal
 from ahrsd.calibration import Estimate
 from ahrsd.writeback.clocks import Now, passed_s
 from ahrsd.writeback.composition import Proposal
-from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
 
 DAY_S: Final = 86400.0
@@ -105,12 +105,12 @@ class WriteBackPolicy:
     still: StillPolicy = field(default_factory=StillPolicy)
 
 
-def margin(policy: WriteBackPolicy, history: History) -> float:
+def margin(policy: WriteBackPolicy, history: JournalHistory) -> float:
     """How much larger a change or a gain must be than usual: more after a rollback."""
     return policy.margin_after_rollback if history.rollbacks else 1.0
 
 
-def worth_writing(policy: WriteBackPolicy, history: History, proposal: Proposal) -> bool:
+def worth_writing(policy: WriteBackPolicy, history: JournalHistory, proposal: Proposal) -> bool:
     """Whether the change is large enough."""
     factor = margin(policy, history)
     return (
@@ -131,7 +131,7 @@ def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate)
     return proposal.heading_change_deg > heading_deg or proposal.gyro_change_rad_s > gyro_rad_s
 
 
-def ram_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:
+def ram_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> list[str]:
     """Why RAM must not be written now; empty where it may. Times as `clocks.passed_s` reads them:
     no clock that was wrong, or was set, makes one longer.
     """
@@ -158,7 +158,7 @@ def ram_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]
     return reasons
 
 
-def flash_budget(policy: WriteBackPolicy, history: History, now: Now) -> list[str]:
+def flash_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> list[str]:
     """Why flash must not be written now; empty where it may."""
     reasons: list[str] = []
     *flashes_s, _ = passed_s((*history.flashes_at, history.newest_at), now)

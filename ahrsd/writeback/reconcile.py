@@ -22,7 +22,7 @@ from ahrsd.writeback.states import Signal
 from drivers.vn100.registers import Values, same
 
 
-class Kind(StrEnum):
+class RecordKind(StrEnum):
     """Records of the journal. The first group leaves a transaction open, the second ends it."""
 
     PREPARED = "PREPARED"  # J1: what the device holds, what it shall hold; nothing sent yet
@@ -49,18 +49,18 @@ class Kind(StrEnum):
 
 
 OPEN: Final = (
-    Kind.PREPARED,
-    Kind.RAM_FAILED,
-    Kind.RAM_VERIFIED,
-    Kind.PROVEN,
-    Kind.ROLLBACK,
-    Kind.FLASH_SENT,
-    Kind.FLASH_ACKED,
+    RecordKind.PREPARED,
+    RecordKind.RAM_FAILED,
+    RecordKind.RAM_VERIFIED,
+    RecordKind.PROVEN,
+    RecordKind.ROLLBACK,
+    RecordKind.FLASH_SENT,
+    RecordKind.FLASH_ACKED,
 )
-OF_OUTPUTS: Final = (Kind.OUTPUTS_KEPT, Kind.OUTPUTS_BACK)
+OF_OUTPUTS: Final = (RecordKind.OUTPUTS_KEPT, RecordKind.OUTPUTS_BACK)
 
 
-class Found(Enum):
+class DeviceContents(Enum):
     """What the device holds in the registers of a transaction; a restart counts if it is proven."""
 
     OLD = "the old values"
@@ -77,7 +77,7 @@ class Resolution:
     """What follows: the signal, the record that says so (if any), the level and text of a note."""
 
     signal: Signal
-    record: Kind | None
+    record: RecordKind | None
     level: str
     text: str
 
@@ -87,23 +87,23 @@ def found(
     new: Mapping[int, Values],
     device: Mapping[int, Values],
     restarted: bool,
-) -> Found:
+) -> DeviceContents:
     """Compare register by register, as the device prints them. A register not read is neither."""
     is_old = {n: n in device and same(n, old[n], device[n]) for n in new}
     is_new = {n: n in device and same(n, new[n], device[n]) for n in new}
     if all(is_old.values()):
-        return Found.OLD_AFTER_RESTART if restarted else Found.OLD
+        return DeviceContents.OLD_AFTER_RESTART if restarted else DeviceContents.OLD
     if all(is_new.values()):
-        return Found.NEW_AFTER_RESTART if restarted else Found.NEW
+        return DeviceContents.NEW_AFTER_RESTART if restarted else DeviceContents.NEW
     if all(is_old[n] or is_new[n] for n in new):
-        return Found.MIXED_AFTER_RESTART if restarted else Found.MIXED
-    return Found.NEITHER
+        return DeviceContents.MIXED_AFTER_RESTART if restarted else DeviceContents.MIXED
+    return DeviceContents.NEITHER
 
 
 def _foreign(what: str) -> Resolution:
     return Resolution(
         Signal.FOREIGN,
-        Kind.FOREIGN,
+        RecordKind.FOREIGN,
         "error",
         f"{what}, and the device holds values that nobody here wrote; compare it with the journal, "
         "then unlock",
@@ -111,17 +111,17 @@ def _foreign(what: str) -> Resolution:
 
 
 def _undo(level: str, text: str) -> Resolution:
-    return Resolution(Signal.UNDO, Kind.ROLLBACK, level, text)
+    return Resolution(Signal.UNDO, RecordKind.ROLLBACK, level, text)
 
 
-def _closed(record: Kind, level: str, text: str) -> Resolution:
+def _closed(record: RecordKind, level: str, text: str) -> Resolution:
     return Resolution(Signal.NOTHING_OPEN, record, level, text)
 
 
 def _saved_by_others(what: str) -> Resolution:
     return Resolution(
         Signal.FOREIGN,
-        Kind.FOREIGN,
+        RecordKind.FOREIGN,
         "error",
         f"{what}, and somebody else saved registers: the device holds new values after a restart; "
         "compare it with the journal, then unlock",
@@ -130,129 +130,141 @@ def _saved_by_others(what: str) -> Resolution:
 
 _TORN: Final = Resolution(
     Signal.TORN,
-    Kind.FLASH_TORN,
+    RecordKind.FLASH_TORN,
     "error",
     "FLASH TORN: saving was interrupted and the device holds neither the old nor the new values; "
     "write the journal's old values by hand, check the heading, then unlock",
 )
 _CONFIRMED: Final = Resolution(
-    Signal.READ_CONFIRMED, Kind.CONFIRMED, "info", "the new values survived a restart"
+    Signal.READ_CONFIRMED, RecordKind.CONFIRMED, "info", "the new values survived a restart"
 )
 _BACK: Final = (
     "the device has its old values, and nobody knows why: a rollback that could not be journaled, "
     "a restart that nobody saw, or a person"
 )
 
-TABLE: Final[dict[Kind, dict[Found, Resolution]]] = {
-    Kind.PREPARED: {
-        Found.OLD: _closed(Kind.ABORTED, "info", "a write was prepared and never made"),
-        Found.OLD_AFTER_RESTART: _closed(
-            Kind.ABORTED, "info", "a write was prepared; the device restarted with its old values"
+TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
+    RecordKind.PREPARED: {
+        DeviceContents.OLD: _closed(
+            RecordKind.ABORTED, "info", "a write was prepared and never made"
         ),
-        Found.NEW: Resolution(
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.ABORTED,
+            "info",
+            "a write was prepared; the device restarted with its old values",
+        ),
+        DeviceContents.NEW: Resolution(
             Signal.RESUME_TRIAL,
-            Kind.RAM_VERIFIED,
+            RecordKind.RAM_VERIFIED,
             "warning",
             "the device holds the new values of an interrupted write; the trial begins",
         ),
-        Found.NEW_AFTER_RESTART: _saved_by_others("a write was prepared"),
-        Found.MIXED: _undo("warning", "a write was interrupted between its registers"),
-        Found.MIXED_AFTER_RESTART: _saved_by_others("a write was prepared"),
-        Found.NEITHER: _foreign("a write was prepared"),
+        DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a write was prepared"),
+        DeviceContents.MIXED: _undo("warning", "a write was interrupted between its registers"),
+        DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a write was prepared"),
+        DeviceContents.NEITHER: _foreign("a write was prepared"),
     },
-    Kind.RAM_FAILED: {
-        Found.OLD: _closed(Kind.ROLLED_BACK, "info", "a failed write is undone"),
-        Found.OLD_AFTER_RESTART: _closed(Kind.ROLLED_BACK, "info", "a failed write is undone"),
-        Found.NEW: _undo("warning", "a failed write was not undone"),
-        Found.NEW_AFTER_RESTART: _saved_by_others("a write failed"),
-        Found.MIXED: _undo("warning", "a failed write was not undone"),
-        Found.MIXED_AFTER_RESTART: _saved_by_others("a write failed"),
-        Found.NEITHER: _foreign("a write failed"),
+    RecordKind.RAM_FAILED: {
+        DeviceContents.OLD: _closed(RecordKind.ROLLED_BACK, "info", "a failed write is undone"),
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.ROLLED_BACK, "info", "a failed write is undone"
+        ),
+        DeviceContents.NEW: _undo("warning", "a failed write was not undone"),
+        DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a write failed"),
+        DeviceContents.MIXED: _undo("warning", "a failed write was not undone"),
+        DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a write failed"),
+        DeviceContents.NEITHER: _foreign("a write failed"),
     },
-    Kind.RAM_VERIFIED: {
-        Found.OLD: _closed(Kind.REVERTED, "warning", f"a trial was under way; {_BACK}"),
-        Found.OLD_AFTER_RESTART: _closed(
-            Kind.LOST,
+    RecordKind.RAM_VERIFIED: {
+        DeviceContents.OLD: _closed(
+            RecordKind.REVERTED, "warning", f"a trial was under way; {_BACK}"
+        ),
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.LOST,
             "warning",
             "the device restarted during the trial and has its old values: safe",
         ),
-        Found.NEW: Resolution(
+        DeviceContents.NEW: Resolution(
             Signal.RESUME_TRIAL, None, "info", "the device kept the new values; the trial restarts"
         ),
-        Found.NEW_AFTER_RESTART: _saved_by_others("a trial was under way"),
-        Found.MIXED: _undo("warning", "one of two registers went back by itself"),
-        Found.MIXED_AFTER_RESTART: _saved_by_others("a trial was under way"),
-        Found.NEITHER: _foreign("a trial was under way"),
+        DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a trial was under way"),
+        DeviceContents.MIXED: _undo("warning", "one of two registers went back by itself"),
+        DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a trial was under way"),
+        DeviceContents.NEITHER: _foreign("a trial was under way"),
     },
-    Kind.PROVEN: {
-        Found.OLD: _closed(Kind.REVERTED, "warning", f"proven values waited to be saved; {_BACK}"),
-        Found.OLD_AFTER_RESTART: _closed(
-            Kind.LOST,
+    RecordKind.PROVEN: {
+        DeviceContents.OLD: _closed(
+            RecordKind.REVERTED, "warning", f"proven values waited to be saved; {_BACK}"
+        ),
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.LOST,
             "warning",
             "the device restarted before the proven values were saved and has its old ones: safe",
         ),
-        Found.NEW: Resolution(
+        DeviceContents.NEW: Resolution(
             Signal.RESUME_PROVEN, None, "info", "the device kept the proven values"
         ),
-        Found.NEW_AFTER_RESTART: Resolution(
+        DeviceContents.NEW_AFTER_RESTART: Resolution(
             Signal.READ_CONFIRMED,
-            Kind.CONFIRMED,
+            RecordKind.CONFIRMED,
             "warning",
             "somebody else saved the device's registers: the proven values survived a restart",
         ),
-        Found.MIXED: _undo("warning", "one of two registers went back by itself"),
-        Found.MIXED_AFTER_RESTART: _saved_by_others("proven values waited to be saved"),
-        Found.NEITHER: _foreign("proven values waited to be saved"),
+        DeviceContents.MIXED: _undo("warning", "one of two registers went back by itself"),
+        DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("proven values waited to be saved"),
+        DeviceContents.NEITHER: _foreign("proven values waited to be saved"),
     },
-    Kind.ROLLBACK: {
-        Found.OLD: _closed(Kind.ROLLED_BACK, "info", "a rollback is complete"),
-        Found.OLD_AFTER_RESTART: _closed(Kind.ROLLED_BACK, "info", "a rollback is complete"),
-        Found.NEW: _undo("warning", "a rollback was interrupted"),
-        Found.NEW_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
-        Found.MIXED: _undo("warning", "a rollback was interrupted"),
-        Found.MIXED_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
-        Found.NEITHER: _foreign("a rollback was interrupted"),
+    RecordKind.ROLLBACK: {
+        DeviceContents.OLD: _closed(RecordKind.ROLLED_BACK, "info", "a rollback is complete"),
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.ROLLED_BACK, "info", "a rollback is complete"
+        ),
+        DeviceContents.NEW: _undo("warning", "a rollback was interrupted"),
+        DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
+        DeviceContents.MIXED: _undo("warning", "a rollback was interrupted"),
+        DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
+        DeviceContents.NEITHER: _foreign("a rollback was interrupted"),
     },
-    Kind.FLASH_SENT: {
-        Found.OLD: _closed(
-            Kind.REVERTED,
+    RecordKind.FLASH_SENT: {
+        DeviceContents.OLD: _closed(
+            RecordKind.REVERTED,
             "warning",
             f"saving was interrupted; {_BACK}; its flash may hold either, the next restart tells",
         ),
-        Found.OLD_AFTER_RESTART: _closed(
-            Kind.NOT_SAVED,
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.NOT_SAVED,
             "warning",
             "saving was interrupted and the device has its old values: not saved, safe",
         ),
-        Found.NEW: Resolution(
+        DeviceContents.NEW: Resolution(
             Signal.UNRESOLVED,
             None,
             "error",
             "nobody knows whether the registers were saved: switch the device off and on while "
             "this runs, then they are read again",
         ),
-        Found.NEW_AFTER_RESTART: _CONFIRMED,
-        Found.MIXED: _TORN,
-        Found.MIXED_AFTER_RESTART: _TORN,
-        Found.NEITHER: _TORN,
+        DeviceContents.NEW_AFTER_RESTART: _CONFIRMED,
+        DeviceContents.MIXED: _TORN,
+        DeviceContents.MIXED_AFTER_RESTART: _TORN,
+        DeviceContents.NEITHER: _TORN,
     },
-    Kind.FLASH_ACKED: {
-        Found.OLD: _closed(
-            Kind.REVERTED,
+    RecordKind.FLASH_ACKED: {
+        DeviceContents.OLD: _closed(
+            RecordKind.REVERTED,
             "warning",
             f"the new values were saved; {_BACK}; the next restart tells what its flash holds",
         ),
-        Found.OLD_AFTER_RESTART: _closed(
-            Kind.NOT_SAVED,
+        DeviceContents.OLD_AFTER_RESTART: _closed(
+            RecordKind.NOT_SAVED,
             "error",
             "the device acknowledged the save and still has its old values",
         ),
-        Found.NEW: Resolution(
+        DeviceContents.NEW: Resolution(
             Signal.RESUME_COMMITTED, None, "info", "saved; the next restart confirms it"
         ),
-        Found.NEW_AFTER_RESTART: _CONFIRMED,
-        Found.MIXED: _TORN,
-        Found.MIXED_AFTER_RESTART: _TORN,
-        Found.NEITHER: _TORN,
+        DeviceContents.NEW_AFTER_RESTART: _CONFIRMED,
+        DeviceContents.MIXED: _TORN,
+        DeviceContents.MIXED_AFTER_RESTART: _TORN,
+        DeviceContents.NEITHER: _TORN,
     },
 }

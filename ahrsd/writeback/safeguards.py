@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from ahrsd.events import GateResult
 from ahrsd.writeback.clocks import Now
 from ahrsd.writeback.composition import GYRO, MAG
-from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode, Purpose, permitted
 from ahrsd.writeback.policy import VERDICT_AGE_S, WriteBackPolicy, flash_budget, ram_budget
 from ahrsd.writeback.stillness import Stillness
@@ -111,7 +111,7 @@ class Safeguards:
             return ""
         return self.interlock_holds(host_s)
 
-    def write_holds(self, history: History, host_s: float, now: Now) -> list[str]:
+    def write_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
         """Why no write may begin now, but for the approval."""
         reasons = list(self._limits)
         if self.policy.mode < Mode.STAGE:
@@ -128,7 +128,7 @@ class Safeguards:
         reasons += ram_budget(self.policy, history, now)
         return reasons + self._always(host_s)
 
-    def save_holds(self, history: History, host_s: float, now: Now) -> list[str]:
+    def save_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
         """Why the flash may not be written now."""
         reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
         if not self.armed:

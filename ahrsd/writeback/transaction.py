@@ -112,7 +112,7 @@ def _from_json(registers: Mapping[str, list[float | int | str]]) -> dict[int, Va
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ProcedureOutcome:
     """How a procedure ended: as expected, or which registers were not, or what was refused.
 
     other:   who answered, where it was not the transaction's device
@@ -133,7 +133,7 @@ class Outcome:
         return self.why or f"registers {', '.join(map(str, self.differing))} differ"
 
 
-def check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
+def check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
     """Everything is still as the journal will say it was. Changes nothing.
 
     session_keys: settings that the daemon itself changed for the session; they may differ.
@@ -141,7 +141,7 @@ def check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[O
     return quiet(_check(transaction, session_keys))
 
 
-def stage(transaction: Transaction) -> Procedure[Outcome]:
+def stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
     """Write the new values, each read back, then all of them together with who answers.
 
     Nothing is written where the old values are gone.
@@ -149,7 +149,7 @@ def stage(transaction: Transaction) -> Procedure[Outcome]:
     return quiet(_stage(transaction))
 
 
-def roll_back(transaction: Transaction, *, only_ours: bool) -> Procedure[Outcome]:
+def roll_back(transaction: Transaction, *, only_ours: bool) -> Procedure[ProcedureOutcome]:
     """The old values again, read back; a register that has them is not written.
 
     Every register is tried before a failure is reported, and all of them also where the device does
@@ -161,7 +161,7 @@ def roll_back(transaction: Transaction, *, only_ours: bool) -> Procedure[Outcome
     return _roll_back(transaction, only_ours)
 
 
-def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
+def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
     """VNWNV saves all of RAM, so: session settings put back, every register compared, then VNWNV.
 
     Only the registers of the transaction may differ from what the user had, and they must hold the
@@ -195,26 +195,26 @@ def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
     return tuple(changed)
 
 
-def _check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
+def _check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
     if (other := (yield from _other(transaction))) is not None:
-        return Outcome(False, other=other)
+        return ProcedureOutcome(False, other=other)
     return (yield from _compare(transaction, transaction.old, session_keys))
 
 
 def _compare(
     transaction: Transaction, expected: Mapping[int, Values], ignored: frozenset[int]
-) -> Procedure[Outcome]:
+) -> Procedure[ProcedureOutcome]:
     now = yield from read_configuration(transaction.profile)
     wanted = {**transaction.snapshot, **expected}
     differing = tuple(sorted(differences(wanted, now).keys() - ignored - {HSI_RESULT}))
-    return Outcome(not differing, differing)
+    return ProcedureOutcome(not differing, differing)
 
 
-def _stage(transaction: Transaction) -> Procedure[Outcome]:
+def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
     if (other := (yield from _other(transaction))) is not None:
-        return Outcome(False, other=other)
+        return ProcedureOutcome(False, other=other)
     if changed := (yield from _changed(transaction.old)):
-        return Outcome(False, changed)
+        return ProcedureOutcome(False, changed)
     written = False
     for number, values in transaction.new.items():
         refused = yield from _write(transaction, number, values, written)
@@ -224,7 +224,7 @@ def _stage(transaction: Transaction) -> Procedure[Outcome]:
     return (yield from _together(transaction, transaction.new))
 
 
-def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
+def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureOutcome]:
     abandoned = False
     try:
         with suppress(NoReply, DeviceRefused):
@@ -239,17 +239,19 @@ def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
                 yield from resume()
 
 
-def _together(transaction: Transaction, expected: Mapping[int, Values]) -> Procedure[Outcome]:
+def _together(
+    transaction: Transaction, expected: Mapping[int, Values]
+) -> Procedure[ProcedureOutcome]:
     """Both registers in one reading, and whose they are: a restart between two writes shows."""
     if (other := (yield from _stranger(transaction))) is not None:
-        return Outcome(False, other=other, written=True)
+        return ProcedureOutcome(False, other=other, written=True)
     changed = yield from _changed(expected)
-    return Outcome(not changed, changed, written=True)
+    return ProcedureOutcome(not changed, changed, written=True)
 
 
 def _write(
     transaction: Transaction, number: int, values: Values, written: bool
-) -> Procedure[Outcome | None]:
+) -> Procedure[ProcedureOutcome | None]:
     """Write a register of the transaction's device; the outcome where another one answers.
 
     written: whether something was before
@@ -261,7 +263,7 @@ def _write(
     for _ in range(WRITE_TRIES):
         command = _written_once(number, values)
         if (other := (yield from _right_behind(transaction, command))) is not None:
-            return Outcome(False, other=other, written=written)
+            return ProcedureOutcome(False, other=other, written=written)
         written = True
         back = yield from read(number)
         if same(number, values, back[: len(values)]):
@@ -298,14 +300,14 @@ def _right_behind(
     return None
 
 
-def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[Outcome]:
+def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureOutcome]:
     if (other := (yield from _stranger(transaction))) is not None:
-        return Outcome(False, other=other)
+        return ProcedureOutcome(False, other=other)
     if only_ours and (strange := (yield from _strange(transaction))):
-        return Outcome(False, strange)
+        return ProcedureOutcome(False, strange)
     errors: dict[int, Exception] = {}
     for number, values in transaction.old.items():
-        refused: Outcome | None = None
+        refused: ProcedureOutcome | None = None
         try:
             if not same(number, values, (yield from read(number))):
                 refused = yield from _write(transaction, number, values, True)
@@ -330,22 +332,22 @@ def _strange(transaction: Transaction) -> Procedure[tuple[int, ...]]:
     return found
 
 
-def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Outcome]:
+def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
     keys = [number for number in SESSION_SETTINGS if number in session_keys]
     try:
         if (other := (yield from _other(transaction))) is not None:
-            return Outcome(False, other=other)
+            return ProcedureOutcome(False, other=other)
         yield from restore(transaction.snapshot, keys)
         outcome = yield from _compare(transaction, transaction.new, frozenset())
         if outcome.as_expected:
             outcome = yield from _together(transaction, transaction.new)
     except (NotPermitted, RestoreFailed, NoReply, DeviceRefused) as error:
-        return Outcome(False, why=str(error))
+        return ProcedureOutcome(False, why=str(error))
     if outcome.as_expected:
         try:
             other = yield from _right_behind(transaction, partial(save_settings, behind=True))
         except (NotPermitted, TooLate) as error:
-            return Outcome(False, why=str(error))
+            return ProcedureOutcome(False, why=str(error))
         if other is not None:
-            return Outcome(False, other=other)
+            return ProcedureOutcome(False, other=other)
     return outcome

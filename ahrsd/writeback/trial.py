@@ -51,7 +51,7 @@ class TrialMetrics:
         )
 
 
-class Finding(Enum):
+class TrialVerdict(Enum):
     """What the metrics say."""
 
     GOES_ON = "goes on"
@@ -67,23 +67,23 @@ class Trial:
         self._predicted_deg = predicted_jump_deg
         self._worse_since_s: float | None = None
 
-    def judge(self, metrics: TrialMetrics) -> tuple[Finding, str]:
+    def judge(self, metrics: TrialMetrics) -> tuple[TrialVerdict, str]:
         """The finding and its reason. Metrics that are not finite say nothing."""
         if not metrics.finite:
-            return Finding.GOES_ON, "nothing to judge yet"
+            return TrialVerdict.GOES_ON, "nothing to judge yet"
         if reason := self._failure(metrics):
-            return Finding.FAILED, reason
+            return TrialVerdict.FAILED, reason
         policy = self._policy
         if self._worse_since_s is not None:
-            return Finding.GOES_ON, "worse than the old registers for the moment"
+            return TrialVerdict.GOES_ON, "worse than the old registers for the moment"
         # turns end a trial only once they have been judged
         turned = metrics.turns >= policy.turns and np.isfinite(metrics.wrong_sigmas)
         if metrics.duration_s >= policy.duration_s or turned:
-            return Finding.PASSED, (
+            return TrialVerdict.PASSED, (
                 f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
                 f"{metrics.old_figure:.2%} ({metrics.duration_s:.0f} s, {metrics.turns:.1f} turns)"
             )
-        return Finding.GOES_ON, ""
+        return TrialVerdict.GOES_ON, ""
 
     def _failure(self, metrics: TrialMetrics) -> str | None:
         policy = self._policy

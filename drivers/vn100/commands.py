@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from drivers.vn100.decode import Reply
-from drivers.vn100.errors import ERRORS, DriverError, Outcome
+from drivers.vn100.errors import ERRORS, DriverError, Remedy
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,
@@ -243,7 +243,7 @@ def confusable(earlier: Speech, later: Speech) -> bool:
 
 
 # Damaged on the way to the device, so nothing was carried out.
-RETRIED_ERRORS = frozenset(code for code, row in ERRORS.items() if row.outcome is Outcome.RETRY)
+RETRIED_ERRORS = frozenset(code for code, row in ERRORS.items() if row.outcome is Remedy.RETRY)
 # Answers to a command; the others (01, 0A, 0B, FF, unknown ones) are about the device's own state.
 REFUSALS = frozenset({0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0C})
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Literal, Self, TypeVar, cast
 
-from drivers.serial_port import LinkLost, SerialPort
+from drivers.serial_port import PortLost, SerialPort
 from drivers.vn100.commands import (
     QUIET,
     Command,
@@ -23,7 +23,7 @@ from drivers.vn100.commands import (
     reply_time_s,
 )
 from drivers.vn100.procedures import resume
-from drivers.vn100.session import Event, Failed, Finished, Session
+from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
 T = TypeVar("T")
 Direction = Literal["rx", "tx"]
@@ -61,7 +61,7 @@ class Device:
         self._tap = tap
         self._on_event = on_event
         self._session = Session(self._gate, reply_timeout_s=reply_time_s(port.baud))
-        self._outcome: Finished | Failed | None = None
+        self._outcome: ProcedureFinished | ProcedureFailed | None = None
         self._quiet = False
 
     def run(self, procedure: Procedure[T], timeout_s: float = 60.0) -> T:
@@ -95,7 +95,7 @@ class Device:
     def _result(self, timeout_s: float) -> object:
         if self._outcome is None:
             raise TookTooLong(f"{self._port.path}: no end after {timeout_s:g} s, given up")
-        if isinstance(self._outcome, Failed):
+        if isinstance(self._outcome, ProcedureFailed):
             raise self._outcome.error
         return self._outcome.result
 
@@ -127,7 +127,7 @@ class Device:
                     self._take(self._session.receive(data, time.monotonic()))
                 else:
                     self._take(self._session.tick(time.monotonic()))
-        except LinkLost:
+        except PortLost:
             self._session.link_lost(time.monotonic())
             self._quiet = False
             raise
@@ -141,8 +141,10 @@ class Device:
 
     def _take(self, events: list[Event]) -> None:
         for event in events:
-            if isinstance(event, Finished | Failed):
+            if isinstance(event, ProcedureFinished | ProcedureFailed):
                 self._outcome = event
         for event in events:  # afterwards: it may raise
-            if self._on_event is not None and not isinstance(event, Finished | Failed):
+            if self._on_event is not None and not isinstance(
+                event, ProcedureFinished | ProcedureFailed
+            ):
                 self._on_event(event)

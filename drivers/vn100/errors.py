@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 
-class Outcome(Enum):
+class Remedy(Enum):
     """What a program can do about an error."""
 
     RETRY = "retry"  # the command was damaged on the way and not carried out
@@ -25,12 +25,12 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceError:
+class ErrorCode:
     """A row of the table of error codes. `advice` is for a person."""
 
     code: int
     name: str
-    outcome: Outcome
+    outcome: Remedy
     advice: str
 
 
@@ -41,29 +41,21 @@ NO_CHECKSUM = (
 )
 
 _ROWS = (
-    DeviceError(
-        0x01, "hard fault", Outcome.RESET, "its processor restarted; RAM settings are gone"
-    ),
-    DeviceError(0x02, "serial input buffer overflow", Outcome.RETRY, "a line was over 256 bytes"),
-    DeviceError(
-        0x03, "invalid checksum", Outcome.RETRY, "a byte was lost on the way to the device"
-    ),
-    DeviceError(0x04, "invalid command", Outcome.STOP, "this firmware does not know the command"),
-    DeviceError(0x05, "not enough parameters", Outcome.STOP, "this firmware expects more values"),
-    DeviceError(0x06, "too many parameters", Outcome.STOP, "this firmware expects fewer values"),
-    DeviceError(0x07, "invalid parameter", Outcome.STOP, "a value is out of the allowed range"),
-    DeviceError(
-        0x08, "invalid register", Outcome.STOP, "this model or firmware lacks the register"
-    ),
-    DeviceError(0x09, "unauthorized access", Outcome.STOP, "the register is read-only"),
-    DeviceError(
-        0x0A, "watchdog reset", Outcome.RESET, "the device restarted; RAM settings are gone"
-    ),
-    DeviceError(0x0B, "output buffer overflow", Outcome.BANDWIDTH, "lower rates or raise the baud"),
-    DeviceError(0x0C, "insufficient baud rate", Outcome.BANDWIDTH, "lower rates or raise the baud"),
-    DeviceError(0xFF, "error buffer overflow", Outcome.STOP, "errors came faster than it reports"),
+    ErrorCode(0x01, "hard fault", Remedy.RESET, "its processor restarted; RAM settings are gone"),
+    ErrorCode(0x02, "serial input buffer overflow", Remedy.RETRY, "a line was over 256 bytes"),
+    ErrorCode(0x03, "invalid checksum", Remedy.RETRY, "a byte was lost on the way to the device"),
+    ErrorCode(0x04, "invalid command", Remedy.STOP, "this firmware does not know the command"),
+    ErrorCode(0x05, "not enough parameters", Remedy.STOP, "this firmware expects more values"),
+    ErrorCode(0x06, "too many parameters", Remedy.STOP, "this firmware expects fewer values"),
+    ErrorCode(0x07, "invalid parameter", Remedy.STOP, "a value is out of the allowed range"),
+    ErrorCode(0x08, "invalid register", Remedy.STOP, "this model or firmware lacks the register"),
+    ErrorCode(0x09, "unauthorized access", Remedy.STOP, "the register is read-only"),
+    ErrorCode(0x0A, "watchdog reset", Remedy.RESET, "the device restarted; RAM settings are gone"),
+    ErrorCode(0x0B, "output buffer overflow", Remedy.BANDWIDTH, "lower rates or raise the baud"),
+    ErrorCode(0x0C, "insufficient baud rate", Remedy.BANDWIDTH, "lower rates or raise the baud"),
+    ErrorCode(0xFF, "error buffer overflow", Remedy.STOP, "errors came faster than it reports"),
 )
-ERRORS: dict[int, DeviceError] = {row.code: row for row in _ROWS}
+ERRORS: dict[int, ErrorCode] = {row.code: row for row in _ROWS}
 _CODE = re.compile(r"[0-9A-Fa-f]{1,2}")
 _BY_NAME = {row.name.replace(" ", ""): row.code for row in _ROWS}
 _BY_NAME["serialbufferoverflow"] = 0x02  # the manual's name
@@ -82,10 +74,10 @@ def _letters(text: str) -> str:
     return "".join(character for character in text.lower() if character.isalpha())
 
 
-def device_error(code: int) -> DeviceError:
+def device_error(code: int) -> ErrorCode:
     """The row of `code`; codes that no manual lists get one that says so."""
     advice = "no manual lists this code; nothing was confirmed"
-    return ERRORS.get(code) or DeviceError(code, "unknown error", Outcome.STOP, advice)
+    return ERRORS.get(code) or ErrorCode(code, "unknown error", Remedy.STOP, advice)
 
 
 class DriverError(Exception):

@@ -88,14 +88,14 @@ class Stray:
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class ProcedureFinished:
     """The procedure ended and returned `result`."""
 
     result: object
 
 
 @dataclass(frozen=True, slots=True)
-class Failed:
+class ProcedureFailed:
     """The procedure ended with `error`: a SessionError, DeviceRefused or ValueError."""
 
     error: Exception
@@ -106,7 +106,16 @@ class LineEchoes:
     """What is sent comes back before the answer; told once per link."""
 
 
-Event = Measurement | Unused | Undecodable | DeviceFault | Stray | LineEchoes | Finished | Failed
+Event = (
+    Measurement
+    | Unused
+    | Undecodable
+    | DeviceFault
+    | Stray
+    | LineEchoes
+    | ProcedureFinished
+    | ProcedureFailed
+)
 
 
 @dataclass(slots=True)
@@ -337,10 +346,10 @@ class Session:
             else:
                 command = next(procedure) if outcome is None else procedure.send(outcome)
         except StopIteration as end:
-            events.append(Finished(end.value))
+            events.append(ProcedureFinished(end.value))
             return None
         except (DriverError, ValueError) as error:
-            events.append(Failed(error))
+            events.append(ProcedureFailed(error))
             return None
         self._procedure = procedure
         return command

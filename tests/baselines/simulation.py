@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ahrsd.baselines import Data
+from ahrsd.baselines import MethodData
 from ahrsd.samples import Array, SampleBlock
 
 SOFT_IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
@@ -23,7 +23,7 @@ HALF_RANGE_DEG = {"wam": (180, 180, 180), "mam": (5, 45, 180), "lam": (5, 15, 90
 class Run:
     """Samples and the true field in the sensor frame (N, 3)."""
 
-    data: Data
+    data: MethodData
     field_b: Array
 
 
@@ -53,7 +53,7 @@ def simulate(
     R = Rotation.from_euler("ZYX", angles[:, ::-1])  # R_nb
     rate = (R[:-1].inv() * R[1:]).as_rotvec() * rate_hz
     field = R[1:].inv().apply(FIELD)
-    data = Data(
+    data = MethodData(
         time_s=t[1:],
         dt_s=np.full(n, 1 / rate_hz),
         raw_b_gauss=field @ soft_iron.T + hard_iron + sigma_mag * rng.normal(size=(n, 3)),
@@ -73,7 +73,9 @@ def clean(kind: str = "wam", seed: int = 0, **changes: object) -> Run:
     return simulate(kind, seed, **(settings | changes))  # type: ignore[arg-type]
 
 
-def blocks(data: Data, sizes: tuple[int, ...], gaps: tuple[int, ...] = ()) -> list[SampleBlock]:
+def blocks(
+    data: MethodData, sizes: tuple[int, ...], gaps: tuple[int, ...] = ()
+) -> list[SampleBlock]:
     """The samples cut into blocks of these sizes; those of index in `gaps` come after a gap."""
     edges = np.cumsum([0, *sizes])
     assert edges[-1] == len(data)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from simulation import GYRO_BIAS, HARD_IRON, blocks, clean
 
-from ahrsd.baselines import METHODS, Settings, calibrate_with, joined, run
+from ahrsd.baselines import METHODS, MethodSettings, calibrate_with, joined, run
 from ahrsd.baselines.windows import per_sample, windowed
 
-KNOWN = Settings(known_gyro_bias_rad_s=GYRO_BIAS)
+KNOWN = MethodSettings(known_gyro_bias_rad_s=GYRO_BIAS)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -53,7 +53,7 @@ def test_a_gap_is_not_differentiated(method):
 def test_windows_and_differences_stay_inside_segments(derivative):
     data = jumped(3000)
     cut = blocks(data, (700, 300, 1000), gaps=(1, 2))
-    settings = Settings(derivative=derivative)
+    settings = MethodSettings(derivative=derivative)
     kin = joined(cut)
     assert kin.starts == (0, 700, 1000)
     assert len(per_sample(kin, settings)) == 699 + 299 + 999

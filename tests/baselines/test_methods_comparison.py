@@ -10,7 +10,7 @@ import pytest
 from simulation import HARD_IRON, UNIT_SOFT_IRON, blocks, simulate
 
 from ahrsd.baselines import calibrate_with
-from ahrsd.baselines.comparison import PIECES, Row, halves, spread_of
+from ahrsd.baselines.comparison import PIECES, ComparisonRow, halves, spread_of
 from ahrsd.report.methods_figure import write_methods_figure
 
 
@@ -60,11 +60,15 @@ def test_a_fit_of_half_of_it_is_judged_by_the_other_half():
 
 
 def test_the_picture_is_drawn_with_failures_in_words(tmp_path):
-    good = Row("magyc", np.eye(3), np.array([0.1, -0.2, 0.3]), np.zeros(3), True, "", 0.01, 0.02)
+    good = ComparisonRow(
+        "magyc", np.eye(3), np.array([0.1, -0.2, 0.3]), np.zeros(3), True, "", 0.01, 0.02
+    )
     rows = [
         good,
         replace(good, method="np", hard_iron_gauss=np.array([0.1, 0.2, 90.0]), held_out=None),
-        Row("twostep", None, None, None, False, "needs the field's magnitude: " + 40 * "long "),
+        ComparisonRow(
+            "twostep", None, None, None, False, "needs the field's magnitude: " + 40 * "long "
+        ),
     ]
     write_methods_figure(tmp_path / "all.png", "All", rows)
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")

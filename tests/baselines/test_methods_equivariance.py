@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from simulation import GYRO_BIAS, simulate
 
-from ahrsd.baselines import Settings, run
+from ahrsd.baselines import MethodSettings, run
 
 DATA = simulate("wam", 5, n=4000, faster=2.0).data
 # the medians of windows are taken axis by axis, so they are not in this list
@@ -32,8 +32,8 @@ def test_another_sensor_frame(method, seed):
         gyro_b_rad_s=DATA.gyro_b_rad_s @ Q.T,
         R_nb=DATA.R_nb @ Q.T,
     )
-    a = run(method, DATA, Settings(known_gyro_bias_rad_s=GYRO_BIAS))
-    b = run(method, turned, Settings(known_gyro_bias_rad_s=Q @ GYRO_BIAS))
+    a = run(method, DATA, MethodSettings(known_gyro_bias_rad_s=GYRO_BIAS))
+    b = run(method, turned, MethodSettings(known_gyro_bias_rad_s=Q @ GYRO_BIAS))
     atol = ATOL.get(method, 1e-9)
     assert np.allclose(Q @ a.hard_iron_gauss, b.hard_iron_gauss, atol=atol)
     if a.soft_iron is not None:
@@ -46,7 +46,7 @@ def test_another_sensor_frame(method, seed):
 @given(shift=st.tuples(*[st.floats(-0.4, 0.4)] * 3))
 @settings(max_examples=8, deadline=None)
 def test_another_hard_iron(method, shift):
-    chosen = Settings(known_gyro_bias_rad_s=GYRO_BIAS)
+    chosen = MethodSettings(known_gyro_bias_rad_s=GYRO_BIAS)
     a = run(method, DATA, chosen)
     b = run(method, replace(DATA, raw_b_gauss=DATA.raw_b_gauss + shift), chosen)
     atol = ATOL.get(method, 1e-9)

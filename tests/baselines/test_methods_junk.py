@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ahrsd.baselines import METHODS, Data, Settings, run
+from ahrsd.baselines import METHODS, MethodData, MethodSettings, run
 
 
 def junk(seed, n, size, smooth, rate):
@@ -15,7 +15,7 @@ def junk(seed, n, size, smooth, rate):
     rng = np.random.default_rng(seed)
     walk = np.cumsum(rng.normal(size=(n, 3)), axis=0) / np.sqrt(n)
     raw = size * (smooth * walk + (1 - smooth) * rng.normal(size=(n, 3)) + 0.5)
-    return Data(
+    return MethodData(
         time_s=0.04 * np.arange(n), dt_s=np.full(n, 0.04), raw_b_gauss=raw,
         gyro_b_rad_s=rate * rng.normal(size=(n, 3)) + rate * np.sin(0.01 * np.arange(n))[:, None],
         R_nb=np.tile(np.eye(3), (n, 1, 1)), field_n_gauss=np.array([0.2, 0.0, 0.4]),
@@ -34,7 +34,7 @@ def junk(seed, n, size, smooth, rate):
 )
 @settings(max_examples=25, deadline=None)
 def test_junk(method, seed, n, size, smooth, rate, derivative, constraint):
-    chosen = Settings(
+    chosen = MethodSettings(
         derivative=derivative, ellipsoid_constraint=constraint, sigma_mag_gauss=1e-3 * size
     )
     result = run(method, junk(seed, n, size, smooth, rate), chosen)

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 from simulation import FIELD, HARD_IRON, UNIT_SOFT_IRON, simulate
 
-from ahrsd.baselines import Settings, np_constrained, np_uncertain_field, run, tls
+from ahrsd.baselines import MethodSettings, np_constrained, np_uncertain_field, run, tls
 from ahrsd.baselines.sphere import linear_centre
 
 SIZE = float(np.linalg.norm(FIELD))
@@ -111,17 +111,17 @@ def test_a_field_that_is_unsure_in_places_counts_less_there():
     norms[:1000] *= 1.05
     sigma = np.where(np.arange(4000) < 1000, 0.05 * SIZE, 1e-4)
     known = replace(data, field_norm_gauss=norms)
-    aware = run("np-uncertain-field", known, Settings(sigma_field_gauss=sigma))
+    aware = run("np-uncertain-field", known, MethodSettings(sigma_field_gauss=sigma))
     unaware = run("np-uncertain-field", known)
     assert 1e3 * np.linalg.norm(aware.hard_iron_gauss - HARD_IRON) < 0.2
     assert 1e3 * np.linalg.norm(unaware.hard_iron_gauss - HARD_IRON) > 2
-    short = run("np-uncertain-field", known, Settings(sigma_field_gauss=sigma[:-1]))
+    short = run("np-uncertain-field", known, MethodSettings(sigma_field_gauss=sigma[:-1]))
     assert "one number or 4000" in short.reason
 
 
 def test_the_same_uncertainty_everywhere_changes_nothing():
     data = simulate("wam", 1, n=2000, soft_iron=np.eye(3)).data
-    settings = Settings(sigma_mag_gauss=1e-3, sigma_field_gauss=2e-3)
+    settings = MethodSettings(sigma_mag_gauss=1e-3, sigma_field_gauss=2e-3)
     sure = run("np-uncertain-field", data, settings)
     assert np.allclose(sure.hard_iron_gauss, run("fnp", data).hard_iron_gauss, atol=1e-8)
 
@@ -131,7 +131,7 @@ def test_total_least_squares_differs_from_norm_preservation_in_second_order_only
     data = replace(
         simulate("wam", n=400).data, raw_b_gauss=field, field_norm_gauss=norms, field_n_gauss=None
     )
-    settings = Settings(sigma_mag_gauss=1e-3)  # in no order, so that differences say nothing
+    settings = MethodSettings(sigma_mag_gauss=1e-3)  # in no order, so that differences say nothing
     a = run("tls", data, settings).hard_iron_gauss
     b = run("fnp", data, settings).hard_iron_gauss
     difference = np.linalg.norm(a - b)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.baselines import METHODS, Settings, calibrate_with
+from ahrsd.baselines import METHODS, MethodSettings, calibrate_with
 from ahrsd.recording.table import read_table
 
 
@@ -25,7 +25,7 @@ def test_a_sensor_at_rest_is_refused(method, blocks):
 
 def test_circles_determine_the_horizontal_hard_iron_and_say_that_the_rest_is_weak(blocks):
     circles = blocks("circles_2022_rahul")
-    settings = Settings(derivative="savgol")
+    settings = MethodSettings(derivative="savgol")
     found = {
         method: calibrate_with(method, circles, settings=settings, field_norm_gauss=0.5)
         for method in ("magical-ls", "magical-nls", "magyc-bfg", "magyc-ifg", "tls", "fnp")
@@ -40,7 +40,7 @@ def test_circles_determine_the_horizontal_hard_iron_and_say_that_the_rest_is_wea
 def test_hand_waving_gives_two_kinematic_methods_one_answer(blocks):
     """All attitudes, indoors: soft iron near the identity, hard iron of some tens of mG."""
     waving = blocks("hand_2023_thumatti")
-    settings = Settings(derivative="savgol")
+    settings = MethodSettings(derivative="savgol")
     a, b = (
         calibrate_with(method, waving, settings=settings) for method in ("magyc-bfg", "magical-bfg")
     )

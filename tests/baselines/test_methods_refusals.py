@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulation import HARD_IRON, clean, simulate
 
-from ahrsd.baselines import METHODS, MethodError, Settings, run
+from ahrsd.baselines import METHODS, MethodError, MethodSettings, run
 
 EVERY = list(METHODS)
 
@@ -73,24 +73,26 @@ def test_too_few_windows(method):
 
 def test_an_update_that_never_fills():
     data = clean(n=1000, rate_hz=12.5).data
-    assert "the first update needs 60" in refused("magyc-ifg", data, Settings(update_every=60))
+    assert "the first update needs 60" in refused(
+        "magyc-ifg", data, MethodSettings(update_every=60)
+    )
 
 
 @pytest.mark.parametrize("value", [0.0, -1e-3, np.nan, np.inf])
 def test_settings_that_cannot_be(value):
     for name in ("sigma_mag_gauss", "sigma_field_gauss"):
         with pytest.raises(MethodError, match=f"{name} is .*: it must be a positive number"):
-            Settings(**{name: value})
+            MethodSettings(**{name: value})
 
 
 def test_other_settings_that_cannot_be():
     for wrong in ({"window": 1}, {"update_every": 0}, {"savgol_window": 4}):
         with pytest.raises(MethodError, match="at least"):
-            Settings(**wrong)
+            MethodSettings(**wrong)
     with pytest.raises(MethodError, match="one of median, savgol"):
-        Settings(derivative="spline")
+        MethodSettings(derivative="spline")
     with pytest.raises(MethodError, match="one of trace, fang"):
-        Settings(ellipsoid_constraint="unit")
+        MethodSettings(ellipsoid_constraint="unit")
 
 
 @pytest.mark.parametrize("method", EVERY)

@@ -14,7 +14,7 @@ from simulation import (
     simulate,
 )  # fmt: skip
 
-from ahrsd.baselines import METHODS, Settings, run
+from ahrsd.baselines import METHODS, MethodSettings, run
 
 KINEMATIC = [name for name, row in METHODS.items() if "gyro" in row.needs]
 HARD_ONLY = [name for name, row in METHODS.items() if row.estimates == ("hard iron",)]
@@ -45,7 +45,7 @@ def test_ids_are_the_contracts():
 @pytest.mark.parametrize("derivative", ["median", "savgol"])
 @pytest.mark.parametrize("method", KINEMATIC)
 def test_kinematic_methods_without_noise(method, derivative):
-    settings = Settings(derivative=derivative, relinearize=1e-6, **KNOWN)
+    settings = MethodSettings(derivative=derivative, relinearize=1e-6, **KNOWN)
     b, A, w = errors(run(method, clean().data, settings))
     assert b < 0.6
     assert A < 1.5e-3
@@ -57,8 +57,8 @@ def test_kinematic_methods_without_noise(method, derivative):
 
 @pytest.mark.parametrize("method", ["magical-ls", "magical-nls"])
 def test_denser_sampling_leaves_less(method):
-    coarse = errors(run(method, clean(rate_hz=50.0, n=4000).data, Settings(**KNOWN)))
-    fine = errors(run(method, clean(rate_hz=400.0, n=32_000).data, Settings(**KNOWN)))
+    coarse = errors(run(method, clean(rate_hz=50.0, n=4000).data, MethodSettings(**KNOWN)))
+    fine = errors(run(method, clean(rate_hz=400.0, n=32_000).data, MethodSettings(**KNOWN)))
     assert fine[0] < coarse[0] / 6
     assert fine[1] < coarse[1] / 6
 
@@ -144,7 +144,7 @@ def wam_runs():
 
 @pytest.mark.parametrize(("method", "derivative"), WAM)
 def test_noisy_wam_is_as_published(method, derivative, wam_runs):
-    settings = Settings(derivative=derivative, **KNOWN)
+    settings = MethodSettings(derivative=derivative, **KNOWN)
     found = [errors(run(method, data, settings)) for data in wam_runs]
     for limits, column in zip(WAM[method, derivative], zip(*found, strict=True), strict=True):
         if limits is None:
@@ -157,7 +157,7 @@ def test_the_thesis_incremental_gyro_bias_is_half_of_the_truth(wam_runs):
     """[R] Table 5.1: (1.775, -2.136, 0.852) mrad/s of a true (4, -5, 2)."""
     found = [1e3 * run("magical-ifg", data).gyro_bias_rad_s for data in wam_runs]
     assert np.allclose(np.mean(found, axis=0), [1.775, -2.136, 0.852], atol=0.25)
-    mended = Settings(relinearize=1e-6, derivative="savgol")
+    mended = MethodSettings(relinearize=1e-6, derivative="savgol")
     assert errors(run("magical-ifg", wam_runs[0], mended))[2] < 0.3
 
 

@@ -30,12 +30,12 @@ from peers_table import best_peers, set_lines, time_lines, verdict_lines
 
 from ahrsd.baselines import MethodError
 from ahrsd.estimator.online import WHOLE, Estimator
-from ahrsd.montecarlo.accuracy import Answer
+from ahrsd.montecarlo.accuracy import MethodAnswer
 from ahrsd.montecarlo.methods import OURS, STREAM
 from ahrsd.montecarlo.runs import Plan, Record, run_many, scored
-from ahrsd.montecarlo.summary import Row, summarise
+from ahrsd.montecarlo.summary import SummaryRow, summarise
 from ahrsd.report.peers_figure import write_peers_figure
-from ahrsd.simulation import Experiment, Settings, simulate
+from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 
 PROJECT = Path(__file__).resolve().parents[2]
 TOOL = PROJECT.parent / "shared" / "tools" / "magyc_peers.py"
@@ -109,7 +109,7 @@ def readings(experiment: Experiment, path: Path) -> None:
 class Case:
     """One experiment, the peers that are to answer it, and the file that keeps their answers."""
 
-    settings: Settings
+    settings: ScenarioSettings
     kept: Path
     names: tuple[str, ...]
 
@@ -162,12 +162,12 @@ def answers(kept: Path) -> dict[str, Record]:
     return found
 
 
-def answered(said: Record) -> Answer:
+def answered(said: Record) -> MethodAnswer:
     """A peer's line as an answer; MethodError with its own words where it has none."""
     if said["failure"] is not None:
         raise MethodError(said["failure"])
     bias = said["gyro_bias_rad_s"]
-    return Answer(
+    return MethodAnswer(
         None if said["soft_iron"] is None else np.array(said["soft_iron"]),
         np.array(said["hard_iron_mg"]) / 1e3,
         None if bias is None else np.array(bias),
@@ -207,7 +207,7 @@ def times(cache: Path, python: Path, tool: Path, counts: Sequence[int]) -> list[
     out = []
     for motion in ("slow", "rov"):
         for count in counts:
-            settings = Settings("mam", motion, seed=0, samples=count)
+            settings = ScenarioSettings("mam", motion, seed=0, samples=count)
             say(f"time: mam {motion}, {count} samples")
             case = Case(settings, cache / "time" / f"mam-{motion}-{count}.jsonl", (IFG,))
             ask_peers(python, tool, [case])
@@ -301,7 +301,7 @@ class Comparison:
                 say(f"peers: seed {seed}")
             ask_peers(self.python, self.tool, cases)
 
-    def compared(self, plan: Plan) -> tuple[list[Record], list[Row]]:
+    def compared(self, plan: Plan) -> tuple[list[Record], list[SummaryRow]]:
         """Records and rows of ours and of all peers; dear ones over fewer seeds."""
         say(f"ours: {plan.name}")
         records = []
@@ -339,7 +339,9 @@ def only(record: Record, names: Sequence[str]) -> Record:
 
 
 def write(
-    folder: Path, compared: Sequence[tuple[Plan, list[Record], list[Row]]], timed: list[Record]
+    folder: Path,
+    compared: Sequence[tuple[Plan, list[Record], list[SummaryRow]]],
+    timed: list[Record],
 ) -> None:
     """peers.json, table.md and peers.png."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -28,12 +28,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS
-from ahrsd.baselines.comparison import Row
+from ahrsd.baselines.comparison import ComparisonRow
 from ahrsd.calibration import Affine
 from ahrsd.cli.evaluate_sources import gps_beside, read_fixes, read_track
 from ahrsd.config.loading import Config
-from ahrsd.config.sections import Location
-from ahrsd.evaluation import Evaluation, StoredCalibration, Track, judge
+from ahrsd.config.sections import LocationSection
+from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
 from ahrsd.evaluation.references import QUATERNION, course, optical
 from ahrsd.heading import wrapped
 from ahrsd.offline.calibrate import BatchResult, calibrate
@@ -43,7 +43,7 @@ from ahrsd.samples import Array
 RECORDINGS = Path(__file__).parents[3] / "shared" / "recordings"
 # Boston, where the car drove. The day is not known: a year moves |H| there by 1 mG.
 BOSTON = Config(
-    location=Location(latitude_deg=42.34, longitude_deg=-71.09, date=date(2022, 10, 15))
+    location=LocationSection(latitude_deg=42.34, longitude_deg=-71.09, date=date(2022, 10, 15))
 )
 QUICK = ("magical-ls", "magyc-bfg", "ellipsoid", "fnp")
 LEAST_SPEED_M_S = 4.0
@@ -72,14 +72,16 @@ class Judged:
     spread_after: float | None = None
 
 
-def rows_of(path: Path, methods: tuple[str, ...], config: Config) -> tuple[list[Row], BatchResult]:
+def rows_of(
+    path: Path, methods: tuple[str, ...], config: Config
+) -> tuple[list[ComparisonRow], BatchResult]:
     """Ours and these methods on a recording."""
     result = calibrate(path, config)
     theirs = [row_of(result, run_published(result, name), held_out=False) for name in methods]
     return [our_row(result, held_out=False), *theirs], result
 
 
-def stored(row: Row, recording: str) -> StoredCalibration | None:
+def stored(row: ComparisonRow, recording: str) -> StoredCalibration | None:
     """A row as a calibration; None where it has no answer."""
     if row.hard_iron_gauss is None:
         return None
@@ -88,7 +90,7 @@ def stored(row: Row, recording: str) -> StoredCalibration | None:
     return StoredCalibration("", row.method, recording, row.converged, correction)
 
 
-def judged(row: Row, made_from: str, judged_on: str, found: Evaluation | None) -> Judged:
+def judged(row: ComparisonRow, made_from: str, judged_on: str, found: Evaluation | None) -> Judged:
     """The figures of an evaluation in one line."""
     base = (row.method, made_from, judged_on, row.converged, row.reason)
     if found is None or not found.headings:
@@ -153,12 +155,12 @@ def against_optics(
     return lines
 
 
-def without_lag(track: Track, lag_s: float) -> Track:
+def without_lag(track: EvaluationTrack, lag_s: float) -> EvaluationTrack:
     """The same with each reading of the field as it was at its own instant."""
     steps = round(lag_s / float(np.median(np.diff(track.time_s))))
     kept = len(track) - steps
     raw = track.raw_b_gauss[steps:]
-    return Track(
+    return EvaluationTrack(
         track.time_s[:kept],
         raw,
         raw,
@@ -168,7 +170,7 @@ def without_lag(track: Track, lag_s: float) -> Track:
     )
 
 
-def oracle(track: Track) -> Row:
+def oracle(track: EvaluationTrack) -> ComparisonRow:
     """C and b with the least RMS of heading error that any linear calibration has here.
 
     Start: C m - c = R_wb^T H is linear in C, c and H together up to scale, the least singular
@@ -197,7 +199,7 @@ def oracle(track: Track) -> Row:
     found = least_squares(error_rad, least[:12]).x
     C, c = found[:9].reshape(3, 3), found[9:12]
     A = np.linalg.inv(C / np.cbrt(np.linalg.det(C)))
-    return Row("oracle", A, np.linalg.solve(C, c), None, True, "")
+    return ComparisonRow("oracle", A, np.linalg.solve(C, c), None, True, "")
 
 
 def punch(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[dict[str, object]]:
@@ -226,7 +228,7 @@ def punch(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[dict[
     return lines
 
 
-def at_rest(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Row]:
+def at_rest(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[ComparisonRow]:
     """What every method says about a sensor at rest."""
     return rows_of(folder / "vn100" / "static_2025_kiran_5min.csv.gz", methods, BOSTON)[0]
 

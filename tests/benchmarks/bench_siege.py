@@ -28,7 +28,7 @@ from typing import BinaryIO
 import numpy as np
 import psutil
 
-from ahrsd.telemetry.client import Asked
+from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.protocol import line_of
 from drivers.vn100.emulator.process import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
@@ -105,7 +105,7 @@ def listen(path: Path, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Device times of all samples, and how late each was."""
     times: list[float] = []
     latency: list[float] = []
-    with Asked(path) as asked:
+    with DaemonConnection(path) as asked:
         end = time.monotonic() + seconds
         for record in asked.watch(("samples",)):
             now = time.monotonic()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.montecarlo.summary import BOUNDED, Row
+from ahrsd.montecarlo.summary import BOUNDED, SummaryRow
 
 Found = Mapping[str, Any]
 _ENOUGH = 10  # runs, to be the best of the peers
@@ -37,7 +37,7 @@ def paired(
 
 
 def best_peers(
-    records: Sequence[Found], rows: Sequence[Row], peers: Sequence[str], ours: str
+    records: Sequence[Found], rows: Sequence[SummaryRow], peers: Sequence[str], ours: str
 ) -> dict[str, Found]:
     """By figure: the peer that is nearest to the bound, how far ours is ahead, and the room.
 
@@ -69,18 +69,18 @@ def best_peers(
     return out
 
 
-def set_lines(name: str, rows: Sequence[Row]) -> list[str]:
+def set_lines(name: str, rows: Sequence[SummaryRow]) -> list[str]:
     """One set: the bound, ours and the peers."""
     head = [f"\n### {name}\n", _HEAD, "|---" * _HEAD.count(" | ") + "|---|"]
     return [*head, _bound_line(rows[0]), *(_line(row) for row in rows)]
 
 
-def _bound_line(row: Row) -> str:
+def _bound_line(row: SummaryRow) -> str:
     hard, soft, gyro = (row.against_bound[figure].bound for figure in BOUNDED)
     return f"| bound | | {number(hard, 1e3)} | | {number(soft)} | | {number(gyro, 1e3)} | | |"
 
 
-def _line(row: Row) -> str:
+def _line(row: SummaryRow) -> str:
     hard, soft, gyro = (row.against_bound[figure] for figure in BOUNDED)
     spread = "" if hard.standard_error is None else f" ± {number(hard.standard_error)}"
     doubted = f" ({row.unconverged} doubted)" if row.unconverged else ""

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from ahrsd.challenge import judge as j
-from ahrsd.challenge.answers import Answer, Finding, Parameter, read_answer
+from ahrsd.challenge.answers import ClaimedEffect, ClaimedParameter, ToolAnswer, read_answer
 from ahrsd.challenge.judge import compare, judge, overlap
 from ahrsd.challenge.scores import calibration_error, error_rate, scores, wilson
 from ahrsd.challenge.units import normal
@@ -50,11 +50,11 @@ def truth(kind, *effects, **changes):
 def finding(
     name, *alternatives, confidence=0.9, frame="sensor", spans=(), parameters=(), gain=None
 ):
-    return Finding(name, confidence, alternatives, frame, spans, parameters, gain, None)
+    return ClaimedEffect(name, confidence, alternatives, frame, spans, parameters, gain, None)
 
 
 def said(*findings, unexplained=False, frame=None, spans=(), failure=None, closed=None):
-    return Answer(
+    return ToolAnswer(
         failure, "", 1.0, bool(findings) or unexplained, findings, unexplained, frame, spans, closed
     )
 
@@ -116,9 +116,9 @@ def test_a_name_for_the_same_signal_is_right_but_not_strictly():
 
 def test_a_table_in_degrees_may_be_refused_in_words_that_say_so():
     case = truth("single", effect("unit_error"))
-    refused = Answer("exit 2", "gyro: median 30, looks like deg/s", 0.3)
+    refused = ToolAnswer("exit 2", "gyro: median 30, looks like deg/s", 0.3)
     assert judge(case, refused).word == j.RIGHT
-    assert judge(case, Answer("exit 2", "no such file", 0.3)).word == j.NONE
+    assert judge(case, ToolAnswer("exit 2", "no such file", 0.3)).word == j.NONE
 
 
 def test_intervals_onset_gain_and_coefficients_of_a_right_name():
@@ -135,10 +135,10 @@ def test_intervals_onset_gain_and_coefficients_of_a_right_name():
         ),
     )
     parameters = (
-        Parameter("onset", 121.0, 0.5, "s"),
-        Parameter("field_z", -1.2, 0.1, "mG"),
-        Parameter("field_x", 1.1, 0.1, "mG"),
-        Parameter("field_y", 0.1, 0.1, "mG"),
+        ClaimedParameter("onset", 121.0, 0.5, "s"),
+        ClaimedParameter("field_z", -1.2, 0.1, "mG"),
+        ClaimedParameter("field_x", 1.1, 0.1, "mG"),
+        ClaimedParameter("field_y", 0.1, 0.1, "mG"),
     )
     answer = said(
         finding("hard_iron_step", spans=((123.0, 400.0),), parameters=parameters, gain=0.0099)
@@ -159,7 +159,7 @@ def test_semireal_is_judged_beyond_the_control():
 
     def of(value, *more):
         return said(
-            finding("mag_time_lag", parameters=(Parameter("tau", value, 1.0, "ms"),)),
+            finding("mag_time_lag", parameters=(ClaimedParameter("tau", value, 1.0, "ms"),)),
             *map(finding, more),
         )
 
@@ -196,7 +196,7 @@ def test_a_delay_of_the_other_sensor_counts_against_the_controls():
     case = truth("semireal", lag | {"parameters": [{"name": "lag", "value": 0.03, "unit": "s"}]})
 
     def of(name, value):
-        return said(finding(name, parameters=(Parameter("lag", value, 1e-3, "s"),)))
+        return said(finding(name, parameters=(ClaimedParameter("lag", value, 1e-3, "s"),)))
 
     own = of("mag_time_lag", 0.012)
     turned = judge(case, of("gyro_time_lag", 0.018), own)
@@ -211,8 +211,10 @@ def test_a_delay_of_the_other_sensor_counts_against_the_controls():
 def test_half_a_step_is_the_delay_that_it_is():
     lag = effect("mag_time_lag", right=["mag_time_lag", "gyro_integration"])
     case = truth("semireal", lag | {"parameters": [{"name": "lag", "value": 0.01, "unit": "s"}]})
-    half = said(finding("gyro_integration", parameters=(Parameter("half_steps", 1.0, 0.1, "1"),)))
-    late = said(finding("mag_time_lag", parameters=(Parameter("lag", 0.0225, 1e-3, "s"),)))
+    half = said(
+        finding("gyro_integration", parameters=(ClaimedParameter("half_steps", 1.0, 0.1, "1"),))
+    )
+    late = said(finding("mag_time_lag", parameters=(ClaimedParameter("lag", 0.0225, 1e-3, "s"),)))
     verdict = judge(case, late, half)
     assert (verdict.word, verdict.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
 
@@ -239,7 +241,7 @@ def test_on_and_off_are_the_same_to_the_hard_iron():
 
 
 def test_a_coefficient_of_another_unit_is_not_compared():
-    one = finding("a", parameters=(Parameter("k", 1.0, 0.1, "rad"),))
+    one = finding("a", parameters=(ClaimedParameter("k", 1.0, 0.1, "rad"),))
     assert compare([{"name": "k", "value": 1.0, "unit": "gauss"}], one) == ((), None)
 
 
@@ -302,7 +304,7 @@ def test_wilson_interval_is_the_textbooks():
 def test_alternatives_for_the_very_same_signal_share_the_confidence():
     names = ("mag_time_lag", "mag_low_pass")
     either = [truth("single", effect(name, right=list(names))) for name in names]
-    found = Finding(
+    found = ClaimedEffect(
         names[0], 0.7, (names[1], "eddy_current"), "sensor", (), (), None, None, (0.2, 0.1)
     )
     rows = {row.name: row for row in scores([judge(case, said(found)) for case in either])}

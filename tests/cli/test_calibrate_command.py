@@ -21,7 +21,7 @@ from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader, CaptureWriter
 from drivers.vn100.emulator.emulator import Emulator
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 from drivers.vn100.emulator.pty import PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup, build
 
@@ -39,7 +39,7 @@ REGISTERS = {
 }
 
 
-def corrected(register: list[float], truth: Truth, h: np.ndarray) -> np.ndarray:
+def corrected(register: list[float], truth: EmulatedTruth, h: np.ndarray) -> np.ndarray:
     """(N, 3) what a device with this register 23 puts out in true fields h, by the manual."""
     C, B = np.reshape(register[:9], (3, 3)), np.array(register[9:])
     m = h @ truth.soft_iron.T + truth.hard_iron_gauss
@@ -58,7 +58,7 @@ def true_fields() -> np.ndarray:
     return 0.49 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def check_registers(found: dict[str, object], truth: Truth, h: np.ndarray) -> None:
+def check_registers(found: dict[str, object], truth: EmulatedTruth, h: np.ndarray) -> None:
     """What would be written is right on the device, by arithmetic that shares nothing with ours."""
     written = found["registers"]
     assert set(written) == {"23", "84"}

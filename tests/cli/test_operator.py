@@ -15,11 +15,11 @@ from planted_operator import estimate
 from ahrsd.core.core import Core
 from ahrsd.daemon.operator_inbox import (
     LONGEST_S,
-    Answer,
+    OperatorAnswer,
     OperatorBox,
+    OperatorCommand,
     OperatorFolderError,
     OperatorInbox,
-    Word,
 )
 from ahrsd.events import Answered, GateResult
 from ahrsd.inputs import Journalled, Operator
@@ -64,8 +64,8 @@ def answer_of(box, name):
 def test_a_word_is_taken_once_and_in_order(box, inbox):
     first, second = box.put("approve", "ae188205"), box.put("lock", "crew aboard")
     assert heard(inbox, 2) == [
-        Word(first, "approve", "ae188205"),
-        Word(second, "lock", "crew aboard"),
+        OperatorCommand(first, "approve", "ae188205"),
+        OperatorCommand(second, "lock", "crew aboard"),
     ]
     assert inbox.take() == []
     assert list(box.folder.iterdir()) == []
@@ -78,9 +78,9 @@ def test_whoever_said_it_gets_the_answer(box, inbox):
     )
     caller.start()
     (word,) = heard(inbox)
-    inbox.answer(word.name, Answer(False, "it is b0b1b2b3"))
+    inbox.answer(word.name, OperatorAnswer(False, "it is b0b1b2b3"))
     caller.join(VERY_LONG_S)
-    assert answers == [Answer(False, "it is b0b1b2b3")]
+    assert answers == [OperatorAnswer(False, "it is b0b1b2b3")]
     assert list(box.folder.iterdir()) == []
 
 
@@ -313,8 +313,8 @@ def test_the_command_says_that_nobody_listens(run, tmp_path, box, capsys, monkey
 @pytest.mark.parametrize(
     ("answer", "code", "printed"),
     [
-        (Answer(True, "ae188205 approved"), 0, "accepted: ae188205 approved\n"),
-        (Answer(False, "it is b0b1b2b3"), 1, "ahrsd: refused: it is b0b1b2b3\n"),
+        (OperatorAnswer(True, "ae188205 approved"), 0, "accepted: ae188205 approved\n"),
+        (OperatorAnswer(False, "it is b0b1b2b3"), 1, "ahrsd: refused: it is b0b1b2b3\n"),
     ],
 )
 def test_the_command_prints_the_answer(run, tmp_path, inbox, capsys, answer, code, printed):

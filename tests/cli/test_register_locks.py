@@ -13,7 +13,7 @@ from writeback_rig import estimate
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.daemon.journal import Journal, journal_path
-from ahrsd.daemon.operator_inbox import Answer, OperatorBox, OperatorInbox
+from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorBox, OperatorInbox
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.emulator.scenarios import Setup, build
@@ -94,7 +94,7 @@ def test_where_a_daemon_runs_it_is_told_and_its_journal_is_left_alone(here, tmp_
         while not done.wait(0.01):
             for word in inbox.take():
                 words.append((word.verb, word.argument))
-                inbox.answer(word.name, Answer(word.argument != "again", "said"))
+                inbox.answer(word.name, OperatorAnswer(word.argument != "again", "said"))
 
     thread = threading.Thread(target=daemon)
     thread.start()
@@ -133,10 +133,10 @@ def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, c
     OperatorBox(tmp_path).prepare()
     (tmp_path / "socket").touch()
     monkeypatch.setattr("ahrsd.cli.register_locks._daemon_heard", lambda *_: True)
-    monkeypatch.setattr("ahrsd.cli.register_locks.Asked", answers(77))
+    monkeypatch.setattr("ahrsd.cli.register_locks.DaemonConnection", answers(77))
     assert here("registers", "lock", "crew aboard", "--serial", SERIAL) == 0
     assert kinds(tmp_path) == ["LOCKED"]
-    monkeypatch.setattr("ahrsd.cli.register_locks.Asked", answers(SERIAL))
+    monkeypatch.setattr("ahrsd.cli.register_locks.DaemonConnection", answers(SERIAL))
     assert here("registers", "unlock", "gone", "--serial", SERIAL) == 0
     assert "the daemon heard it" in capsys.readouterr().out
     assert kinds(tmp_path) == ["LOCKED"]

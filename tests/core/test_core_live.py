@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from ahrsd.config.loading import Config, check_config
-from ahrsd.config.sections import Gates
+from ahrsd.config.sections import GatesSection
 from ahrsd.daemon.daemon import Daemon, HostClock
 from ahrsd.daemon.service import close_shell, open_shell
 from ahrsd.events import SamplesSeen, StateChanged
@@ -46,7 +46,7 @@ class AlwaysSafe:
 def easy_gates():
     """Limits that a minute of motion passes: what is tested here is not their wisdom."""
     easy = {}
-    for name, info in Gates.model_fields.items():
+    for name, info in GatesSection.model_fields.items():
         bounds = {type(m).__name__: m for m in info.metadata}
         if name.startswith(("max_", "holdout_rms", "holdout_max", "repeat", "field_", "closure")):
             easy[name] = float(bounds["Le"].le)

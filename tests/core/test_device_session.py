@@ -22,7 +22,7 @@ from ahrsd.core.device_session import (
 from ahrsd.writeback.actions import SetUpStream
 from ahrsd.writeback.journal_history import StoredRecord
 from ahrsd.writeback.permissions import Mode, Purpose
-from ahrsd.writeback.reconcile import Kind
+from ahrsd.writeback.reconcile import RecordKind
 from drivers.vn100.commands import LinkGone, Read, Word, Write
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.procedures import SESSION_SETTINGS, quiet, read, write_verified
@@ -233,7 +233,7 @@ def test_what_cannot_be_put_back_is_said():
     closed = talk.close(STOP_S + 0.1)
     assert "settings not put back" in str(closed.error)
     assert "the next run" in str(closed.error)
-    assert Kind.OUTPUTS_BACK not in [record.kind for record in talk.journal]
+    assert RecordKind.OUTPUTS_BACK not in [record.kind for record in talk.journal]
     assert not any("put back as they were" in getattr(one, "text", "") for one in talk.said)
 
 

@@ -11,7 +11,7 @@ import pytest
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
-from ahrsd.core.sensor_checks import Limits, SensorChecks
+from ahrsd.core.sensor_checks import SensorChecks, SensorLimits
 from ahrsd.events import Noted
 from ahrsd.inputs import RegistersKnown, Samples
 from ahrsd.recording.inputs_json import to_json
@@ -177,7 +177,7 @@ def test_readings_that_no_sensor_gives_are_counted():
 
 
 def checks_text(percent, count):
-    checks = SensorChecks(Limits())
+    checks = SensorChecks(SensorLimits())
     checks.count(percent * count // 100, count - percent * count // 100)
     return checks.findings["readings"]
 

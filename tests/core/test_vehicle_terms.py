@@ -22,7 +22,7 @@ from ahrsd.diagnosis.values import Noise, NullModel, Term
 from ahrsd.errors import ConfigError
 from ahrsd.inputs import Columns, RegistersKnown, Samples, Stop, TermsKnown
 from ahrsd.samples import SampleBlock
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -114,7 +114,7 @@ def test_without_a_model_the_block_is_the_same_object():
 
 
 def test_the_core_calibrates_as_if_the_current_were_off():
-    made = simulate(Settings("mam", "rov", seed=4, samples=5000, rate_hz=25.0))
+    made = simulate(ScenarioSettings("mam", "rov", seed=4, samples=5000, rate_hz=25.0))
     s, host_s = made.samples, made.samples.time_s + 100.0
     ampere = 6.0 + 5.0 * np.sign(np.sin(host_s / 5.0)) * (host_s > 130.0)
     dirty = s.raw_b_gauss + ampere[:, None] * K

@@ -14,7 +14,7 @@ from ahrsd.config.loading import Config
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader
-from ahrsd.telemetry.client import Asked, default_socket_path
+from ahrsd.telemetry.client import DaemonConnection, default_socket_path
 
 PATIENCE_S = 120.0
 
@@ -65,7 +65,10 @@ def daemon(emulated, folder, change_field=None, **setup):
             path = default_socket_path(folder)
             if not path.exists():
                 return None
-            with contextlib.suppress(DeviceError), Asked(path) as running:  # busy, or just begun
+            with (
+                contextlib.suppress(DeviceError),
+                DaemonConnection(path) as running,
+            ):  # busy, or just begun
                 return running.ask(what)
             return None
 

@@ -12,11 +12,11 @@ from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.diagnose import load_spec, load_track
 from ahrsd.recording.table_writer import write_table
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 
 
 def _settings(scenario, seed):
-    return Settings(scenario, "rov", seed, samples=3000, noise_gyro_rad_s=5e-4)
+    return ScenarioSettings(scenario, "rov", seed, samples=3000, noise_gyro_rad_s=5e-4)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from ahrsd.core.core import Core
 from ahrsd.events import Judged, Noted
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.inputs import Samples
-from ahrsd.monitoring.block_score import Reference, Scorer, Thinned, carried
+from ahrsd.monitoring.block_score import ReferenceCalibration, Scorer, Thinned, carried
 from ahrsd.monitoring.online import KEPT, Step, StepDetector
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
@@ -243,15 +243,15 @@ def test_a_block_says_what_the_model_says():
     rows = Thinned(s.time_s[:128], s.raw_b_gauss[:128], angle[:128], 1)
     right = replace(estimate_of(made), covariance=np.diag(SIGMA**2))
     scorer = Scorer()
-    base = scorer.score(rows, Reference.of(right))
+    base = scorer.score(rows, ReferenceCalibration.of(right))
     theta = np.r_[np.zeros(6), 2e-4, -1e-4, 1e-4, 3e-5, -2e-5, 4e-5]
     theta[[1, 3]] = 3e-4, -2e-4
-    off = Reference.of(right).theta - theta
+    off = ReferenceCalibration.of(right).theta - theta
     A = np.zeros((3, 3))
     A[np.triu_indices(3)] = off[:6]
     A = A + A.T - np.diag(np.diag(A))
     moved = replace(right, soft_iron=A, hard_iron_gauss=off[6:9], gyro_bias_rad_s=off[9:])
-    found = scorer.score(rows, Reference.of(moved)).score[:12] - base.score[:12]
+    found = scorer.score(rows, ReferenceCalibration.of(moved)).score[:12] - base.score[:12]
     expected = base.information[:12, :12] @ theta
     assert np.allclose(found, expected, atol=0.02 * np.abs(expected).max())
 

@@ -12,7 +12,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model_file import RepairedModel, to_text
 from ahrsd.diagnosis.values import NullModel, Term
 from ahrsd.recording.table import read_table
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 
 SHORT = ("--motion", "rov", "--seconds", 40, "--seed", 3)
 
@@ -22,7 +22,7 @@ def truth_of(path):
 
 
 def plain():
-    return simulate(Settings("mam", "rov", seed=3, samples=1000))
+    return simulate(ScenarioSettings("mam", "rov", seed=3, samples=1000))
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))

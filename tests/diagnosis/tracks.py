@@ -11,7 +11,7 @@ import pytest
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.recording.table import read_table
-from ahrsd.simulation import Experiment, Settings, simulate
+from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 
 RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings"
 
@@ -27,7 +27,9 @@ def experiment(
     motion: str = "rov",
 ) -> Experiment:
     """A simulated null; VN-100 class noise unless said otherwise."""
-    return simulate(Settings(scenario, motion, seed, samples, rate_hz, sigma_mag, sigma_gyro))
+    return simulate(
+        ScenarioSettings(scenario, motion, seed, samples, rate_hz, sigma_mag, sigma_gyro)
+    )
 
 
 def track_of(made: Experiment) -> Track:

@@ -26,7 +26,7 @@ def epoch(n=12, seed=0, *, measures_first=True):
     b = np.array([0.1, -0.2, 0.05])
     field = u @ M + b + rng.normal(size=(n, 3)) * 2e-3
     bias = np.array([0.01, -0.02, 0.03])
-    data = chain.Data(
+    data = chain.EpochData(
         field,
         angle + bias * DT + rng.normal(size=(n, 3)) * 2e-4,
         np.full(n, DT),

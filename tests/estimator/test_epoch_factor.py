@@ -14,9 +14,16 @@ from gtsam.symbol_shorthand import B, C, U
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from ahrsd.estimator.epoch_factor import Epoch, EpochKeys, Noise, Point, epoch_factor, summarise
+from ahrsd.estimator.epoch_factor import (
+    Epoch,
+    EpochKeys,
+    Noise,
+    Point,
+    epoch_factor,
+    summarise,
+)
 from ahrsd.montecarlo.cramer_rao import TRIANGLE, Trajectory, cramer_rao
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "guide" / "examples" / "smoothing_with_epochs.py"
 NOISE = Noise(1e-3, 5e-3)
@@ -25,7 +32,7 @@ APART, JOINED = EpochKeys(C(0), B(0)), EpochKeys(C(0), B(0), U(0), U(1))
 
 def made(seed=0, rows=30, scenario="mam"):
     """A short, fast experiment: 5 Hz, so that the direction turns visibly between readings."""
-    return simulate(Settings(scenario, "rov", seed=seed, samples=rows, rate_hz=5.0))
+    return simulate(ScenarioSettings(scenario, "rov", seed=seed, samples=rows, rate_hz=5.0))
 
 
 def part(experiment, rows, **options):
@@ -144,7 +151,7 @@ def test_a_summary_is_the_factor_to_second_order(keys):
 
 def test_the_information_is_the_fisher_matrix():
     """With the truth as the point, the inverse is the Cramer-Rao bound, which shares no code."""
-    experiment = simulate(Settings("wam", "rov", seed=3, samples=2000, rate_hz=5.0))
+    experiment = simulate(ScenarioSettings("wam", "rov", seed=3, samples=2000, rate_hz=5.0))
     truth = experiment.truth
     u = experiment.field_b / truth.field_gauss
     summary = summarise(
@@ -232,7 +239,7 @@ def test_the_example_recovers_calibration_map_and_attitude(capsys):
     example = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = example
     spec.loader.exec_module(example)
-    experiment = simulate(Settings("wam", "rov", seed=1, samples=3100))
+    experiment = simulate(ScenarioSettings("wam", "rov", seed=1, samples=3100))
     result = example.smooth(experiment)
     truth, c = experiment.truth, result.values.atVector(C(0))
     error = c[6:] - truth.hard_iron_gauss

@@ -11,8 +11,8 @@ from ahrsd.estimator.factors import (
     SIZE,
     C,
     Factor,
+    LinearisationPoint,
     Node,
-    Point,
     Stack,
     bias_prior,
     chain_step,
@@ -35,7 +35,7 @@ def random_graph(nodes=6, seed=0, *, rank=12):
     for j in range(nodes - 1):
         graph.nodes[j + 1] = places[j + 1]
         J = rng.normal(size=(rank, SIZE)) * 10.0
-        point = Point(c.copy(), places[j], places[j + 1])
+        point = LinearisationPoint(c.copy(), places[j], places[j + 1])
         walk = 0.0 if j == 2 else 1e6
         graph.factors.append(Factor(j, j + 1, J.T @ J, J.T @ rng.normal(size=rank), point, walk))
     return graph
@@ -112,7 +112,9 @@ def test_chart_change_of_a_node():
     old = Node.at(np.zeros(3), u)
     new = old.moved(np.array([0.1, 0.2, 0.3, 1e-3, -2e-3]))
     weights = np.random.default_rng(0).normal(size=SIZE)
-    factor = Factor(0, 1, np.zeros((SIZE, SIZE)), weights, Point(np.zeros(9), old, old))
+    factor = Factor(
+        0, 1, np.zeros((SIZE, SIZE)), weights, LinearisationPoint(np.zeros(9), old, old)
+    )
     stack = Stack([factor], np.ones(9), {0: new, 1: old})
     z, g = stack.z[0], stack.here()[1][0]
     np.testing.assert_allclose(z[:9], 1.0)
@@ -153,7 +155,9 @@ def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
         g = J.T @ rng.normal(size=40)
 
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
-    factor = epoch_factor(Quadratic, 0, Point(np.zeros(9), node, node), 0.0, rest=node.direction)
+    factor = epoch_factor(
+        Quadratic, 0, LinearisationPoint(np.zeros(9), node, node), 0.0, rest=node.direction
+    )
     own = Quadratic.H[9:, 9:]
     expected = np.zeros((SIZE, SIZE))
     across = np.eye(3) - np.outer([0.0, 0.6, 0.8], [0.0, 0.6, 0.8])
@@ -164,7 +168,7 @@ def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
     gradient = across @ marginal @ np.linalg.solve(own, Quadratic.g[9:])[:3]
     np.testing.assert_allclose(factor.g[9:12], gradient, rtol=1e-6)
     assert not np.delete(factor.g, [9, 10, 11]).any()
-    point = Point(np.zeros(9), node, node)
+    point = LinearisationPoint(np.zeros(9), node, node)
     drawn = epoch_factor(Quadratic, 0, point, 0.0, rest=node.direction, drawn=(False, True))
     wanted = -np.linalg.solve(Quadratic.H[12:, 12:] + np.eye(4), Quadratic.g[12:])
     np.testing.assert_allclose(drawn.g[17:19], -wanted[2:])

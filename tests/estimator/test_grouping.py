@@ -31,7 +31,7 @@ def epoch(n=60, *, cut=None, noise=0.0, speed=0.03):
         linked[cut], angle[cut] = 0.0, 0.0
     field = u @ M + B + noise * rng.normal(size=(n, 3))
     angle = angle + noise * 0.1 * rng.normal(size=(n, 3)) * linked[:, None]
-    data = chain.Data(
+    data = chain.EpochData(
         field, angle, np.full(n, DT), np.full((n, 3), np.nan), t * DT, True,
         linked=None if cut is None else linked,
     )  # fmt: skip

@@ -89,7 +89,7 @@ def test_a_rate_that_lost_messages_made_wrong_is_no_answer():
 def test_delay_turns_what_the_field_is_the_image_of():
     rate = np.array([0.0, 0.0, 2.0])
     dt = np.full(5, 0.05)
-    data = chain.Data(
+    data = chain.EpochData(
         np.ones((5, 3)), rate * dt[:, None], dt, np.ones((5, 3)), np.cumsum(dt), measures_first=True
     )
     np.testing.assert_allclose(rates(data), np.tile(rate, (5, 1)))
@@ -102,7 +102,7 @@ def test_delay_turns_what_the_field_is_the_image_of():
 
 def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
     angle = np.array([[0.0, 0, 0], [0.1, 0, 0], [9.0, 0, 0], [0.3, 0, 0]])
-    data = chain.Data(
+    data = chain.EpochData(
         np.ones((4, 3)), angle, np.full(4, 0.1), np.ones((4, 3)), np.arange(4.0),
         measures_first=True, linked=np.array([0.0, 1.0, 0.0, 1.0]),
     )  # fmt: skip

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.estimator.factors import SIZE, Factor, Node, Point
+from ahrsd.estimator.factors import SIZE, Factor, LinearisationPoint, Node
 from ahrsd.estimator.misfit import Misfit, scores
 
 EPOCHS = 20
@@ -16,7 +16,7 @@ EPOCHS = 20
 def _misfit(rng, louder=1.0):
     """Of epochs whose gradients have `louder` times the sigma that their information says."""
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
-    point, factors = Point(np.zeros(9), node, node), []
+    point, factors = LinearisationPoint(np.zeros(9), node, node), []
     for k in range(EPOCHS):
         J = rng.normal(size=(40, SIZE))
         g = louder * J.T @ rng.normal(size=40)

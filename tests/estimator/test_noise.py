@@ -27,7 +27,7 @@ def epochs(count, seed=0):
             u[k] = so3.exp(-rate[k] * DT) @ u[k - 1]
         field = u @ M + rng.normal(size=(n, 3)) * TRUE.mag_gauss
         gyro = rate + rng.normal(size=(n, 3)) * TRUE.gyro_rad_s
-        yield chain.Data(
+        yield chain.EpochData(
             field, gyro * DT, np.full(n, DT), np.full((n, 3), np.nan), np.arange(n) * DT, True
         )
 

@@ -27,7 +27,7 @@ def epoch(amplitude, noise_gauss, seed=0, n=2000):
     for k in range(1, n):
         u[k] = so3.exp(-rate[k] * DT) @ u[k - 1]
     field = u @ M + B + rng.normal(size=(n, 3)) * noise_gauss
-    return chain.Data(field, rate * DT, np.full(n, DT), np.full((n, 3), np.nan), t, True)
+    return chain.EpochData(field, rate * DT, np.full(n, DT), np.full((n, 3), np.nan), t, True)
 
 
 def test_linear_start_is_exact_without_noise():
@@ -52,7 +52,7 @@ def test_linear_start_needs_an_epoch_longer_than_its_lags():
 def test_linear_start_refuses_what_is_not_positive_definite():
     rng = np.random.default_rng(0)
     field = rng.normal(size=(400, 3))
-    data = chain.Data(
+    data = chain.EpochData(
         field, rng.normal(size=(400, 3)), np.full(400, DT), field, DT * field[:, 0], True
     )
     c = start.linear_start([data])

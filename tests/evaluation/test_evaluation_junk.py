@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd.calibration import Affine
-from ahrsd.evaluation import EvaluationError, StoredCalibration, Track, judge, tracked
+from ahrsd.evaluation import EvaluationError, EvaluationTrack, StoredCalibration, judge, tracked
 from ahrsd.evaluation.references import (
     Fixes,
     course,
@@ -55,7 +55,7 @@ def test_junk(seed, n, columns, accel, gyro, scale, gap):
     rng = np.random.default_rng(seed)
     t = 0.02 * np.arange(n) + (30.0 * (np.arange(n) > n // 2) if gap else 0.0)
     raw = rng.normal(size=(n, 3))
-    track = Track(
+    track = EvaluationTrack(
         t, raw, raw,
         np.column_stack([values(rng, n, gyro, 1.0) for _ in "xyz"]),
         np.column_stack([values(rng, n, accel, scale) for _ in "xyz"]),

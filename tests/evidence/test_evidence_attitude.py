@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from ahrsd.evidence.attitude import nodes_at, track
-from ahrsd.evidence.history import History
+from ahrsd.evidence.history import SegmentHistory
 
 
 def segments(scene):
-    history = History()
+    history = SegmentHistory()
     for _, part in history.parts(scene.block()):
         history.add(part)
     history.interrupt()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.history import History
+from ahrsd.evidence.history import SegmentHistory
 from ahrsd.evidence.stillness import rest, stretches
 from ahrsd.samples import SampleBlock
 from ahrsd.world_field import WorldField
@@ -119,7 +119,7 @@ def rests(seconds_of_rest: float, every_s: float, phase_s: float, minutes: float
     dt_s = np.full(len(time_s), 1 / rate_hz)
     dt_s[0] = np.nan
     block = SampleBlock(time_s, dt_s, time_s, field, rate, force, gap_before=True)
-    history = History()
+    history = SegmentHistory()
     for _, part in history.parts(block):
         history.add(part)
     history.interrupt()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ahrsd.evidence.history import History, HistoryParameters
+from ahrsd.evidence.history import HistoryParameters, SegmentHistory
 from ahrsd.samples import SampleBlock
 
 
@@ -18,14 +18,14 @@ def block(start_s=0.0, seconds=1.0, rate_hz=100.0, *, turn=0.0, gap=False, epoch
     return SampleBlock(t, dt, t, mag, gyro, np.tile([0, 0, -9.81], (n, 1)), {}, epoch, gap)
 
 
-def fill(history: History, start_s: float, end_s: float, **given) -> None:
+def fill(history: SegmentHistory, start_s: float, end_s: float, **given) -> None:
     for t in np.arange(start_s, end_s):
         for _, part in history.parts(block(float(t), **given)):
             history.add(part)
 
 
 def test_every_fourth_slot_of_thirty_seconds_is_held_out() -> None:
-    history = History()
+    history = SegmentHistory()
     fill(history, 100.0, 350.0)
     history.interrupt()
     assert [s.heldout for s in history.segments] == [False] * 3 + [True] + [False] * 3 + [True] + [
@@ -39,7 +39,7 @@ def test_every_fourth_slot_of_thirty_seconds_is_held_out() -> None:
 
 def test_role_is_the_same_however_the_stream_is_cut() -> None:
     whole = block(0.0, 250.0)
-    one, many = History(), History()
+    one, many = SegmentHistory(), SegmentHistory()
     for _, part in one.parts(whole):
         one.add(part)
     fill(many, 0.0, 250.0)
@@ -53,7 +53,7 @@ def test_role_is_the_same_however_the_stream_is_cut() -> None:
 
 
 def test_parts_are_disjoint_complete_and_gapped_where_the_role_changes() -> None:
-    history = History()
+    history = SegmentHistory()
     parts = history.parts(block(0.0, 125.0))
     assert [role for role, _ in parts] == ["train"] * 3 + ["heldout", "train"]
     assert [part.gap_before for _, part in parts] == [False, False, False, True, True]
@@ -65,7 +65,7 @@ def test_parts_are_disjoint_complete_and_gapped_where_the_role_changes() -> None
 
 def test_averages_share_one_instant() -> None:
     """At 100 Hz four samples are one; a field linear in time and the angle tell the same time."""
-    history = History()
+    history = SegmentHistory()
     fill(history, 0.0, 20.0, turn=0.5)
     history.interrupt()
     segment = history.segments[0]
@@ -79,7 +79,7 @@ def test_averages_share_one_instant() -> None:
 
 @pytest.mark.parametrize("change", [{"gap_before": True}, {"epoch": 1}])
 def test_a_gap_and_a_new_register_epoch_end_a_segment(change) -> None:
-    history = History()
+    history = SegmentHistory()
     fill(history, 0.0, 10.0)
     history.add(replace(block(10.5), **change))
     fill(history, 12.0, 20.0, epoch=change.get("epoch", 0))
@@ -88,7 +88,7 @@ def test_a_gap_and_a_new_register_epoch_end_a_segment(change) -> None:
 
 
 def test_a_sample_that_is_not_finite_ends_the_segment() -> None:
-    history = History()
+    history = SegmentHistory()
     fill(history, 0.0, 10.0)
     bad = block(10.0)
     bad.raw_b_gauss[3, 1] = np.nan
@@ -100,7 +100,7 @@ def test_a_sample_that_is_not_finite_ends_the_segment() -> None:
 
 
 def test_a_clock_that_starts_again_begins_a_segment() -> None:
-    history = History()
+    history = SegmentHistory()
     fill(history, 1000.0, 1010.0)
     fill(history, 0.0, 10.0)
     history.interrupt()
@@ -109,14 +109,14 @@ def test_a_clock_that_starts_again_begins_a_segment() -> None:
 
 
 def test_memory_is_bounded_and_rest_is_forgotten_first() -> None:
-    history = History(HistoryParameters(segment_s=10.0, segments=8))
+    history = SegmentHistory(HistoryParameters(segment_s=10.0, segments=8))
     fill(history, 0.0, 40.0, turn=0.5, rate_hz=10)
     fill(history, 40.0, 60.0, rate_hz=10)
     fill(history, 60.0, 200.0, turn=0.5, rate_hz=10)
     history.interrupt()
     assert len(history.segments) == 8
     assert all(s.turned_rad > 1.0 for s in history.segments)
-    quiet = History(HistoryParameters(segment_s=10.0, segments=8))
+    quiet = SegmentHistory(HistoryParameters(segment_s=10.0, segments=8))
     fill(quiet, 0.0, 40.0, turn=0.5, rate_hz=10)
     fill(quiet, 40.0, 200.0, rate_hz=10)
     quiet.interrupt()
@@ -124,7 +124,7 @@ def test_memory_is_bounded_and_rest_is_forgotten_first() -> None:
 
 
 def test_an_empty_block_changes_nothing() -> None:
-    history = History()
+    history = SegmentHistory()
     history.add(block(0.0, 0.0))
     assert history.parts(block(0.0, 0.0)) == []
     assert history.role(block(0.0, 0.0)) == "train"

@@ -5,7 +5,7 @@ import pytest
 
 from ahrsd.calibration import Affine
 from ahrsd.evidence.attitude import nodes_at, track
-from ahrsd.evidence.history import History
+from ahrsd.evidence.history import SegmentHistory
 from ahrsd.evidence.prediction import Envelope, heading_error_curve, worst_difference_deg
 from ahrsd.evidence.refits import gyro_fit, size_fit
 
@@ -13,7 +13,7 @@ DIP = np.radians(60.0)
 
 
 def nodes_of(world, scene):
-    history = History()
+    history = SegmentHistory()
     for _, part in history.parts(scene.block()):
         history.add(part)
     history.interrupt()

@@ -24,7 +24,7 @@ from ahrsd.inputs import Received, Stop
 from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.report.summary import summary_json
 from ahrsd.telemetry.protocol import BadRequest, parse_request
-from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.journal_history import JournalHistory
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 
@@ -104,7 +104,7 @@ def journal(data: bytes) -> None:
     except JournalError:
         return
     records = opened.records()
-    History.of(records)
+    JournalHistory.of(records)
     for record in records:
         try:
             wrg_lines(record)

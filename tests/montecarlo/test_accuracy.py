@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd.montecarlo.accuracy import (
-    Answer,
+    MethodAnswer,
     expected_heading_deg,
     figures,
     geodesic,
@@ -14,16 +14,16 @@ from ahrsd.montecarlo.accuracy import (
     nees,
     unit_volume,
 )
-from ahrsd.simulation import Iron, Settings, simulate
+from ahrsd.simulation import Iron, ScenarioSettings, simulate
 from ahrsd.simulation.experiment import measured
 from ahrsd.simulation.motion import rotation_nb
 
-EXPERIMENT = simulate(Settings("mam", samples=500))
+EXPERIMENT = simulate(ScenarioSettings("mam", samples=500))
 TRUTH = EXPERIMENT.truth
 
 
 def test_the_truth_has_no_error_whatever_its_volume():
-    exact = Answer(7.0 * TRUTH.soft_iron, TRUTH.hard_iron_gauss, TRUTH.gyro_bias_rad_s)
+    exact = MethodAnswer(7.0 * TRUTH.soft_iron, TRUTH.hard_iron_gauss, TRUTH.gyro_bias_rad_s)
     found = figures(exact, EXPERIMENT)
     for name in ("hard_iron_gauss", "soft_iron", "soft_iron_geodesic", "gyro_bias_rad_s"):
         assert found[name] == pytest.approx(0.0, abs=1e-12)
@@ -35,7 +35,7 @@ def test_the_truth_has_no_error_whatever_its_volume():
 
 def test_errors_are_norms():
     hard_iron = TRUTH.hard_iron_gauss + np.array([3e-3, 0.0, 4e-3])
-    off = Answer(None, hard_iron, TRUTH.gyro_bias_rad_s + np.array([0.0, 2e-3, 0.0]))
+    off = MethodAnswer(None, hard_iron, TRUTH.gyro_bias_rad_s + np.array([0.0, 2e-3, 0.0]))
     found = figures(off, EXPERIMENT)
     assert found["hard_iron_gauss"] == pytest.approx(5e-3)
     assert found["gyro_bias_rad_s"] == pytest.approx(2e-3)
@@ -47,7 +47,7 @@ def test_field_spread_and_constraint_error_of_a_hard_iron():
     """A hard iron of d too much leaves |h + d|, about |h| + u.d: its spread is that of u.d."""
     d = np.array([0.0, 1e-4, 0.0])
     made = EXPERIMENT
-    off = Answer(TRUTH.soft_iron, TRUTH.hard_iron_gauss - TRUTH.soft_iron @ d, None)
+    off = MethodAnswer(TRUTH.soft_iron, TRUTH.hard_iron_gauss - TRUTH.soft_iron @ d, None)
     found = figures(off, made)
     along = (made.field_b[::5] / TRUTH.field_gauss) @ d
     assert found["field_spread"] == pytest.approx(np.std(along) / TRUTH.field_gauss, rel=2e-3)
@@ -79,7 +79,7 @@ def test_a_hard_iron_across_the_field_turns_a_level_heading_by_its_angle():
 
 @pytest.mark.parametrize("noise_gauss", [0.0, 2e-3])
 def test_the_expected_heading_error_is_that_of_draws_from_the_covariance(noise_gauss):
-    made = simulate(Settings("mam", "rov", samples=5000))
+    made = simulate(ScenarioSettings("mam", "rov", samples=5000))
     draws = 1e-4 * np.random.default_rng(3).standard_normal((40, 12))
     errors = []
     for draw in draws:
@@ -95,7 +95,7 @@ def test_the_expected_heading_error_is_that_of_draws_from_the_covariance(noise_g
 
 def test_each_experiment_has_its_own_noise_on_headings():
     def floor(seed):
-        made = simulate(Settings("mam", seed=seed, samples=500))
+        made = simulate(ScenarioSettings("mam", seed=seed, samples=500))
         return heading_rms_deg(made, TRUTH.soft_iron, TRUTH.hard_iron_gauss, 0.01)
 
     assert floor(1) == floor(1)
@@ -122,10 +122,10 @@ def test_nees_of_draws_from_the_covariance_is_one():
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        (Answer(-np.eye(3), np.zeros(3), np.zeros(3)), "determinant -1 cannot"),
-        (Answer(np.full((3, 3), np.nan), np.zeros(3), None), "soft iron is not finite"),
-        (Answer(np.diag([-1.0, -1.0, 1.0]), np.zeros(3), None), "not positive definite"),
-        (Answer(None, np.array([np.nan, 0, 0]), None), "hard_iron_gauss is not finite"),
+        (MethodAnswer(-np.eye(3), np.zeros(3), np.zeros(3)), "determinant -1 cannot"),
+        (MethodAnswer(np.full((3, 3), np.nan), np.zeros(3), None), "soft iron is not finite"),
+        (MethodAnswer(np.diag([-1.0, -1.0, 1.0]), np.zeros(3), None), "not positive definite"),
+        (MethodAnswer(None, np.array([np.nan, 0, 0]), None), "hard_iron_gauss is not finite"),
     ],
 )
 def test_what_is_no_calibration_is_refused(answer, said):

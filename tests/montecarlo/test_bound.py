@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from ahrsd.estimator.online import Estimator
 from ahrsd.montecarlo.cramer_rao import Trajectory, UnobservableError, cramer_rao
-from ahrsd.simulation import Iron, Settings, simulate
+from ahrsd.simulation import Iron, ScenarioSettings, simulate
 from ahrsd.simulation.experiment import measured
 
 SM, SG = 1e-3, 5e-3
@@ -104,7 +104,7 @@ def _slope(function, x0, k, step=1e-5):
     return (function(x0 + d) - function(x0 - d)) / (2 * step)
 
 
-SHORT = simulate(Settings("wam", "rov", seed=2, samples=60))
+SHORT = simulate(ScenarioSettings("wam", "rov", seed=2, samples=60))
 
 
 def quick(samples=60):
@@ -144,7 +144,7 @@ def test_a_known_field_frees_the_volume_and_costs_nothing_else():
 
 
 def test_the_antisymmetric_part_costs_accuracy_and_the_full_matrix_says_how_much():
-    experiment = simulate(Settings("lam", "slow", seed=0))
+    experiment = simulate(ScenarioSettings("lam", "slow", seed=0))
     symmetric, full = bound_of(experiment), bound_of(experiment, full_matrix=True)
     assert full.covariance.shape == (15, 15)
     assert 1.0 < full.hard_iron_gauss / symmetric.hard_iron_gauss < 1.3
@@ -152,7 +152,7 @@ def test_the_antisymmetric_part_costs_accuracy_and_the_full_matrix_says_how_much
 
 
 def test_a_gap_is_not_bridged_and_costs_information():
-    whole = simulate(Settings("mam", "rov", seed=1, samples=4000))
+    whole = simulate(ScenarioSettings("mam", "rov", seed=1, samples=4000))
     t = trajectory(whole)
     dt = t.dt_s.copy()
     dt[2000] = np.nan
@@ -165,7 +165,7 @@ def test_a_gap_is_not_bridged_and_costs_information():
 
 
 def test_scales_with_the_noise_and_with_the_units():
-    e = simulate(Settings("mam", "rov", samples=3000))
+    e = simulate(ScenarioSettings("mam", "rov", samples=3000))
     one = bound_of(e)
     ten = cramer_rao(trajectory(e), e.truth.soft_iron, 10 * SM, 10 * SG)
     assert ten.covariance == pytest.approx(100 * one.covariance, rel=1e-6)
@@ -185,7 +185,7 @@ def test_a_sensor_at_rest_determines_nothing():
 
 
 def test_ten_thousand_samples_take_less_than_a_second():
-    experiment = simulate(Settings("lam"))
+    experiment = simulate(ScenarioSettings("lam"))
     began = time.process_time()
     bound_of(experiment)
     assert time.process_time() - began < 1.0
@@ -209,7 +209,7 @@ def test_published_bounds_at_400_s(scenario, motion):
 
     "rov" MAM and LAM come out 10 % below the published figures (0.29 and 0.56 for 0.32 and 0.62).
     """
-    runs = [bound_of(simulate(Settings(scenario, motion, seed))) for seed in range(12)]
+    runs = [bound_of(simulate(ScenarioSettings(scenario, motion, seed))) for seed in range(12)]
     hard, soft, gyro = PUBLISHED[scenario, motion]
     for values, published, tolerance in (
         ([1e3 * b.hard_iron_gauss for b in runs], hard, 0.20),
@@ -231,7 +231,10 @@ def test_published_bounds_at_400_s(scenario, motion):
 )  # fmt: skip
 def test_published_bounds_of_short_times(scenario, at_s, published_mg):
     runs = [
-        1e3 * bound_of(simulate(Settings(scenario, seed=seed, samples=25 * at_s))).hard_iron_gauss
+        1e3
+        * bound_of(
+            simulate(ScenarioSettings(scenario, seed=seed, samples=25 * at_s))
+        ).hard_iron_gauss
         for seed in range(30)
     ]
     # the phases decide: bounds of single runs spread over a decade, so medians bracket the figure
@@ -350,7 +353,7 @@ def check_at_bound(errors, bounds, above):
 
 
 def test_a_full_likelihood_smoother_of_its_own_reaches_it():
-    settings = [Settings("mam", "rov", seed, samples=1500) for seed in range(40)]
+    settings = [ScenarioSettings("mam", "rov", seed, samples=1500) for seed in range(40)]
     check_at_bound(*errors_and_bounds(smooth, settings), above=1.0)
 
 
@@ -364,5 +367,5 @@ def test_the_estimator_fed_whole_reaches_it():
             [found.soft_iron[UPPER], found.hard_iron_gauss, found.gyro_bias_rad_s]
         )
 
-    settings = [Settings("mam", "rov", seed, samples=3000) for seed in range(12)]
+    settings = [ScenarioSettings("mam", "rov", seed, samples=3000) for seed in range(12)]
     check_at_bound(*errors_and_bounds(estimate, settings), above=1.1)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ahrsd.baselines import METHODS
 from ahrsd.cli.calibrate import _METHODS
 from ahrsd.config.loading import Config
-from ahrsd.config.sections import Location
+from ahrsd.config.sections import LocationSection
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import run_published
 
@@ -80,7 +80,9 @@ def test_magfactor3_takes_the_devices_attitude_where_place_and_attitude_are_know
     header = ",".join([*names[:7], "vn_yaw_deg", "vn_pitch_deg", "vn_roll_deg"])
     table = tmp_path / "with_attitude.csv"
     np.savetxt(table, np.hstack([rows[:, :7], ypr]), "%.7g", ",", header=header, comments="")
-    place = Config(location=Location(latitude_deg=43.0, longitude_deg=34.0, date=date(2026, 7, 1)))
+    place = Config(
+        location=LocationSection(latitude_deg=43.0, longitude_deg=34.0, date=date(2026, 7, 1))
+    )
     found = run_published(calibrate(table, place), "magfactor3")
     assert found.converged, found.reason
     error = found.hard_iron_gauss - np.array(truth["hard_iron_gauss"])

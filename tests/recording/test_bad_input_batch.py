@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ahrsd.baselines import METHODS, MethodError, Settings
+from ahrsd.baselines import METHODS, MethodError, MethodSettings
 from ahrsd.config.loading import Config
-from ahrsd.config.sections import Location
+from ahrsd.config.sections import LocationSection
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.offline.calibrate import BatchResult, calibrate
@@ -26,7 +26,9 @@ SOFT_IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]
 HARD_IRON = np.array([0.04, 0.11, 0.11])
 FIELD_N = np.array([0.227, 0.052, 0.412])
 # Near Boston the field has about the size of FIELD_N: the methods that need it get it.
-PLACE = Config(location=Location(latitude_deg=42.3, longitude_deg=-71.1, date=date(2022, 10, 15)))
+PLACE = Config(
+    location=LocationSection(latitude_deg=42.3, longitude_deg=-71.1, date=date(2022, 10, 15))
+)
 GYRO = [name for name, method in METHODS.items() if "gyro" in method.needs]
 HEADER = "time_s,mag_x_gauss,mag_y_gauss,mag_z_gauss,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s"
 FEW = settings(
@@ -225,7 +227,7 @@ def test_a_sigma_that_cannot_be(value):
             EstimatorParameters(**{name: value})
     for name in ("sigma_mag_gauss", "sigma_field_gauss"):
         with pytest.raises(MethodError, match=f"{name} is .*: it must be a positive number"):
-            Settings(**{name: value})
+            MethodSettings(**{name: value})
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import LinkOpened, Received, RegistersKnown, Samples, Stop
 from ahrsd.recording.capture import CaptureWriter
-from ahrsd.recording.opening import Kind, open_recording
+from ahrsd.recording.opening import RecordingKind, open_recording
 
 TABLE = "time_s,mag_x_gauss,mag_y_gauss,mag_z_gauss,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s\n"
 TABLE += "".join(f"{100 + 0.1 * k:.1f},0.2,0.1,0.4,0.0,0.0,0.1\n" for k in range(1500))
@@ -30,7 +30,7 @@ def test_byte_streams(tmp_path, name, zipped):
     path = tmp_path / (name + ".gz" * zipped)
     path.write_bytes(gzip.compress(SENTENCES, mtime=0) if zipped else SENTENCES)
     recording = open_recording(path, rate_hz=40.0)
-    assert (recording.kind, recording.rate_hz, recording.notes) == (Kind.BYTES, 40.0, [])
+    assert (recording.kind, recording.rate_hz, recording.notes) == (RecordingKind.BYTES, 40.0, [])
     *received, stop = recording.inputs()
     assert b"".join(item.data for item in received) == SENTENCES
     assert stop == Stop(0, "end of recording")
@@ -39,7 +39,7 @@ def test_byte_streams(tmp_path, name, zipped):
 def test_tables(tmp_path):
     (tmp_path / "t.csv").write_text(TABLE)
     recording = open_recording(tmp_path / "t.csv")
-    assert (recording.kind, recording.name) == (Kind.TABLE, "t.csv")
+    assert (recording.kind, recording.name) == (RecordingKind.TABLE, "t.csv")
     first, second, stop = recording.inputs()
     assert isinstance(first, Samples)
     assert isinstance(second, Samples)
@@ -88,9 +88,9 @@ def test_a_capture_of_a_silent_device_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("content", "kind"),
     [
-        (b"noise\r\n$VNYMR,+010.071*64\r\n" * 9, Kind.BYTES),
-        (b"\xfa\x14\x3e\x00" * 9, Kind.BYTES),
-        (TABLE.encode(), Kind.TABLE),
+        (b"noise\r\n$VNYMR,+010.071*64\r\n" * 9, RecordingKind.BYTES),
+        (b"\xfa\x14\x3e\x00" * 9, RecordingKind.BYTES),
+        (TABLE.encode(), RecordingKind.TABLE),
     ],
 )
 def test_an_unknown_name_is_judged_by_its_content(tmp_path, content, kind):
@@ -101,9 +101,9 @@ def test_an_unknown_name_is_judged_by_its_content(tmp_path, content, kind):
 @pytest.mark.parametrize(
     ("name", "content", "kind"),
     [
-        ("a.txt", TABLE.encode(), Kind.TABLE),
-        ("a.log.gz", gzip.compress(TABLE.encode("utf-16"), mtime=0), Kind.TABLE),
-        ("a.csv", SENTENCES, Kind.BYTES),
+        ("a.txt", TABLE.encode(), RecordingKind.TABLE),
+        ("a.log.gz", gzip.compress(TABLE.encode("utf-16"), mtime=0), RecordingKind.TABLE),
+        ("a.csv", SENTENCES, RecordingKind.BYTES),
         ("a.csv", b"PAR1", None),
     ],
 )
@@ -155,5 +155,5 @@ def test_paths_that_are_no_file(tmp_path):
 
 def test_the_real_mixed_stream_opens_as_bytes(recordings):
     recording = open_recording(recordings / "vn100" / "F00379.logger_mixed_stream.gz")
-    assert recording.kind is Kind.BYTES
+    assert recording.kind is RecordingKind.BYTES
     assert sum(len(item.data) for item in recording.inputs() if isinstance(item, Received)) > 10**6

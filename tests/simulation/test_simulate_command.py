@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ahrsd.recording.table import read_table
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 from ahrsd.simulation.motion import quaternion
 from ahrsd.simulation.recorded import rotation
 from drivers.vn100.decode import Measurement, decode
@@ -20,7 +20,7 @@ def test_tables_keep_every_digit_and_say_the_truth(run, tmp_path, suffix):
     path = tmp_path / f"x{suffix}"
     arguments = ("--motion", "rov", "--seed", 5, "--seconds", 8, "--rate", 50)
     assert run("simulate", "mam", "-o", path, *arguments) == 0
-    expected = simulate(Settings("mam", "rov", seed=5, samples=400, rate_hz=50.0))
+    expected = simulate(ScenarioSettings("mam", "rov", seed=5, samples=400, rate_hz=50.0))
     table = read_table(path)
     assert np.array_equal(table.rows.raw_b_gauss, expected.samples.raw_b_gauss)
     assert np.array_equal(table.rows.gyro_b_rad_s, expected.samples.gyro_b_rad_s)
@@ -42,7 +42,7 @@ def test_the_byte_stream_is_what_a_device_prints(run, tmp_path):
     rows = [decode(frame) for frame in frames]
     assert all(isinstance(row, Measurement) for row in rows)
     assert {row.layout.name for row in rows} == {"VNYMR"}
-    expected = simulate(Settings("lam", samples=100, noise_mag_gauss=0.0))
+    expected = simulate(ScenarioSettings("lam", samples=100, noise_mag_gauss=0.0))
     values = np.array([row.values for row in rows])
     assert values[:, 3:6] == pytest.approx(expected.samples.raw_b_gauss, abs=0.51e-4)
     assert values[:, 9:12] == pytest.approx(expected.samples.gyro_b_rad_s, abs=0.51e-6)
@@ -102,7 +102,7 @@ def test_a_field_on_the_motion_of_a_recording(run, tmp_path):
 
 
 def test_quaternions_do_not_jump():
-    made = simulate(Settings("wam", "rov", samples=3000))
+    made = simulate(ScenarioSettings("wam", "rov", samples=3000))
     q = quaternion(made.R_nb)
     assert np.linalg.norm(q, axis=1) == pytest.approx(np.ones(3000))
     assert np.linalg.norm(np.diff(q, axis=0), axis=1).max() < 0.02

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 from ahrsd.simulation.disturbance import Disturbances
 
 
 def made(**wanted):
-    return simulate(Settings("mam", samples=1000, disturbances=Disturbances(**wanted)))
+    return simulate(ScenarioSettings("mam", samples=1000, disturbances=Disturbances(**wanted)))
 
 
 def field_difference(**wanted):

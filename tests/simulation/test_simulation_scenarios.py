@@ -9,7 +9,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.heading import tilt_compensated_heading
-from ahrsd.simulation import Iron, Settings, simulate
+from ahrsd.simulation import Iron, ScenarioSettings, simulate
 from ahrsd.simulation.experiment import predicted_directions
 from ahrsd.simulation.motion import MOTIONS, SCENARIOS, SUBSTEPS, mean_rate, rotation_nb, sinusoids
 from ahrsd.simulation.scenarios import generator
@@ -40,7 +40,7 @@ def test_the_published_sensor_in_this_projects_gauge():
 
 
 def test_a_reading_is_the_published_formula():
-    quiet = Settings("mam", "rov", samples=200, noise_mag_gauss=0.0, noise_gyro_rad_s=0.0)
+    quiet = ScenarioSettings("mam", "rov", samples=200, noise_mag_gauss=0.0, noise_gyro_rad_s=0.0)
     made = simulate(quiet)
     iron = Iron()
     for k in (0, 57, 199):
@@ -55,7 +55,7 @@ def test_a_reading_is_the_published_formula():
 def test_the_gyro_of_a_step_turns_the_field_of_the_row_before_into_that_of_the_row(
     scenario, motion
 ):
-    made = simulate(Settings(scenario, motion, seed=4, samples=2000))
+    made = simulate(ScenarioSettings(scenario, motion, seed=4, samples=2000))
     u = made.field_b / made.truth.field_gauss
     assert np.abs(predicted_directions(made) - u).max() < 6e-7  # coning within 40 ms
     late = replace(made, rate_b_rad_s=np.roll(made.rate_b_rad_s, 1, axis=0))
@@ -94,7 +94,7 @@ def test_half_ranges_and_frequencies_are_those_of_the_thesis(motion):
 
 
 def test_noise_has_its_level_and_is_white():
-    made = simulate(Settings("wam", samples=10_000))
+    made = simulate(ScenarioSettings("wam", samples=10_000))
     mag = made.samples.raw_b_gauss - made.field_b @ made.truth.soft_iron.T
     mag -= made.truth.hard_iron_gauss
     gyro = made.samples.gyro_b_rad_s - made.rate_b_rad_s - made.truth.gyro_bias_rad_s
@@ -105,14 +105,14 @@ def test_noise_has_its_level_and_is_white():
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_another_motion():
-    one, same, other = (simulate(Settings("mam", seed=s, samples=300)) for s in (3, 3, 4))
+    one, same, other = (simulate(ScenarioSettings("mam", seed=s, samples=300)) for s in (3, 3, 4))
     assert np.array_equal(one.samples.raw_b_gauss, same.samples.raw_b_gauss)
     assert np.array_equal(one.samples.gyro_b_rad_s, same.samples.gyro_b_rad_s)
     assert np.abs(one.R_nb - other.R_nb).max() > 0.1
 
 
 def test_sweeps_keep_the_trajectory_and_scale_the_same_noise():
-    base = Settings("mam", samples=100)
+    base = ScenarioSettings("mam", samples=100)
     quiet, loud = (simulate(replace(base, noise_mag_gauss=n)) for n in (1e-3, 1e-2))
     truth = quiet.field_b @ quiet.truth.soft_iron.T + quiet.truth.hard_iron_gauss
     small, large = (e.samples.raw_b_gauss - truth for e in (quiet, loud))
@@ -123,7 +123,7 @@ def test_sweeps_keep_the_trajectory_and_scale_the_same_noise():
 
 
 def test_gravity_and_field_give_back_the_true_heading():
-    made = simulate(Settings("mam", samples=500))
+    made = simulate(ScenarioSettings("mam", samples=500))
     north_east = made.R_nb[0] @ made.field_b[0]
     declination = np.arctan2(north_east[1], north_east[0])
     found = tilt_compensated_heading(made.field_b, made.samples.accel_b_m_s2) + declination
@@ -143,4 +143,4 @@ def test_gravity_and_field_give_back_the_true_heading():
 )
 def test_wrong_settings_are_named(wrong, said):
     with pytest.raises(ValueError, match=said):
-        Settings(**wrong)
+        ScenarioSettings(**wrong)

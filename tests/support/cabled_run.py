@@ -13,7 +13,7 @@ from ahrsd import events, inputs
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.config.sections import Gates
+from ahrsd.config.sections import GatesSection
 from ahrsd.core.core import Core
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
@@ -39,7 +39,7 @@ def estimate(**changes: Any) -> Estimate:
 def lenient_gates() -> dict[str, float]:
     """Limits that a minute of motion passes."""
     easy: dict[str, float] = {}
-    for name, info in Gates.model_fields.items():
+    for name, info in GatesSection.model_fields.items():
         bounds: dict[str, Any] = {type(one).__name__: one for one in info.metadata}
         if name.startswith(("max_", "holdout_rms", "holdout_max", "repeat", "field_", "closure")):
             easy[name] = float(bounds["Le"].le)

@@ -9,7 +9,7 @@ import numpy as np
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.track import Track
-from ahrsd.simulation import Settings, simulate
+from ahrsd.simulation import ScenarioSettings, simulate
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Made:
 
     track: Track
     truth: list[tuple[str, np.ndarray, dict]] = field(default_factory=list)
-    settings: Settings | None = None
+    settings: ScenarioSettings | None = None
 
 
 def made(trial: Trial) -> Made:
     """Build the trial: motion, covariates, effects exactly, then noise."""
     rng = np.random.default_rng([trial.seed, 77])
-    settings = Settings(
+    settings = ScenarioSettings(
         scenario=trial.scenario,
         motion="rov",
         seed=trial.seed,

@@ -10,7 +10,7 @@ from operator import xor
 
 from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 
 
 def xor8(body: bytes) -> bytes:
@@ -45,7 +45,7 @@ def bodies(wire: bytes) -> list[str]:
 
 
 def device(motion="static", truth=None, **options) -> Emulator:
-    return Emulator(truth or Truth(), make_motion(motion, 1), **options)
+    return Emulator(truth or EmulatedTruth(), make_motion(motion, 1), **options)
 
 
 def quiet(**options) -> Emulator:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ahrsd.calibration import Affine
-from ahrsd.evaluation import StoredCalibration, Track
+from ahrsd.evaluation import EvaluationTrack, StoredCalibration
 from ahrsd.evaluation.references import Fixes
 from ahrsd.samples import Array
 
@@ -20,7 +20,7 @@ DECLINATION_DEG = float(np.degrees(np.arctan2(-0.05, 0.20)))
 
 @dataclass(frozen=True)
 class Vehicle:
-    track: Track
+    track: EvaluationTrack
     heading_rad: Array
     R_nb: Array
     fixes: Fixes
@@ -45,7 +45,7 @@ def drive() -> Vehicle:
     raw = field_b @ SOFT_IRON.T + HARD_IRON
     accel = np.einsum("kji,j->ki", R_nb, np.array([0.0, 0.0, -9.81]))
     names = ("velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s")
-    track = Track(
+    track = EvaluationTrack(
         time_s=t, raw_b_gauss=raw, before_b_gauss=raw, gyro_b_rad_s=rate, accel_b_m_s2=accel,
         covariates=dict(zip(names, velocity_b.T, strict=True)),
     )  # fmt: skip

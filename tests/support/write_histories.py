@@ -27,7 +27,7 @@ from write_events import EVENTS, ORIGIN_SERIAL, Act, random_iron, users_values
 from write_observer import KINDS
 
 from ahrsd.config.loading import Config
-from ahrsd.config.sections import Location
+from ahrsd.config.sections import LocationSection
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy
 
 MOTION = Motion(rest_s=2.5, turn_s=3.5)
@@ -223,7 +223,7 @@ def run_real(number: int, seed: int, tally: HistoriesTally) -> World:
     presets = {7: "40", **({6: "19"} if number % 3 == 2 else {6: "0", 75: "1,20,06,0001,083F"})}
     iron = Iron(soft, random_iron(draw).hard_gauss, random_iron(draw).gyro_bias_rad_s)
     unit = Unit(ORIGIN_SERIAL, iron, Vehicle(REAL_MOTION), boot_s=-20.0, presets=presets)
-    place = Location(latitude_deg=48.0, longitude_deg=11.0, date=datetime.date(2026, 6, 1))
+    place = LocationSection(latitude_deg=48.0, longitude_deg=11.0, date=datetime.date(2026, 6, 1))
     with folder() as at:
         clocks = HostClocks(wall_ahead_s=float(draw.choice(WALLS_S)))
         world = World(Cable(unit), at, policy, clocks, Config(location=place))

@@ -18,10 +18,10 @@ from ahrsd.events import GateResult, Noted, StateChanged
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.actions import (
     Action,
+    AppendToJournal,
     Emit,
     IdentifyAgain,
     InForce,
-    JournalAppend,
     Look,
     RunProcedure,
     SetUpStream,
@@ -193,7 +193,7 @@ class Rig:
         queue = list(actions)
         while queue:
             action = queue.pop(0)
-            if isinstance(action, JournalAppend):
+            if isinstance(action, AppendToJournal):
                 queue = self._append(action) + queue
             elif isinstance(action, RunProcedure):
                 queue += self._carry_out(action)
@@ -206,7 +206,7 @@ class Rig:
             else:
                 self.asked.append(action)
 
-    def _append(self, action: JournalAppend) -> list[Action]:
+    def _append(self, action: AppendToJournal) -> list[Action]:
         self._point()
         if self.disk_full:
             return self.wb.on_journal_failed(action.kind, "no space left", self.now_s)

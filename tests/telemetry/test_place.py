@@ -14,14 +14,14 @@ import pytest
 
 import ahrsd
 from ahrsd.cli import COMMANDS, bundle
-from ahrsd.cli.running import _HINT, Place
+from ahrsd.cli.running import _HINT, DaemonPlace
 from ahrsd.config.loading import Config
 
 TALK = ("status", "explain", "watch", "bundle", "operator")
 
 
-def place(given: Path | None) -> Place:
-    return Place(Config(), given or Path("/var/lib/ahrsd"), None, given is not None)
+def place(given: Path | None) -> DaemonPlace:
+    return DaemonPlace(Config(), given or Path("/var/lib/ahrsd"), None, given is not None)
 
 
 def test_hints_name_the_daemon_that_was_named(tmp_path):

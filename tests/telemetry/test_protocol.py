@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ahrsd.telemetry.outbox import Outbox
-from ahrsd.telemetry.protocol import BadRequest, Request, line_of, parse_request
+from ahrsd.telemetry.protocol import BadRequest, SocketRequest, line_of, parse_request
 
 
 def test_requests():
-    assert parse_request(b'{"ask": "status"}') == Request("status")
-    assert parse_request(b'{"ask":"watch","of":["samples"]}') == Request(
+    assert parse_request(b'{"ask": "status"}') == SocketRequest("status")
+    assert parse_request(b'{"ask":"watch","of":["samples"]}') == SocketRequest(
         "watch", frozenset({"samples"})
     )
     assert parse_request(b'{"ask":"watch"}').streams == {"status", "events"}

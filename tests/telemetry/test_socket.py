@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from ahrsd.errors import DeviceError
-from ahrsd.telemetry.client import Asked
+from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.server import MOST_CLIENTS, SocketServer
@@ -31,7 +31,7 @@ def served(live, tmp_path):
 def until_status(path):
     """The first status with samples."""
     for _ in range(100):
-        with Asked(path) as asked:
+        with DaemonConnection(path) as asked:
             try:
                 status = asked.ask("status")
             except DeviceError:
@@ -50,12 +50,12 @@ def test_status_explain_and_watch_of_a_running_daemon(served):
     assert status["stream"]["rejected"] == 0
     assert status["mode"] == "observe"
     assert any(line.startswith("device: VN-100") for line in status_lines(status))
-    with Asked(path) as asked:
+    with DaemonConnection(path) as asked:
         explained = asked.ask("explain")
     assert explained["state"] == "OBSERVING"
     assert "the mode is observe; stage or commit may write" in explained["others"]
     assert explained["next"].startswith("drive two full circles")
-    with Asked(path) as asked:
+    with DaemonConnection(path) as asked:
         records = asked.watch(("samples",))
         assert next(records) == {"watching": ["samples"]}
         some = [next(records) for _ in range(20)]
@@ -84,7 +84,7 @@ def test_readers_that_never_read_cost_no_sample(served):
 def test_a_request_that_is_none_is_answered_and_the_connection_lives(tmp_path):
     server = SocketServer(tmp_path / "s")
     try:
-        with Asked(tmp_path / "s") as asked:
+        with DaemonConnection(tmp_path / "s") as asked:
             asked._socket.sendall(b'nonsense\n{"ask":"status"}\n')
             assert "not a JSON object" in asked._line()["error"]
             assert "only just begun" in asked._line()["error"]
@@ -100,9 +100,9 @@ def test_too_many_clients_and_a_second_daemon_are_refused(tmp_path):
     server = SocketServer(path)
     try:
         assert path.stat().st_mode & 0o777 == 0o660
-        held = [Asked(path) for _ in range(MOST_CLIENTS)]
+        held = [DaemonConnection(path) for _ in range(MOST_CLIENTS)]
         with pytest.raises(DeviceError, match="clients are connected already"):
-            Asked(path)
+            DaemonConnection(path)
         for one in held:
             one.__exit__()
         with pytest.raises(FileExistsError, match="another daemon serves here"):
@@ -117,19 +117,19 @@ def test_what_a_dead_daemon_left_is_replaced(tmp_path):
     dead.bind(str(path))
     dead.close()
     server = SocketServer(path)
-    with Asked(path):
+    with DaemonConnection(path):
         server.close()
 
 
 def test_no_daemon_is_one_clear_line(tmp_path):
     with pytest.raises(DeviceError, match=r"no daemon answers .*; is `ahrsd run` running"):
-        Asked(tmp_path / "none")
+        DaemonConnection(tmp_path / "none")
 
 
 def test_a_slow_reader_gets_a_gap_record(tmp_path):
     server = SocketServer(tmp_path / "s", limit_bytes=20_000)
     try:
-        with Asked(tmp_path / "s") as asked:
+        with DaemonConnection(tmp_path / "s") as asked:
             asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
             assert asked._line() == {"watching": ["status"]}
             for number in range(600):
@@ -156,13 +156,13 @@ def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
     try:
         server.status({"number": 0})
         for number in range(400):
-            with Asked(tmp_path / "s") as asked:
+            with DaemonConnection(tmp_path / "s") as asked:
                 asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
                 assert asked._line() == {"watching": ["status"]}
                 asked._socket.sendall(b'{"ask": "status"}\n')
                 server.status({"number": number})
             server.status({"number": number})
-        with Asked(tmp_path / "s") as asked:
+        with DaemonConnection(tmp_path / "s") as asked:
             assert asked.ask("status") == {"number": 399}
     finally:
         server.close()

@@ -25,7 +25,7 @@ from drivers.vn100.decode import (
     decode_batch,
 )
 from drivers.vn100.deframer import Deframer, Packet, Sentence
-from drivers.vn100.errors import ERRORS, DeviceRefused, DriverError, Outcome, device_error
+from drivers.vn100.errors import ERRORS, DeviceRefused, DriverError, Remedy, device_error
 from drivers.vn100.sentences import encode, sentence_layout
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "bench_parse.py"
@@ -177,25 +177,25 @@ def test_the_error_table() -> None:
     assert sorted(ERRORS) == [*range(1, 13), 255]
     by_outcome = {
         outcome: sorted(code for code, row in ERRORS.items() if row.outcome is outcome)
-        for outcome in Outcome
+        for outcome in Remedy
     }
     assert by_outcome == {
-        Outcome.RETRY: [2, 3],
-        Outcome.STOP: [4, 5, 6, 7, 8, 9, 255],
-        Outcome.RESET: [1, 10],
-        Outcome.BANDWIDTH: [11, 12],
+        Remedy.RETRY: [2, 3],
+        Remedy.STOP: [4, 5, 6, 7, 8, 9, 255],
+        Remedy.RESET: [1, 10],
+        Remedy.BANDWIDTH: [11, 12],
     }
 
 
 def test_a_refusal_says_what_and_why() -> None:
     error = DeviceRefused(0x0C)
     assert isinstance(error, DriverError)
-    assert (error.code, error.error.outcome) == (12, Outcome.BANDWIDTH)
+    assert (error.code, error.error.outcome) == (12, Remedy.BANDWIDTH)
     assert str(error) == (
         "the device answered error 0C (insufficient baud rate): lower rates or raise the baud"
     )
     assert "error 55 (unknown error)" in str(DeviceRefused(0x55))
-    assert device_error(0x55).outcome is Outcome.STOP
+    assert device_error(0x55).outcome is Remedy.STOP
 
 
 # ── speed ────────────────────────────────────────────────────────────────────────────────────────

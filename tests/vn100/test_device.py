@@ -10,7 +10,7 @@ import tty
 
 import pytest
 
-from drivers.serial_port import LinkLost, SerialPort
+from drivers.serial_port import PortLost, SerialPort
 from drivers.vn100.commands import NoReply, NotPermitted, Pause, Word, Write
 from drivers.vn100.decode import Measurement
 from drivers.vn100.device import Device, TookTooLong
@@ -172,7 +172,7 @@ def test_even_an_interrupted_clean_up_resumes_the_output_at_the_end(scripted):
 def test_a_port_that_goes_away_ends_the_run_at_once(scripted):
     scripted.hang_up_on = b"$VNRRG,23*72"
     with (
-        pytest.raises(LinkLost, match="is gone"),
+        pytest.raises(PortLost, match="is gone"),
         Device(SerialPort(scripted.path, 115200), everything) as device,
     ):
         device.run(quiet(read(23)))

@@ -7,7 +7,7 @@ import pytest
 from drivers.vn100.commands import NoReply, Read, Word, Write
 from drivers.vn100.procedures import identify, read_registers, save_settings, write_verified
 from drivers.vn100.sentences import encode
-from drivers.vn100.session import Failed, Finished, LineEchoes, Session
+from drivers.vn100.session import LineEchoes, ProcedureFailed, ProcedureFinished, Session
 
 NEW = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.0, 0.0)
 
@@ -55,7 +55,7 @@ class Line:
 
 
 def outcome(events):
-    return next(event for event in events if isinstance(event, Finished | Failed))
+    return next(event for event in events if isinstance(event, ProcedureFinished | ProcedureFailed))
 
 
 @pytest.mark.parametrize("end", [b"\r\n", b"\r", b"\r\r\n"])
@@ -101,7 +101,7 @@ def test_a_verified_write_goes_through():
     assert outcome(line.run(procedure())).result == pytest.approx(NEW)
     line.keeps = {23}
     line.registers[23] = "1,0,0,0,1,0,0,0,1,0,0,0"
-    assert isinstance(outcome(line.run(procedure())), Failed)
+    assert isinstance(outcome(line.run(procedure())), ProcedureFailed)
 
 
 def test_a_save_that_is_only_echoed_is_no_save():
@@ -110,7 +110,7 @@ def test_a_save_that_is_only_echoed_is_no_save():
         yield from save_settings()
 
     line = Line()
-    assert isinstance(outcome(line.run(procedure())), Finished)
+    assert isinstance(outcome(line.run(procedure())), ProcedureFinished)
     line.mute = {"VNWNV"}
     error = outcome(line.run(procedure())).error
     assert isinstance(error, NoReply)

@@ -13,7 +13,7 @@ import pytest
 from quiet_device import Host, bodies, command, device, quiet
 
 from drivers.vn100.emulator.emulator import BOOT_S
-from drivers.vn100.emulator.physics import Truth, draw_truth
+from drivers.vn100.emulator.physics import EmulatedTruth, draw_truth
 
 WIRE = Path(__file__).parents[2] / "fixtures" / "vn100" / "wire_examples.json"
 
@@ -237,7 +237,7 @@ def test_baud_write_is_answered_at_the_old_rate(host):
 
 
 def test_rotation_acts_only_after_save_and_reset():
-    host = Host(quiet(truth=Truth(noise_mag_gauss=0)))
+    host = Host(quiet(truth=EmulatedTruth(noise_mag_gauss=0)))
 
     def field():
         return [float(value) for value in host.ask("VNRRG,17").split(",")[2:]]
@@ -257,7 +257,7 @@ def test_rotation_acts_only_after_save_and_reset():
 
 def test_worked_example_through_register_23():
     """5.2: m = (0.25, 0.10, 0.50) becomes (0.2053, 0.1294, 0.4040)."""
-    truth = Truth(
+    truth = EmulatedTruth(
         field_n_gauss=np.zeros(3), hard_iron_gauss=np.array([0.25, 0.1, 0.5]), noise_mag_gauss=0
     )
     host = Host(quiet(truth=truth))
@@ -270,7 +270,7 @@ def test_worked_example_through_register_23():
 
 def test_gyro_bias_written_to_84_disappears_from_the_uncompensated_rate():
     bias = np.array([0.004, -0.005, 0.002])
-    host = Host(quiet(truth=Truth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)))
+    host = Host(quiet(truth=EmulatedTruth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)))
     assert host.ask("VNRRG,54").split(",")[8:11] == ["+00.004000", "-00.005000", "+00.002000"]
     host.ask("VNWRG,84,1,0,0,0,1,0,0,0,1,0.004,-0.005,0.002")
     after = [float(value) for value in host.ask("VNRRG,54").split(",")[8:11]]
@@ -280,7 +280,9 @@ def test_gyro_bias_written_to_84_disappears_from_the_uncompensated_rate():
 @pytest.mark.parametrize(("firmware", "register"), [("3.1.0.0", 43), ("2.1.0.0", 74)])
 def test_vnsgb_keeps_the_filters_bias_for_the_next_start(firmware, register):
     bias = np.array([0.004, -0.005, 0.002])
-    host = Host(quiet(firmware=firmware, truth=Truth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)))
+    host = Host(
+        quiet(firmware=firmware, truth=EmulatedTruth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0))
+    )
     host.wait(120.0)
     host.ask("VNSGB")
     kept = [float(value) for value in host.ask(f"VNRRG,{register}").split(",")[2:5]]

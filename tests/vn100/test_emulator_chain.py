@@ -6,29 +6,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.vn100.emulator.chain import BIAS_S, FilterState, Outputs, Settings
+from drivers.vn100.emulator.chain import BIAS_S, ChainSettings, FilterState, SensorOutputs
 from drivers.vn100.emulator.hsi import OnBoardHsi
 from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import BLOCK_TICKS, Block, Truth, World
+from drivers.vn100.emulator.physics import BLOCK_TICKS, EmulatedTruth, EmulatedWorld, SensorBlock
 
 EYE = (np.eye(3), np.zeros(3))
-PLAIN = Settings(EYE, EYE, EYE, np.eye(3), None, np.array([0.245, 0, 0.424]))
+PLAIN = ChainSettings(EYE, EYE, EYE, np.eye(3), None, np.array([0.245, 0, 0.424]))
 SKEWED = (np.array([[1.02, 0.01, 0], [0.01, 0.98, 0], [0, 0, 1.01]]), np.array([0.05, -0.03, 0.1]))
 TURNED = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # x of the output is y of the sensor
 
 
 def block(motion="tumble", number=1, **truth):
-    world = World(Truth(**truth), make_motion(motion, 1), 1)
+    world = EmulatedWorld(EmulatedTruth(**truth), make_motion(motion, 1), 1)
     return [world.next_block() for _ in range(number)][-1]
 
 
-def with_field(made: Block, field) -> Block:
+def with_field(made: SensorBlock, field) -> SensorBlock:
     return replace(made, mag_gauss=np.tile(field, (len(made.mag_gauss), 1)))
 
 
 def test_worked_example_of_5_2():
     made = with_field(block(), [0.25, 0.10, 0.50])
-    out = Outputs(made, replace(PLAIN, mag=SKEWED), FilterState())
+    out = SensorOutputs(made, replace(PLAIN, mag=SKEWED), FilterState())
     for name in ("uncomp_mag", "mag"):
         np.testing.assert_allclose(out.quantity(name)[7], [0.2053, 0.1294, 0.4040], atol=1e-12)
 
@@ -37,8 +37,10 @@ def test_rotation_acts_behind_the_calibration():
     """With R = diag(-1,1,-1) a bias in register 23 moves the output by -R C b (5.3, measured)."""
     R = np.diag([-1.0, 1, -1])
     made = with_field(block(), [0.25, 0.10, 0.50])
-    without = Outputs(made, replace(PLAIN, mag=(SKEWED[0], np.zeros(3)), rotation=R), FilterState())
-    moved = Outputs(made, replace(PLAIN, mag=SKEWED, rotation=R), FilterState())
+    without = SensorOutputs(
+        made, replace(PLAIN, mag=(SKEWED[0], np.zeros(3)), rotation=R), FilterState()
+    )
+    moved = SensorOutputs(made, replace(PLAIN, mag=SKEWED, rotation=R), FilterState())
     shift = moved.quantity("uncomp_mag")[0] - without.quantity("uncomp_mag")[0]
     np.testing.assert_allclose(shift, [0.0507, 0.0289, 0.1010], atol=1e-12)
 
@@ -46,7 +48,7 @@ def test_rotation_acts_behind_the_calibration():
 def test_hsi_acts_on_the_compensated_field_only_and_last():
     hsi = (np.diag([2.0, 1.0, 0.5]), np.array([0.1, 0.0, 0.0]))
     made = with_field(block(), [0.25, 0.10, 0.50])
-    out = Outputs(made, replace(PLAIN, mag=SKEWED, rotation=TURNED, hsi=hsi), FilterState())
+    out = SensorOutputs(made, replace(PLAIN, mag=SKEWED, rotation=TURNED, hsi=hsi), FilterState())
     np.testing.assert_allclose(out.quantity("uncomp_mag")[0], [0.1294, -0.2053, 0.4040], atol=1e-12)
     expected = [2 * (0.1294 - 0.1), -0.2053, 0.5 * 0.4040]
     np.testing.assert_allclose(out.quantity("mag")[0], expected, atol=1e-12)
@@ -54,7 +56,9 @@ def test_hsi_acts_on_the_compensated_field_only_and_last():
 
 def test_gyro_and_accel_registers_and_rotation():
     made = block()
-    out = Outputs(made, replace(PLAIN, gyro=SKEWED, accel=SKEWED, rotation=TURNED), FilterState())
+    out = SensorOutputs(
+        made, replace(PLAIN, gyro=SKEWED, accel=SKEWED, rotation=TURNED), FilterState()
+    )
     read, accel = made.rates(16)[50], made.accel_m_s2[50]
     C, B = SKEWED
     for seen, raw in ((out.rates(16)[50], read), (out.quantity("uncomp_accel")[50], accel)):
@@ -65,10 +69,10 @@ def test_gyro_and_accel_registers_and_rotation():
 
 def test_filter_bias_converges_and_is_subtracted_from_angular_rate_only():
     bias = np.array([0.004, -0.005, 0.002])
-    world = World(Truth(gyro_bias_rad_s=bias), make_motion("static", 1), 1)
+    world = EmulatedWorld(EmulatedTruth(gyro_bias_rad_s=bias), make_motion("static", 1), 1)
     state = FilterState()
     for number in range(1, 121):  # thirty seconds
-        out = Outputs(world.next_block(), PLAIN, state)
+        out = SensorOutputs(world.next_block(), PLAIN, state)
         difference = out.rates(16)[-1] - out.compensated_rates(16)[-1]
         expected = bias * (1 - math.exp(-number * 0.25 / BIAS_S))
         np.testing.assert_allclose(difference, expected, atol=1e-12)
@@ -77,7 +81,7 @@ def test_filter_bias_converges_and_is_subtracted_from_angular_rate_only():
 
 def test_register_85_window_smooths_what_it_is_told_to():
     made = block(number=5)
-    out = Outputs(made, replace(PLAIN, windows=(0, 8)), FilterState())
+    out = SensorOutputs(made, replace(PLAIN, windows=(0, 8)), FilterState())
     field = made.field()
     np.testing.assert_array_equal(out.quantity("uncomp_mag"), field)
     np.testing.assert_allclose(out.quantity("mag")[60], field[53:61].mean(axis=0), atol=1e-12)
@@ -86,12 +90,12 @@ def test_register_85_window_smooths_what_it_is_told_to():
 def test_heading_shows_the_iron_and_recovers_with_the_registers():
     """Level and at rest the yaw is off by what the uncorrected field's direction says."""
     hard = np.array([0.03, -0.12, 0.05])
-    truth = Truth(hard_iron_gauss=hard, noise_mag_gauss=0.0)
+    truth = EmulatedTruth(hard_iron_gauss=hard, noise_mag_gauss=0.0)
     motion = make_motion("static", 1)
     yaw = motion.angles(np.zeros(1))[0, 2]
-    made = World(truth, motion, 1).next_block()
-    off = Outputs(made, PLAIN, FilterState())
-    right = Outputs(made, replace(PLAIN, mag=(np.eye(3), hard)), FilterState())
+    made = EmulatedWorld(truth, motion, 1).next_block()
+    off = SensorOutputs(made, PLAIN, FilterState())
+    right = SensorOutputs(made, replace(PLAIN, mag=(np.eye(3), hard)), FilterState())
     assert right.quantity("ypr")[-1, 0] == pytest.approx(yaw, abs=1e-9)
     c, s = math.cos(yaw), math.sin(yaw)
     x, y = 0.245 * c + 0.03, -0.245 * s - 0.12  # tilt of this static attitude is below 3 degrees
@@ -100,7 +104,7 @@ def test_heading_shows_the_iron_and_recovers_with_the_registers():
 
 
 def test_attitude_quantities_belong_together():
-    out = Outputs(block("tumble", 3), replace(PLAIN, rotation=TURNED), FilterState())
+    out = SensorOutputs(block("tumble", 3), replace(PLAIN, rotation=TURNED), FilterState())
     mag, R = out.quantity("mag")[9], out.R_nu[9]
     np.testing.assert_allclose(R @ mag, out.quantity("mag_ned")[9], atol=1e-12)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -114,14 +118,16 @@ def test_attitude_quantities_belong_together():
 
 
 def test_saturation_flags():
-    out = Outputs(block(hard_iron_gauss=np.array([0.0, 4.0, 0])), PLAIN, FilterState())
+    out = SensorOutputs(block(hard_iron_gauss=np.array([0.0, 4.0, 0])), PLAIN, FilterState())
     assert set(out.saturation().tolist()) == {2.0}
 
 
 def test_on_board_hsi_finds_the_iron():
     soft = np.array([[1.05, 0.05, 0], [0.05, 0.97, 0.02], [0, 0.02, 1.0]])
     hard = np.array([0.1, -0.08, 0.05])
-    world = World(Truth(soft_iron=soft, hard_iron_gauss=hard), make_motion("tumble", 1), 1)
+    world = EmulatedWorld(
+        EmulatedTruth(soft_iron=soft, hard_iron_gauss=hard), make_motion("tumble", 1), 1
+    )
     hsi = OnBoardHsi()
     spread = []
     for _ in range(160):
@@ -137,7 +143,9 @@ def test_on_board_hsi_finds_the_iron():
 
 
 def test_on_board_hsi_keeps_still_at_rest():
-    world = World(Truth(hard_iron_gauss=np.array([0.1, 0, 0])), make_motion("static", 1), 1)
+    world = EmulatedWorld(
+        EmulatedTruth(hard_iron_gauss=np.array([0.1, 0, 0])), make_motion("static", 1), 1
+    )
     hsi = OnBoardHsi()
     for _ in range(80):
         hsi.add(world.next_block().field()[::40], 5, 0.05)
@@ -146,7 +154,7 @@ def test_on_board_hsi_keeps_still_at_rest():
 
 
 def test_outputs_have_a_row_per_tick():
-    out = Outputs(block(), PLAIN, FilterState())
+    out = SensorOutputs(block(), PLAIN, FilterState())
     for name in ("uncomp_mag", "ypr", "linear_accel_body", "mag_ned"):
         assert out.quantity(name).shape == (BLOCK_TICKS, 3)
     with pytest.raises(KeyError):

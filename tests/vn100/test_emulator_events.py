@@ -7,7 +7,7 @@ import pytest
 
 from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 from drivers.vn100.emulator.scenarios import SCENARIOS, Setup, build
 
 QUIET = {6: (0,)}
@@ -16,7 +16,9 @@ VALUES = {6: (0,), 75: (1, 8, 4, 0x0002)}  # UncompMag at 100 Hz, 18 bytes
 
 
 def device(*faults, presets=QUIET, motion="tumble", **options) -> Emulator:
-    return Emulator(Truth(), make_motion(motion, 1), faults=faults, presets=presets, **options)
+    return Emulator(
+        EmulatedTruth(), make_motion(motion, 1), faults=faults, presets=presets, **options
+    )
 
 
 def say(made: Emulator, line: bytes, at_s: float, wait_s: float = 0.2) -> bytes:

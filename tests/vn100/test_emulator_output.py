@@ -13,7 +13,7 @@ from quiet_device import Host, bodies, command, crc16, device, quiet
 
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def packets(wire: bytes, header: bytes, length: int) -> list[bytes]:
 
 def test_calibration_set_has_the_layout_of_the_recommended_frame():
     """syn_time_imu_cal_set of the vector file: FA 06 0100 3F08, 64 bytes."""
-    truth = Truth(hard_iron_gauss=np.array([0.1, 0, 0]))
+    truth = EmulatedTruth(hard_iron_gauss=np.array([0.1, 0, 0]))
     wire = binary_device((1, 8, 6, 0x0001, 0x083F), truth=truth).advance(2.0)
     found = packets(wire, bytes.fromhex("FA0601003F08"), 64)
     assert len(found) == 199 or len(found) == 200
@@ -94,7 +94,7 @@ def test_calibration_set_has_the_layout_of_the_recommended_frame():
 
 
 def test_rates_of_a_binary_stream_integrate_to_its_quaternions():
-    truth = Truth(noise_gyro_rad_s=0, noise_mag_gauss=0, clock_jitter_s=0)
+    truth = EmulatedTruth(noise_gyro_rad_s=0, noise_mag_gauss=0, clock_jitter_s=0)
     wire = binary_device((1, 16, 0x14, 0x0008, 0x0004), truth=truth).advance(20.0)
     found = packets(wire, bytes.fromhex("FA1408000400"), 6 + 12 + 16 + 2)
     rows = np.array([struct.unpack("<7f", packet[6:-2]) for packet in found])
@@ -189,7 +189,7 @@ def test_every_field_of_a_vn100_can_be_sent_and_is_finite(group, word, sizes):
 def test_compensated_set_agrees_with_the_codec_and_with_the_truth():
     """syn_time_imu_comp_uncomp: FA 06 8100 0E07; HSI is not applied, so Mag = UncompMag."""
     bias = np.array([0.01, -0.02, 0.03])
-    truth = Truth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)
+    truth = EmulatedTruth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)
     wire = binary_device((1, 16, 6, 0x0081, 0x070E), "static", truth=truth).advance(200.0)
     last = packets(wire, bytes.fromhex("FA0681000E07"), 92)[-1]
     raw = struct.unpack("<QI18f", last[6:-2])
@@ -264,7 +264,7 @@ def test_800_hz_binary_runs_and_carries_every_tick():
 
 
 def test_time_startup_runs_by_the_devices_clock():
-    truth = Truth(clock_ppm=50.0, clock_jitter_s=0)
+    truth = EmulatedTruth(clock_ppm=50.0, clock_jitter_s=0)
     wire = binary_device((1, 800, 1, 0x0001), truth=truth).advance(101.0)
     times = [
         struct.unpack_from("<Q", packet, 4)[0] for packet in packets(wire, b"\xfa\x01\x01\x00", 14)

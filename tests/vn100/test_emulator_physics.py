@@ -21,9 +21,9 @@ from drivers.vn100.emulator.physics import (
     HISTORY_TICKS,
     TICK_HZ,
     Dipole,
+    EmulatedTruth,
+    EmulatedWorld,
     IronStep,
-    Truth,
-    World,
     draw_truth,
     field_from,
 )
@@ -50,13 +50,13 @@ def exponential(vector):
 
 def quiet(**changes):
     """A truth without noise."""
-    return Truth(
+    return EmulatedTruth(
         noise_mag_gauss=0, noise_gyro_rad_s=0, noise_accel_m_s2=0, clock_jitter_s=0, **changes
     )
 
 
 def blocks(truth, motion, count, seed=0, disturbances=()):
-    world = World(truth, motion, seed, disturbances)
+    world = EmulatedWorld(truth, motion, seed, disturbances)
     return [world.next_block() for _ in range(count)]
 
 
@@ -102,7 +102,7 @@ def test_field_from_inclination():
 
 
 def test_noise_has_the_stated_deviation():
-    truth = Truth()
+    truth = EmulatedTruth()
     made = blocks(truth, make_motion("static", 0), 100)
     field = np.vstack([block.field() for block in made])
     rate = np.vstack([block.rates(16) for block in made])
@@ -113,7 +113,7 @@ def test_noise_has_the_stated_deviation():
 
 
 def test_register_85_mean_is_a_running_mean():
-    made = blocks(Truth(), make_motion("tumble", 0), 5)
+    made = blocks(EmulatedTruth(), make_motion("tumble", 0), 5)
     field = np.vstack([block.field() for block in made])
     smooth = np.vstack([block.field(8) for block in made])
     for row in (8, 199, 200, 733):
@@ -138,8 +138,10 @@ def test_saturation_clips():
 
 
 def test_same_seed_same_world_other_seed_other_world():
-    first, again = (blocks(Truth(), make_motion("survey", 1), 5, seed=7)[4] for _ in range(2))
-    other = blocks(Truth(), make_motion("survey", 1), 5, seed=8)[4]
+    first, again = (
+        blocks(EmulatedTruth(), make_motion("survey", 1), 5, seed=7)[4] for _ in range(2)
+    )
+    other = blocks(EmulatedTruth(), make_motion("survey", 1), 5, seed=8)[4]
     assert np.array_equal(first.mag_gauss, again.mag_gauss)
     assert np.array_equal(first.gyro_extra_rad_s, again.gyro_extra_rad_s)
     assert not np.array_equal(first.mag_gauss, other.mag_gauss)

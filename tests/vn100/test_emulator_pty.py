@@ -16,7 +16,7 @@ import serial
 
 from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import Truth
+from drivers.vn100.emulator.physics import EmulatedTruth
 from drivers.vn100.emulator.process import EmulatorProcess
 from drivers.vn100.emulator.pty import OVERRUN_BYTES, Line, PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup
@@ -27,7 +27,7 @@ READ_07, REPLY_07 = b"$VNRRG,07*74\r\n", b"$VNRRG,07,40*5C\r\n"
 
 def emulator(*faults, presets=None) -> Emulator:
     presets = {6: (0,)} if presets is None else presets
-    return Emulator(Truth(), make_motion("static", 0), faults=faults, presets=presets)
+    return Emulator(EmulatedTruth(), make_motion("static", 0), faults=faults, presets=presets)
 
 
 def opened(path: str, baud: int = 115200) -> serial.Serial:

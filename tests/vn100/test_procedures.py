@@ -31,7 +31,7 @@ from drivers.vn100.procedures import (
     save_settings,
     write_verified,
 )
-from drivers.vn100.session import Failed, Finished, Session
+from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 NO_CALIBRATION = "1,0,0,0,1,0,0,0,1,0,0,0"
 NEW_23 = (1.0021, 0.0123456, 0.0, 0.0123456, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 7.1384e-05)
@@ -123,9 +123,9 @@ def run(device, procedure, allow=lambda _: True):
         if not lines:
             now_s = max(now_s, session.deadline_s or now_s)
             events += session.tick(now_s)
-    (end,) = [event for event in events if isinstance(event, Finished | Failed)]
+    (end,) = [event for event in events if isinstance(event, ProcedureFinished | ProcedureFailed)]
     assert session.take_output() == b""
-    if isinstance(end, Failed):
+    if isinstance(end, ProcedureFailed):
         raise end.error
     return end.result
 

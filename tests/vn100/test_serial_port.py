@@ -22,10 +22,10 @@ from drivers import serial_port
 from drivers.port_holders import holders
 from drivers.serial_port import (
     BaudNotFound,
-    LinkLost,
     PortAbsent,
     PortBusy,
     PortForbidden,
+    PortLost,
     PortUnusable,
     SerialPort,
     detect_baud,
@@ -179,13 +179,13 @@ def test_hang_up_is_link_lost_for_reading_and_writing(pty):
     port = SerialPort(pty.path, 115200)
     pty.hang_up()
     assert port.wait_readable(1.0)
-    with pytest.raises(LinkLost, match=pty.path):
+    with pytest.raises(PortLost, match=pty.path):
         port.read()
-    with pytest.raises(LinkLost):
+    with pytest.raises(PortLost):
         port.write(b"$VNRRG,01*72\r\n")
     port.close()
     port.close()
-    with pytest.raises(LinkLost):
+    with pytest.raises(PortLost):
         port.read()
 
 
@@ -205,7 +205,7 @@ def test_writing_waits_for_a_slow_reader_and_not_for_ever(pty):
         reader.join(20.0)
         assert bytes(taken) == data
         begin_s = time.monotonic()
-        with pytest.raises(LinkLost, match="of 200000 bytes"):
+        with pytest.raises(PortLost, match="of 200000 bytes"):
             port.write(bytes(200_000), timeout_s=0.2)
         assert 0.15 < time.monotonic() - begin_s < 60.0
 
@@ -215,7 +215,7 @@ def test_opening_and_losing_a_port_leaks_nothing():
         pty = Pty()
         port = SerialPort(pty.path, 115200)
         pty.hang_up()
-        with pytest.raises(LinkLost):
+        with pytest.raises(PortLost):
             while True:
                 port.wait_readable(1.0)
                 port.read()

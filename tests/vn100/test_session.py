@@ -22,7 +22,7 @@ from drivers.vn100.commands import (
 from drivers.vn100.decode import Measurement, Reply
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.procedures import quiet, read, save_settings, write_verified
-from drivers.vn100.session import DeviceFault, Finished, Session, Stray
+from drivers.vn100.session import DeviceFault, ProcedureFinished, Session, Stray
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 OTHER = (1.02, 0.01, 0.0, 0.01, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 0.1)
@@ -78,7 +78,7 @@ def test_a_read_is_asked_in_ascii_and_answered():
     assert s.busy
     assert s.deadline_s == pytest.approx(0.4)
     assert s.receive(REPLY_23[:20], 0.01) == []
-    assert s.receive(REPLY_23[20:], 0.02) == [Finished(IDENTITY)]
+    assert s.receive(REPLY_23[20:], 0.02) == [ProcedureFinished(IDENTITY)]
     assert not s.busy
     assert s.deadline_s is None
 
@@ -94,7 +94,7 @@ def test_a_measurement_never_answers_a_read_and_keeps_its_place():
     s = session()
     s.start(read(27), 0.0)
     events = s.receive(YMR + REPLY_27 + YMR, 0.1)
-    assert [type(event) for event in events] == [Measurement, Finished, Measurement]
+    assert [type(event) for event in events] == [Measurement, ProcedureFinished, Measurement]
     assert events[0].layout.name == "VNYMR"
     assert events[1].result[:3] == (6.38, 0.023, -1.953)
 
@@ -107,7 +107,7 @@ def test_a_reply_about_another_register_is_somebody_elses():
     assert (event.reply.word, event.reply.register) == ("VNRRG", 25)
     (event,) = s.receive(WRITE_23, 0.2)
     assert event == Stray(Reply("VNWRG", 23, tuple("100010001000")))
-    assert s.receive(REPLY_23, 0.3) == [Finished(IDENTITY)]
+    assert s.receive(REPLY_23, 0.3) == [ProcedureFinished(IDENTITY)]
 
 
 def test_a_reply_with_nonsense_in_it_is_no_reply():
@@ -125,7 +125,7 @@ def test_the_echo_of_a_write_must_be_what_was_sent():
     (event,) = s.receive(WRITE_23_OTHER, 0.1)
     assert isinstance(event, Stray)
     (event,) = s.receive(WRITE_23, 0.2)
-    assert isinstance(event, Finished)
+    assert isinstance(event, ProcedureFinished)
 
 
 def test_silence_is_asked_three_times_then_no_reply():
@@ -171,7 +171,7 @@ def test_faults_are_events_at_any_time_and_answer_nothing(code):
     assert s.receive(error(code), 0.0) == [DeviceFault(code)]
     s.start(read(23), 0.1)
     assert s.receive(error(code), 0.2) == [DeviceFault(code)]
-    assert s.receive(REPLY_23, 0.3) == [Finished(IDENTITY)]
+    assert s.receive(REPLY_23, 0.3) == [ProcedureFinished(IDENTITY)]
 
 
 def test_a_refusal_without_a_command_is_a_fault():
@@ -195,7 +195,7 @@ def test_a_late_reply_answers_the_repeated_command_and_a_barrier_catches_the_sec
     assert s.receive(REPLY_1, 0.55) == []
     assert s.take_output() == READ_23
     fresh = checksum("VNRRG,23,1.02,0.01,0,0.01,0.98,0,0,0,1.01,0.05,-0.03,0.1")
-    assert s.receive(fresh, 0.6) == [Finished((IDENTITY, OTHER))]
+    assert s.receive(fresh, 0.6) == [ProcedureFinished((IDENTITY, OTHER))]
 
 
 def test_a_late_reply_with_the_old_values_does_not_verify_a_write():
@@ -238,7 +238,7 @@ def test_errors_during_a_barrier_are_the_earlier_commands():
     assert s.receive(error(0x08), 1.25) == [DeviceFault(0x08)]
     s.receive(REPLY_1, 1.3)
     assert s.take_output() == READ_23
-    assert s.receive(REPLY_23, 1.35) == [Finished(IDENTITY)]
+    assert s.receive(REPLY_23, 1.35) == [ProcedureFinished(IDENTITY)]
 
 
 def test_a_silent_barrier_is_tried_with_another_register_then_the_command_must_be_unmistakable():
@@ -255,7 +255,7 @@ def test_a_silent_barrier_is_tried_with_another_register_then_the_command_must_b
         now_s = s.deadline_s
         events += s.tick(now_s)
         sent += s.take_output()
-    assert events == [Finished("end")]
+    assert events == [ProcedureFinished("end")]
     # the second read of 23 could be answered by the first's late reply: never sent
     assert sent == READ_23 * 3 + READ_1 + READ_3 + READ_4 + checksum("VNRRG,02") + (
         checksum("VNRRG,25") * 3
@@ -307,7 +307,7 @@ def test_output_is_paused_and_resumed_around_a_sequence():
     assert s.take_output() == READ_23
     s.receive(REPLY_23, 0.2)
     assert s.take_output() == ASY_1
-    assert s.receive(ASY_1, 0.3) == [Finished(IDENTITY)]
+    assert s.receive(ASY_1, 0.3) == [ProcedureFinished(IDENTITY)]
 
 
 @pytest.mark.parametrize("how", ["refused", "no reply", "cancelled"])
@@ -363,7 +363,7 @@ def test_saving_waits_longer_asks_once_and_watches_for_errors():
     assert s.deadline_s == 2.0
     assert s.receive(WNV, 1.0) == []
     assert s.deadline_s == 2.5
-    assert s.tick(2.5) == [Finished(None)]
+    assert s.tick(2.5) == [ProcedureFinished(None)]
 
     s.start(save_settings(), 3.0)
     s.receive(WNV, 4.0)
@@ -426,7 +426,7 @@ def test_what_must_be_right_behind_an_answer_is_held_back_where_that_is_old(comm
     talk.receive(REPLY_23, 0.20)
     assert talk.take_output() == sent
     events = talk.receive(checksum(sent.decode()[1:].split("*")[0]), 0.21)
-    assert events == [Finished(1)]
+    assert events == [ProcedureFinished(1)]
 
 
 def test_an_answer_to_a_repeated_question_may_be_to_the_first_and_is_old():

@@ -27,7 +27,7 @@ from drivers.vn100.procedures import (
     save_settings,
     write_verified,
 )
-from drivers.vn100.session import Failed, Finished, Session
+from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 NEW_23 = (1.0021, 0.0123456, 0.0, 0.0123456, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 7.1384e-05)
 STEP_S = 0.004
@@ -54,12 +54,14 @@ class Bench:
         return events
 
     def run(self, procedure):
-        """Finished or Failed, within two minutes."""
+        """ProcedureFinished or ProcedureFailed, within two minutes."""
         events, until_s = self.session.start(procedure, self.now_s), self.now_s + 120.0
         while self.session.busy:
             events += self.step()
             assert self.now_s < until_s
-        (end,) = [event for event in events if isinstance(event, Finished | Failed)]
+        (end,) = [
+            event for event in events if isinstance(event, ProcedureFinished | ProcedureFailed)
+        ]
         return end
 
     def measurements(self, seconds):
@@ -94,7 +96,7 @@ def test_a_verified_write_is_in_the_devices_memory_and_the_stream_goes_on():
 def test_saving_makes_it_survive_a_reset():
     bench = Bench(Setup(faults=("reset@5",)))
     bench.run(quiet(write_verified(84, NEW_23)))
-    assert isinstance(bench.run(save_settings()), Finished)
+    assert isinstance(bench.run(save_settings()), ProcedureFinished)
     bench.measurements(max(0.0, 7.0 - bench.now_s))
     assert bench.emulator.counters["restarts"] == 1
     values = bench.run(read_registers((84,))).result[84]
@@ -115,7 +117,7 @@ def test_the_calibration_stream_is_set_up_and_put_back(firmware, port, output):
     heard = bench.measurements(1.0)
     assert {measurement.layout.name for measurement in heard} == {stream.layout}
     assert len(heard) == pytest.approx(100, abs=1)
-    assert isinstance(bench.run(quiet(restore(before, keys))), Finished)
+    assert isinstance(bench.run(quiet(restore(before, keys))), ProcedureFinished)
     assert bench.run(read_registers(keys)).result == before
 
 
@@ -135,14 +137,14 @@ def test_verified_is_true_under_every_fault_and_the_output_comes_back(fault, see
     in the memory, and once the fault is over the device streams (a resume may be needed)."""
     bench = Bench(Setup(seed=seed, faults=(fault,), rate_hz=20))
     end = bench.run(quiet(write_verified(23, NEW_23)))
-    if isinstance(end, Finished):
+    if isinstance(end, ProcedureFinished):
         assert bench.emulator.memory.get(23) == tuple(float(v) for v in np.float32(NEW_23))
     else:
         assert isinstance(end.error, SessionError | DeviceRefused)
     bench.measurements(max(0.0, 8.0 - bench.now_s))
     if not bench.measurements(0.5):
-        assert isinstance(end, Failed), "verified, yet left silent"
-        assert isinstance(bench.run(quiet(read_registers((23,)))), Finished)
+        assert isinstance(end, ProcedureFailed), "verified, yet left silent"
+        assert isinstance(bench.run(quiet(read_registers((23,)))), ProcedureFinished)
     assert len(bench.measurements(1.0)) == pytest.approx(20, abs=1)
 
 

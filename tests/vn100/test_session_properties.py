@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from drivers.vn100.commands import NoReply
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.procedures import VerifyFailed, quiet, read, write_verified
-from drivers.vn100.session import Failed, Finished, Session
+from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 OTHER = (1.02, 0.01, 0.0, 0.01, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 0.1)
@@ -104,7 +104,9 @@ def converse(s, wire, procedure, now_s, strangers, cut):
         else:
             events += s.tick(now_s)
         assert now_s < 500.0
-    return next(event for event in events if isinstance(event, Finished | Failed)), now_s
+    return next(
+        event for event in events if isinstance(event, ProcedureFinished | ProcedureFailed)
+    ), now_s
 
 
 @settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -120,7 +122,7 @@ def test_verified_means_that_the_device_holds_the_values(faults, foreign, writes
     for values in writes:
         procedure = quiet(write_verified(23, values))
         end, now_s = converse(s, wire, procedure, now_s, strangers, cut)
-        if isinstance(end, Finished):
+        if isinstance(end, ProcedureFinished):
             verified += 1
             assert [float(v) for v in wire.register[23]] == list(values)
         else:
@@ -140,7 +142,7 @@ def test_a_read_never_returns_what_was_there_before_it_was_asked(faults, foreign
     for number in range(8):
         wire.register[23] = [str(number)] * 12  # another program's write, between our reads
         end, now_s = converse(s, wire, read(23), now_s, strangers, 9)
-        if isinstance(end, Finished):
+        if isinstance(end, ProcedureFinished):
             answers += 1
             assert end.result == (float(number),) * 12
         else:

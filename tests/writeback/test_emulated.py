@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ahrsd.core.device_session import identify_surely, read_surely
-from ahrsd.writeback.actions import IdentifyAgain, JournalAppend, RunProcedure
+from ahrsd.writeback.actions import AppendToJournal, IdentifyAgain, RunProcedure
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
 from ahrsd.writeback.states import State
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.session import Failed, Finished, Session
+from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 STEP_S = 0.01
 FAULT_OVER_S = 12.0
@@ -51,7 +51,7 @@ class Bench:
         queue = list(actions)
         while queue:
             action = queue.pop(0)
-            if isinstance(action, JournalAppend):
+            if isinstance(action, AppendToJournal):
                 record = SimpleNamespace(kind=action.kind.value, facts=dict(action.facts))
                 self.journal.append(record)
                 queue = self.wb.on_journal_ok(action.kind, self.now_s) + queue
@@ -82,10 +82,10 @@ class Bench:
 
     def end(self, events):
         for event in events:
-            if not isinstance(event, Finished | Failed):
+            if not isinstance(event, ProcedureFinished | ProcedureFailed):
                 continue
             name = self.running.name
-            if name == "identify" and isinstance(event, Failed):
+            if name == "identify" and isinstance(event, ProcedureFailed):
                 self.identify()
             elif name == "identify":
                 who, held = event.result
@@ -93,7 +93,7 @@ class Bench:
                 self.do(self.wb.on_clock(wall_s, "boot", boot_s, self.now_s))
                 self.do(self.wb.on_device(who, held, self.journal, self.now_s))
                 self.identified = who
-            elif isinstance(event, Finished):
+            elif isinstance(event, ProcedureFinished):
                 self.do(self.wb.on_procedure_finished(name, event.result, self.now_s))
             else:
                 self.do(self.wb.on_procedure_failed(name, event.error, self.now_s))

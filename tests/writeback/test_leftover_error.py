@@ -10,7 +10,7 @@ from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.leftover_error import Leftover, LeftoverError
 from ahrsd.writeback.policy import TrialPolicy
-from ahrsd.writeback.trial import Finding, Trial, TrialMetrics
+from ahrsd.writeback.trial import Trial, TrialMetrics, TrialVerdict
 from ahrsd.writeback.trial_metrics import LiveTrial
 
 FIELD_N = np.array([0.24, 0.0, 0.42])
@@ -46,7 +46,7 @@ def lived(seed: int, noise_gauss: float, motion: str, *, places: bool = False) -
     return SampleBlock(time_s, dt_s, time_s, raw, np.vstack([gyro[:1], gyro]), accel)
 
 
-def judged(written: Affine, block: SampleBlock) -> tuple[float, list[Finding]]:
+def judged(written: Affine, block: SampleBlock) -> tuple[float, list[TrialVerdict]]:
     """Sigmas at the end, and every finding on the way."""
     policy = TrialPolicy(duration_s=1e9, turns=1e9)
     limit, trial = 0.01 * policy.max_wrong_percent, Trial(policy, 180.0)
@@ -84,10 +84,10 @@ def test_right_and_wrong_are_far_apart_at_every_level_of_noise(noise_gauss, moti
         off *= max(0.025, 6.0 * noise_gauss) / np.linalg.norm(off)
         sigmas, findings = judged(TRUE, block)
         right.append(sigmas)
-        assert Finding.FAILED not in findings
+        assert TrialVerdict.FAILED not in findings
         sigmas, findings = judged(Affine(TRUE.matrix, TRUE.offset + off), block)
         wrong.append(sigmas)
-        assert Finding.FAILED in findings
+        assert TrialVerdict.FAILED in findings
     print(
         f"{noise_gauss} {motion}: right at most {max(right):.1f}, wrong at least {min(wrong):.1f}"
     )
@@ -100,7 +100,7 @@ def test_places_with_other_fields_do_not_make_right_registers_wrong(motion):
     for seed in SEEDS:
         sigmas, findings = judged(TRUE, lived(seed, 0.002, motion, places=True))
         assert sigmas < 2.0
-        assert Finding.FAILED not in findings
+        assert TrialVerdict.FAILED not in findings
 
 
 def test_a_soft_iron_that_is_wrong_shows_as_well():
@@ -108,7 +108,7 @@ def test_a_soft_iron_that_is_wrong_shows_as_well():
         block = lived(seed, 0.002, "tumble")
         sigmas, findings = judged(Affine(np.diag([1.10, 1.0, 0.95]), TRUE.offset), block)
         assert sigmas > 6.0
-        assert Finding.FAILED in findings
+        assert TrialVerdict.FAILED in findings
 
 
 def test_an_error_below_the_limit_is_none_however_clear():
@@ -127,4 +127,4 @@ def test_a_vehicle_that_does_not_turn_says_nothing():
     )  # fmt: skip
     sigmas, findings = judged(Affine(TRUE.matrix, TRUE.offset + 0.05), still)
     assert np.isnan(sigmas)
-    assert set(findings) <= {Finding.GOES_ON}
+    assert set(findings) <= {TrialVerdict.GOES_ON}

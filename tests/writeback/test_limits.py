@@ -9,7 +9,7 @@ import pytest
 
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.clocks import Now, Stamp
-from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy, flash_budget, ram_budget
 from ahrsd.writeback.states import State
@@ -42,10 +42,10 @@ def at(boot_s, boot_id="one", wall_s=None):
 
 def test_ram_writes_keep_their_distance_and_their_number():
     policy = WriteBackPolicy()
-    history = History(ram_writes_at=(at(1000.0),))
+    history = JournalHistory(ram_writes_at=(at(1000.0),))
     assert "599 s ago" in ram_budget(policy, history, Now(at(1599.0)))[0]
     assert ram_budget(policy, history, Now(at(1600.0))) == []
-    many = History(ram_writes_at=tuple(at(1000.0 + 700.0 * k) for k in range(6)))
+    many = JournalHistory(ram_writes_at=tuple(at(1000.0 + 700.0 * k) for k in range(6)))
     assert ram_budget(policy, many, Now(at(10_000.0))) == ["6 RAM writes in a day, limit 6"]
     assert ram_budget(policy, many, Now(at(1000.1 + DAY_S))) == []
 
@@ -68,16 +68,16 @@ def test_ram_writes_keep_their_distance_and_their_number():
     ],
 )
 def test_no_clock_that_is_wrong_or_set_gives_a_budget(now, granted):
-    history = History(ram_writes_at=(at(9.0),) * 6, flashes_at=(at(9.0),), flashes=1)
+    history = JournalHistory(ram_writes_at=(at(9.0),) * 6, flashes_at=(at(9.0),), flashes=1)
     assert (ram_budget(WriteBackPolicy(), history, Now(now)) == []) is granted
     assert (flash_budget(WriteBackPolicy(), history, Now(now)) == []) is granted
-    cooling = History(rollback_at=at(9.0))
+    cooling = JournalHistory(rollback_at=at(9.0))
     assert (ram_budget(WriteBackPolicy(), cooling, Now(now)) == []) is granted
 
 
 @pytest.mark.parametrize("wall_s", [1e6, None, 1.8e9])
 def test_records_of_an_older_version_count_until_this_run_is_a_day_old(wall_s):
-    history = History(flashes_at=(Stamp(wall_s),), flashes=1)
+    history = JournalHistory(flashes_at=(Stamp(wall_s),), flashes=1)
     present = at(9 * DAY_S, wall_s=1.8e9 + 3600.0)
     assert flash_budget(WriteBackPolicy(), history, Now(present, DAY_S - 1.0)) != []
     assert flash_budget(WriteBackPolicy(), history, Now(present, DAY_S)) == []
@@ -85,7 +85,7 @@ def test_records_of_an_older_version_count_until_this_run_is_a_day_old(wall_s):
 
 def test_a_record_of_1970_is_as_old_as_one_behind_it():
     early = Stamp(4000.0, "one", 30.0)
-    history = History(flashes_at=(early,), flashes=1, newest_at=at(90.0))
+    history = JournalHistory(flashes_at=(early,), flashes=1, newest_at=at(90.0))
     assert flash_budget(WriteBackPolicy(), history, Now(at(5.0, "two"))) != []
     later = at(5.0, "two", wall_s=1.8e9 + 2 * DAY_S)
     assert flash_budget(WriteBackPolicy(), history, Now(later)) == []
@@ -93,11 +93,11 @@ def test_a_record_of_1970_is_as_old_as_one_behind_it():
 
 def test_flash_by_day_and_by_life():
     policy = WriteBackPolicy()
-    one = History(flashes=1, flashes_at=(at(0.0),))
+    one = JournalHistory(flashes=1, flashes_at=(at(0.0),))
     assert flash_budget(policy, one, Now(at(DAY_S))) == []
     today = flash_budget(policy, one, Now(at(DAY_S - 1.0)))
     assert today == ["1 flash writes in a day, limit 1"]
-    worn = flash_budget(policy, History(flashes=200), Now(at(DAY_S)))
+    worn = flash_budget(policy, JournalHistory(flashes=200), Now(at(DAY_S)))
     assert worn == ["200 flash writes of this device, limit 200"]
 
 
@@ -328,11 +328,13 @@ def test_the_gate_itself_asks_everything_again(make_rig):
     assert safe.allow(write, Purpose.ROLL_BACK, now_s + 1.1)
     safe.journal_ok = False
     assert not safe.allow(save, Purpose.SAVE, now_s)
-    assert safe.write_holds(History(), now_s, Now(Stamp()))[-1].startswith(
+    assert safe.write_holds(JournalHistory(), now_s, Now(Stamp()))[-1].startswith(
         "the journal cannot be written"
     )
     safe.gates = rig.RED
-    assert "gate observability: turn more" in safe.write_holds(History(), now_s, Now(Stamp()))
+    assert "gate observability: turn more" in safe.write_holds(
+        JournalHistory(), now_s, Now(Stamp())
+    )
 
 
 def test_samples_are_marked_unusable_while_registers_are_in_doubt(make_rig):
@@ -350,12 +352,12 @@ def test_the_history_of_the_file_is_the_history_that_was_lived(make_rig):
     rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
     another(rig)
     rig.live()
-    assert History.of(rig.journal) == rig.wb.history
+    assert JournalHistory.of(rig.journal) == rig.wb.history
 
 
 def test_a_record_that_cannot_be_understood_forbids_writing(make_rig):
     record = SimpleNamespace(kind="PREPARED", facts={"txn": "x"})
-    history = History.of([record])
+    history = JournalHistory.of([record])
     assert history.broken == "PREPARED"
     assert "cannot be understood" in ram_budget(WriteBackPolicy(), history, Now(Stamp()))[0]
 

@@ -19,12 +19,12 @@ from virtual_run import VirtualRun
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.config.sections import Location
+from ahrsd.config.sections import LocationSection
 from ahrsd.samples import Array
 from ahrsd.so3 import exp
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
-from drivers.vn100.emulator.physics import Truth, draw_truth
+from drivers.vn100.emulator.physics import EmulatedTruth, draw_truth
 from drivers.vn100.emulator.scenarios import Setup, build
 
 SEED = 4
@@ -40,11 +40,11 @@ class Planted:
     gyro: Array
 
 
-def right(truth: Truth) -> Planted:
+def right(truth: EmulatedTruth) -> Planted:
     return Planted(np.linalg.inv(truth.soft_iron), truth.hard_iron_gauss, truth.gyro_bias_rad_s)
 
 
-def squeezed(truth: Truth, by: list[float], offset: list[float]) -> Planted:
+def squeezed(truth: EmulatedTruth, by: list[float], offset: list[float]) -> Planted:
     """A fit whose ellipsoid is squeezed along the axes and whose centre is off."""
     good, D = right(truth), np.diag(by)
     return Planted(
@@ -52,28 +52,28 @@ def squeezed(truth: Truth, by: list[float], offset: list[float]) -> Planted:
     )
 
 
-def planar_cap(truth: Truth) -> Planted:
+def planar_cap(truth: EmulatedTruth) -> Planted:
     """A level circle fitted in three dimensions: up and down are anybody's guess."""
     return squeezed(truth, [1.0, 1.0, 0.8], [0.0, 0.0, 0.15])
 
 
-def partial_motion(truth: Truth) -> Planted:
+def partial_motion(truth: EmulatedTruth) -> Planted:
     """A quarter of a turn: the ellipse is drawn out along the chord and its centre is off."""
     return squeezed(truth, [0.9, 1.08, 1.0], [0.06, -0.05, 0.0])
 
 
-def other_compass(truth: Truth) -> Planted:
+def other_compass(truth: EmulatedTruth) -> Planted:
     """The heading came from a compass that is 15 deg off; the hard iron took it up."""
     return squeezed(truth, [1.0, 1.0, 1.0], [0.0, 0.245 * np.sin(np.radians(15.0)), 0.0])
 
 
-def other_compass_turned(truth: Truth) -> Planted:
+def other_compass_turned(truth: EmulatedTruth) -> Planted:
     """The same, and the matrix took it up: it is turned by 15 deg about the vertical."""
     good = right(truth)
     return Planted(turn(0.0, 0.0, 15.0) @ good.matrix, good.offset, good.gyro)
 
 
-def mounting_turned(truth: Truth) -> Planted:
+def mounting_turned(truth: EmulatedTruth) -> Planted:
     """The mounting frame was turned by 10 deg about the nose."""
     good = right(truth)
     return Planted(turn(10.0, 0.0, 0.0) @ good.matrix, good.offset, good.gyro)
@@ -83,12 +83,12 @@ def turn(*degrees: float) -> Array:
     return np.asarray(exp(np.radians(degrees)))
 
 
-def soft_iron_twice(truth: Truth) -> Planted:
+def soft_iron_twice(truth: EmulatedTruth) -> Planted:
     good = right(truth)
     return Planted(good.matrix @ good.matrix, good.offset, good.gyro)
 
 
-def soft_iron_in_place(truth: Truth) -> Planted:
+def soft_iron_in_place(truth: EmulatedTruth) -> Planted:
     """Each component was overwritten before the next one was computed from it."""
     good, done = right(truth), np.eye(3)
     for row in range(3):
@@ -96,44 +96,44 @@ def soft_iron_in_place(truth: Truth) -> Planted:
     return Planted(done, good.offset, good.gyro)
 
 
-def soft_iron_inverted(truth: Truth) -> Planted:
+def soft_iron_inverted(truth: EmulatedTruth) -> Planted:
     good = right(truth)
     return Planted(truth.soft_iron, good.offset, good.gyro)
 
 
-def wrong_sign(truth: Truth) -> Planted:
+def wrong_sign(truth: EmulatedTruth) -> Planted:
     good = right(truth)
     return Planted(good.matrix, -good.offset, good.gyro)
 
 
-def magnet_nearby(truth: Truth) -> Planted:
+def magnet_nearby(truth: EmulatedTruth) -> Planted:
     """A magnet lay beside the sensor while it was calibrated, and was taken away again."""
     good = right(truth)
     return Planted(good.matrix, good.offset + np.array([0.1, -0.06, 0.05]), good.gyro)
 
 
-def double_correction(truth: Truth) -> Planted:
+def double_correction(truth: EmulatedTruth) -> Planted:
     """The values in the register were taken off once more."""
     good = right(truth)
     return Planted(good.matrix @ good.matrix, 2.0 * good.offset, 2.0 * good.gyro)
 
 
-def another_device(truth: Truth) -> Planted:
+def another_device(truth: EmulatedTruth) -> Planted:
     """A calibration of another unit."""
     return right(draw_truth(SEED + 100))
 
 
-def hsi_active(truth: Truth) -> Planted:
+def hsi_active(truth: EmulatedTruth) -> Planted:
     """The on-board estimator had already corrected what was fitted: nothing seems to be wrong."""
     return Planted(np.eye(3), np.zeros(3), truth.gyro_bias_rad_s)
 
 
-def gyro_sign(truth: Truth) -> Planted:
+def gyro_sign(truth: EmulatedTruth) -> Planted:
     good = right(truth)
     return Planted(good.matrix, good.offset, -3.0 * good.gyro)
 
 
-Bad = Callable[[Truth], Planted]
+Bad = Callable[[EmulatedTruth], Planted]
 ROLLED_BACK: tuple[Bad, ...] = (
     planar_cap, partial_motion, other_compass, soft_iron_twice, soft_iron_inverted, wrong_sign,
     magnet_nearby, double_correction, another_device, hsi_active, gyro_sign,
@@ -269,7 +269,7 @@ GUARDS = {  # one of these is red in the end
 def test_through_the_real_gates_nothing_of_it_reaches_the_flash(name):
     """Whatever qualifies is approved at once; three minutes, with the world model's field."""
     policy = WriteBackPolicy(mode=Mode.COMMIT)
-    place = Location(latitude_deg=48.0, longitude_deg=8.0, date=datetime.date(2026, 1, 1))
+    place = LocationSection(latitude_deg=48.0, longitude_deg=8.0, date=datetime.date(2026, 1, 1))
     settings = core_settings(Config(location=place), policy=policy)
     run = VirtualRun(build(GATED[name]), settings, step_s=0.1)
     while run.now_s < 180.0:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.reconcile import TABLE, Found, Kind, found
+from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind, found
 from ahrsd.writeback.states import Signal, State, after
 from drivers.vn100.commands import Word, Write
 
@@ -159,7 +159,7 @@ def test_a_cut_inside_vnwnv_that_tears_the_flash_is_an_alarm(make_rig, reference
     assert rig.wb.state is State.FLASH_TORN
     rig.do(rig.wb.on_operator("unlock", "old values typed in and checked", rig.now_s))
     assert rig.wb.state is State.OBSERVING
-    assert History.of(rig.journal).torn is False
+    assert JournalHistory.of(rig.journal).torn is False
 
 
 @pytest.mark.parametrize("number", [23, 84])
@@ -228,7 +228,7 @@ def test_the_table_is_total_and_its_signals_are_taken():
 
     assert set(TABLE) == set(OPEN)
     for row in TABLE.values():
-        assert set(row) == set(Found)
+        assert set(row) == set(DeviceContents)
         for resolution in row.values():
             assert after(State.RECONCILING, resolution.signal) is not State.RECONCILING
             assert resolution.text
@@ -240,22 +240,27 @@ def test_the_table_is_total_and_its_signals_are_taken():
 
 def test_contradictions_are_alarms_and_old_values_never_are_before_a_save():
     for last, row in TABLE.items():
-        assert row[Found.NEITHER].level in ("error", "warning")
-        assert row[Found.NEITHER].signal not in (Signal.NOTHING_OPEN, Signal.READ_CONFIRMED)
-        for held in (Found.OLD, Found.OLD_AFTER_RESTART):
-            assert row[held].signal is Signal.NOTHING_OPEN
-        assert {Kind.LOST, Kind.NOT_SAVED}.isdisjoint(
-            row[held].record for held in Found if held is not Found.OLD_AFTER_RESTART
+        assert row[DeviceContents.NEITHER].level in ("error", "warning")
+        assert row[DeviceContents.NEITHER].signal not in (
+            Signal.NOTHING_OPEN,
+            Signal.READ_CONFIRMED,
         )
-        if last not in (Kind.FLASH_SENT, Kind.FLASH_ACKED):
-            assert row[Found.NEITHER].record is Kind.FOREIGN
-            assert row[Found.MIXED_AFTER_RESTART].record is Kind.FOREIGN
-            if last is not Kind.PROVEN:
-                assert row[Found.NEW_AFTER_RESTART].record is Kind.FOREIGN
-        confirming = {held for held in Found if row[held].record is Kind.CONFIRMED}
-        assert confirming <= {Found.NEW_AFTER_RESTART}
-        if last is not Kind.FLASH_ACKED:
-            assert row[Found.OLD].level != "error"
+        for held in (DeviceContents.OLD, DeviceContents.OLD_AFTER_RESTART):
+            assert row[held].signal is Signal.NOTHING_OPEN
+        assert {RecordKind.LOST, RecordKind.NOT_SAVED}.isdisjoint(
+            row[held].record
+            for held in DeviceContents
+            if held is not DeviceContents.OLD_AFTER_RESTART
+        )
+        if last not in (RecordKind.FLASH_SENT, RecordKind.FLASH_ACKED):
+            assert row[DeviceContents.NEITHER].record is RecordKind.FOREIGN
+            assert row[DeviceContents.MIXED_AFTER_RESTART].record is RecordKind.FOREIGN
+            if last is not RecordKind.PROVEN:
+                assert row[DeviceContents.NEW_AFTER_RESTART].record is RecordKind.FOREIGN
+        confirming = {held for held in DeviceContents if row[held].record is RecordKind.CONFIRMED}
+        assert confirming <= {DeviceContents.NEW_AFTER_RESTART}
+        if last is not RecordKind.FLASH_ACKED:
+            assert row[DeviceContents.OLD].level != "error"
 
 
 OLD, NEW = (1.0,) * 9 + (0.0,) * 3, (1.0,) * 9 + (0.5,) * 3
@@ -265,15 +270,15 @@ OTHER = (2.0,) * 12
 @pytest.mark.parametrize(
     ("device", "restarted", "expected"),
     [
-        ({23: OLD, 84: OLD}, False, Found.OLD),
-        ({23: OLD, 84: OLD}, True, Found.OLD_AFTER_RESTART),
-        ({23: NEW, 84: NEW}, False, Found.NEW),
-        ({23: NEW, 84: NEW}, True, Found.NEW_AFTER_RESTART),
-        ({23: NEW, 84: OLD}, False, Found.MIXED),
-        ({23: NEW, 84: OLD}, True, Found.MIXED_AFTER_RESTART),
-        ({23: NEW, 84: OTHER}, True, Found.NEITHER),
-        ({23: NEW}, True, Found.NEITHER),
-        ({23: (float("nan"),) * 12, 84: NEW}, False, Found.NEITHER),
+        ({23: OLD, 84: OLD}, False, DeviceContents.OLD),
+        ({23: OLD, 84: OLD}, True, DeviceContents.OLD_AFTER_RESTART),
+        ({23: NEW, 84: NEW}, False, DeviceContents.NEW),
+        ({23: NEW, 84: NEW}, True, DeviceContents.NEW_AFTER_RESTART),
+        ({23: NEW, 84: OLD}, False, DeviceContents.MIXED),
+        ({23: NEW, 84: OLD}, True, DeviceContents.MIXED_AFTER_RESTART),
+        ({23: NEW, 84: OTHER}, True, DeviceContents.NEITHER),
+        ({23: NEW}, True, DeviceContents.NEITHER),
+        ({23: (float("nan"),) * 12, 84: NEW}, False, DeviceContents.NEITHER),
     ],
 )
 def test_found(device, restarted, expected):

@@ -7,9 +7,9 @@ import pytest
 from writeback_rig import Record
 
 from ahrsd.writeback.clocks import Stamp, restarted_since
-from ahrsd.writeback.journal_history import History
+from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.reconcile import TABLE, Found, Kind
+from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind
 from ahrsd.writeback.states import State
 from drivers.vn100.commands import Word, Write
 
@@ -188,9 +188,18 @@ def test_a_failed_write_of_weeks_ago_is_not_undone_over_somebodys_values(make_ri
 
 
 def test_what_somebody_saved_is_not_written_over_after_a_restart(make_rig):
-    for kind in (Kind.PREPARED, Kind.RAM_FAILED, Kind.RAM_VERIFIED, Kind.ROLLBACK):
-        for held in (Found.NEW_AFTER_RESTART, Found.MIXED_AFTER_RESTART, Found.NEITHER):
-            assert TABLE[kind][held].record is Kind.FOREIGN
+    for kind in (
+        RecordKind.PREPARED,
+        RecordKind.RAM_FAILED,
+        RecordKind.RAM_VERIFIED,
+        RecordKind.ROLLBACK,
+    ):
+        for held in (
+            DeviceContents.NEW_AFTER_RESTART,
+            DeviceContents.MIXED_AFTER_RESTART,
+            DeviceContents.NEITHER,
+        ):
+            assert TABLE[kind][held].record is RecordKind.FOREIGN
 
 
 def test_a_failed_write_that_is_still_in_ram_is_undone(make_rig):
@@ -225,7 +234,7 @@ def test_a_rollback_that_could_not_be_journaled_is_not_called_lost(make_rig):
     assert rig.wb.state is State.OBSERVING
     assert rig.kinds[-1] == "REVERTED"
     assert "a rollback that could not be journaled" in rig.notes("warning")[-1]
-    assert rig.wb.history.holds == History.of(rig.journal).holds
+    assert rig.wb.history.holds == JournalHistory.of(rig.journal).holds
     assert rig.wb.history.holds[23] == pytest.approx(rig.device.held()[23])
 
 
@@ -253,8 +262,8 @@ def test_a_rollback_that_could_not_be_journaled_is_journaled_later(make_rig, whe
     assert rig.kinds == wanted + (["LOCKED"] if when == "person" else [])
     assert rig.journal[2].facts["counts"] is True
     assert rig.journal[2].facts["boot_s"] < rig.now_s - rig.boot_began_s or when == "stop"
-    assert History.of(rig.journal).rollbacks == 1
-    assert rig.wb.history == History.of(rig.journal)
+    assert JournalHistory.of(rig.journal).rollbacks == 1
+    assert rig.wb.history == JournalHistory.of(rig.journal)
     assert not any("journal" in text for text in rig.wb.holds())
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
-from ahrsd.writeback.reconcile import Found, Kind
+from ahrsd.writeback.reconcile import DeviceContents, RecordKind
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     ON_TIMEOUT,
@@ -123,15 +123,15 @@ def test_the_document_shows_every_timeout(state: State) -> None:
 
 
 @pytest.mark.parametrize("last", RECONCILE)
-def test_the_document_shows_what_follows_an_interruption(last: Kind) -> None:
+def test_the_document_shows_what_follows_an_interruption(last: RecordKind) -> None:
     cells = [
         f"`{row.record.value}`, {row.signal.value}" if row.record else row.signal.value
-        for row in (RECONCILE[last][held] for held in Found)
+        for row in (RECONCILE[last][held] for held in DeviceContents)
     ]
     assert f"| `{last.value}` | {' | '.join(cells)} |\n" in DOCUMENT.read_text()
 
 
-@pytest.mark.parametrize("kind", Kind)
-def test_the_document_says_what_each_record_means(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", RecordKind)
+def test_the_document_says_what_each_record_means(kind: RecordKind) -> None:
     rows = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("| `")]
     assert any(f"`{kind.value}`" in row.split("|")[1] for row in rows)

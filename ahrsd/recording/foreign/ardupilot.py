@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.foreign.dataflash import Log, read_log, refuse_empty
-from ahrsd.recording.foreign.sensors import Choice, Sensors, Stream, positions
+from ahrsd.recording.foreign.sensors import Choice, Sensors, SensorSeries, positions
 from ahrsd.samples import Array
 
 _MAGS = ("MAG", "MAG2", "MAG3")
@@ -64,7 +64,7 @@ def read(path: Path, choice: Choice) -> Sensors:
     message, rows, number = _compass(path, log, choice, out)
     at = _times(path, log, message)[rows]
     undone = _without_corrections(path, log, parameters, message, rows, number)
-    out.mag, out.names["mag"] = Stream(at, undone.raw_mg), f"{message}[{number}]"
+    out.mag, out.names["mag"] = SensorSeries(at, undone.raw_mg), f"{message}[{number}]"
     out.notes += undone.notes
     words = [undone.words, _inertial(path, log, parameters, out)]
     out.facts |= {
@@ -218,13 +218,13 @@ def _inertial(path: Path, log: Log, parameters: dict[str, float], out: Sensors) 
             words = f"gyro offsets {np.round(1e3 * offset, 2).tolist()} mrad/s"
         else:
             words = "not the gyro's offsets (AHRS_ORIENTATION turns them)"
-    out.gyro, out.names["gyro"] = Stream(at, rate), "IMU[0]"
+    out.gyro, out.names["gyro"] = SensorSeries(at, rate), "IMU[0]"
     if log.has("IMU", "AccX", "AccY", "AccZ"):
-        out.accel = Stream(at, _vector(log, "IMU", ("AccX", "AccY", "AccZ"), rows))
+        out.accel = SensorSeries(at, _vector(log, "IMU", ("AccX", "AccY", "AccZ"), rows))
         out.names["accel"] = "IMU[0]"
     for name in ("T", "Temp"):
         if log.has("IMU", name, "TimeUS"):
-            out.more["temperature_c"] = Stream(at, log.column("IMU", name)[rows][:, None])
+            out.more["temperature_c"] = SensorSeries(at, log.column("IMU", name)[rows][:, None])
             break
     return words
 
@@ -234,7 +234,7 @@ def _covariates(path: Path, log: Log, out: Sensors) -> None:
         if log.has(message, name) and column not in out.more:
             rows = _rows(log, message, 0)
             values = factor * log.column(message, name)[rows]
-            out.more[column] = Stream(_times(path, log, message)[rows], values[:, None])
+            out.more[column] = SensorSeries(_times(path, log, message)[rows], values[:, None])
 
     for message in ("BAT", "CURR"):
         old = log.has(message, "Volt") and float(np.median(log.column(message, "Volt"))) > 100.0
@@ -257,4 +257,4 @@ def _covariates(path: Path, log: Log, out: Sensors) -> None:
         lat, lon, height = (log.column("GPS", name)[rows] for name in ("Lat", "Lng", "Alt"))
         out.more |= positions(at, lat, lon, height)
         if log.has("GPS", "Spd"):
-            out.more["gps_speed_m_s"] = Stream(at, log.column("GPS", "Spd")[rows][:, None])
+            out.more["gps_speed_m_s"] = SensorSeries(at, log.column("GPS", "Spd")[rows][:, None])

@@ -25,7 +25,7 @@ import numpy as np
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
 from ahrsd.printable import printable
-from ahrsd.recording.foreign.sensors import Choice, RawBytes, Sensors, Stream, positions
+from ahrsd.recording.foreign.sensors import Choice, RawBytes, Sensors, SensorSeries, positions
 from ahrsd.recording.foreign.vectornav_messages import DEFINITIONS
 from ahrsd.recording.limits import TABLE_BYTES, TABLE_CELLS, refuse_beyond
 from ahrsd.samples import Array
@@ -59,12 +59,12 @@ class _Series:
     device_s: array[float] = field(default_factory=lambda: array("d"))
     values: array[float] = field(default_factory=lambda: array("d"))
 
-    def stream(self, shift_s: float, device: bool) -> Stream:
+    def stream(self, shift_s: float, device: bool) -> SensorSeries:
         """On the recording's clock; shift_s: from the host's clock to it."""
         time_s = np.array(self.device_s)
         if not (device and np.isfinite(time_s).all()):
             time_s = self._host_s() + shift_s
-        return Stream(time_s, np.array(self.values).reshape(-1, self.width))
+        return SensorSeries(time_s, np.array(self.values).reshape(-1, self.width))
 
     def _host_s(self) -> Array:
         stamps = np.array(self.stamp_s)
@@ -484,12 +484,12 @@ def _covariates(found: _Found, out: Sensors, gyro: _Series, shift_s: float, devi
         if kind == "vn_attitude":
             names = ("vn_yaw_deg", "vn_pitch_deg", "vn_roll_deg")
             out.more |= {
-                n: Stream(stream.time_s, v[:, None])
+                n: SensorSeries(stream.time_s, v[:, None])
                 for n, v in zip(names, stream.values.T, strict=True)
             }
             out.angles |= set(names)
         elif kind == "attitude" and name == gyro.name:
             out.more |= {
-                f"attitude_q{n}": Stream(stream.time_s, v[:, None])
+                f"attitude_q{n}": SensorSeries(stream.time_s, v[:, None])
                 for n, v in zip("wxyz", stream.values.T, strict=True)
             }

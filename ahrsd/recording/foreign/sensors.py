@@ -31,7 +31,7 @@ _SENSORS = {"mag": MAG, "gyro": GYRO, "accel": ACCEL}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stream:
+class SensorSeries:
     """time_s (N,), on the clock of all the recording's streams; values (N, k)."""
 
     time_s: Array
@@ -55,14 +55,14 @@ class Sensors:
     facts:  for the metadata of a converted table: frame, clock, undone, ...
     """
 
-    mag: Stream | None = None
-    gyro: Stream | None = None
-    accel: Stream | None = None
+    mag: SensorSeries | None = None
+    gyro: SensorSeries | None = None
+    accel: SensorSeries | None = None
     units: dict[str, str] = field(
         default_factory=lambda: {"mag": "gauss", "gyro": "rad/s", "accel": "m/s^2"}
     )
     names: dict[str, str] = field(default_factory=dict)
-    more: dict[str, Stream] = field(default_factory=dict)
+    more: dict[str, SensorSeries] = field(default_factory=dict)
     angles: frozenset[str] = frozenset()
     notes: list[str] = field(default_factory=list)
     facts: dict[str, str] = field(default_factory=dict)
@@ -133,7 +133,9 @@ def merged(path: object, found: Sensors, columns: ColumnMap = NO_MAP) -> Merged:
     return Merged(out, notes, facts)
 
 
-def positions(time_s: Array, lat_deg: Array, lon_deg: Array, height_m: Array) -> dict[str, Stream]:
+def positions(
+    time_s: Array, lat_deg: Array, lon_deg: Array, height_m: Array
+) -> dict[str, SensorSeries]:
     """Fixes as covariates: m north, east and down of the first one; none without a fix."""
     known = np.isfinite(lat_deg) & np.isfinite(lon_deg) & ((lat_deg != 0.0) | (lon_deg != 0.0))
     known &= (np.abs(lat_deg) <= 90.0) & (np.abs(lon_deg) <= 360.0)
@@ -146,7 +148,7 @@ def positions(time_s: Array, lat_deg: Array, lon_deg: Array, height_m: Array) ->
         "position_east_m": east * _EARTH_M,
         "position_down_m": height[0] - height,
     }
-    return {name: Stream(time_s, values[:, None]) for name, values in columns.items()}
+    return {name: SensorSeries(time_s, values[:, None]) for name, values in columns.items()}
 
 
 def _called(what: str, found: Sensors, key: str) -> str:
@@ -154,7 +156,7 @@ def _called(what: str, found: Sensors, key: str) -> str:
     return f"the {what} ({name})" if name else f"the {what}"
 
 
-def _tidy(path: object, stream: Stream, name: str, notes: list[str]) -> Stream:
+def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> SensorSeries:
     """In order of time, finite, each time once."""
     refuse_beyond(path, len(stream.time_s), TABLE_ROWS, f"readings of {name}", "cut it in parts")
     known = np.isfinite(stream.time_s) & (np.abs(stream.values) < _LARGEST).all(axis=1)
@@ -180,10 +182,10 @@ def _tidy(path: object, stream: Stream, name: str, notes: list[str]) -> Stream:
         raise RecordingError(
             path, f"{name} has {len(time_s)} readings, {FEWEST} are needed", "record longer"
         )
-    return Stream(time_s, values)
+    return SensorSeries(time_s, values)
 
 
-def _fresh(mag: Stream, notes: list[str]) -> Stream:
+def _fresh(mag: SensorSeries, notes: list[str]) -> SensorSeries:
     """A magnetometer that is logged faster than it reads repeats itself: the first of each."""
     fresh = np.concatenate([[True], (np.diff(mag.values, axis=0) != 0.0).any(axis=1)])
     count = int(np.count_nonzero(fresh))
@@ -193,10 +195,10 @@ def _fresh(mag: Stream, notes: list[str]) -> Stream:
         f"{len(fresh) - count} of {len(fresh)} magnetometer readings repeat the one before: "
         "left out, it is logged faster than it reads"
     )
-    return Stream(mag.time_s[fresh], mag.values[fresh])
+    return SensorSeries(mag.time_s[fresh], mag.values[fresh])
 
 
-def _overlapping(path: object, mag: Stream, gyro: Stream) -> Stream:
+def _overlapping(path: object, mag: SensorSeries, gyro: SensorSeries) -> SensorSeries:
     slack_s = 1.0 / gyro.rate_hz if gyro.rate_hz else 0.0
     inside = (mag.time_s >= gyro.time_s[0] - slack_s) & (mag.time_s <= gyro.time_s[-1] + slack_s)
     if np.count_nonzero(inside) < FEWEST:
@@ -206,10 +208,10 @@ def _overlapping(path: object, mag: Stream, gyro: Stream) -> Stream:
             f"({gyro.time_s[0]:.3f} to {gyro.time_s[-1]:.3f} s) hardly overlap",
             "their clocks differ: record both with one clock",
         )
-    return Stream(mag.time_s[inside], mag.values[inside])
+    return SensorSeries(mag.time_s[inside], mag.values[inside])
 
 
-def _at_steps(time_s: Array, source: Stream, name: str, notes: list[str]) -> Array:
+def _at_steps(time_s: Array, source: SensorSeries, name: str, notes: list[str]) -> Array:
     """(N, k) values for the rows: as they are, means over the steps, or interpolated."""
     if len(source.time_s) >= len(time_s):
         at = np.minimum(np.searchsorted(source.time_s, time_s), len(source.time_s) - 1)
@@ -230,7 +232,7 @@ def _at_steps(time_s: Array, source: Stream, name: str, notes: list[str]) -> Arr
     return np.column_stack([np.interp(time_s, source.time_s, column) for column in source.values.T])
 
 
-def step_means(time_s: Array, source: Stream) -> Array:
+def step_means(time_s: Array, source: SensorSeries) -> Array:
     """(N, k) mean of a faster stream over each step (time_s[k-1], time_s[k]], by its integral."""
     t_s, values = source.time_s, source.values
     slices = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
@@ -245,7 +247,7 @@ def step_means(time_s: Array, source: Stream) -> Array:
     return np.vstack([first, np.diff(integral, axis=0) / np.diff(time_s)[:, None]])
 
 
-def _covariate(time_s: Array, stream: Stream, angle: bool) -> Array | None:
+def _covariate(time_s: Array, stream: SensorSeries, angle: bool) -> Array | None:
     known = np.isfinite(stream.time_s) & np.isfinite(stream.values[:, 0])
     t_s, values = stream.time_s[known], stream.values[known, 0]
     order = np.argsort(t_s, kind="stable")

@@ -19,7 +19,7 @@ import numpy as np
 
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
-from ahrsd.recording.foreign.sensors import Choice, Sensors, Stream, positions
+from ahrsd.recording.foreign.sensors import Choice, Sensors, SensorSeries, positions
 from ahrsd.samples import Array
 
 _TOPICS = (
@@ -119,7 +119,7 @@ def _field(
         relative = combined.data["magnetometer_timestamp_relative"].astype(np.int64)
         new = relative != _NO_TIME
         at = (combined.data["timestamp"] + relative)[new] * 1e-6
-        out.mag = Stream(at, _three(path, combined, "magnetometer_ga")[new])
+        out.mag = SensorSeries(at, _three(path, combined, "magnetometer_ga")[new])
         out.names["mag"] = "sensor_combined"
         return "nothing of the field (PX4 before 1.9 does not say which device it is)"
     if not found:
@@ -140,7 +140,7 @@ def _field(
     logged = _three(path, one, "magnetometer_ga")
     raw, words = _without_calibration(logged, device, parameters, out)
     out.mag, out.names["mag"] = (
-        Stream(one.data[stamp] * 1e-6, raw),
+        SensorSeries(one.data[stamp] * 1e-6, raw),
         f"vehicle_magnetometer[{number}]",
     )
     out.facts["device"] = str(device)
@@ -202,11 +202,11 @@ def _inertial(
         offset = _xyz(f"CAL_GYRO{slot}", "OFF", parameters, 0.0)
         rate = rate + offset
         words = f"gyro offset {np.round(1e3 * offset, 2).tolist()} mrad/s of CAL_GYRO{slot}"
-    out.gyro, out.names["gyro"] = Stream(at, rate), "sensor_combined"
+    out.gyro, out.names["gyro"] = SensorSeries(at, rate), "sensor_combined"
     if "accelerometer_m_s2[0]" in combined.data:
         relative = combined.data.get("accelerometer_timestamp_relative", np.zeros(len(at)))
         new = relative != _NO_TIME
-        out.accel = Stream(
+        out.accel = SensorSeries(
             (at + 1e-6 * relative)[new], _three(path, combined, "accelerometer_m_s2")[new]
         )
         out.names["accel"] = "sensor_combined"
@@ -222,7 +222,7 @@ def _covariates(sets: dict[str, list[_Set]], out: Sensors) -> None:
             numbers = factor * np.asarray(values, dtype=np.float64)
             if topic == "battery_status":
                 numbers = np.where(numbers < 0.0, np.nan, numbers)  # -1: not measured
-            out.more[column] = Stream(one.data["timestamp"] * 1e-6, numbers[:, None])
+            out.more[column] = SensorSeries(one.data["timestamp"] * 1e-6, numbers[:, None])
 
     add("battery_status", "current_a", "motor_current_a")
     add("battery_status", "voltage_v", "battery_v")
@@ -253,7 +253,7 @@ def _fixes(one: _Set, out: Sensors) -> None:
     out.more |= positions(at, *place)
     if "vel_m_s" in data:
         speed = data["vel_m_s"][fixed].astype(np.float64)
-        out.more["gps_speed_m_s"] = Stream(at, speed[:, None])
+        out.more["gps_speed_m_s"] = SensorSeries(at, speed[:, None])
 
 
 def _attitude(one: _Set, out: Sensors) -> None:
@@ -265,5 +265,5 @@ def _attitude(one: _Set, out: Sensors) -> None:
         "vn_pitch_deg": np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)),
         "vn_roll_deg": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
     }
-    out.more |= {name: Stream(at, np.degrees(v)[:, None]) for name, v in angles.items()}
+    out.more |= {name: SensorSeries(at, np.degrees(v)[:, None]) for name, v in angles.items()}
     out.angles |= set(angles)

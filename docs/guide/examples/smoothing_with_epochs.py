@@ -29,7 +29,7 @@ from gtsam.symbol_shorthand import B, C, N, U, X
 from numpy.typing import NDArray
 
 from ahrsd.estimator.epoch_factor import Epoch, EpochKeys, Noise, Point, epoch_factor, summarise
-from ahrsd.simulation import Experiment, Settings, simulate
+from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 from ahrsd.so3 import skew
 
 Array = NDArray[np.float64]
@@ -224,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args(arguments)
     count = round(25.0 * chosen.seconds)
-    experiment = simulate(Settings(chosen.scenario, "rov", seed=chosen.seed, samples=count))
+    experiment = simulate(ScenarioSettings(chosen.scenario, "rov", seed=chosen.seed, samples=count))
     sys.stdout.write("\n".join(report(smooth(experiment), experiment)) + "\n")
 
 

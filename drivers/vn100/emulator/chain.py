@@ -35,7 +35,7 @@ from drivers.vn100.emulator.physics import (
     GYRO_RANGE_RAD_S,
     MAG_RANGE_GAUSS,
     TICK_HZ,
-    Block,
+    SensorBlock,
 )
 
 LARGEST = 1e9  # whatever a host writes into a matrix: every value still fits an f32
@@ -51,7 +51,7 @@ def affine(values: tuple[float, ...]) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Settings:
+class ChainSettings:
     """What the registers say that matters here.
 
     mag, accel, gyro: (C, B) of 23, 25, 84;  rotation: R (3, 3) of 26;  hsi: (C, B) of 47 or None
@@ -87,14 +87,14 @@ def _through(vectors: Array, stage: tuple[Array, Array], rotation: Array) -> Arr
     return np.asarray(np.clip(passed, -LARGEST, LARGEST))
 
 
-class Outputs:
+class SensorOutputs:
     """All output quantities of one block under one set of register values, as they are needed.
 
     Arrays have a row per tick of the block. Vectors are in the output frame u (behind register 26)
     unless their name ends in `ned`.
     """
 
-    def __init__(self, block: Block, settings: Settings, state: FilterState) -> None:
+    def __init__(self, block: SensorBlock, settings: ChainSettings, state: FilterState) -> None:
         self.block = block
         self._settings = settings
         self._state = state

@@ -1,7 +1,7 @@
 """What the emulated VN-100 answers to a command (vn100-protocol 3, 4 and 10).
 
 A command that the device refuses raises RegisterValueError with the VNERR code. What a command does
-beyond its reply is returned as an `Effect`; the emulator sees to the times.
+beyond its reply is returned as an `SideEffect`; the emulator sees to the times.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from drivers.vn100.emulator.output import (
     MEASURED,
     quantities_of,
 )
-from drivers.vn100.emulator.physics import GRAVITY_M_S2, HISTORY_TICKS, World
+from drivers.vn100.emulator.physics import GRAVITY_M_S2, HISTORY_TICKS, EmulatedWorld
 from drivers.vn100.emulator.sensor import Sensor
 from drivers.vn100.emulator.streams import BINARY_OUTPUTS, binary_packet, fits
 from drivers.vn100.register_codec import RegisterValueError, Values
@@ -29,7 +29,7 @@ INSUFFICIENT_BAUD = 0x0C
 MAGNETIC_MODEL, GRAVITY_MODEL = 0, 1  # fields of register 83
 
 
-class Effect(Enum):
+class SideEffect(Enum):
     """What happens besides the reply."""
 
     NONE = auto()
@@ -41,12 +41,12 @@ class Effect(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class CommandReply:
     """A reply: the body of a sentence, and a packet as it goes on the wire behind it."""
 
     body: str = ""
     packet: bytes = b""
-    effect: Effect = Effect.NONE
+    effect: SideEffect = SideEffect.NONE
 
 
 def _refused(code: int, message: str) -> RegisterValueError:
@@ -75,19 +75,19 @@ class Interpreter:
     streaming: whether VNASY lets async messages out on this port
     """
 
-    def __init__(self, memory: Memory, sensor: Sensor, world: World, port: int) -> None:
+    def __init__(self, memory: Memory, sensor: Sensor, world: EmulatedWorld, port: int) -> None:
         self.memory = memory
         self.sensor = sensor
         self.port = port
         self.streaming = True
         self._world = world
         self._integrated_tick = 0
-        self._words: dict[str, Callable[[list[str], int], Answer]] = {
+        self._words: dict[str, Callable[[list[str], int], CommandReply]] = {
             "VNRRG": self._read,
             "VNWRG": self._write,
-            "VNWNV": self._plain("VNWNV", Effect.SAVE),
-            "VNRST": self._plain("VNRST", Effect.RESTART),
-            "VNRFS": self._plain("VNRFS", Effect.FACTORY),
+            "VNWNV": self._plain("VNWNV", SideEffect.SAVE),
+            "VNRST": self._plain("VNRST", SideEffect.RESTART),
+            "VNRFS": self._plain("VNRFS", SideEffect.FACTORY),
             "VNASY": self._gate,
             "VNKMD": self._disturbance("VNKMD", KNOWN_MAGNETIC),
             "VNKAD": self._disturbance("VNKAD", KNOWN_ACCELERATION),
@@ -100,7 +100,7 @@ class Interpreter:
             self._words["VNSIH"] = self._initial_heading
             self._words["VNSFB"] = self._keep_bias_as("VNSFB")
 
-    def answer(self, body: str, tick: int) -> Answer:
+    def answer(self, body: str, tick: int) -> CommandReply:
         """Carry out a command at `tick`. Raises RegisterValueError where it is refused."""
         word, *arguments = body.split(",")
         handler = self._words.get(word)
@@ -145,7 +145,7 @@ class Interpreter:
             raise _refused(INVALID_REGISTER, f"no register {arguments[0]}")
         return self.memory.row(int(arguments[0])).id
 
-    def _read(self, arguments: list[str], tick: int) -> Answer:
+    def _read(self, arguments: list[str], tick: int) -> CommandReply:
         register = self._register(arguments)
         if register in PER_PORT and len(arguments) == 2:
             port = _one(arguments[1:], (1, 2))
@@ -153,7 +153,7 @@ class Interpreter:
         _none(arguments[1:])
         return self._echo("VNRRG", register, self.values(register, tick))
 
-    def _write(self, arguments: list[str], _: int) -> Answer:
+    def _write(self, arguments: list[str], _: int) -> CommandReply:
         register = self._register(arguments)
         values = self.memory.parsed(register, arguments[1:])
         stored, port = values, 0
@@ -166,48 +166,48 @@ class Interpreter:
             self.sensor.hsi.reset()
         self.sensor.changed()
         here = register == 5 and port == self.port
-        return self._echo("VNWRG", register, values, Effect.BAUD if here else Effect.OUTPUT)
+        return self._echo("VNWRG", register, values, SideEffect.BAUD if here else SideEffect.OUTPUT)
 
     def _echo(
-        self, word: str, register: int, values: Values, effect: Effect = Effect.NONE
-    ) -> Answer:
-        return Answer(f"{word},{format_reply(register, values)}", effect=effect)
+        self, word: str, register: int, values: Values, effect: SideEffect = SideEffect.NONE
+    ) -> CommandReply:
+        return CommandReply(f"{word},{format_reply(register, values)}", effect=effect)
 
-    def _plain(self, word: str, effect: Effect) -> Callable[[list[str], int], Answer]:
-        def handler(arguments: list[str], _: int) -> Answer:
+    def _plain(self, word: str, effect: SideEffect) -> Callable[[list[str], int], CommandReply]:
+        def handler(arguments: list[str], _: int) -> CommandReply:
             _none(arguments)
-            return Answer(word, effect=effect)
+            return CommandReply(word, effect=effect)
 
         return handler
 
-    def _gate(self, arguments: list[str], _: int) -> Answer:
+    def _gate(self, arguments: list[str], _: int) -> CommandReply:
         self.streaming = _one(arguments, (0, 1)) == 1
-        return Answer(f"VNASY,{int(self.streaming)}", effect=Effect.OUTPUT)
+        return CommandReply(f"VNASY,{int(self.streaming)}", effect=SideEffect.OUTPUT)
 
-    def _disturbance(self, word: str, bit: int) -> Callable[[list[str], int], Answer]:
-        def handler(arguments: list[str], _: int) -> Answer:
+    def _disturbance(self, word: str, bit: int) -> Callable[[list[str], int], CommandReply]:
+        def handler(arguments: list[str], _: int) -> CommandReply:
             present = _one(arguments, (0, 1))
             known = self.sensor.known_disturbance & ~bit
             self.sensor.known_disturbance = known | (bit if present else 0)
             self.sensor.changed()
-            return Answer(f"{word},{present}")
+            return CommandReply(f"{word},{present}")
 
         return handler
 
-    def _keep_bias_as(self, word: str) -> Callable[[list[str], int], Answer]:
+    def _keep_bias_as(self, word: str) -> Callable[[list[str], int], CommandReply]:
         """The filter's gyro bias into its start-up register (VNSGB, in newer words VNSFB)."""
 
-        def handler(arguments: list[str], _: int) -> Answer:
+        def handler(arguments: list[str], _: int) -> CommandReply:
             _none(arguments)
             register = self.memory.bias_register
             rest = self.memory.get(register)[3:]
             bias = self.memory.stored(register, (*self.sensor.filter_bias(), *rest))
             self.memory.ram[register, 0] = bias
-            return Answer(word)
+            return CommandReply(word)
 
         return handler
 
-    def _initial_heading(self, arguments: list[str], tick: int) -> Answer:
+    def _initial_heading(self, arguments: list[str], tick: int) -> CommandReply:
         """VNSIH: the heading of now, in degrees, until the next start."""
         if len(arguments) != 1:
             raise _refused(TOO_MANY if arguments else TOO_FEW, "one heading, in degrees")
@@ -218,18 +218,18 @@ class Interpreter:
         if not abs(heading_deg) <= 360.0:
             raise _refused(INVALID_PARAMETER, f"{arguments[0]} is no heading in degrees")
         self.sensor.set_heading(tick, math.radians(heading_deg))
-        return Answer(f"VNSIH,{arguments[0]}")
+        return CommandReply(f"VNSIH,{arguments[0]}")
 
-    def _tare(self, arguments: list[str], tick: int) -> Answer:
+    def _tare(self, arguments: list[str], tick: int) -> CommandReply:
         """The present attitude becomes the zero attitude until the next start (2.x)."""
         _none(arguments)
         self.sensor.tare(tick)
-        return Answer("VNTAR")
+        return CommandReply("VNTAR")
 
-    def _poll(self, arguments: list[str], tick: int) -> Answer:
+    def _poll(self, arguments: list[str], tick: int) -> CommandReply:
         number = _one(arguments, (1, 2, 3))
         output = BINARY_OUTPUTS[number - 1]
         packet = binary_packet(self.memory.get(output), self.sensor, tick, 1)
         if not packet:
             raise _refused(INVALID_PARAMETER, f"register {output} selects nothing")
-        return Answer(f"VNBOM,{number}", packet)
+        return CommandReply(f"VNBOM,{number}", packet)

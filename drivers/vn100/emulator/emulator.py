@@ -25,14 +25,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from drivers.vn100.deframer import Cause, Deframer, Sentence
-from drivers.vn100.emulator.commands import Answer, Effect, Interpreter
+from drivers.vn100.emulator.commands import CommandReply, Interpreter, SideEffect
 from drivers.vn100.emulator.events import Events
 from drivers.vn100.emulator.faults import FaultPlan
 from drivers.vn100.emulator.memory import Memory
 from drivers.vn100.emulator.motion import Motion
-from drivers.vn100.emulator.physics import TICK_HZ, Further, Truth, World
+from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, EmulatedWorld, Further
 from drivers.vn100.emulator.sensor import Sensor
-from drivers.vn100.emulator.streams import Stream, streams
+from drivers.vn100.emulator.streams import OutputStream, streams
 from drivers.vn100.emulator.wire import Transmitter
 from drivers.vn100.register_codec import RegisterValueError
 from drivers.vn100.registers import format_reply
@@ -59,7 +59,7 @@ class Emulator:
 
     def __init__(
         self,
-        truth: Truth,
+        truth: EmulatedTruth,
         motion: Motion,
         firmware: str = "3.1.0.0",
         seed: int = 0,
@@ -77,7 +77,7 @@ class Emulator:
         self._firmware, self._port = firmware, port
         self._presets = dict(presets or {})
         self._plan = FaultPlan(faults, seed)
-        self._world = World(truth, motion, seed, self._plan.disturbances(), further)
+        self._world = EmulatedWorld(truth, motion, seed, self._plan.disturbances(), further)
         self._delays = np.random.default_rng([seed, 5])
         self._make_unit(serial)
         self._wire = Transmitter(self._plan, self.memory.number(5, port), self._overflowed)
@@ -90,7 +90,7 @@ class Emulator:
         self._log: list[str] = []
         self._awake_s = 0.0  # listens and sends from then on; infinity without power
         self._boot_tick = 0
-        self._streams: list[Stream] = []
+        self._streams: list[OutputStream] = []
         self._due_tick = NEVER
         self._output_changed(-1)
         self._events = Events(self, self._plan.events)
@@ -226,23 +226,23 @@ class Emulator:
         fault = self._plan.active("silent_refusal", now_s)
         return fault is not None and fault.parameter in (0, int(body.split(",")[1]))
 
-    def _follow(self, answer: Answer, now_s: float) -> None:
+    def _follow(self, answer: CommandReply, now_s: float) -> None:
         if answer.packet:
             self._reply(answer.body, now_s)
             self._wire.send(answer.packet, now_s)
             return
-        if answer.effect is Effect.SAVE:
+        if answer.effect is SideEffect.SAVE:
             self._ready_s = now_s + SAVE_S
             if not self._events.save_begins(now_s, SAVE_S):
                 self.at(self._ready_s, self._saved)
             return
         self._reply(answer.body, now_s)
-        if answer.effect is Effect.OUTPUT:
+        if answer.effect is SideEffect.OUTPUT:
             self._output_changed(int(now_s * TICK_HZ + 1e-6))
-        elif answer.effect is Effect.BAUD:
+        elif answer.effect is SideEffect.BAUD:
             self.at(self._wire.empty_at_s(now_s), self._switch_baud)
-        elif answer.effect in (Effect.RESTART, Effect.FACTORY):
-            if answer.effect is Effect.FACTORY:
+        elif answer.effect in (SideEffect.RESTART, SideEffect.FACTORY):
+            if answer.effect is SideEffect.FACTORY:
                 self.memory.restore_factory()
             self._fall_silent()
             self.at(self._wire.empty_at_s(now_s) + 1e-3, self.restart)

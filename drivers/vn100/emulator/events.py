@@ -19,7 +19,7 @@ from drivers.vn100.register_codec import Values
 from drivers.vn100.registers import REGISTERS, format_reply
 
 
-class Device(Protocol):
+class EventTarget(Protocol):
     """What events need of the emulator."""
 
     memory: Memory
@@ -55,7 +55,7 @@ class Device(Protocol):
 class Events:
     """The faults of a schedule that strike once."""
 
-    def __init__(self, device: Device, faults: Iterable[Fault]) -> None:
+    def __init__(self, device: EventTarget, faults: Iterable[Fault]) -> None:
         self._device = device
         self._armed: list[Fault] = []
         self._writes_left = 0

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.vn100.emulator.chain import Settings, affine
+from drivers.vn100.emulator.chain import ChainSettings, affine
 from drivers.vn100.emulator.hsi import OnBoardHsi
 from drivers.vn100.emulator.motion import Array
 from drivers.vn100.register_codec import Register, RegisterValueError, Values, float32
@@ -127,11 +127,11 @@ class Memory:
             for value, kind in zip(values, kinds, strict=False)
         )
 
-    def settings(self, hsi: OnBoardHsi, heading_frozen: bool) -> Settings:
+    def settings(self, hsi: OnBoardHsi, heading_frozen: bool) -> ChainSettings:
         """What of it the compensation chain needs."""
         filtering = [int(value) for value in self.get(85)]
         window, mode = filtering[0], filtering[5]
-        return Settings(
+        return ChainSettings(
             mag=self._affine(23),
             accel=self._affine(25),
             gyro=self._affine(84),

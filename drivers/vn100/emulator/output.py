@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from drivers.vn100.emulator.chain import Outputs
+from drivers.vn100.emulator.chain import SensorOutputs
 from drivers.vn100.emulator.motion import Array
 from drivers.vn100.emulator.physics import BLOCK_TICKS, TICK_HZ
 from drivers.vn100.fields import Columns
@@ -28,7 +28,7 @@ MEASURED: dict[int, Columns] = {
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceClock:
+class EmulatedClock:
     """TimeStartup: runs from `boot_tick`, `ppm` fast, with resolution of a microsecond."""
 
     boot_tick: int
@@ -52,11 +52,11 @@ class Switches:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Readings:
+class OutputReadings:
     """One block as an output with a step of `step_ticks` sees it."""
 
-    outputs: Outputs
-    clock: DeviceClock
+    outputs: SensorOutputs
+    clock: EmulatedClock
     switches: Switches
     step_ticks: int
 
@@ -72,61 +72,61 @@ class Readings:
         return np.arange(first, first + BLOCK_TICKS, dtype=np.float64)
 
 
-def _time_startup(of: Readings) -> Array:
+def _time_startup(of: OutputReadings) -> Array:
     seconds = of.ticks / TICK_HZ * (1 + of.clock.ppm * 1e-6) + of.clock.step_s
     stamps = np.round(seconds + of.outputs.block.jitter_s, 6)
     return np.asarray(np.maximum(stamps, 0.0))  # jitter must not put the first one before zero
 
 
-def _delta_theta(of: Readings) -> Array:
+def _delta_theta(of: OutputReadings) -> Array:
     outputs = of.outputs
     wanted = of.switches.delta_without_bias
     rates = (outputs.compensated_rates if wanted else outputs.rates)(of.step_ticks)
     return _delta(of, rates)
 
 
-def _delta_velocity(of: Readings) -> Array:
+def _delta_velocity(of: OutputReadings) -> Array:
     name = "linear_accel_body" if of.switches.delta_without_gravity else "accel"
     return _delta(of, of.outputs.quantity(name))
 
 
-def _delta(of: Readings, per_second: Array) -> Array:
+def _delta(of: OutputReadings, per_second: Array) -> Array:
     if of.switches.delta_ned:
         per_second = np.einsum("kij,kj->ki", of.outputs.R_nu, per_second)
     return np.asarray(per_second * (of.step_ticks / TICK_HZ))
 
 
-def _vpe_status(of: Readings) -> Array:
+def _vpe_status(of: OutputReadings) -> Array:
     full = of.outputs.saturation().astype(np.int64)
     bits = np.where(full & 0x1C0, GYRO_FULL, 0) | np.where(full & 0x007, MAG_FULL, 0)
     return np.asarray(bits | of.switches.vpe_status, dtype=np.float64)
 
 
-def _sync_out_count(of: Readings) -> Array:
+def _sync_out_count(of: OutputReadings) -> Array:
     every = of.switches.sync_out_ticks
     return np.floor_divide(of.ticks, every) if every else _zeros(1)(of)
 
 
-def _zeros(columns: int) -> Callable[[Readings], Array]:
+def _zeros(columns: int) -> Callable[[OutputReadings], Array]:
     return lambda _: np.zeros((BLOCK_TICKS, columns))
 
 
-def _plain(name: str) -> Callable[[Readings], Array]:
+def _plain(name: str) -> Callable[[OutputReadings], Array]:
     return lambda of: of.outputs.quantity(name)
 
 
-def _raw(of: Readings) -> Array:
+def _raw(of: OutputReadings) -> Array:
     """What firmware 2 puts into Imu.Raw is not known; here the uncompensated values."""
     names = ("uncomp_mag_x_gauss", "uncomp_accel_x_m_s2", "uncomp_gyro_x_rad_s", "temperature_c")
     return np.hstack([of.column(name) for name in names])
 
 
-def _dcm(of: Readings) -> Array:
+def _dcm(of: OutputReadings) -> Array:
     return of.outputs.R_nu.reshape(BLOCK_TICKS, 9)  # row by row, as recordings show
 
 
 # By the name of the quantity's first column (`fields`); SI, angles in rad.
-QUANTITIES: dict[str, Callable[[Readings], Array]] = {
+QUANTITIES: dict[str, Callable[[OutputReadings], Array]] = {
     "time_startup_s": _time_startup,
     "time_sync_in_s": _time_startup,  # no SyncIn event ever came: since the start
     "sync_in_count": _zeros(1),

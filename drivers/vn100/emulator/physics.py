@@ -6,8 +6,8 @@
 
 on a grid of 800 Hz (the device's internal rate), in blocks. The magnetometer value of a tick is the
 field at that tick; the rate is the mean over the step that ends there, so it depends on the length
-of the step and `Block.rates` is asked for it. All noise comes from one generator in a fixed order:
-two worlds with the same seed are equal bit for bit, however they are asked.
+of the step and `SensorBlock.rates` is asked for it. All noise comes from one generator in a fixed
+order: two worlds with the same seed are equal bit for bit, however they are asked.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def field_from(magnitude_gauss: float, inclination_deg: float, declination_deg: 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class EmulatedTruth:
     """What is hidden in the emulated device and its vehicle.
 
     soft_iron:        A (3, 3), any matrix with a positive determinant
@@ -98,7 +98,7 @@ class Truth:
         )
 
 
-def draw_truth(seed: int) -> Truth:
+def draw_truth(seed: int) -> EmulatedTruth:
     """A hidden calibration as a small vehicle has it: uncalibrated heading 12 to 50 degrees off.
 
     Symmetric positive definite soft iron with det 1, hard iron of 0.08 to 0.2 gauss, gyro bias of
@@ -110,7 +110,7 @@ def draw_truth(seed: int) -> Truth:
         soft = root @ root.T
         direction = draw.standard_normal(3)
         hard = draw.uniform(0.08, 0.2) * direction / np.linalg.norm(direction)
-        truth = Truth(
+        truth = EmulatedTruth(
             soft_iron=soft / np.linalg.det(soft) ** (1 / 3),
             hard_iron_gauss=hard,
             gyro_bias_rad_s=draw.uniform(-6e-3, 6e-3, 3),
@@ -165,7 +165,7 @@ class Further(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class SensorBlock:
     """`BLOCK_TICKS` ticks of sensor values behind the factory calibration, sensor frame.
 
     first_tick: number of the block's first tick since the emulator began; tick k is at k / 800 s
@@ -211,12 +211,12 @@ def clip_rate(rate_rad_s: Array) -> Array:
     return np.clip(rate_rad_s, -GYRO_RANGE_RAD_S, GYRO_RANGE_RAD_S)
 
 
-class World:
+class EmulatedWorld:
     """Makes the blocks, one after the other."""
 
     def __init__(
         self,
-        truth: Truth,
+        truth: EmulatedTruth,
         motion: Motion,
         seed: int,
         disturbances: tuple[Disturbance, ...] = (),
@@ -233,7 +233,7 @@ class World:
         self._q_nb = quaternions(motion.angles(past))
         self._mag = self._read_field(past, matrices(self._q_nb), self._normal(HISTORY_TICKS, 3))
 
-    def next_block(self) -> Block:
+    def next_block(self) -> SensorBlock:
         """The next `BLOCK_TICKS` ticks."""
         ticks = np.arange(self._next_tick, self._next_tick + BLOCK_TICKS)
         time_s = ticks / TICK_HZ
@@ -247,7 +247,7 @@ class World:
         truth = self.truth
         accel = -GRAVITY_M_S2 * R_nb[:, 2, :] + truth.noise_accel_m_s2 * noise[:, 6:9]
         warmth = 1 - np.exp(-time_s / 600.0)
-        block = Block(
+        block = SensorBlock(
             first_tick=self._next_tick,
             q_nb=self._q_nb,
             mag_gauss=self._mag,

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import Motion, make_motion
-from drivers.vn100.emulator.physics import TICK_HZ, Further, Truth, draw_truth
+from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, Further, draw_truth
 from drivers.vn100.emulator.streams import fits
 
 Values = tuple[float | int | str, ...]
@@ -83,7 +83,7 @@ class Setup:
     motion: str | tuple[tuple[str, float], ...] = ""
 
 
-def hidden(setup: Setup) -> tuple[Scenario, Truth, Motion]:
+def hidden(setup: Setup) -> tuple[Scenario, EmulatedTruth, Motion]:
     """The scenario, its hidden truth and its motion.  ValueError for a name that there is not."""
     scenario = SCENARIOS.get(setup.scenario)
     if scenario is None:
@@ -120,7 +120,7 @@ def build(setup: Setup, further: Further | None = None) -> Emulator:
     return device
 
 
-def calibration_registers(truth: Truth) -> dict[int, Values]:
+def calibration_registers(truth: EmulatedTruth) -> dict[int, Values]:
     """Registers 23 and 84 as a perfect calibration would write them."""
     matrix = np.linalg.inv(truth.soft_iron)
     return {

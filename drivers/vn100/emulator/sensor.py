@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.vn100.emulator.chain import FilterState, Outputs
+from drivers.vn100.emulator.chain import FilterState, SensorOutputs
 from drivers.vn100.emulator.hsi import SAMPLE_TICKS, OnBoardHsi
 from drivers.vn100.emulator.memory import Memory
 from drivers.vn100.emulator.motion import Array
-from drivers.vn100.emulator.output import DeviceClock, Readings, Switches
-from drivers.vn100.emulator.physics import BLOCK_TICKS, HISTORY_TICKS, TICK_HZ, World
+from drivers.vn100.emulator.output import EmulatedClock, OutputReadings, Switches
+from drivers.vn100.emulator.physics import BLOCK_TICKS, HISTORY_TICKS, TICK_HZ, EmulatedWorld
 
 Row = list[float]
 _TIMES = ("time_startup_s", "time_sync_in_s", "delta_time_s")
@@ -29,16 +29,16 @@ class Sensor:
     stuck: all readings but time repeat the last values
     """
 
-    def __init__(self, world: World, memory: Memory) -> None:
+    def __init__(self, world: EmulatedWorld, memory: Memory) -> None:
         self.memory = memory
         self.hsi = OnBoardHsi()
-        self.clock = DeviceClock(0, world.truth.clock_ppm)
+        self.clock = EmulatedClock(0, world.truth.clock_ppm)
         self.known_disturbance = 0
         self.stuck = False
         self._world = world
         self._block = world.next_block()
         self._filter = FilterState(memory.startup_bias())
-        self._outputs: Outputs | None = None
+        self._outputs: SensorOutputs | None = None
         self._tare: Array | None = None
         self._columns: dict[tuple[str, int], list[Row]] = {}
         self._last: dict[str, Row] = {}
@@ -66,7 +66,7 @@ class Sensor:
 
     def start(self, tick: int) -> None:
         """The device starts at `tick`: its filter begins anew."""
-        self.clock = DeviceClock(tick, self.clock.ppm)
+        self.clock = EmulatedClock(tick, self.clock.ppm)
         self.hsi.reset()
         self.known_disturbance = 0
         self._tare = None
@@ -108,18 +108,18 @@ class Sensor:
     def _magnetic_disturbance(self) -> bool:
         return bool(self.known_disturbance & 0x0800)
 
-    def _present(self) -> Outputs:
+    def _present(self) -> SensorOutputs:
         if self._outputs is None:
             settings = self.memory.settings(self.hsi, self._magnetic_disturbance)
             settings = replace(settings, tare=self._tare)
-            self._outputs = Outputs(self._block, settings, self._filter)
+            self._outputs = SensorOutputs(self._block, settings, self._filter)
         return self._outputs
 
     def _column(self, name: str, step_ticks: int) -> list[Row]:
         key = name, step_ticks
         if key not in self._columns:
             step = max(1, min(step_ticks, HISTORY_TICKS))
-            readings = Readings(self._present(), self.clock, self._switches(), step)
+            readings = OutputReadings(self._present(), self.clock, self._switches(), step)
             self._columns[key] = readings.column(name).tolist()
         return self._columns[key]
 

@@ -27,14 +27,14 @@ LINE_BYTES |= {19: 110, 30: 75, 34: 38}
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class OutputStream:
     """One asynchronous output: `message(tick)` is due at every multiple of `step_ticks`."""
 
     step_ticks: int
     message: Callable[[int], bytes]
 
 
-def streams(memory: Memory, sensor: Sensor, port: int) -> list[Stream]:
+def streams(memory: Memory, sensor: Sensor, port: int) -> list[OutputStream]:
     """What comes out of `port`, in the order in which it comes at a common instant."""
     found = []
     for output in BINARY_OUTPUTS:
@@ -52,13 +52,13 @@ def _routed(values: Values, port: int) -> bool:
     return bool(mode >> (port - 1) & 1 and divisor and groups)
 
 
-def _binary_stream(values: Values, sensor: Sensor) -> Stream:
+def _binary_stream(values: Values, sensor: Sensor) -> OutputStream:
     step = int(values[1])
-    return Stream(step, lambda tick: binary_packet(values, sensor, tick, step))
+    return OutputStream(step, lambda tick: binary_packet(values, sensor, tick, step))
 
 
-def _ascii_stream(ador: int, step: int, memory: Memory, sensor: Sensor) -> Stream:
-    return Stream(step, lambda tick: ascii_message(ador, memory, sensor, tick, step))
+def _ascii_stream(ador: int, step: int, memory: Memory, sensor: Sensor) -> OutputStream:
+    return OutputStream(step, lambda tick: ascii_message(ador, memory, sensor, tick, step))
 
 
 def ascii_message(ador: int, memory: Memory, sensor: Sensor, tick: int, step: int) -> bytes:
