@@ -212,3 +212,13 @@ def test_the_reference_is_up_to_date():
     assert (PROJECT / "docs" / "reference" / "configuration.md").read_text() == reference(), (
         "run: python -m ahrsd.config.text > docs/reference/configuration.md"
     )
+
+
+def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp_path):
+    from click.testing import CliRunner
+
+    from ahrsd.cli.run import command
+
+    said = CliRunner().invoke(command, ["--state-directory", str(tmp_path), "--print-config"])
+    assert said.exit_code == 0
+    assert load(tmp_path, said.output).state_directory == tmp_path

@@ -31,7 +31,7 @@ from ahrsd.samples import Array
 SHORTEST_S, LONGEST_S = 5.0, 20.0  # of a stretch
 STRETCHES = 60  # the newest ones, that are remembered
 FEWEST = 6  # from which something is said
-_TURNED = 0.02  # variance of u over a stretch that says something; 0.02 is some 8 deg each way
+TURNED = 0.02  # variance of u over a stretch that says something; 0.02 is some 8 deg each way
 _WELL_TURNED = 0.15  # and that need not become longer
 _FEWEST_ROWS = 20
 _BELIEF = 0.05  # size of d and S before anything is known, in parts of the field
@@ -104,7 +104,7 @@ class LeftoverError:
         if turned < _WELL_TURNED and not last:
             return
         self._fields = []
-        if turned > _TURNED and len(field) >= _FEWEST_ROWS and np.isfinite(field).all():
+        if turned > TURNED and len(field) >= _FEWEST_ROWS and np.isfinite(field).all():
             square = (u[:, :, None] * u[:, None, :])[:, _UPPER[0], _UPPER[1]][:, :5]
             X = np.column_stack([u, square])
             X = X - X.mean(axis=0)

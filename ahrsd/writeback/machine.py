@@ -252,6 +252,7 @@ class WriteBack:
             )
             self._recheck.soon(host_s)
         elif seen.unit != flow.identity.unit:
+            self._restarts.another()
             flow.another(seen.unit)
         elif changed := differences(flow.expected(seen.values), seen.values):
             flow.changed(tuple(changed))
@@ -421,6 +422,8 @@ class WriteBack:
         self._outbox.host_s = host_s
         if name == self._outbox.running and isinstance(result, ProcedureOutcome):
             self._outbox.running = ""
+            if result.other is not None:
+                self._restarts.another()
             self._flow.on_outcome(result)
             if not result.as_expected:
                 self._recheck.now(host_s)

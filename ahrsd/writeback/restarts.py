@@ -27,6 +27,7 @@ class RestartWatch:
         self._seen: int | None = None
         self._in_run = False  # its time fell since this run knows it
         self._read_from_s = math.inf
+        self._another = False  # nobody knows whose the messages are
         self._first_s: float | None = None  # when its time was heard first since it was bound
         self._newest_s = self._newest_at_s = math.nan  # its time, as last heard, and when
         self._started_s = math.inf  # when it started up, at the latest
@@ -36,6 +37,8 @@ class RestartWatch:
 
         So what the device only reports (VNERR) counts where its stream has no time.
         """
+        if self._another:
+            return
         if uptime_s is not None:
             self._in_run |= self._fell(uptime_s) and self._may_have_restarted(uptime_s, host_s)
         untimed = uptime_s is None and self._first_s is None
@@ -51,12 +54,17 @@ class RestartWatch:
         """The link went away, or nobody is there to ask."""
         self._bound = False
 
+    def another(self) -> None:
+        """Another device has the cable: what was seen may be of that one, until one is read."""
+        self._another, self._bound = True, False
+        self._seen, self._in_run, self._newest_s = None, False, math.nan
+
     def bind(self, serial: int, read_from_s: float) -> bool:
         """A device was identified and read; whether this one was seen to restart before."""
         restarted = self._seen == serial
         if serial != self._serial:
             self._in_run, self._newest_s = False, math.nan
-        self._serial, self._seen, self._bound = serial, None, True
+        self._serial, self._seen, self._bound, self._another = serial, None, True, False
         self._read_from_s = math.inf if restarted else read_from_s
         self._first_s, self._started_s = None, math.inf
         return restarted

@@ -19,6 +19,8 @@ class TrialMetrics:
     duration_s, turns: of use, on the device's clock
     new_figure, old_figure: the same figure of quality (heading or field error, smaller is better)
                        over the newest stretch with the new and with the old registers
+    turned:            whether the vehicle turned in that stretch; at rest the figures are of noise,
+                       which a soft iron makes larger along some axes than along others
     field_spread:      std/mean of the corrected field
     new_swing, old_swing: how far the corrected field moves when the corrected gyroscope carries it
                        into one frame, in parts of the field; `old`: the least with either or both
@@ -34,6 +36,7 @@ class TrialMetrics:
     new_figure: float
     old_figure: float
     field_spread: float
+    turned: bool = True
     heading_jump_deg: float | None = None
     new_swing: float = 0.0
     old_swing: float = 0.0
@@ -120,7 +123,7 @@ class Trial:
 
 def _worse(metrics: TrialMetrics, factor: float) -> str | None:
     """What is worse with the new registers than with the old ones, in words."""
-    if metrics.new_figure > metrics.old_figure * factor:
+    if metrics.turned and metrics.new_figure > metrics.old_figure * factor:
         return (
             f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
             f"{metrics.old_figure:.2%}"

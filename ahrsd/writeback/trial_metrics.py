@@ -2,15 +2,16 @@
 
 The figure is the spread (std / mean) of the corrected field over the newest minute: both
 corrections see the same motion and the same disturbances, so only their quality differs. At rest
-both show the sensor's noise and neither is worse. Whether the new ones are *right* is not told by
-the spread, which noise has as well, but by how much of it an error of the calibration explains
-(`leftover_error`). That says nothing of the gyroscope, nor of a
-matrix that is turned: `carried_field` does, with the new registers and with each alternative to
-them (either one put back, or both). The heading's jump is the difference of the two
-tilt-compensated headings of the same samples, averaged over the first seconds of samples in which
-the vehicle is nearly level. It was predicted for level, on the side it may be twice as much, and
-at 15 deg a hard iron along the vertical adds half as much again: so each sample is turned level on
-its own heading before the two are compared.
+both show the sensor's noise, scaled by a matrix each, and are not compared. Whether the new ones
+are *right* is not told by the spread, which noise has as well, but by how much of it an error of
+the calibration explains (`leftover_error`). That says nothing of the gyroscope, nor of a matrix
+that is turned: `field_steadiness` does, with the new registers and with each alternative to them
+(either one put back, or both; at rest only the gyroscope's).
+
+The heading's jump is the difference of the two tilt-compensated headings of the same samples,
+averaged over the first seconds of samples in which the vehicle is nearly level. It was predicted
+for level, on the side it may be twice as much, and at 15 deg a hard iron along the vertical adds
+half as much again: so each sample is turned level on its own heading before the two are compared.
 Seconds are those that samples cover, taken in pieces of a quarter of one: over a gap, or over the
 many seconds that a busy host reads at once, the vehicle turns, and a mean over a turn is no field.
 """
@@ -25,13 +26,14 @@ from ahrsd.calibration import Affine
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.field_steadiness import CarriedField
-from ahrsd.writeback.leftover_error import LeftoverError
+from ahrsd.writeback.leftover_error import TURNED, LeftoverError
 from ahrsd.writeback.trial import TrialMetrics
 
 _WINDOW_S = 60.0
 _JUMP_S = 3.0
 _PIECE_S = 0.25  # one heading each; a vehicle turns by little in it
 _LEVEL = np.cos(np.radians(15.0))
+_OLD_GYRO = 2  # of the pairs that are carried: the new magnetometer's register, the old gyro's
 _SPACING_S = 0.1  # samples closer than this add nothing to a spread
 
 
@@ -101,6 +103,8 @@ class LiveTrial:
         field = np.array([m for _, m in self._rows])
         new = np.linalg.norm(self._new.apply(field), axis=1)
         old = np.linalg.norm(self._old.apply(field), axis=1)
+        directions = self._new.apply(field) / new[:, None]
+        turned = bool(len(field) > 1 and directions.var(axis=0).sum() > TURNED)
         spread = float(new.std() / new.mean()) if len(field) > 1 else float("nan")
         jump = None
         if self._jumps:
@@ -115,9 +119,10 @@ class LiveTrial:
             new_figure=spread,
             old_figure=float(old.std() / old.mean()) if len(field) > 1 else float("nan"),
             field_spread=spread,
+            turned=turned,
             heading_jump_deg=jump,
             new_swing=float(swing[0]),
-            old_swing=float(swing[1:].min()),
+            old_swing=float(swing[1:].min() if turned else swing[_OLD_GYRO]),
             wrong=left.share,
             old_wrong=self._old_leftover.leftover(self._wrong_limit).share,
             wrong_sigmas=left.sigmas,

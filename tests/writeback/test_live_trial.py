@@ -10,6 +10,8 @@ import pytest
 from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
+from ahrsd.writeback.policy import TrialPolicy
+from ahrsd.writeback.trial import Finding, Trial
 from ahrsd.writeback.trial_metrics import LiveTrial
 
 RATE_HZ = 40.0
@@ -187,3 +189,40 @@ def test_the_figure_is_of_the_newest_minute():
 def test_one_sample_says_nothing_of_a_spread():
     metrics = LiveTrial(RIGHT, IDENTITY, NO_BIAS).take(pieces(circle(1.0, 0.0), 1)[0])
     assert not metrics.finite
+
+
+def at_rest(seconds: float, *, noise_gauss: float, bias_b_rad_s: np.ndarray) -> SampleBlock:
+    """A vehicle that stands, its nose along the axis that the matrix below makes shorter."""
+    draw = np.random.default_rng(5)
+    block = circle(seconds, 0.0)
+    field = np.array([0.5, 0.0, 0.0]) + RIGHT.offset
+    return replace(
+        block,
+        raw_b_gauss=field + noise_gauss * draw.standard_normal((len(block), 3)),
+        gyro_b_rad_s=bias_b_rad_s + 1e-3 * draw.standard_normal((len(block), 3)),
+    )
+
+
+def judged(trial: LiveTrial, block: SampleBlock) -> list[str]:
+    """Why the trial fails, piece by piece."""
+    rules = Trial(TrialPolicy(), 90.0)
+    found = [rules.judge(trial.take(piece)) for piece in pieces(block)]
+    return [reason for finding, reason in found if finding is Finding.FAILED]
+
+
+def test_at_rest_noise_that_a_matrix_makes_larger_is_no_worse_figure():
+    flat = Affine(np.diag([0.8, 1.1, 1.0 / 0.88]), RIGHT.offset)
+    block = at_rest(200.0, noise_gauss=2e-3, bias_b_rad_s=NO_BIAS)
+    trial = LiveTrial(flat, RIGHT, NO_BIAS)
+    assert judged(trial, block) == []
+    metrics = trial.take(pieces(block)[-1])
+    assert not metrics.turned
+    assert metrics.new_swing > 1.1 * run(LiveTrial(RIGHT, RIGHT, NO_BIAS), block).new_swing
+
+
+def test_at_rest_a_wrong_gyro_bias_is_still_seen():
+    bias = np.array([0.0, 0.01, 0.0])
+    block = at_rest(200.0, noise_gauss=2e-3, bias_b_rad_s=bias)
+    reasons = judged(LiveTrial(RIGHT, IDENTITY, NO_BIAS, bias), block)
+    assert reasons
+    assert "carried by the gyroscope" in reasons[0]
