@@ -85,7 +85,7 @@ class TermsKnown:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """A person's command, a verb of `operator_box`; the argument: a candidate's hash, a reason.
+    """A person's command, a verb of `operator_inbox`; the argument: a candidate's hash, a reason.
 
     word: its name, for the answer (`events.Answered`)
     """

@@ -106,7 +106,7 @@ class SerialPort:
         return int(self._serial.fileno())
 
     def read(self) -> bytes:
-        """What has arrived, b"" if nothing; never waits. Raises LinkLost."""
+        """What has arrived, b"" if nothing; never waits. Raises PortLost."""
         try:
             if not self._poll.poll(0):
                 return b""
@@ -120,7 +120,7 @@ class SerialPort:
         return data
 
     def write(self, data: bytes, timeout_s: float = WRITE_TIMEOUT_S) -> None:
-        """Write all of `data`, waiting where the port is full. Raises LinkLost."""
+        """Write all of `data`, waiting where the port is full. Raises PortLost."""
         view, end_s = memoryview(data), time.monotonic() + timeout_s
         while view:
             try:

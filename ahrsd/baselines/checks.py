@@ -68,7 +68,7 @@ def spreads(field: Array) -> Array:
     return np.asarray(scales / np.sqrt(len(field)), dtype=np.float64)
 
 
-def moved(data: MethodData, settings: MethodSettings, axes: int) -> str:
+def check_motion(data: MethodData, settings: MethodSettings, axes: int) -> str:
     """A remark where the motion is weak, else "".
 
     MethodError unless the field's readings vary along `axes` principal directions (2 or 3).

@@ -5,7 +5,7 @@ A field fixed in the world turns against the sensor: h' = -w x h. With h = C m -
     r = [w - w_b]x (C m - b') + C m'        ([R], [M])
     dr/dc = [w - w_b]x S(m) + S(m'),   dr/db' = -[w - w_b]x,   dr/dw_b = [C m - b']x
 
-S(v) c = symmetric(c) v. Checked numerically in tests/baselines/test_jacobians.py.
+S(v) c = symmetric(c) v. Checked numerically in tests/baselines/test_methods_jacobians.py.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from ahrsd.baselines import (
     tls,
     twostep,
 )
-from ahrsd.baselines.checks import agrees_with_gyro, moved, usable
+from ahrsd.baselines.checks import agrees_with_gyro, check_motion, usable
 from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodResult, MethodSettings
 from ahrsd.samples import Array, SampleBlock
 
@@ -83,7 +83,7 @@ def run(
     try:
         chosen = settings or MethodSettings()
         usable(data)
-        remark = moved(data, chosen, row.axes)
+        remark = check_motion(data, chosen, row.axes)
         fit = row.function(data, chosen)
         _finite(fit)
         if "gyro" in row.needs:

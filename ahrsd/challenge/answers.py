@@ -45,7 +45,7 @@ class ToolAnswer:
     """One case's answer; `failure` is why there is none."""
 
     failure: str | None
-    said: str
+    printed: str
     seconds: float | None  # CPU
     mismatch: bool = False
     findings: tuple[ClaimedEffect, ...] = ()
@@ -67,15 +67,15 @@ class ToolAnswer:
 
 def read_answer(record: Json) -> ToolAnswer:
     """An answer out of what `running` wrote."""
-    seconds, said = _number(record.get("cpu_seconds")), str(record.get("said", ""))
+    seconds, printed = _number(record.get("cpu_seconds")), str(record.get("said", ""))
     value = record.get("answer")
     if not isinstance(value, dict):
-        return ToolAnswer(str(record.get("failure") or "no answer"), said, seconds)
+        return ToolAnswer(str(record.get("failure") or "no answer"), printed, seconds)
     unexplained = _object(value.get("unexplained"))
     where = _object(unexplained.get("where"))
     return ToolAnswer(
         failure=None,
-        said=said,
+        printed=printed,
         seconds=seconds,
         mismatch=bool(value.get("mismatch")),
         findings=tuple(

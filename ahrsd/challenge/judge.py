@@ -91,7 +91,7 @@ def judge(truth: Json, answer: ToolAnswer, control: ToolAnswer | None = None) ->
 def _refused_rightly(truth: Json, answer: ToolAnswer) -> bool:
     """A recording in wrong units may be refused in words that say so."""
     unit = any(effect["effect"] == "unit_error" for effect in truth["effects"])
-    return unit and "deg" in answer.said
+    return unit and "deg" in answer.printed
 
 
 def _least(effects: Sequence[Json]) -> float | None:

@@ -135,7 +135,7 @@ def _answer(trial: Round, case: str, command: list[str]) -> Json:
         record: Json = {
             "case": case,
             "exit": ended.code,
-            "said": ended.said,
+            "said": ended.printed,
             "seconds": round(ended.seconds, 3),
             "cpu_seconds": round(ended.cpu_seconds, 3),
             "failure": None,
@@ -144,14 +144,14 @@ def _answer(trial: Round, case: str, command: list[str]) -> Json:
         try:
             record["answer"] = json.loads(out.read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            record["failure"] = ended.said or f"no answer, exit {ended.code}"
+            record["failure"] = ended.printed or f"no answer, exit {ended.code}"
         return record
 
 
 @dataclass(frozen=True, slots=True)
 class _Ended:
     code: int
-    said: str  # the last line on stderr
+    printed: str  # the last line on stderr
     seconds: float
     cpu_seconds: float
 

@@ -97,7 +97,7 @@ def calibration_error(pairs: Sequence[tuple[float, bool]], bins: int = 10) -> fl
     return total
 
 
-def _said(verdicts: Sequence[Verdict], of: Callable[[Verdict], bool | None]) -> list[bool]:
+def _known_values(verdicts: Sequence[Verdict], of: Callable[[Verdict], bool | None]) -> list[bool]:
     return [value for v in verdicts if (value := of(v)) is not None]
 
 
@@ -138,21 +138,29 @@ def _of_singles(singles: Sequence[Verdict]) -> list[RoundScore]:
     strong = [v for v in singles if (v.multiple or 0.0) >= STRONG]
     known = [v for v in strong if v.detected is not None]
     return [
-        share("detected, 2 x limit and more", _said(known, lambda v: v.detected), least=0.99),
-        share("detected, all strengths", _said(singles, lambda v: v.detected)),
-        share("first name right, 2 x limit", _said(strong, lambda v: v.first_right), least=0.99),
         share(
-            "first name right, all detected", _said(singles, lambda v: v.first_right), least=0.97
+            "detected, 2 x limit and more", _known_values(known, lambda v: v.detected), least=0.99
         ),
-        share("first name the key's own word", _said(singles, lambda v: v.strict)),
-        share("truth in the set", _said(singles, lambda v: v.in_set), least=0.99),
+        share("detected, all strengths", _known_values(singles, lambda v: v.detected)),
+        share(
+            "first name right, 2 x limit",
+            _known_values(strong, lambda v: v.first_right),
+            least=0.99,
+        ),
+        share(
+            "first name right, all detected",
+            _known_values(singles, lambda v: v.first_right),
+            least=0.97,
+        ),
+        share("first name the key's own word", _known_values(singles, lambda v: v.strict)),
+        share("truth in the set", _known_values(singles, lambda v: v.in_set), least=0.99),
         share("nothing added", [v.word == RIGHT for v in singles if v.first_right]),
         share(
             "called unknown though a name exists",
             [bool(v.called_unknown) for v in singles if v.detected],
             most=0.01,
         ),
-        share("frame right", _said(singles, lambda v: v.frame_right), least=0.9),
+        share("frame right", _known_values(singles, lambda v: v.frame_right), least=0.9),
         least_median("interval: overlap, median", _numbers(singles, "overlap"), 0.8),
         middle("onset error, median, s", _numbers(singles, "onset_error_s"), most=1.0),
         share(
@@ -203,7 +211,7 @@ def _of_unknowns(by_kind: dict[str, list[Verdict]]) -> list[RoundScore]:
             "unknown called unknown, withheld, 2 x limit",
             [v.word == RIGHT for v in by_kind.get("withheld", []) if (v.multiple or 0) >= STRONG],
         ),
-        share("unknown: frame right", _said(unknown, lambda v: v.frame_right), least=0.9),
+        share("unknown: frame right", _known_values(unknown, lambda v: v.frame_right), least=0.9),
         least_median("unknown: overlap, median", _numbers(unknown, "overlap"), 0.8),
         share("unidentifiable: nothing invented", [not v.error for v in blind], least=0.95),
     ]
@@ -218,16 +226,18 @@ def _of_semireal(semireal: Sequence[Verdict]) -> list[RoundScore]:
         share("semi-real: named, 2 x limit and more", [not v.error for v in strong], least=0.97),
         share(
             "semi-real: detected, 2 x limit and more",
-            _said(strong, lambda v: v.detected),
+            _known_values(strong, lambda v: v.detected),
             least=0.99,
         ),
-        share("semi-real: detected, all strengths", _said(semireal, lambda v: v.detected)),
+        share("semi-real: detected, all strengths", _known_values(semireal, lambda v: v.detected)),
         share(
             "semi-real: first name right, all detected",
-            _said(semireal, lambda v: v.first_right),
+            _known_values(semireal, lambda v: v.first_right),
             least=0.97,
         ),
-        share("semi-real: truth in the set", _said(semireal, lambda v: v.in_set), least=0.99),
+        share(
+            "semi-real: truth in the set", _known_values(semireal, lambda v: v.in_set), least=0.99
+        ),
         share("semi-real: a name that is not true", [v.word in false for v in semireal], most=0.01),
         middle("semi-real: coefficient error, median", _numbers(semireal, "relative"), most=0.1),
         middle("semi-real: onset error, median, s", _numbers(semireal, "onset_error_s"), most=1.0),

@@ -95,7 +95,7 @@ def command(
         click.echo(f"{result.name}: {counted(result.samples, 'sample')}, method {method}")
         for line in estimate_lines(result.estimate):
             click.echo(line)
-        for text in result.said():
+        for text in result.all_warnings():
             click.echo(f"  warning: {text}")
     raise SystemExit(EXIT_DONE if result.converged else EXIT_NO)
 

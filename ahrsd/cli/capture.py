@@ -55,7 +55,7 @@ class _Session:
             if kind in self.kinds or len(self.kinds) < _MOST_KINDS:
                 self.kinds[kind] += 1
 
-    def said(self, now_s: float) -> str:
+    def progress_text(self, now_s: float) -> str:
         """What was heard until now, for a person."""
         took_s = now_s - self.start_s
         if not self.messages:
@@ -180,9 +180,9 @@ def _signals(session: _Session) -> Iterator[None]:
 def _progress(session: _Session, status: CaptureStatus, now_s: float) -> None:
     trouble = f"  {status.error}" if status.error else ""
     if sys.stderr.isatty():
-        click.echo(f"\r{session.said(now_s)}{trouble}\033[K", err=True, nl=False)
+        click.echo(f"\r{session.progress_text(now_s)}{trouble}\033[K", err=True, nl=False)
     elif now_s > session.start_s:
-        click.echo(f"{session.said(now_s)}{trouble}", err=True)
+        click.echo(f"{session.progress_text(now_s)}{trouble}", err=True)
 
 
 def _report(path: Path, session: _Session, status: CaptureStatus, json_path: str | None) -> None:

@@ -67,21 +67,19 @@ def command(
         json_path, figure_path = _into(folder, json_path, figure_path)
     with byte_progress(recording) as progress:
         found, without = evaluate(recording, calibration_path, progress=progress, **options)  # type: ignore[arg-type]
-    from ahrsd.evaluation import spoken
+    from ahrsd.evaluation import text
 
     several = options["method"] == "all"
     if json_path is not None:
         write_json(
             json_path,
-            spoken.comparison_json(found, without) if several else spoken.evaluation_json(found[0]),
+            text.comparison_json(found, without) if several else text.evaluation_json(found[0]),
         )
     if figure_path is not None:
         _draw(figure_path, found[0])
     if json_path != "-":
         lines = (
-            spoken.comparison_lines(found, without)
-            if several
-            else spoken.evaluation_lines(found[0])
+            text.comparison_lines(found, without) if several else text.evaluation_lines(found[0])
         )
         click.echo("\n".join(lines))
     raise SystemExit(EXIT_DONE if found[0].better else EXIT_NO)

@@ -1,6 +1,6 @@
 """The write-back's actions, carried out one after the other.
 
-A journal record stops the line until it is on the disk: what waits behind it may be a byte to the
+A journal record stops the queue until it is on the disk: what waits behind it may be a byte to the
 device. A procedure waits until the session is idle.
 """
 
@@ -35,16 +35,16 @@ class CoreCallbacks(Protocol):
     """The core, as far as the queue calls it back."""
 
     def emit(self, event: events.Event) -> None:
-        """Let the event out."""
+        """Answer the shell with this event."""
 
     def take(self, found: list[SessionEvent]) -> None:
-        """Take in what the session heard."""
+        """Process measurements and faults that the session received."""
 
     def in_force(self, registers: Mapping[int, Values] | None) -> None:
-        """These registers act from now on."""
+        """The device applies these registers from now on; None: unknown."""
 
     def calibrate_anew(self, reason: str) -> None:
-        """What was estimated until now rests on samples that prove nothing."""
+        """Discard the estimate: the registers that its samples passed are in doubt."""
 
 
 class ActionQueue:
@@ -74,11 +74,11 @@ class ActionQueue:
 
     @property
     def awaiting_journal(self) -> bool:
-        """Whether the line waits for a record to be on the disk."""
+        """Whether the queue waits for a record to be on the disk."""
         return self._awaiting_journal
 
     def add(self, actions: Iterable[Action]) -> None:
-        """To the end of the line."""
+        """Append to the queue."""
         self._todo.extend(actions)
 
     def stop(self, host_s: float) -> None:
@@ -103,7 +103,7 @@ class ActionQueue:
         self._todo.extendleft(reversed(first))
 
     def let_out(self, core: CoreCallbacks) -> None:
-        """Facts at the head of the line, at once: when they are told must not depend on chunks."""
+        """Emit the events at the head now: when must not depend on how the bytes were cut."""
         while self._todo and not self._awaiting_journal:
             action = self._todo[0]
             if not isinstance(action, Emit):
@@ -112,7 +112,7 @@ class ActionQueue:
             core.emit(action.event)
 
     def work(self, core: CoreCallbacks, host_s: float) -> bool:
-        """As far as it goes now; whether anything was done."""
+        """Carry out what can be done now; returns whether anything was."""
         done, self._now_s = False, host_s
         self._todo.extend(self._device_session.outputs.take_actions())
         while self._todo and not self._awaiting_journal:

@@ -130,7 +130,7 @@ class Calibrator:
         at_s = self.estimator.restarted_s
         if estimate is not None and at_s is not None and at_s != self._heeded_s:
             self._heeded_s = at_s
-            self._void = change.spoken(at_s)
+            self._void = change.change_message(at_s)
             self._begin_anew([self._void])
 
     def _begin_anew(self, notes: list[str]) -> None:

@@ -1,9 +1,9 @@
 """Columns that the vehicle tells beside the stream, and what a repaired model's terms make of them.
 
-    vehicle.know(text)                                # model.json of `ahrsd diagnose --report`
-    vehicle.told(host_s, {"motor_current_a": 3.2})    # as often as the vehicle says it
-    block = vehicle.with_columns(block)               # by the host's time of each sample
-    free = vehicle.without(block)                     # what is calibrated; None: no column
+    vehicle.load_terms(text)                 # model.json of `ahrsd diagnose --report`
+    vehicle.record_columns(host_s, {"motor_current_a": 3.2})  # as often as the vehicle says it
+    block = vehicle.with_columns(block)      # by the host's time of each sample
+    free = vehicle.without_terms(block)      # what is calibrated; None: no column
 
 Only terms that a column gives from one sample to the next can be taken out of a running stream: a
 current's field, a temperature's bias. What follows the motion, the edges of a column or the time
@@ -40,17 +40,17 @@ class VehicleTerms:
         self._gap = False
         self._added: Added | None = None
 
-    def hear(self, item: Columns | TermsKnown) -> None:
+    def take(self, item: Columns | TermsKnown) -> None:
         """What the vehicle measures, or the model. A text that is no model is said, not raised."""
         if isinstance(item, Columns):
-            self.told(item.host_ns * 1e-9, item.values)
+            self.record_columns(item.host_ns * 1e-9, item.values)
             return
         try:
-            self.know(item.text)
+            self.load_terms(item.text)
         except ValueError as error:
             self._warn(f"the model of the terms {error}")
 
-    def know(self, text: str) -> None:
+    def load_terms(self, text: str) -> None:
         """The model's text; terms that cannot be followed are said. ValueError: it is no model."""
         # the library of effects takes 50 MB, which a daemon without a model does without
         from ahrsd.diagnosis.column_terms import added, follows_a_column
@@ -68,7 +68,7 @@ class VehicleTerms:
             names = ", ".join(f"{t.identifier} ({t.setting['covariate']})" for t in self.terms)
             self._warn(f"calibrated without {names}")
 
-    def told(self, host_s: float, values: Mapping[str, float]) -> None:
+    def record_columns(self, host_s: float, values: Mapping[str, float]) -> None:
         """The columns at a moment."""
         for name, value in values.items():
             self._columns.setdefault(name, deque(maxlen=_KEPT)).append((host_s, value))
@@ -87,7 +87,7 @@ class VehicleTerms:
         away_s = np.minimum(np.abs(host_s - at_s[after]), np.abs(host_s - at_s[before]))
         return np.where(away_s <= self._max_age_s, np.interp(host_s, at_s, values), np.nan)
 
-    def without(self, block: SampleBlock) -> SampleBlock | None:
+    def without_terms(self, block: SampleBlock) -> SampleBlock | None:
         """The block without what the terms add; None where one of its columns is not known."""
         if not self.terms or self._added is None or not len(block):
             return block

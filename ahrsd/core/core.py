@@ -115,7 +115,7 @@ class Core:
             inputs.LinkLost: self._link_lost,
             inputs.Interlock: lambda it: add(back.on_interlock(it.safe, self._host_s)),
             inputs.Operator: self._operator,
-            **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.hear),
+            **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.take),
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
             inputs.EarlierSamples: self.warm.sampled,
@@ -210,7 +210,7 @@ class Core:
         self._from_scratch = (calibrator, *self._from_scratch[1:])
         self._judged_anew += 1
         self._note("info", "the limits of the gates were changed")
-        self._begin(self._estimation_queue.adopt(self.calibrator, calibrator))
+        self._begin_task(self._estimation_queue.adopt(self.calibrator, calibrator))
         self._action_queue.add(self.writeback.on_limits_changed(self._host_s))
 
     def _stop(self, item: inputs.Stop) -> None:
@@ -255,7 +255,7 @@ class Core:
             self._device_reset("its time fell", self.at_s)
 
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
-        """Whose samples these are is not sure any more; empty: it is."""
+        """From now on samples may be of another device, for this reason; empty: for none."""
         if reason and self.device_session.listening and self.device_session.identity is not None:
             self.warm.doubt()
             if not jumped:
@@ -294,7 +294,7 @@ class Core:
         )
 
     def _in_force(self, values: dict[int, Values]) -> None:
-        """These registers act on what follows; the first ones are the estimator's prior."""
+        """Samples from now on passed these registers; the first ones are the estimator's prior."""
         self.registers = values
         compensation = Compensation.from_registers(values)
         self.epochs.begin(self._host_s, compensation)
@@ -304,7 +304,7 @@ class Core:
         trial = self.writeback.history.open
         users = values if trial is None else {**values, **trial.old}
         self._compared = user_compensation(users)
-        self._begin(self._estimation_queue.compare(self.calibrator, *self._compared))
+        self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
 
     def _identified(self, unit: Unit) -> None:
         """A device said who it is; what was estimated of another one is not for it."""
@@ -392,7 +392,7 @@ class Core:
             self._on_state(event)
 
     def in_force(self, registers: Mapping[int, Values] | None) -> None:
-        """The write-back says what the device applies from now on; None: nobody knows."""
+        """The device applies these registers from now on; None: unknown, a write is under way."""
         self._flush()
         if registers is None:
             self.epochs.begin(self._host_s, None)
@@ -442,7 +442,7 @@ class Core:
         if self.stream.take_replaced():
             self.unconfirmed.drop()
             self.calibrator = self.calibrator.anew()
-            self._begin(self._estimation_queue.compare(self.calibrator, *self._compared))
+            self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
             self.warm.again()
         reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
         self._doubt(reason, jumped=jumped)
@@ -451,7 +451,7 @@ class Core:
         self._action_queue.add(self.writeback.on_samples(block))
         for text in self.sensors.take(block):
             self._note("warning", text)
-        if (free := self.vehicle.without(block)) is not None:
+        if (free := self.vehicle.without_terms(block)) is not None:
             if self._trial is not None:
                 metrics = self._trial.take(free)
                 self._action_queue.add(self.writeback.on_trial_metrics(metrics, self._host_s))
@@ -472,7 +472,7 @@ class Core:
             taken[0] = self._recall(taken[0])
             for block in taken:
                 self.warm.live(block)
-            self._begin(self._estimation_queue.examine(self.calibrator, taken, when))
+            self._begin_task(self._estimation_queue.examine(self.calibrator, taken, when))
 
     def _recall(self, block: SampleBlock) -> SampleBlock:
         """The block, after the calibrator was given the samples of an earlier run, if any."""
@@ -494,12 +494,12 @@ class Core:
         if not blocks:
             return block
         self.calibrator = Calibrator(*self._from_scratch)
-        self._begin(self._estimation_queue.compare(self.calibrator, *self._compared))
+        self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
         how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
         now = Circumstances(self.at_s, self._host_s, *how)
         for old in blocks:
             old = replace(old, epoch=self.epochs.now.number)
-            self._begin(self._estimation_queue.recall(self.calibrator, old, now))
+            self._begin_task(self._estimation_queue.recall(self.calibrator, old, now))
         self._action_queue.add(self.writeback.on_doubt("samples of an earlier run", self._host_s))
         unknown = np.concatenate([[np.nan], block.dt_s[1:]])
         return replace(block, dt_s=unknown, gap_before=True)
@@ -508,15 +508,15 @@ class Core:
         if text:
             self._note("info", text)
 
-    def _begin(self, piece: EstimationTask) -> None:
-        """Have it done beside the core, or do it now."""
+    def _begin_task(self, task: EstimationTask) -> None:
+        """Hand the task to the estimation thread, or do it now."""
         if self.settings.beside:
-            self._out.append(events.Examine(piece.work))
+            self._out.append(events.Examine(task.work))
         else:
             self._take_results(1)
 
-    def _take_results(self, pieces: int, failure: str = "") -> None:
-        for found in self._estimation_queue.take(pieces, failure):
+    def _take_results(self, tasks: int, failure: str = "") -> None:
+        for found in self._estimation_queue.take(tasks, failure):
             if found.calibrator is not self.calibrator:
                 continue  # another device or other quantities since
             if isinstance(found, EstimationFailure):
@@ -533,7 +533,7 @@ class Core:
             self._action_queue.add(back.on_examined(when.host_s, self._host_s))
 
     def _estimator_failed(self, reason: str) -> None:
-        """Nothing is written from what it made, and it begins anew after a pause."""
+        """Drop the calibrator and what it proposed; a new one starts after a pause."""
         self.estimator.broke_off(reason)
         self.calibrator = Calibrator(self.settings.calibrator, *self._compared)
         self._proposed = None

@@ -1,15 +1,15 @@
-"""The slow part of the core, in pieces that may be done beside it.
+"""The slow part of the core, as tasks that another thread may do.
 
 The calibrator takes samples and judges; now and then that takes a good part of a second, in which
-the port, the vehicle's word and an operator would wait. So the core makes a piece of work of each
-block and takes its result later: in a run another thread does the pieces in their order
+the port, the vehicle's word and an operator would wait. So the core makes a task of each
+block and takes its result later: in a run another thread does the tasks in their order
 (`estimation_worker`), and the input `Examined` says how many are done. A replay does them when it
 comes to that input, and so takes the same decisions from the same results at the same place.
 
-A calibrator belongs to its pieces: only they may change it.
+A calibrator belongs to its tasks: only they may change it.
 
 `supervised` is the one place where whatever breaks off is caught: what the estimator cannot take
-is a state with a reason (`core`), never an end. In a run `Examined` says which piece broke off, so
+is a state with a reason (`core`), never an end. In a run `Examined` says which task broke off, so
 that a replay takes the same decision.
 """
 
@@ -70,14 +70,14 @@ class EstimationResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimationFailure:
-    """A piece that broke off: `calibrator` may be anything now and is used no more."""
+    """A task that broke off: `calibrator` may be anything now and is used no more."""
 
     calibrator: Calibrator
     reason: str
 
 
 class EstimationTask:
-    """Work that is done once, by whoever comes first."""
+    """Work that is done once: by the thread, or when its result is asked for."""
 
     def __init__(self, calibrator: Calibrator, make: Callable[[], EstimationResult | None]) -> None:
         self.calibrator = calibrator
@@ -87,7 +87,7 @@ class EstimationTask:
         self._failure: Failure | None = None
 
     def work(self) -> Failure | None:
-        """Do it; how it broke off, None where it did not, or a piece before it has."""
+        """Do it; returns how it broke off. None: not at all, or its calibrator was broken."""
         self._begun = True
         if not self.calibrator.broken:
             self._result, self._failure = supervised(self._make)
@@ -149,10 +149,10 @@ class EstimatorState:
 
 
 class EstimationQueue:
-    """The pieces that nobody has taken the result of yet, oldest first."""
+    """Tasks whose results the core has not taken yet, oldest first."""
 
     def __init__(self) -> None:
-        self._pieces: deque[EstimationTask] = deque()
+        self._tasks: deque[EstimationTask] = deque()
 
     def examine(
         self, calibrator: Calibrator, blocks: list[SampleBlock], circumstances: Circumstances
@@ -179,20 +179,20 @@ class EstimationQueue:
     def _put(
         self, calibrator: Calibrator, make: Callable[[], EstimationResult | None]
     ) -> EstimationTask:
-        piece = EstimationTask(calibrator, make)
-        self._pieces.append(piece)
-        return piece
+        task = EstimationTask(calibrator, make)
+        self._tasks.append(task)
+        return task
 
-    def take(self, pieces: int, broken: str = "") -> list[EstimationResult | EstimationFailure]:
-        """The results of the oldest pieces; a record that lost some of them may ask for more.
+    def take(self, tasks: int, broken: str = "") -> list[EstimationResult | EstimationFailure]:
+        """The results of the oldest tasks; a record that lost some of them may ask for more.
 
         broken: how the last one of them broke off; it is not tried again
         """
-        taken = [self._pieces.popleft() for _ in range(min(pieces, len(self._pieces)))]
+        taken = [self._tasks.popleft() for _ in range(min(tasks, len(self._tasks)))]
         last = [EstimationFailure(taken.pop().calibrator, broken)] if broken and taken else []
         if last:
             last[0].calibrator.broken = True
-        found = [one for piece in taken if (one := piece.result()) is not None]
+        found = [one for task in taken if (one := task.result()) is not None]
         return [*found, *last]
 
 

@@ -1,4 +1,4 @@
-"""The thread that does the slow part of the core beside it (`examination`).
+"""The thread that does the slow part of the core beside it (`estimation_queue`).
 
 Python lets one thread run at a time, and lets another one have its turn after `SWITCH_S`: that, and
 no longer, is what a byte waits for a long computation.

@@ -48,12 +48,12 @@ class OperatorFolderError(OSError):
 
 
 class NoAnswerInTime(Exception):
-    """The daemon took the word and did not say in time what became of it."""
+    """The daemon took the command and did not answer within the time limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class OperatorCommand:
-    """What a person said; `name` is that of its file, for the answer."""
+    """A command of a person; `name` is that of its file, and of the answer's."""
 
     name: str
     verb: str
@@ -62,7 +62,7 @@ class OperatorCommand:
 
 @dataclass(frozen=True, slots=True)
 class OperatorAnswer:
-    """What became of a word."""
+    """Whether a command was accepted, and why not or what follows."""
 
     accepted: bool
     text: str
@@ -129,7 +129,7 @@ class OperatorBox:
     def say(self, verb: str, argument: str, wait_s: float) -> OperatorAnswer | None:
         """Say a word and wait for the answer; None where nobody took it, then it is gone.
 
-        Raises Unanswered, OSError.
+        Raises NoAnswerInTime, OSError.
         """
         name, until_s = self.put(verb, argument), boot_s() + wait_s
         word, answer = self.folder / f"{name}.json", self.folder / f"{name}.answer"

@@ -179,7 +179,7 @@ class SerialLink:
         return bool(poll.poll(0))
 
     def write(self, data: bytes) -> None:
-        """Send; nothing where the port is closed. Raises LinkLost."""
+        """Send; nothing where the port is closed. Raises PortLost."""
         if self._port is not None:
             self._port.write(data)
 

@@ -36,8 +36,8 @@ _CHANCE = 12.0  # chi squared of the best of all times, in units of the misfit, 
 _FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
 
 
-def spoken(at_s: float) -> str:
-    """What is said of a change at that time."""
+def change_message(at_s: float) -> str:
+    """The line for the log about a change of the iron at that time."""
     return f"the iron changed at about {at_s:.0f} s: calibrated anew from there"
 
 

@@ -33,7 +33,7 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """What an epoch says of iron and instrument (`instrument.py`): H (17, 17), g (17,) at c."""
+    """Quadratic of an epoch in iron and instrument (`instrument.py`): H (17, 17), g (17,) at c."""
 
     H: Array
     g: Array
@@ -54,8 +54,8 @@ class LinearisationPlan:
 class WindowEpoch:
     """One epoch in the window: what it is, directions, noise, and its factor.
 
-    used: the noise that it was linearised with; usual: that of the window then; told: known once
-    somebody asked.
+    used: the noise that it was linearised with; usual: that of the window then; instrument: set
+    by `instrument.linearise_instrument`.
     """
 
     piece: EpochContent
@@ -65,7 +65,7 @@ class WindowEpoch:
     quadratic: chain.Quadratic
     factor: Factor
     score: MisfitScore | None = None
-    told: InstrumentInformation | None = None
+    instrument: InstrumentInformation | None = None
     _residuals: noise.Residuals | None = None
     _cells: Cells | None = None
 
@@ -153,7 +153,7 @@ def place_borders(graph: Graph, begun: Sequence[WindowEpoch]) -> None:
         if epoch.data.measures_first:
             own.append((epoch.a, step[:2]))
         for j, tangent in own:
-            graph.nodes[j] = graph.nodes[j].moved(np.r_[np.zeros(3), tangent])
+            graph.nodes[j] = graph.nodes[j].retracted(np.r_[np.zeros(3), tangent])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -48,16 +48,16 @@ class Node:
         """A node with a tangent basis of its direction."""
         return Node(bias.copy(), direction.copy(), so3.tangent_basis(direction[None])[0])
 
-    def moved(self, step: Array) -> Node:
+    def retracted(self, step: Array) -> Node:
         """The node after a step (5,), on the sphere."""
-        return moved_all([self], step[None])[0]
+        return retract_nodes([self], step[None])[0]
 
     def turned(self, R: Array) -> Node:
         """The node with its direction and tangents turned by R (3, 3)."""
         return Node(self.bias, R @ self.direction, R @ self.tangent)
 
 
-def moved_all(nodes: Sequence[Node], steps: Array) -> list[Node]:
+def retract_nodes(nodes: Sequence[Node], steps: Array) -> list[Node]:
     """Nodes after their steps (N, 5), all at once."""
     bias = np.array([n.bias for n in nodes]) + steps[:, :3]
     T = np.array([n.tangent for n in nodes])

@@ -31,9 +31,9 @@ from ahrsd.estimator.factors import (
     LinearisationPoint,
     Node,
     Stack,
-    moved_all,
+    retract_nodes,
 )
-from ahrsd.estimator.retraction import Moments, moved
+from ahrsd.estimator.retraction import Moments, retract
 from ahrsd.samples import Array
 
 
@@ -110,7 +110,7 @@ class Graph:
         self.factors: list[Factor] = []
         self._kept: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
 
-    def twin(self) -> Graph:
+    def copy(self) -> Graph:
         """A copy that goes its own way; nodes and factors are shared, they never change."""
         other = copy(self)
         other.nodes, other.factors = dict(self.nodes), list(self.factors)
@@ -135,7 +135,7 @@ class Graph:
         d = self.c - self.anchor[0]
         return float(0.5 * d @ (self._belief() + self.hold) @ d)
 
-    def strayed(self, covariance: Array) -> float:
+    def distance_from_prior(self, covariance: Array) -> float:
         """Mean square in sigmas of the prior of where c is in the directions that are badly known.
 
         covariance (9, 9) of c, tempered; badly: to no more than _BADLY of the prior's sigma. Beyond
@@ -206,9 +206,11 @@ class Graph:
 
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
         """Move all values by a step, the calibration along its valley (`retraction.py`)."""
-        self.c = moved(self.c, dc, self.moments)
+        self.c = retract(self.c, dc, self.moments)
         steps = np.array([dy[j] for j in self.nodes])
-        self.nodes = dict(zip(self.nodes, moved_all(list(self.nodes.values()), steps), strict=True))
+        self.nodes = dict(
+            zip(self.nodes, retract_nodes(list(self.nodes.values()), steps), strict=True)
+        )
 
     def turn_first(self, R: Array) -> None:
         """Turn the oldest node's direction by R (3, 3), and with it what was folded about it."""

@@ -53,7 +53,7 @@ class HeldReadings:
         self._rows = np.empty((0, 0))
         self._begun = False
 
-    def twin(self) -> HeldReadings:
+    def copy(self) -> HeldReadings:
         """A copy that goes its own way."""
         return copy(self)
 

@@ -72,8 +72,8 @@ Said = tuple[Array, Array]
 """H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
 
 
-class Informations:
-    """What the epochs with motion say around the present answer; found once where they are."""
+class InstrumentInformations:
+    """Quadratics of the epochs with motion around the present estimate, computed once."""
 
     def __init__(self) -> None:
         self._kept: tuple[list[object], Said] | None = None
@@ -90,8 +90,8 @@ class Informations:
         return kept[1]
 
 
-class Past:
-    """What epochs that left the window said of iron, turn, lag and scale, as one Gaussian.
+class FoldedInformation:
+    """Information on iron, turn, lag and scale from epochs that left the window, as one Gaussian.
 
     The gyro's bias walks, so each epoch had its own, which is eliminated.
     """
@@ -101,33 +101,35 @@ class Past:
         self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, 0, lag, 0]
 
     @staticmethod
-    def of_iron(graph: Graph, lag_s: float) -> Past:
-        """What the graph's folded epochs say of the iron; of a lag they were not asked."""
+    def of_iron(graph: Graph, lag_s: float) -> FoldedInformation:
+        """Information on the iron from the epochs folded into the graph; none on a lag."""
         H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).here())
         gain = H[C, Y_A] @ np.linalg.pinv(H[Y_A, Y_A], rcond=1e-12, hermitian=True)
         own_H, own_g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
         own_H[C, C], own_g[C] = H[C, C] - gain @ H[Y_A, C], g[C] - gain @ g[Y_A]
-        past = Past()
+        past = FoldedInformation()
         past._add(own_H, own_g, graph.c, lag_s)
         return past
 
     @staticmethod
-    def of_lag(lag_s: float, sigma_s: float) -> Past:
+    def of_lag(lag_s: float, sigma_s: float) -> FoldedInformation:
         """A lag is known, and nothing of the iron."""
-        past = Past()
+        past = FoldedInformation()
         past._H[LAG, LAG] = 1.0 / sigma_s**2
         past._eta[LAG] = lag_s / sigma_s**2
         return past
 
-    def with_epoch(self, told: InstrumentInformation, lag_s: float, sigma_bias: float) -> Past:
-        """The past with one epoch more, that assumed this lag; sigma_bias in rad/s."""
+    def with_epoch(
+        self, told: InstrumentInformation, lag_s: float, sigma_bias: float
+    ) -> FoldedInformation:
+        """With one epoch more, which was linearised at this lag; sigma_bias in rad/s."""
         bias = slice(9, 12)
         own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
         gain = np.linalg.solve(own, told.H[bias]).T
         H, g = told.H - gain @ told.H[bias], told.g - gain @ told.g[bias]
         keep = np.zeros(_SIZE)
         keep[_LASTING] = 1.0
-        past = Past()
+        past = FoldedInformation()
         past._H, past._eta = self._H.copy(), self._eta.copy()
         past._add(H * np.outer(keep, keep), g * keep, told.c, lag_s)
         return past
@@ -147,22 +149,24 @@ def _place(c: Array, lag_s: float) -> Array:
     return x
 
 
-def tell(epochs: Sequence[WindowEpoch], graph: Graph) -> None:
-    """Let epochs with motion say what they say of the instrument, where they have not yet."""
-    silent = [epoch for epoch in epochs if epoch.turned and epoch.told is None]
+def linearise_instrument(epochs: Sequence[WindowEpoch], graph: Graph) -> None:
+    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet."""
+    silent = [epoch for epoch in epochs if epoch.turned and epoch.instrument is None]
     if silent:
         _informations(silent, graph)
 
 
-def lag_known(epochs: Sequence[WindowEpoch], graph: Graph, past: Past, sigma_bias: float) -> Lag:
-    """How well all data tell the lag that is taken out of the field.  LinAlgError: not at all.
+def lag_known(
+    epochs: Sequence[WindowEpoch], graph: Graph, past: FoldedInformation, sigma_bias: float
+) -> Lag:
+    """Sigma of the lag that is taken out of the field, from all data.  LinAlgError: unobservable.
 
     The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
     the lag, so what both make adds up.
     """
-    tell(epochs, graph)
+    linearise_instrument(epochs, graph)
     H = believed(graph, sigma_bias)[0] + past.at(graph.c, 0.0)[0]
-    H = H + sum(epoch.told.H for epoch in epochs if epoch.told is not None)
+    H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
     sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
     return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
 
@@ -183,7 +187,7 @@ def _inverse(H: Array) -> Array:
 def instrument(
     said: Said, graph: Graph, sigma_bias: float, before: tuple[Array, Array] | None = None
 ) -> Instrument:
-    """From what the epochs of a settled window say, and those before it.
+    """Misalignment, lag and scale from the epochs of a settled window and those before it.
 
     LinAlgError where the motion does not tell.
     """
@@ -208,7 +212,7 @@ def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
 
 
 def disagreement(H: Array, g: Array, steps: Array) -> float:
-    """Mean square per degree of freedom of what epochs (N, n, n), (N, n) still ask for after steps.
+    """Mean square per degree of freedom of the gradients of epochs (N, n, n), (N, n) after steps.
 
     steps (n,), or (N, n) where each takes its own.
     """
@@ -247,7 +251,7 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> Said:
         H[k][_FIELD] += chain.squares(J[:, :, a:b])
         H[k][_MOTION] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
-        epoch.told = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
+        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
 
 

@@ -172,13 +172,13 @@ class Intake:
         self._work_off()
         return self._pending_count
 
-    def twin(self) -> Intake:
+    def copy(self) -> Intake:
         """A copy that goes its own way, for closing the epoch early."""
         self._work_off()
         other = copy(self)
         other._pending, other._rows = list(self._pending), list(self._rows)
         other._averager, other._waiting = copy(self._averager), []
-        other._held = None if self._held is None else self._held.twin()
+        other._held = None if self._held is None else self._held.copy()
         return other
 
     def interrupt(self) -> chain.EpochData | None:

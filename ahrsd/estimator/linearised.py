@@ -24,7 +24,7 @@ from ahrsd.estimator.factors import (
 )
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.grouping import group_size, grouped
-from ahrsd.estimator.instrument import Past, tell
+from ahrsd.estimator.instrument import FoldedInformation, linearise_instrument
 from ahrsd.estimator.lag import delayed, rates
 from ahrsd.estimator.misfit import Misfit
 from ahrsd.estimator.parameters import EstimatorParameters
@@ -54,7 +54,7 @@ class Linearised:
         self.misfit = Misfit()
         self.folded = False
         self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
-        self.past = Past()  # of what was folded since there is a lag
+        self.past = FoldedInformation()  # of what was folded since there is a lag
         self._folded_cells = Cells()
         self._rest: Array | None = None
         self._work = 0
@@ -66,10 +66,10 @@ class Linearised:
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, belief, first, prior)
 
-    def twin(self) -> Self:
+    def copy(self) -> Self:
         """A copy that goes its own way."""
         other = copy(self)
-        other.graph, other.epochs = self.graph.twin(), list(self.epochs)
+        other.graph, other.epochs = self.graph.copy(), list(self.epochs)
         other._guesses, other.misfit = self._guesses.copy(), copy(self.misfit)
         other._waiting = list(self._waiting)
         return other
@@ -139,14 +139,14 @@ class Linearised:
                 self.graph.fold_oldest()
 
     def _remember_lag(self, old: WindowEpoch) -> None:
-        """What an epoch that leaves the window said of a lag, if there is one."""
+        """Keep what an epoch that leaves the window knows of the lag, where one is taken out."""
         if not old.turned or self.lag_s == 0.0:
             return
-        if old.told is None:  # the others will be asked soon; together it is cheaper
-            tell([old, *self.epochs], self.graph)
-        if old.told is not None:
+        if old.instrument is None:  # the others will be asked soon; together it is cheaper
+            linearise_instrument([old, *self.epochs], self.graph)
+        if old.instrument is not None:
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            self.past = self.past.with_epoch(old.told, self.lag_s, sigma_bias)
+            self.past = self.past.with_epoch(old.instrument, self.lag_s, sigma_bias)
 
     # -- linearisation ---------------------------------------------------------------------------
 
@@ -224,7 +224,7 @@ class Linearised:
         The directions turn back by as much, so that they fit the fields as well as before.
         """
         if self.lag_s == 0.0 and self.folded:
-            self.past = Past.of_iron(self.graph, lag_s)
+            self.past = FoldedInformation.of_iron(self.graph, lag_s)
         graph, more, everyone = self.graph, lag_s - self.lag_s, range(len(self.epochs))
         places = []
         for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):

@@ -15,7 +15,7 @@ from ahrsd.calibration import Affine
 from ahrsd.estimator import chain
 from ahrsd.estimator.graph import Graph
 from ahrsd.estimator.instrument import TURN, Said, instrument
-from ahrsd.estimator.retraction import moved
+from ahrsd.estimator.retraction import retract
 from ahrsd.samples import Array
 
 _EVIDENCE = 30.0  # chi squared with 3 degrees of freedom: once in a million where there is none
@@ -49,7 +49,7 @@ def misalignment(said: Said, graph: Graph, sigma_bias: float) -> Misalignment:
     """From what the epochs of a settled window say.  LinAlgError where the motion does not tell."""
     found = instrument(said, graph, sigma_bias)
     theta, spread = found.step[TURN], found.covariance[TURN, TURN]
-    c = moved(graph.c, found.step[:9], graph.moments)
+    c = retract(graph.c, found.step[:9], graph.moments)
     C = so3.exp(-theta[None])[0] @ np.linalg.inv(chain.symmetric(c[:6]))
     full = Affine(C / np.cbrt(np.linalg.det(C)), c[6:9].copy())
     chi2 = float(theta @ np.linalg.solve(spread, theta))

@@ -16,7 +16,7 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, change, intake, noise, summary
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import SingularError, whitening
-from ahrsd.estimator.instrument import Informations, Instrument, instrument
+from ahrsd.estimator.instrument import Instrument, InstrumentInformations, instrument
 from ahrsd.estimator.intake import Intake
 from ahrsd.estimator.misalignment import Misalignment, misalignment
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
@@ -78,7 +78,7 @@ class Estimator:
         self._strange = 0
         self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
         self._parted = 1.0  # variance over the expected of what earlier and later data ask for
-        self._said = Informations()
+        self._informations = InstrumentInformations()
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
@@ -187,7 +187,7 @@ class Estimator:
             return window
         p = self.parameters
         try:
-            said = self._said.of(window.epochs, window.graph)
+            said = self._informations.of(window.epochs, window.graph)
             found = change.divided(
                 said, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
             )
@@ -260,12 +260,12 @@ class Estimator:
             window.delay(float(np.clip(window.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)))
             window.track(everything=True)
             least, changed = _LAG_SAME, True
-        self._said = Informations()  # nobody else asks before they are others
+        self._informations = InstrumentInformations()  # nobody else asks before they are others
         return changed
 
     def _instrument(self, window: Window) -> Instrument | None:
         try:
-            said = self._said.of(window.epochs, window.graph)
+            said = self._informations.of(window.epochs, window.graph)
             before = window.past.at(window.graph.c, window.lag_s)
             return instrument(said, window.graph, self.parameters.prior_gyro_bias_rad_s, before)
         except np.linalg.LinAlgError:
@@ -286,7 +286,7 @@ class Estimator:
         An epoch that is under way counts as far as it is, if it is long enough to be one.
         """
         if self._new or (self._window and self._intake.pending >= MIN_EPOCH_STEPS):
-            return self._twin().finish()
+            return self._copy().finish()
         return self._answer()
 
     @staticmethod
@@ -301,16 +301,16 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            said = self._said.of(window.epochs, window.graph)
+            said = self._informations.of(window.epochs, window.graph)
             return misalignment(said, window.graph, self.parameters.prior_gyro_bias_rad_s)
         except np.linalg.LinAlgError:
             return None
 
-    def _twin(self) -> Estimator:
+    def _copy(self) -> Estimator:
         other = copy(self)
-        other._intake, other._down = self._intake.twin(), self._down.copy()
-        other._new, other._said = list(self._new), Informations()
-        other._window = None if self._window is None else self._window.twin()
+        other._intake, other._down = self._intake.copy(), self._down.copy()
+        other._new, other._informations = list(self._new), InstrumentInformations()
+        other._window = None if self._window is None else self._window.copy()
         return other
 
     def _answer(self) -> Estimate | None:
@@ -356,7 +356,7 @@ class Estimator:
                 and self._misscaled == 0.0
                 and self._doubted_s is None
             ),
-            warnings=() if self.restarted_s is None else (change.spoken(self.restarted_s),),
+            warnings=() if self.restarted_s is None else (change.change_message(self.restarted_s),),
             mag_lag_s=window.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,

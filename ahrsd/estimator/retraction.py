@@ -38,7 +38,7 @@ class Moments:
         return float(total / self._count)
 
 
-def moved(c: Array, dc: Array, moments: Moments) -> Array:
+def retract(c: Array, dc: Array, moments: Moments) -> Array:
     """c = [M (6), b (3)] after a step dc; plainly c + dc where C would not stay positive."""
     M, dM = chain.symmetric(c[:6]), chain.symmetric(dc[:6])
     C = np.linalg.inv(M)
@@ -62,6 +62,6 @@ def curvature(c: Array, covariance: Array, moments: Moments) -> Array:
     added = np.zeros((9, 9))
     for value, vector in zip(values, vectors.T, strict=True):
         step = np.sqrt(max(float(value), 0.0)) * scale * vector
-        q = (moved(c, step, moments) + moved(c, -step, moments)) / 2 - c
+        q = (retract(c, step, moments) + retract(c, -step, moments)) / 2 - c
         added += 3 * np.outer(q, q)
     return added

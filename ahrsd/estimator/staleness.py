@@ -16,7 +16,7 @@ from ahrsd.estimator import chain
 from ahrsd.estimator.epoch import WindowEpoch
 from ahrsd.estimator.factors import Node
 from ahrsd.estimator.graph import sigmas
-from ahrsd.estimator.retraction import Moments, moved
+from ahrsd.estimator.retraction import Moments, retract
 from ahrsd.samples import Array
 
 _WORTH = 0.02  # sigmas
@@ -31,7 +31,7 @@ def bends(epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information
     for epoch in epochs:
         at = epoch.factor.point.c
         if epoch.turned and id(at) not in known:
-            known[id(at)] = sigmas(moved(at, c - at, moments) - c, information)
+            known[id(at)] = sigmas(retract(at, c - at, moments) - c, information)
     return np.array([known[id(e.factor.point.c)] if e.turned else 0.0 for e in epochs])
 
 

@@ -22,7 +22,7 @@ from ahrsd.estimator.change import contradicts
 from ahrsd.estimator.epoch import LinearisationPlan, Snapshot, WindowEpoch, place_borders, scores_of
 from ahrsd.estimator.factors import Node, Stack
 from ahrsd.estimator.graph import SingularError, sigmas
-from ahrsd.estimator.instrument import Lag, Past, lag_known
+from ahrsd.estimator.instrument import FoldedInformation, Lag, lag_known
 from ahrsd.estimator.linearised import Linearised
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.estimator.staleness import bends, drifts, outdated
@@ -85,7 +85,7 @@ class Window(Linearised):
         other._guesses, other._guess = self._guesses.copy(), self._guess
         other.lag_s = self.lag_s
         if self.lag_s != 0.0 and (known := self.lag_known(self.epochs[:-count])):
-            other.past = Past.of_lag(self.lag_s, known.sigma_s)
+            other.past = FoldedInformation.of_lag(self.lag_s, known.sigma_s)
         for epoch in kept:
             other.graph.moments.take(epoch.data.field_b_gauss)
         other.attach([first, *(e.data for e in kept[1:])], [e.turned for e in kept])
@@ -279,9 +279,9 @@ class Window(Linearised):
         told = self.found_misfit > 1.0 + _CHANCE * chance  # else sigmas would only ever grow by it
         graph.temper = max(1.0, self.found_misfit if told else 1.0, self._repeating())
         covariance = graph.covariance()[:9, :9] * graph.temper
-        strayed = graph.strayed(covariance)
-        if strayed > graph.temper:
-            graph.temper = strayed
+        distance_from_prior = graph.distance_from_prior(covariance)
+        if distance_from_prior > graph.temper:
+            graph.temper = distance_from_prior
             covariance = graph.covariance()[:9, :9] * graph.temper
         self._covariance = covariance
         graph.hold_blind(BLIND, covariance)

@@ -11,7 +11,7 @@ A gyro bias that differs by d from the one used here needs no new integration:
     R_0k(b + d) = Exp(-P_k d) R_0k(b),   P_k = sum_j R_0j dt_j
 
 to first order in |d| t; beyond 0.05 rad the segment is integrated again.
-Checked by tests/test_evidence_attitude.py.
+Checked by tests/evidence/test_evidence_attitude.py.
 """
 
 from __future__ import annotations

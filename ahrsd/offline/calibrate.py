@@ -30,7 +30,7 @@ from ahrsd.offline.replay import Replayed, replay
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS
 from ahrsd.report.calibration_json import calibration_json, why_not_converged
-from ahrsd.report.summary import said_of, serial_of
+from ahrsd.report.summary import serial_of, warnings_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,14 +58,14 @@ class BatchResult:
         """Whether the recording determines the calibration."""
         return self.estimate is not None and self.estimate.converged
 
-    def said(self) -> list[str]:
+    def all_warnings(self) -> list[str]:
         """Warnings of recording and stream."""
         turned = self.misalignment
         return [
             *(f"{words}: put this right and calibrate again" for words in self.wrong),
-            *said_of(self.core, self.warnings),
+            *warnings_of(self.core, self.warnings),
             *(self.estimate.warnings if self.estimate is not None else ()),
-            *([] if turned is None or not turned.significant else [_spoken(turned)]),
+            *([] if turned is None or not turned.significant else [_misalignment_text(turned)]),
         ]
 
     def reasons(self) -> list[str]:
@@ -81,7 +81,7 @@ class BatchResult:
             method=method,
             samples=self.samples,
             gyro_is_raw=not self.core.stream.compensated_gyro,
-            warnings=self.said(),
+            warnings=self.all_warnings(),
             serial=serial_of(self.core),
         )
 
@@ -97,7 +97,7 @@ class BatchResult:
             verdict=" ".join(f"{text[:1].upper()}{text[1:]}." for text in self.reasons()),
             good=self.converged,
             command=f"ahrsd calibrate {self.name}",
-            warnings=tuple(self.said()),
+            warnings=tuple(self.all_warnings()),
         )
         try:
             write_report(path, report)
@@ -181,7 +181,7 @@ def _without_terms(
     return events, left
 
 
-def _spoken(turned: Misalignment) -> str:
+def _misalignment_text(turned: Misalignment) -> str:
     x, y, z = np.degrees(turned.rotation_rad)
     rows = ", ".join(f"{v:.4f}" for v in turned.correction.matrix.ravel())
     return (

@@ -35,7 +35,7 @@ def published_json(
     `registers` stays empty: these methods say nothing about their own uncertainty, and nothing is
     written to a device without it. With the row of the table, its spreads are in it.
     """
-    said = [*result.said(), *([found.reason] if found.reason else [])]
+    said = [*result.all_warnings(), *([found.reason] if found.reason else [])]
     body = calibration_json(
         result.name, None, {}, method=found.method, samples=result.samples, warnings=said
     )

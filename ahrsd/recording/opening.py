@@ -189,13 +189,13 @@ def _of_another(path: Path, other: Format, choice: Choice, rate_hz: float | None
             path, "does not fit into this computer's memory", "cut it in parts"
         ) from error
     facts = {"format": other.what.removeprefix("is "), **rows.facts}
-    table = table_of(path, rows.columns, [*rows.notes, _said(facts)])
+    table = table_of(path, rows.columns, [*rows.notes, _source_text(facts)])
     return Recording(
         path, RecordingKind.TABLE, notes=[*notes, *table.notes], table=table, facts=facts
     )
 
 
-def _said(facts: Mapping[str, str]) -> str:
+def _source_text(facts: Mapping[str, str]) -> str:
     """The one line about what was taken of a recording of another program."""
     return (
         f"{facts['format']}: field of {facts['mag source']} ({facts['mag unit']}), rates of "

@@ -59,7 +59,7 @@ def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> di
             samples=facts.samples,
             gyro_is_raw=not core.stream.compensated_gyro,
             heading=heading_errors(core),
-            warnings=said_of(core, warnings),
+            warnings=warnings_of(core, warnings),
             serial=serial_of(core),
         ),
         "decisions": core.decisions.entries,
@@ -73,7 +73,7 @@ def serial_of(core: Core) -> int | None:
     return None if identity is None else identity.serial
 
 
-def said_of(core: Core, warnings: Iterable[str] = ()) -> list[str]:
+def warnings_of(core: Core, warnings: Iterable[str] = ()) -> list[str]:
     """What a reader of the result must know: of the recording, the stream and the registers."""
     said = [*warnings, *core.stream.warnings]
     if not core.registers:
@@ -119,7 +119,7 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
         )
     lines += estimate_lines(core.calibrator.estimate)
     lines += _gate_lines(core.calibrator.gates, core.settings.level)
-    lines += [f"  warning: {text}" for text in said_of(core, warnings)]
+    lines += [f"  warning: {text}" for text in warnings_of(core, warnings)]
     lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
     return lines
 

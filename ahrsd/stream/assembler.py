@@ -5,7 +5,7 @@ so that the blocks do not depend on how the bytes were cut), then turned into ar
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
 the rate. Damaged messages, steps over which the device turned further than its rate can explain
-(`stream_rate.TurnWatch`), and a pause in the arrivals count as lost messages then, so that nothing
+(`rate.TurnWatch`), and a pause in the arrivals count as lost messages then, so that nothing
 is bridged. The rate of such a stream is what the caller says, else what the register of this very
 output says (`output_rates`), else what the arrival times say, else the factory's 40 Hz. Where
 messages come at another rate than a register says, time after time, the arrivals are right.

@@ -24,7 +24,7 @@ class Notifier:
         #: how often the watchdog is fed, seconds; 0 where there is none
         self.period_s = asked_us * 1e-6 / 3.0
         self._next_s = 0.0
-        self._said = ""
+        self._status_sent = ""
         self._is_ready = False
 
     def ready(self, status: str) -> None:
@@ -32,13 +32,13 @@ class Notifier:
         if self._is_ready:
             self.status(status)
             return
-        self._is_ready, self._said = True, status
+        self._is_ready, self._status_sent = True, status
         self._send(f"READY=1\nSTATUS={status}")
 
     def status(self, status: str) -> None:
         """One line for `systemctl status`; the same line is not sent twice."""
-        if status != self._said:
-            self._said = status
+        if status != self._status_sent:
+            self._status_sent = status
             self._send(f"STATUS={status}")
 
     def stopping(self) -> None:

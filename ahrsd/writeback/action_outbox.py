@@ -54,7 +54,7 @@ class ActionOutbox:
         self._journal_again_s = 0.0
         self._runs = 0
         self._out: list[Action] = []
-        self._said = ""
+        self._last_note = ""
 
     @property
     def wall_s(self) -> float:
@@ -176,9 +176,9 @@ class ActionOutbox:
 
     def note(self, level: str, text: str) -> None:
         """One line for the log; not the same one twice in a row."""
-        if text != self._said:
+        if text != self._last_note:
             self.ask(Emit(Noted(self.at_s, self.host_s, level, text)))
-        self._said = text
+        self._last_note = text
 
     def changed(self, old: str, new: str, reason: str) -> None:
         """The state changed."""

@@ -1,7 +1,7 @@
 """From an estimate of the raw sensor and the registers in force to the registers to write.
 
 The estimate is of the *raw* sensor: every sample was un-mapped through the registers in force when
-it was taken (`unmapping`). So nothing is left to compose but the scale::
+it was taken (`decompensation`). So nothing is left to compose but the scale::
 
     register 23:  C' = s A^-1,  B' = b          whatever stood in 23 and 26 before
     register 84:  C' = C84,     B' = w_b        the gyro's matrix is not estimated

@@ -4,7 +4,7 @@ The core calls the `on_...` methods with the host's monotonic time and carries o
 (`actions`), in that order. The gate in front of each command judges interlock and stillness at the
 newest time that was told, so `tick` comes before bytes are given to the session.
 
-Order of things, which the tests hold (tests/test_writeback_machine.py):
+Order of things, which the tests hold (tests/writeback/test_machine.py):
 
 * PREPARED is on the disk before the first byte of a transaction, FLASH_SENT before VNWNV;
 * a rollback needs neither interlock nor journal: the old values are what the vehicle lived with;

@@ -180,7 +180,7 @@ def _other(transaction: Transaction) -> Procedure[Unit | None]:
     return None if transaction.is_of(unit) else unit
 
 
-def _stranger(transaction: Transaction) -> Procedure[Unit | None]:
+def _other_by_serial(transaction: Transaction) -> Procedure[Unit | None]:
     """The same within a procedure that has asked already: the serial number is enough."""
     if int((yield from read(3))[0]) == transaction.serial:
         return None
@@ -221,7 +221,7 @@ def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
         if refused is not None:
             return refused
         written = True
-    return (yield from _together(transaction, transaction.new))
+    return (yield from _read_all_back(transaction, transaction.new))
 
 
 def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureOutcome]:
@@ -239,11 +239,11 @@ def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[Procedure
                 yield from resume()
 
 
-def _together(
+def _read_all_back(
     transaction: Transaction, expected: Mapping[int, Values]
 ) -> Procedure[ProcedureOutcome]:
     """Both registers in one reading, and whose they are: a restart between two writes shows."""
-    if (other := (yield from _stranger(transaction))) is not None:
+    if (other := (yield from _other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other, written=True)
     changed = yield from _changed(expected)
     return ProcedureOutcome(not changed, changed, written=True)
@@ -288,7 +288,7 @@ def _right_behind(
     Raises TooLate where no answer comes soon enough.
     """
     for left in reversed(range(BEHIND_TRIES)):
-        if (other := (yield from _stranger(transaction))) is not None:
+        if (other := (yield from _other_by_serial(transaction))) is not None:
             return other
         try:
             yield from make()
@@ -301,9 +301,9 @@ def _right_behind(
 
 
 def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _stranger(transaction))) is not None:
+    if (other := (yield from _other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
-    if only_ours and (strange := (yield from _strange(transaction))):
+    if only_ours and (strange := (yield from _foreign_values(transaction))):
         return ProcedureOutcome(False, strange)
     errors: dict[int, Exception] = {}
     for number, values in transaction.old.items():
@@ -317,10 +317,10 @@ def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureO
             return refused
     if errors:
         raise RestoreFailed(errors)
-    return (yield from _together(transaction, transaction.old))
+    return (yield from _read_all_back(transaction, transaction.old))
 
 
-def _strange(transaction: Transaction) -> Procedure[tuple[int, ...]]:
+def _foreign_values(transaction: Transaction) -> Procedure[tuple[int, ...]]:
     """Registers that hold neither the old nor the new value, in two readings."""
     found: tuple[int, ...] = ()
     for _ in range(2):
@@ -340,7 +340,7 @@ def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[P
         yield from restore(transaction.snapshot, keys)
         outcome = yield from _compare(transaction, transaction.new, frozenset())
         if outcome.as_expected:
-            outcome = yield from _together(transaction, transaction.new)
+            outcome = yield from _read_all_back(transaction, transaction.new)
     except (NotPermitted, RestoreFailed, NoReply, DeviceRefused) as error:
         return ProcedureOutcome(False, why=str(error))
     if outcome.as_expected:

@@ -65,7 +65,7 @@ class Device:
         self._quiet = False
 
     def run(self, procedure: Procedure[T], timeout_s: float = 60.0) -> T:
-        """The procedure's result. Raises what it raises, TookTooLong, or LinkLost."""
+        """The procedure's result. Raises what it raises, TookTooLong, or PortLost."""
         self._outcome = None
         try:
             self._take(self._session.start(procedure, time.monotonic()))

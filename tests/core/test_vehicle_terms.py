@@ -51,7 +51,7 @@ def vehicle(*terms):
     said = []
     made = VehicleTerms(said.append, max_age_s=0.5)
     if terms:
-        made.know(model_text(*terms))
+        made.load_terms(model_text(*terms))
     return made, said
 
 
@@ -76,7 +76,7 @@ def test_only_what_a_column_gives_sample_by_sample_is_followed(one, follows):
 def test_columns_are_drawn_between_the_words_and_unknown_far_from_them():
     told, _ = vehicle()
     for at_s, ampere in ((10.0, 0.0), (11.0, 4.0)):
-        told.told(at_s, {"motor_current_a": ampere})
+        told.record_columns(at_s, {"motor_current_a": ampere})
     host_s = np.array([9.4, 9.6, 10.0, 10.25, 10.5, 11.0, 11.4, 11.6])
     column = told.with_columns(block(host_s)).covariates["motor_current_a"]
     assert column == pytest.approx([np.nan, 0.0, 0.0, 1.0, 2.0, 4.0, 4.0, np.nan], nan_ok=True)
@@ -87,7 +87,7 @@ def test_columns_are_drawn_between_the_words_and_unknown_far_from_them():
 def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
     free, said = vehicle(term(), term("mag_time_lag", [0.01], {}))
     host_s = np.array([10.0, 10.1])
-    assert free.without(block(host_s)) is None
+    assert free.without_terms(block(host_s)) is None
     assert free.waits_for == ("motor_current_a",)
     assert said == [
         "mag_time_lag is in the model and does not follow a column from sample to sample: it stays "
@@ -95,11 +95,11 @@ def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
         "calibrated without motor_current_field (motor_current_a)",
         "samples without motor_current_a are not calibrated",
     ]
-    after = free.without(block(host_s, motor_current_a=np.array([1.0, 2.0])))
+    after = free.without_terms(block(host_s, motor_current_a=np.array([1.0, 2.0])))
     assert after.gap_before
     assert after.raw_b_gauss == pytest.approx(np.array([0.3 - K, 0.3 - 2 * K]))
     assert after.gyro_b_rad_s.tolist() == [[0.0] * 3] * 2
-    again = free.without(block(host_s, motor_current_a=np.zeros(2)))
+    again = free.without_terms(block(host_s, motor_current_a=np.zeros(2)))
     assert not again.gap_before
     assert free.waits_for == ()
 
@@ -108,8 +108,8 @@ def test_without_a_model_the_block_is_the_same_object():
     plain, said = vehicle()
     given = block(np.array([1.0, 2.0]))
     assert plain.with_columns(given) is given
-    assert plain.without(given) is given
-    plain.hear(TermsKnown(0, "{}"))
+    assert plain.without_terms(given) is given
+    plain.take(TermsKnown(0, "{}"))
     assert said == ["the model of the terms is no model: its schema must be 'ahrsd.model/1'"]
 
 

@@ -110,7 +110,7 @@ def test_chart_change_of_a_node():
     """z and its derivative are the old coordinates of the present direction and tangents."""
     u = np.array([0.6, 0.0, 0.8])
     old = Node.at(np.zeros(3), u)
-    new = old.moved(np.array([0.1, 0.2, 0.3, 1e-3, -2e-3]))
+    new = old.retracted(np.array([0.1, 0.2, 0.3, 1e-3, -2e-3]))
     weights = np.random.default_rng(0).normal(size=SIZE)
     factor = Factor(
         0, 1, np.zeros((SIZE, SIZE)), weights, LinearisationPoint(np.zeros(9), old, old)
@@ -120,7 +120,7 @@ def test_chart_change_of_a_node():
     np.testing.assert_allclose(z[:9], 1.0)
     np.testing.assert_allclose(z[9:14], [0.1, 0.2, 0.3, 1e-3, -2e-3], atol=1e-8)
     h = np.array([3e-7, -5e-7])
-    further = new.moved(np.r_[np.zeros(3), h])
+    further = new.retracted(np.r_[np.zeros(3), h])
     z2 = Stack([factor], np.ones(9), {0: further, 1: old}).z[0]
     assert weights @ (z2 - z) == pytest.approx(g[12:14] @ h, abs=1e-11)
     np.testing.assert_allclose(z[14:], 0.0)
@@ -138,7 +138,8 @@ def test_rise_integrates_the_gradient():
     g = Stack([factor], graph.c, graph.nodes).here()[1][0]
     h = np.random.default_rng(1).normal(size=SIZE) * 1e-6
     sides = [
-        rise(graph.c + s * h[:9], a.moved(s * h[9:14]), b.moved(s * h[14:])) for s in (1.0, -1.0)
+        rise(graph.c + s * h[:9], a.retracted(s * h[9:14]), b.retracted(s * h[14:]))
+        for s in (1.0, -1.0)
     ]
     assert sides[0] - sides[1] == pytest.approx(2 * g @ h, rel=1e-5)
 
@@ -254,7 +255,7 @@ def test_weakly_known_directions_are_not_called_singular(strong):
 
 def test_node_moves_on_the_sphere():
     node = Node.at(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    moved = node.moved(np.r_[1.0, 2.0, 3.0, 0.75, 0.0])
+    moved = node.retracted(np.r_[1.0, 2.0, 3.0, 0.75, 0.0])
     assert np.linalg.norm(moved.direction) == pytest.approx(1.0)
     np.testing.assert_allclose(moved.bias, [1.0, 2.0, 3.0])
     assert node.direction @ moved.direction == pytest.approx(0.8)
@@ -268,5 +269,5 @@ def test_belief_counts_only_where_the_data_know_little():
     variances[:2] = 0.5
     covariance = np.outer(SIGMA, SIGMA) * ((directions * variances) @ directions.T)
     graph.c = graph.anchor[0] + SIGMA * (directions @ np.r_[3.0, -4.0, np.full(7, 20.0)])
-    assert graph.strayed(covariance) == pytest.approx(12.5)
-    assert graph.strayed(1e-2 * covariance) == 0.0
+    assert graph.distance_from_prior(covariance) == pytest.approx(12.5)
+    assert graph.distance_from_prior(1e-2 * covariance) == 0.0

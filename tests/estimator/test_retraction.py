@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd.estimator import chain
-from ahrsd.estimator.retraction import Moments, curvature, moved
+from ahrsd.estimator.retraction import Moments, curvature, retract
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
 B = np.array([0.1, -0.2, 0.05])
@@ -27,7 +27,7 @@ def test_small_steps_are_additive():
     _, moments = planar(0.6)
     dc = np.random.default_rng(0).normal(size=9)
     for h in (1e-4, 1e-5):
-        error = moved(C9, h * dc, moments) - (C9 + h * dc)
+        error = retract(C9, h * dc, moments) - (C9 + h * dc)
         assert np.linalg.norm(error) < 60 * h**2
 
 
@@ -39,7 +39,7 @@ def test_the_valley_of_a_planar_turn_is_followed_to_any_distance(shift):
     u, moments = planar(0.3)
     field = u @ M + B
     dc = np.r_[chain.upper_triangle(0.3 * shift * M), -shift * M[:, 2]]
-    new = moved(C9, dc, moments)
+    new = retract(C9, dc, moments)
     found = np.linalg.solve(chain.symmetric(new[:6]), (field - new[6:]).T).T
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
     tangential = shift * (1 - 0.3**2)
@@ -52,12 +52,12 @@ def test_the_valley_of_a_planar_turn_is_followed_to_any_distance(shift):
 def test_where_the_matrix_would_not_stay_positive_the_step_is_plain():
     _, moments = planar(0.6)
     dc = np.r_[chain.upper_triangle(1.5 * M), np.zeros(3)]
-    np.testing.assert_array_equal(moved(C9, dc, moments), C9 + dc)
+    np.testing.assert_array_equal(retract(C9, dc, moments), C9 + dc)
 
 
 def test_without_data_the_scale_is_left_alone():
     dc = np.r_[np.zeros(6), 0.01, 0.0, 0.0]
-    np.testing.assert_allclose(moved(C9, dc, Moments()), C9 + dc, atol=1e-12)
+    np.testing.assert_allclose(retract(C9, dc, Moments()), C9 + dc, atol=1e-12)
 
 
 def test_curvature_is_what_the_straight_covariance_misses():
@@ -65,7 +65,7 @@ def test_curvature_is_what_the_straight_covariance_misses():
     _, moments = planar(0.3)
     step = 0.05 * np.r_[chain.upper_triangle(0.3 * M), -M[:, 2]]
     t = np.random.default_rng(0).normal(size=4000)
-    beside = np.array([moved(C9, k * step, moments) - C9 - k * step for k in t])
+    beside = np.array([retract(C9, k * step, moments) - C9 - k * step for k in t])
     expected = beside.T @ beside / len(t)
     added = curvature(C9, np.outer(step, step) + 1e-16 * np.eye(9), moments)
     assert np.trace(expected) > 0

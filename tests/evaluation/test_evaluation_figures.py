@@ -20,7 +20,7 @@ from ahrsd.evaluation.references import (
     fixes_of_track,
     optical,
 )
-from ahrsd.evaluation.spoken import evaluation_json, evaluation_lines
+from ahrsd.evaluation.text import evaluation_json, evaluation_lines
 from ahrsd.evaluation.tilt import up_b
 from ahrsd.heading import wrapped
 from ahrsd.world_field import world_field

@@ -19,7 +19,7 @@ from ahrsd.evaluation.references import (
     fixes_of_track,
     optical,
 )
-from ahrsd.evaluation.spoken import evaluation_json, evaluation_lines
+from ahrsd.evaluation.text import evaluation_json, evaluation_lines
 from ahrsd.samples import SampleBlock
 
 COLUMNS = (

@@ -17,7 +17,7 @@ from contract import REPLAY, faults
 from ahrsd.config.loading import Config
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import Replayed, replay
-from ahrsd.report.summary import said_of, summary_json, summary_lines
+from ahrsd.report.summary import summary_json, summary_lines, warnings_of
 
 BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "bench_replay.py"
 FACTS = tomllib.loads(
@@ -133,7 +133,7 @@ def test_two_walks_with_one_sensor_agree_on_the_horizontal_hard_iron(replayed):
 
 def test_what_a_reader_must_know_is_said_once(replayed):
     found = replayed("walk_square_2024_sazgar.vnraw.gz")
-    said = said_of(found.done.core, found.done.warnings)
+    said = warnings_of(found.done.core, found.done.warnings)
     assert len(said) == len(set(said))
     assert sum("missing without a trace" in text for text in said) == 1
 

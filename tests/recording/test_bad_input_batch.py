@@ -200,7 +200,7 @@ def test_time_going_backwards(tmp_path, seed, row, back):
         assert row > 396
         assert f"row {row + 2}, column time_s: time goes back" in result
         return
-    said = " ".join(result.said())
+    said = " ".join(result.all_warnings())
     assert f"at row {row + 2} (" in said or "put behind the row of the same time" in said
 
 
@@ -239,7 +239,7 @@ def test_a_sigma_that_cannot_be(value):
 )
 def test_a_gyro_that_is_not_what_it_says_is_named(tmp_path, gyro, words):
     rows = tumbling(4)
-    assert not any(words in said for said in tried(tmp_path, rows).said())
+    assert not any(words in said for said in tried(tmp_path, rows).all_warnings())
     rows[:, 4:] = rows[:, 4:] @ gyro.T
     result = tried(tmp_path, rows)
     refused_by_ours(result)
@@ -250,8 +250,8 @@ def test_a_gyro_that_is_not_what_it_says_is_named(tmp_path, gyro, words):
 
 def test_a_field_that_stands_still_while_the_sensor_turns_is_named(tmp_path):
     rows = tumbling(4)
-    assert not any("repeats one reading" in said for said in tried(tmp_path, rows).said())
+    assert not any("repeats one reading" in said for said in tried(tmp_path, rows).all_warnings())
     rows[500:900, 1:4] = rows[500, 1:4]
-    said = [text for text in tried(tmp_path, rows).said() if "repeats one reading" in text]
+    said = [text for text in tried(tmp_path, rows).all_warnings() if "repeats one reading" in text]
     assert len(said) == 1
     assert said[0].startswith("the magnetometer repeats one reading while the sensor turns, ")

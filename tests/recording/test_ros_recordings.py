@@ -170,7 +170,7 @@ def test_what_the_device_sent_calibrates_as_its_byte_stream(tmp_path, container,
     np.testing.assert_allclose(
         result.estimate.hard_iron_gauss, wanted.hard_iron_gauss, atol=1e-6, rtol=0
     )
-    assert any("what the device sent" in text for text in result.said())
+    assert any("what the device sent" in text for text in result.all_warnings())
 
 
 def test_a_real_stream_in_a_bag_calibrates_as_the_stream(recordings, tmp_path):

@@ -17,7 +17,13 @@ from ahrsd.events import GateResult
 from ahrsd.gates import GATES, Level, guards_a_write
 from ahrsd.report.data import ReportData
 from ahrsd.report.page import _gates
-from ahrsd.report.summary import _gate_lines, estimate_lines, said_of, summary_json, summary_lines
+from ahrsd.report.summary import (
+    _gate_lines,
+    estimate_lines,
+    summary_json,
+    summary_lines,
+    warnings_of,
+)
 from ahrsd.viewer.recorder import gate_table
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
@@ -58,8 +64,8 @@ def test_before_anything_came():
 
 
 def test_unknown_registers_are_said_and_known_ones_are_not(core):
-    assert any("registers are not known" in text for text in said_of(core))
-    assert said_of(core, ["a", "a"]).count("a") == 1
+    assert any("registers are not known" in text for text in warnings_of(core))
+    assert warnings_of(core, ["a", "a"]).count("a") == 1
 
 
 def test_numbers_never_show_a_minus_before_nothing(core):

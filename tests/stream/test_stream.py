@@ -212,7 +212,7 @@ class TestWithoutTime:
 
 class TestRegisters:
     def test_samples_are_as_the_sensor_read_them(self):
-        """Independent of `unmapping`: out = R C (m - B) for 23 and 84, put in, m comes out."""
+        """Independent of `decompensation`: out = R C (m - B) for 23 and 84, put in, m comes out."""
         C, B = np.reshape(REGISTERS[23][:9], (3, 3)), np.array(REGISTERS[23][9:])
         R, B84 = np.reshape(REGISTERS[26], (3, 3)), np.array(REGISTERS[84][9:])
         m, w = np.array([0.21, -0.12, 0.4]), np.array([0.3, -0.2, 0.1])

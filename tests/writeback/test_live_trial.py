@@ -11,7 +11,7 @@ from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.policy import TrialPolicy
-from ahrsd.writeback.trial import Finding, Trial
+from ahrsd.writeback.trial import Trial, TrialVerdict
 from ahrsd.writeback.trial_metrics import LiveTrial
 
 RATE_HZ = 40.0
@@ -207,7 +207,7 @@ def judged(trial: LiveTrial, block: SampleBlock) -> list[str]:
     """Why the trial fails, piece by piece."""
     rules = Trial(TrialPolicy(), 90.0)
     found = [rules.judge(trial.take(piece)) for piece in pieces(block)]
-    return [reason for finding, reason in found if finding is Finding.FAILED]
+    return [reason for finding, reason in found if finding is TrialVerdict.FAILED]
 
 
 def test_at_rest_noise_that_a_matrix_makes_larger_is_no_worse_figure():

@@ -51,7 +51,7 @@ class Emulator:
     """One emulated device with one of its two ports connected.
 
     truth, motion: what it senses;  firmware: as register 4 says it;  serial: register 3
-    faults:  schedules as `emulator_faults.parse_fault` takes them
+    faults:  schedules as `faults.parse_fault` takes them
     port:    the serial port that the host is connected to, 1 or 2
     presets: register values that were saved long ago;  further: physics that the caller adds
     plugged: false while the host's port does not exist;  counters: what happened how often
