@@ -67,8 +67,6 @@ __all__ = [
     "upper_triangle",
 ]
 
-SHARED = 9  # M (6) and b (3)
-BIAS = slice(9, 12)
 FIRST = slice(12, 14)
 LAST = slice(14, 16)
 WIDTH = 16

@@ -181,10 +181,6 @@ class CaptureWriter:
         """Record a snapshot of the device's registers."""
         self._put("registers", host_ns, inputs_json.to_json(snapshot))
 
-    def write_covariate(self, host_ns: int, values: Mapping[str, object]) -> None:
-        """Record a side channel (motor current, position, ...), names as in tables."""
-        self._put("covariate", host_ns, inputs_json.to_json(values))
-
     @property
     def status(self) -> CaptureStatus:
         """Counters of this instant."""
@@ -341,7 +337,7 @@ class CaptureReader:
             ) from error
 
     def facts(self, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
-        """(host_ns, fact) of a JSON channel: "event", "registers" or "covariate"."""
+        """(host_ns, fact) of a JSON channel: "event" or "registers"."""
         for entry in self._entries():
             if entry.topic != topic:
                 continue

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd import so3
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.simulation.truth import Iron, Truth
 
@@ -124,14 +123,3 @@ def measured(
         gap_before=True,
     )
     return Experiment(name, block, truth, R_nb, field_b, rate)
-
-
-def predicted_directions(experiment: Experiment) -> Array:
-    """Field directions (N, 3) that the true rates predict from the row before; row 0 is its own.
-
-    They equal the true directions up to the coning within one step: the check of a trajectory.
-    """
-    u = experiment.field_b / np.linalg.norm(experiment.field_b, axis=1, keepdims=True)
-    dt_s = np.diff(experiment.samples.time_s)
-    back = so3.exp(-experiment.rate_b_rad_s[1:] * dt_s[:, None])
-    return np.vstack([u[:1], np.einsum("nij,nj->ni", back, u[:-1])])

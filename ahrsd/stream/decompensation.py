@@ -17,7 +17,7 @@ message layout, `sample_blocks` joins both into what the estimator takes.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
@@ -269,12 +269,8 @@ class Extractor:
             )
         return tuple(texts)
 
-    def extract(self, values: Sequence[tuple[float, ...]]) -> Extracted:
-        """Arrays of N messages of this layout."""
-        return self.extract_table(np.array(values, dtype=np.float64).reshape(len(values), -1))
-
     def extract_table(self, table: Array) -> Extracted:
-        """The same from an (N, columns) table, as a batch decoder yields it."""
+        """Quantities of N messages of this layout, a row (columns,) each."""
         mag, gyro = table[:, self._mag], table[:, self._gyro]
         with np.errstate(invalid="ignore"):  # nan is not possible either
             possible = (np.abs(mag) < IMPOSSIBLE_GAUSS) & (np.abs(gyro) < IMPOSSIBLE_RAD_S)

@@ -37,30 +37,15 @@ JUMP_DRIFT: Final = 5e-4  # plus what an unmodelled drift may build up over a pa
 LATE_S: Final = 0.25  # every point of LATE_SPAN_S this late: the host's clock leapt ahead
 LATE_SPAN_S: Final = 2.0
 RESTART_S: Final = 0.5  # device time falling by more than this is a restart, less is disorder
-RESIDUAL_MEMORY: Final = 0.01  # weight of the newest residual in the running statistics
 GAP_RATIO: Final = 1.5  # a step longer than this many periods is a gap
 PERIOD_MEMORY: Final = 128  # steps whose median is the stream's period
-
-
-@dataclass(frozen=True, slots=True)
-class ClockStats:
-    """How good the line is. Delays are of arrivals over the line, seconds of host time."""
-
-    rate_ppm: float
-    delay_mean_s: float
-    delay_std_s: float
-    delay_worst_s: float
-    updates: int
-    restarts: int
-    jumps: int
 
 
 class DeviceClock:
     """Lower convex hull of (device, host) arrivals; `to_host` is the line below them."""
 
     def __init__(self) -> None:
-        self.updates = self.restarts = self.jumps = self.disorder = 0
-        self._worst_s = self._mean_s = self._square_s2 = 0.0
+        self.restarts = self.jumps = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -81,10 +66,8 @@ class DeviceClock:
         """Take one arrival; returns true where the line began anew (first, restart or jump)."""
         if not (np.isfinite(device_s) and np.isfinite(host_s)):
             return False
-        self.updates += 1
         fell_s = self._last_device_s - device_s
         if self.known and 0.0 <= fell_s <= RESTART_S:
-            self.disorder += fell_s > 0.0
             return False
         anew = not self.known
         if not anew and fell_s > RESTART_S:
@@ -98,7 +81,6 @@ class DeviceClock:
         if self._late_since_s is None:  # a point far above the line says nothing about the line
             self._append(device_s, host_s)
         self._last_device_s = device_s
-        self._note_residual(host_s - self.host_s(device_s))
         return anew
 
     def host_s(self, device_s: float) -> float:
@@ -112,19 +94,6 @@ class DeviceClock:
         if not self.known:
             return np.full_like(device_s, np.nan, dtype=np.float64)
         return self._anchor[1] + self._rate * (np.asarray(device_s, float) - self._anchor[0])
-
-    def stats(self) -> ClockStats:
-        """Drift of the device against the host and how late arrivals are."""
-        variance_s2 = max(self._square_s2 - self._mean_s**2, 0.0)
-        return ClockStats(
-            rate_ppm=(1.0 / self._rate - 1.0) * 1e6 if self._rate > 0.0 else float("nan"),
-            delay_mean_s=self._mean_s,
-            delay_std_s=variance_s2**0.5,
-            delay_worst_s=self._worst_s,
-            updates=self.updates,
-            restarts=self.restarts,
-            jumps=self.jumps,
-        )
 
     def _jumped(self, device_s: float, host_s: float) -> bool:
         """Whether the arrival contradicts a line that is old enough to be trusted."""
@@ -165,12 +134,6 @@ class DeviceClock:
         trusted = self._span_host_s >= DRIFT_SPAN_HOST_S or abs(rate - 1.0) > NOT_DRIFT
         self._rate = rate if trusted and rate > 0.0 else 1.0
         self._anchor = min(hull, key=lambda point: point[1] - self._rate * point[0])
-
-    def _note_residual(self, late_s: float) -> None:
-        weight = max(RESIDUAL_MEMORY, 1.0 / self._points)
-        self._mean_s += weight * (late_s - self._mean_s)
-        self._square_s2 += weight * (late_s * late_s - self._square_s2)
-        self._worst_s = max(self._worst_s, late_s)
 
 
 def _turns_up(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
@@ -233,7 +196,7 @@ class StreamTimeline:
     """Device times to steps. A step is reported only between neighbours of the stream."""
 
     def __init__(self, period_s: float | None = None) -> None:
-        self.duplicates = self.restarts = 0
+        self.restarts = 0
         self._nominal_s = period_s
         self._recent: deque[float] = deque(maxlen=PERIOD_MEMORY)
         self.forget()
@@ -290,7 +253,6 @@ class StreamTimeline:
             self._last_seen_s = last_s
             return False
         if last_s is not None and now_s == last_s:
-            self.duplicates += 1
             return False
         if last_s is not None and now_s < last_s:
             self.restarts += 1

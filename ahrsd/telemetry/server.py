@@ -54,7 +54,6 @@ class SocketServer:
 
     def __init__(self, path: Path, limit_bytes: int = LIMIT_BYTES) -> None:
         self.path, self.limit_bytes = path, limit_bytes
-        self.lost_events = 0  # events that came faster than the thread took them
         self.dropped = 0  # records that slow readers did not get
         self._status: dict[str, object] | None = None
         self._queue: deque[tuple[str, Record | events.Event]] = deque()
@@ -98,7 +97,6 @@ class SocketServer:
         if len(self._queue) >= _QUEUED:
             with contextlib.suppress(IndexError):  # the thread may have emptied it just now
                 self._queue.popleft()
-                self.lost_events += 1
         self._queue.append((stream, item))
         self._nudge()
 

@@ -243,16 +243,3 @@ WITHOUT_TRANSACTION: Final = frozenset(
 def after(state: State, signal: Signal) -> State:
     """The state that `signal` leads to; `state` itself where it is ignored."""
     return TABLE[state].get(signal, state)
-
-
-def mermaid() -> str:
-    """The table as a Mermaid state diagram, signals of one pair of states on one edge."""
-    lines = ["stateDiagram-v2", "    [*] --> RECONCILING"]
-    for state, row in TABLE.items():
-        edges: dict[State, list[str]] = {}
-        for signal, target in row.items():
-            if signal not in _AWAY:
-                edges.setdefault(target, []).append(signal.value)
-        for target, signals in edges.items():
-            lines.append(f"    {state.value} --> {target.value}: {', '.join(signals)}")
-    return "\n".join(lines)

@@ -157,7 +157,6 @@ FIELD_MASKS = {
     for number, group in GROUPS.items()
     if (mask := sum(1 << bit for bit, row in group.items() if row.columns))
 }
-GROUP_MASK = sum(1 << number for number in FIELD_MASKS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +165,7 @@ class BinaryLayout(Layout):
 
     header:  first bytes, FA included
     size:    of the packet, header and CRC included; the least where entries repeat
-    codes, offsets: struct code of each column, and where it begins where nothing repeats
+    codes:   struct code of each column
     left_out: names of the fields that a VN-100 does not measure
     """
 
@@ -174,7 +173,6 @@ class BinaryLayout(Layout):
     size: int
     payload: struct.Struct
     codes: str
-    offsets: tuple[int, ...]
     left_out: tuple[str, ...] = ()
     rows: tuple[Field, ...] = field(default=(), repr=False)
     repeats: bool = False
@@ -254,11 +252,6 @@ def layout_of(header: bytes) -> BinaryLayout:
         raise ValueError(f"{header.hex(' ')} is not the header of a packet of known layout")
     rows, _, repeats = _announced(header)
     groups, words = _split(header)
-    offsets: list[int] = []
-    end = len(header)
-    for row in rows:
-        offsets += [end + place * struct.calcsize(row.code) for place in range(len(row.columns))]
-        end += row.size
     return BinaryLayout(
         name=" ".join(["FA", *(f"{byte:02X}" for byte in groups), *(f"{w:04X}" for w in words)]),
         columns=tuple(column for row in rows for column in row.columns),
@@ -266,7 +259,6 @@ def layout_of(header: bytes) -> BinaryLayout:
         size=size,
         payload=struct.Struct("<" + "".join(row.format for row in rows)),
         codes="".join(row.code * len(row.columns) for row in rows),
-        offsets=tuple(offsets),
         left_out=tuple(row.name for row in rows if not row.columns),
         rows=rows,
         repeats=repeats,

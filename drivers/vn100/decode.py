@@ -8,15 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from operator import truediv
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.vn100.binary import BinaryLayout
 from drivers.vn100.deframer import Packet, Sentence
 from drivers.vn100.errors import code_of
 from drivers.vn100.fields import Layout
@@ -112,44 +106,6 @@ def _decode_reply(
     if _OTHER.fullmatch(word):
         return Unused(word, frame.offset)
     return Undecodable(f"{word} is not a message of a VN-100", frame.offset)
-
-
-def decode_batch(packets: Sequence[Packet]) -> NDArray[np.float64]:
-    """Packets of one layout as rows of SI values, (N, columns); as `decode`, but quick.
-
-    A row of which `decode` says Undecodable is nan all over. ValueError where there is no packet or
-    more than one layout.
-    """
-    layouts = {packet.layout for packet in packets}
-    if len(layouts) != 1:
-        raise ValueError(f"a batch is packets of one layout, not of {len(layouts)}")
-    (layout,) = layouts
-    if layout.repeats:
-        rows = [decode(packet) for packet in packets]
-        nothing = (np.nan,) * len(layout.columns)
-        return np.array([r.values if isinstance(r, Measurement) else nothing for r in rows])
-    wire = np.frombuffer(b"".join([packet.data for packet in packets]), _wire_type(layout))
-    values = np.empty((len(packets), len(layout.columns)))
-    for place, per_si in enumerate(layout.per_si):
-        np.divide(wire[str(place)], per_si, out=values[:, place], dtype=np.float64)
-    values[~np.isfinite(values).all(axis=1)] = np.nan
-    return values
-
-
-@cache
-def _wire_type(layout: BinaryLayout) -> np.dtype[np.void]:
-    """The packet as numpy reads it: columns "0", "1", ..."""
-    return np.dtype(
-        {
-            "names": [str(place) for place in range(len(layout.codes))],
-            "formats": ["<" + _NUMPY_CODES[code] for code in layout.codes],
-            "offsets": layout.offsets,
-            "itemsize": layout.size,
-        }
-    )
-
-
-_NUMPY_CODES = {"f": "f4", "Q": "u8", "I": "u4", "H": "u2"}
 
 
 def _decode_packet(packet: Packet) -> Measurement | Undecodable | Unused:

@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 
 from drivers.vn100.registers import REGISTERS, Values
 
-GYRO_BIAS_REGISTER = 84
 _VN100 = re.compile(r"VN-?100(?![0-9])", re.IGNORECASE)
 _VERSION = re.compile(r"([0-9]{1,3})(?:\.([0-9]{1,5}))?(?:\.([0-9]{1,5}))?(?:\.([0-9]{1,5}))?")
 
@@ -39,8 +38,6 @@ class Profile:
     writable:       false for unknown firmware and other models: observe only
     startup_bias:   register that VNSGB fills, None where unknown
     tare:           whether VNTAR exists
-    padded_replies: true where replies print register numbers with two digits; false where both
-                    forms were seen
     observed_for:   why nothing may be changed, for a person; empty where it may
     """
 
@@ -49,7 +46,6 @@ class Profile:
     writable: bool
     startup_bias: int | None
     tare: bool
-    padded_replies: bool
     observed_for: str = ""
 
     def observed(self, why: str) -> Profile:
@@ -79,12 +75,12 @@ def profile_of(version: str, model: str = "VN-100") -> Profile:
     match = _VERSION.fullmatch(version.strip())
     generation = int(match[1]) if match else 0
     if generation == 2:
-        profile = Profile(2, version, True, 74, True, False)
+        profile = Profile(2, version, True, 74, True)
     elif generation == 3:
-        profile = Profile(3, version, True, 43, False, True)
+        profile = Profile(3, version, True, 43, False)
     else:
         why = f"firmware {version} is unknown (known are 2.x and 3.x)"
-        profile = Profile(0, version, False, None, False, False, why)
+        profile = Profile(0, version, False, None, False, why)
     if _VN100.match(model.strip()):
         return profile
     return profile.observed(f"the model is {model or 'not said'}, and only a VN-100 is written")

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.vn100.binary import binary_layout, encode_packet
-from drivers.vn100.decode import decode, decode_batch
+from drivers.vn100.decode import decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.sentences import MESSAGES, encode_sentence
 
@@ -67,14 +67,9 @@ def seconds(work: Callable[[], int], count: int) -> float:
     return min(times)
 
 
-def parse_sentences(pieces: list[bytes]) -> int:
+def parse(pieces: list[bytes]) -> int:
     deframer = Deframer()
     return sum(len([decode(frame) for frame in deframer.feed(piece)]) for piece in pieces)
-
-
-def parse_packets(pieces: list[bytes]) -> int:
-    deframer = Deframer()
-    return sum(len(decode_batch(deframer.feed(piece))) for piece in pieces)
 
 
 def bound_sentences(messages: list[bytes]) -> int:
@@ -95,13 +90,13 @@ def bound_packets(messages: list[bytes]) -> int:
 def measure(count: int) -> tuple[Result, Result]:
     """Sentences and packets: bytes in chunks to SI values."""
     results = []
-    for name, make, parse, bound in (
-        ("VNYMR sentences", sentences, parse_sentences, bound_sentences),
-        ("64-byte packets", packets, parse_packets, bound_packets),
+    for name, make, bound in (
+        ("VNYMR sentences", sentences, bound_sentences),
+        ("64-byte packets", packets, bound_packets),
     ):
         messages = make(count)
         pieces = chunks(messages)
-        ours = seconds(lambda pieces=pieces, parse=parse: parse(pieces), count)
+        ours = seconds(lambda pieces=pieces: parse(pieces), count)
         least = seconds(lambda messages=messages, bound=bound: bound(messages), count)
         results.append(Result(name, count / ours, ours / least))
     return results[0], results[1]

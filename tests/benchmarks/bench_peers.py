@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from peers_figure import write_peers_figure
 from peers_table import best_peers, set_lines, time_lines, verdict_lines
 
 from ahrsd.baselines import MethodError
@@ -34,7 +35,6 @@ from ahrsd.montecarlo.accuracy import MethodAnswer
 from ahrsd.montecarlo.methods import OURS, STREAM
 from ahrsd.montecarlo.runs import Plan, Record, run_many, scored
 from ahrsd.montecarlo.summary import SummaryRow, summarise
-from ahrsd.report.peers_figure import write_peers_figure
 from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 
 PROJECT = Path(__file__).resolve().parents[2]

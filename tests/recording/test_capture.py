@@ -102,14 +102,12 @@ def test_side_channels(tmp_path):
     with CaptureWriter(tmp_path / "a.mcap", {}) as writer:
         writer.write_event(1, {"state": "CANDIDATE", "value": np.float64(0.5), "path": tmp_path})
         writer.write_registers(2, {"23": [1.0, 2.0]})
-        writer.write_covariate(3, {"motor_current_a": np.array([1.5])})
     reader = CaptureReader(tmp_path / "a.mcap")
     assert list(reader) == []
     assert list(reader.facts("event")) == [
         (1, {"state": "CANDIDATE", "value": 0.5, "path": str(tmp_path)})
     ]
     assert list(reader.facts("registers")) == [(2, {"23": [1.0, 2.0]})]
-    assert list(reader.facts("covariate")) == [(3, {"motor_current_a": [1.5]})]
 
 
 def test_every_kind_of_input_can_be_recorded():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from true_trajectory import predicted_directions
 
 from ahrsd.recording.table import read_table
-from ahrsd.simulation.experiment import predicted_directions
 from ahrsd.simulation.recorded import LICHLYTER, integrate, rotation, simulate_recorded
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from true_trajectory import predicted_directions
 
 from ahrsd import so3
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
-from ahrsd.simulation.experiment import predicted_directions
 from ahrsd.simulation.motion import MOTIONS, SCENARIOS, SUBSTEPS, mean_rate, rotation_nb, sinusoids
 from ahrsd.simulation.scenarios import generator
 

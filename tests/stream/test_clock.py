@@ -33,6 +33,12 @@ def fed(device_s: Array, host_s: Array) -> DeviceClock:
     return clock
 
 
+def rate_ppm(clock: DeviceClock) -> float:
+    """By how much the device's clock runs faster than the host's."""
+    start_s, end_s = clock.to_host(np.array([0.0, 1000.0]))
+    return float(1000.0 / (end_s - start_s) - 1.0) * 1e6
+
+
 def test_nothing_known_before_the_first_arrival() -> None:
     clock = DeviceClock()
     assert not clock.known
@@ -45,19 +51,20 @@ def test_nothing_known_before_the_first_arrival() -> None:
 def test_drift_is_found_through_latency_bursts(ppm: float) -> None:
     device_s = np.arange(0.0, 600.0, 0.005)
     rate = 1.0 / (1.0 + ppm * 1e-6)
-    clock = fed(device_s, arrivals(device_s, rate, burst_s=0.016))
-    assert clock.stats().rate_ppm == pytest.approx(ppm, abs=3.0)
+    host_s = arrivals(device_s, rate, burst_s=0.016)
+    clock = fed(device_s, host_s)
+    assert rate_ppm(clock) == pytest.approx(ppm, abs=3.0)
     error_s = clock.to_host(device_s) - (1000.0 + rate * device_s)
     assert np.all(error_s > 0.0)
     assert np.max(np.abs(error_s)) < 3e-3  # a burst's mean delay is 8 ms
     assert clock.jumps == 0
-    assert 0.006 < clock.stats().delay_mean_s < 0.010
+    assert 0.006 < np.mean(host_s - clock.to_host(device_s)) < 0.010
 
 
 def test_short_run_keeps_the_nominal_rate() -> None:
     device_s = np.arange(0.0, 5.0, 0.025)
     clock = fed(device_s, arrivals(device_s, burst_s=0.016))
-    assert clock.stats().rate_ppm == 0.0
+    assert rate_ppm(clock) == 0.0
     assert np.max(np.abs(clock.to_host(device_s) - 1000.0 - device_s)) < 5e-3
 
 
@@ -96,7 +103,6 @@ def test_a_stall_of_the_host_is_not_a_jump() -> None:
     host_s[1500:1560] = host_s[1560]  # 1.2 s of samples arrive at once
     clock = fed(device_s, host_s)
     assert clock.jumps == 0
-    assert clock.stats().delay_worst_s == pytest.approx(1.2, abs=0.01)
     assert np.max(np.abs(clock.to_host(device_s) - 1000.0 - device_s)) < 5e-3
 
 
@@ -106,14 +112,12 @@ def test_non_finite_and_repeated_times_are_ignored() -> None:
     for device_s, host_s in [(float("nan"), 12.0), (2.0, float("inf")), (1.0, 30.0), (0.9, 31.0)]:
         assert not clock.update(device_s, host_s)
     assert clock.host_s(1.0) == 11.0
-    assert clock.disorder == 1
 
 
 def test_memory_is_bounded_by_a_curve_that_is_all_hull() -> None:
     device_s = np.arange(0.0, 900.0, 0.05)
     clock = fed(device_s, 1000.0 + device_s + 1e-9 * device_s**2)  # convex: each point on the hull
     assert len(clock._hull) <= HULL_POINTS
-    assert clock.updates == len(device_s)
 
 
 def test_step_clock_counts_lost_messages_and_does_not_drift() -> None:

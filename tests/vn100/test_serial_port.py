@@ -30,7 +30,7 @@ from drivers.serial_port import (
     SerialPort,
     detect_baud,
 )
-from drivers.usb import latency_timer_ms, set_latency_timer
+from drivers.usb import latency_timer_ms
 
 YMR = (
     b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"
@@ -314,17 +314,12 @@ def test_a_rate_that_the_adapter_cannot_do_is_passed_over(pty, monkeypatch):
     assert [heard.baud for heard in found.tried] == [921600]
 
 
-def test_the_latency_timer_is_read_and_set_where_allowed(tmp_path):
+def test_the_latency_timer_is_read_where_there_is_one(tmp_path):
     folder = tmp_path / "class" / "tty" / "ttyUSB7" / "device"
     folder.mkdir(parents=True)
     (folder / "latency_timer").write_text("16\n")
     assert latency_timer_ms("/dev/ttyUSB7", tmp_path) == 16
-    assert set_latency_timer("/dev/ttyUSB7", 1, tmp_path) == 1
-    assert (folder / "latency_timer").read_text() == "1\n"
     assert latency_timer_ms("/dev/ttyUSB8", tmp_path) is None
-    assert set_latency_timer("/dev/ttyUSB8", 1, tmp_path) is None
-    with pytest.raises(ValueError, match="latency timer is 1"):
-        set_latency_timer("/dev/ttyUSB7", 0, tmp_path)
     (folder / "latency_timer").write_text("soon\n")
     assert latency_timer_ms("/dev/ttyUSB7", tmp_path) is None
 

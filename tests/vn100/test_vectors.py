@@ -27,7 +27,6 @@ from drivers.vn100.decode import (
     Undecodable,
     Unused,
     decode,
-    decode_batch,
 )
 from drivers.vn100.deframer import Cause, Deframer, Packet, Sentence
 
@@ -302,7 +301,7 @@ def test_the_rotation_matrix_is_body_to_ned_row_by_row(recordings: Path) -> None
     """What the manual leaves open, settled by a real device: R_nb = Rz(yaw) Ry(pitch) Rx(roll)."""
     data = gzip.decompress((recordings / "vn100" / "F00379.vnbin.gz").read_bytes())
     packets = [frame for frame in Deframer().feed(data) if isinstance(frame, Packet)]
-    values = decode_batch(packets[::100])
+    values = np.array([decode(packet).values for packet in packets[::100]])
     names = [column.name for column in packets[0].layout.columns]
     ypr = values[:, names.index("yaw_rad") :][:, :3]
     R_nb = values[:, names.index("dcm_00") :][:, :9].reshape(-1, 3, 3)

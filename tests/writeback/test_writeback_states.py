@@ -14,7 +14,6 @@ from ahrsd.writeback.states import (
     Signal,
     State,
     after,
-    mermaid,
 )
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "design" / "write-back.md"
@@ -110,6 +109,19 @@ def test_flash_is_reached_only_from_proven_through_the_journal() -> None:
 def test_states_with_changed_ram_can_all_be_undone_or_are_undoing() -> None:
     for state in CHANGED_IN_RAM - {State.ROLLING_BACK, State.SAVING}:
         assert TABLE[state][Signal.ROLL_BACK] is State.ROLLING_BACK
+
+
+def mermaid() -> str:
+    """The table as a Mermaid state diagram, signals of one pair of states on one edge."""
+    lines = ["stateDiagram-v2", "    [*] --> RECONCILING"]
+    for state, row in TABLE.items():
+        edges: dict[State, list[str]] = {}
+        for signal, target in row.items():
+            if signal not in {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT}:
+                edges.setdefault(target, []).append(signal.value)
+        for target, signals in edges.items():
+            lines.append(f"    {state.value} --> {target.value}: {', '.join(signals)}")
+    return "\n".join(lines)
 
 
 def test_the_document_shows_this_table() -> None:

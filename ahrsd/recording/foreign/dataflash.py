@@ -20,7 +20,6 @@ from ahrsd.errors import RecordingError
 from ahrsd.recording.limits import TABLE_CELLS, refuse_beyond
 from ahrsd.samples import Array
 
-MAGIC = b"\xa3\x95\x80\x80"
 _HEADER = b"\xa3\x95"
 _FMT, _FMT_BYTES = 128, 89
 _CODES: dict[str, str] = {
