@@ -1,5 +1,9 @@
 """A serial port that is ours alone, and the search for its rate. The only importer of pyserial.
 
+Also one of a device server on the network: `socket://HOST:PORT` (bytes as they are; the server has
+the rate) and `rfc2217://HOST:PORT` (the rate is set from here), both through pyserial. Nobody can
+see who else uses such a port. A network that goes away without a word is noticed within some 15 s.
+
 pyserial opens and configures; bytes go through os.read and os.write on its descriptor, which is
 several times cheaper than pyserial's own. Exclusive means all three: flock (programs that ask),
 TIOCEXCL (the kernel refuses other openings, root's excepted) and nobody else in /proc (programs
@@ -12,7 +16,7 @@ Errors::
     +-- PortBusy                 somebody has it: `holders` says who
     +-- PortForbidden            no permission: the text names the group to join
     +-- PortUnusable             no terminal, a rate it cannot do
-    +-- LinkLost                 it was open and is gone: close, open again
+    +-- PortLost                 it was open and is gone: close, open again
 """
 
 from __future__ import annotations
@@ -23,7 +27,9 @@ import fcntl
 import grp
 import os
 import pwd
+import re
 import select
+import socket
 import stat
 import struct
 import termios
@@ -46,6 +52,10 @@ READ_BYTES = 65536
 WRITE_TIMEOUT_S = 2.0
 LISTEN_S = 0.3
 SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
+_URL = re.compile(r"^(socket|rfc2217):/+")  # a Path has only one slash left
+_WHOLE_URL = re.compile(r"^(socket|rfc2217)://(\[[^\]]+\]|[^:/\[\]]+):\d+/?(\?.*)?$")
+_KEEP_ALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 3, "TCP_KEEPCNT": 3}  # seconds, seconds, times
+_TELNET_POLL_S = 0.005
 _TIOCGEXCL = 0x80045440  # Linux asm-generic/ioctls.h; termios does not have it
 _ENOUGH = 2  # messages at a rate, to believe it
 _GARBAGE_TOLERATED = 0.5  # part of the bytes at a right rate that may lie outside of messages
@@ -88,29 +98,28 @@ class SerialPort:
     """
 
     def __init__(self, path: str | Path, baud: int) -> None:
-        self.path = str(path)
-        _refuse_if_held(self.path)
-        self._serial = _open(self.path, baud)
-        self._poll = select.poll()
-        self._poll.register(self._serial.fileno(), select.POLLIN)
-        with contextlib.suppress(OSError):  # a port without it has the other two
-            fcntl.ioctl(self._serial.fileno(), termios.TIOCEXCL)
+        self.path = spelled(path)
+        if is_url(path):
+            self._serial = _open_url(self.path, baud)
+        else:
+            _refuse_if_held(self.path)
+            self._serial = _open(self.path, baud)
+            with contextlib.suppress(OSError):  # a port without it has the other two
+                fcntl.ioctl(self._serial.fileno(), termios.TIOCEXCL)
+        telnet = self.path.startswith("rfc2217:")
+        self._wire = _Telnet(self._serial) if telnet else _Descriptor(self._serial.fileno())
 
     @property
     def baud(self) -> int:
         """Rate that the host side uses."""
         return int(self._serial.baudrate)
 
-    def fileno(self) -> int:
-        """Descriptor for select and poll."""
-        return int(self._serial.fileno())
-
     def read(self) -> bytes:
         """What has arrived, b"" if nothing; never waits. Raises PortLost."""
         try:
-            if not self._poll.poll(0):
+            if not self._wire.readable(0.0):
                 return b""
-            data = os.read(self.fileno(), READ_BYTES)
+            data = self._wire.read()
         except BlockingIOError:
             return b""
         except (OSError, serial.SerialException) as error:
@@ -124,7 +133,7 @@ class SerialPort:
         view, end_s = memoryview(data), time.monotonic() + timeout_s
         while view:
             try:
-                view = view[os.write(self.fileno(), view) :]
+                view = view[self._wire.write(view) :]
             except BlockingIOError:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0:
@@ -132,7 +141,7 @@ class SerialPort:
                         f"{self.path} took only {len(data) - len(view)} of {len(data)} bytes in "
                         f"{timeout_s:g} s"
                     ) from None
-                select.select([], [self.fileno()], [], left_s)
+                self._wire.wait_writable(left_s)
             except (OSError, serial.SerialException) as error:
                 raise PortLost(f"{self.path} is gone: {error}") from error
 
@@ -146,7 +155,11 @@ class SerialPort:
 
     def wait_readable(self, timeout_s: float) -> bool:
         """Whether bytes (or a hang-up) came within `timeout_s`."""
-        return bool(self._poll.poll(max(0.0, timeout_s) * 1000))
+        return self._wire.readable(timeout_s)
+
+    def has_bytes(self) -> bool:
+        """Whether bytes wait now; also while another thread is in `wait_readable`."""
+        return self._wire.has_bytes()
 
     def close(self) -> None:
         """Close; safe to call again and after the device is gone."""
@@ -165,6 +178,60 @@ class SerialPort:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class _Descriptor:
+    """Bytes straight through a descriptor: a terminal's or a socket's."""
+
+    def __init__(self, fileno: int) -> None:
+        self._fileno = fileno
+        self._poll = select.poll()
+        self._poll.register(fileno, select.POLLIN)
+
+    def readable(self, timeout_s: float) -> bool:
+        return bool(self._poll.poll(max(0.0, timeout_s) * 1000))
+
+    def has_bytes(self) -> bool:
+        poll = select.poll()  # one of its own: a thread may wait on the other
+        poll.register(self._fileno, select.POLLIN)
+        return bool(poll.poll(0))
+
+    def read(self) -> bytes:
+        return os.read(self._fileno, READ_BYTES)
+
+    def write(self, data: memoryview) -> int:
+        return os.write(self._fileno, data)
+
+    def wait_writable(self, timeout_s: float) -> None:
+        select.select([], [self._fileno], [], timeout_s)
+
+
+class _Telnet:
+    """Bytes that pyserial's thread takes out of the telnet protocol of RFC 2217."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        self._port = port
+
+    def readable(self, timeout_s: float) -> bool:
+        end_s = time.monotonic() + timeout_s
+        while not self.has_bytes():
+            if time.monotonic() >= end_s:
+                return False
+            time.sleep(_TELNET_POLL_S)
+        return True
+
+    def has_bytes(self) -> bool:
+        return bool(self._port.in_waiting)
+
+    def read(self) -> bytes:
+        return bytes(self._port.read(min(self._port.in_waiting, READ_BYTES)))
+
+    def write(self, data: memoryview) -> int:
+        self._port.write(bytes(data))
+        return len(data)
+
+    def wait_writable(self, timeout_s: float) -> None:
+        """Never asked: `write` takes all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +293,8 @@ def detect_baud(
     """
     preferred = {last_good: "the last good rate", configured: "the configured rate"}
     order = list(dict.fromkeys(rate for rate in (last_good, configured, *rates) if rate))
+    if spelled(path).startswith("socket:"):
+        del order[1:]  # the device server has the rate
     tried: list[RateHeard] = []
     with SerialPort(path, order[0]) as port:
         for attempt in (_listen, _query) if may_query else (_listen,):
@@ -238,6 +307,8 @@ def detect_baud(
                 if heard.messages:
                     how = "an answer came" if heard.answered else "heard"
                     reason = preferred.get(baud, "found by trying")
+                    if port.path.startswith("socket:"):
+                        return BaudFound(baud, f"{how} through a device server", tuple(tried))
                     return BaudFound(baud, f"{how} at {baud} baud, {reason}", tuple(tried))
     raise BaudNotFound(str(path), tuple(tried), may_query)
 
@@ -297,6 +368,36 @@ def _collect(port: SerialPort, listen_s: float, enough: Callable[[bytes], bool])
             if enough(chunk):
                 break
     return received
+
+
+def is_url(path: str | Path) -> bool:
+    """Whether it is a port of a device server."""
+    return bool(_URL.match(str(path)))
+
+
+def spelled(path: str | Path) -> str:
+    """The port as people write it: a URL that went through a Path has its slashes back."""
+    return _URL.sub(r"\1://", str(path))
+
+
+def _open_url(url: str, baud: int) -> serial.Serial:
+    if not _WHOLE_URL.match(url):
+        scheme = url.partition(":")[0]
+        raise PortUnusable(f"{url} names no port of a device server: expected {scheme}://HOST:PORT")
+    try:
+        port = serial.serial_for_url(url, baud, timeout=0)
+    except (OSError, ValueError) as error:  # serial.SerialException is an OSError
+        text = " ".join(str(error).split())
+        raise PortAbsent(
+            f"{url} does not answer: is the device server on, is it on this network? ({text})"
+        ) from error
+    connection = getattr(port, "_socket", None)
+    if connection is not None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for name, value in _KEEP_ALIVE.items():
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    return port
 
 
 def _refuse_if_held(path: str) -> None:

@@ -19,6 +19,7 @@ from drivers.serial_port import (
     PortForbidden,
     PortLost,
     SerialPort,
+    spelled,
 )
 from drivers.vn100.commands import Command
 from drivers.vn100.device import Device, Tap, reads_only
@@ -47,7 +48,7 @@ def open_port(path: Path, baud: int | None, *, may_query: bool) -> SerialPort:
     """The port at the given rate, or at the one that the device is heard at."""
     if baud is None:
         found = find_device(path, None, may_query=may_query)
-        click.echo(f"{path}: {found.why}", err=True)
+        click.echo(f"{spelled(path)}: {found.why}", err=True)
         baud = found.baud
     return SerialPort(path, baud)
 

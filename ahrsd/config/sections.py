@@ -39,7 +39,8 @@ class DeviceSection(Section):
     """The VN-100 and its port."""
 
     port: Path | None = None
-    """Serial port; best by its stable name in /dev/serial/by-id."""
+    """Serial port; best by its stable name in /dev/serial/by-id. Also one of a device server on the
+    network: socket://HOST:PORT (the server has the rate) or rfc2217://HOST:PORT."""
     serial_number: int | None = Field(default=None, ge=0, le=2**32 - 1)
     """Accept only the device with this serial number (register 3)."""
     baud: Baud = "auto"

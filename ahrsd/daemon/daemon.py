@@ -30,7 +30,7 @@ from ahrsd.daemon.serial_link import Bytes, Lost, SerialLink, find_device
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
 from ahrsd.viewer.sink import RerunSink
-from drivers.serial_port import PortError, PortLost
+from drivers.serial_port import PortError, PortLost, spelled
 from drivers.usb import latency_timer_ms
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
@@ -337,7 +337,7 @@ class Daemon:
         capture, viewer = self.shell.capture, self.shell.viewer
         counters = viewer.counters if isinstance(viewer, RerunSink) else None
         return LinkFacts(
-            port=str(self._link.path),
+            port=spelled(self._link.path),
             baud=self._link.baud,
             is_open=self._link.is_open,
             latency_timer_ms=self._latency_timer_ms,
@@ -358,7 +358,7 @@ class Daemon:
         self._watch.link_opened(time.monotonic())
         path, now = self._link.path, self.clock.now_ns()
         self._latency_timer_ms = latency_timer_ms(path)
-        self._feed(inputs.LinkOpened(now, str(path), self._link.baud, self._latency_timer_ms))
+        self._feed(inputs.LinkOpened(now, spelled(path), self._link.baud, self._latency_timer_ms))
 
     @property
     def _messages(self) -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 import queue
-import select
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -172,11 +171,7 @@ class SerialLink:
 
     def has_more(self) -> bool:
         """Whether bytes lie in the port that the thread has not come to read."""
-        if self._port is None:
-            return False
-        poll = select.poll()  # one of its own: the thread waits on the port's
-        poll.register(self._port.fileno(), select.POLLIN)
-        return bool(poll.poll(0))
+        return self._port is not None and self._port.has_bytes()
 
     def write(self, data: bytes) -> None:
         """Send; nothing where the port is closed. Raises PortLost."""

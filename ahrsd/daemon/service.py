@@ -36,7 +36,7 @@ from ahrsd.report.summary import summary_lines
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.sd_notify import Notifier
 from ahrsd.viewer.sink import RerunLimits, RerunSink
-from drivers.serial_port import BaudFound, PortError
+from drivers.serial_port import BaudFound, PortError, spelled
 
 log = logging.getLogger("ahrsd")
 
@@ -235,7 +235,7 @@ def run_daemon(
     except _Stopped as stopped:
         log.info("stopped (%s) before a device was found", stopped)
         return EXIT_DONE
-    log.info("%s: %s", port, found.why)
+    log.info("%s: %s", spelled(port), found.why)
     config = with_date(config)
     clock = HostClock()
     capture = new_capture_path(config.captures) if config.capture.enabled else None
