@@ -58,7 +58,7 @@ class ActionOutbox:
 
     @property
     def wall_s(self) -> float:
-        """The wall clock now, a label; the monotonic one where nobody told it."""
+        """The wall clock now, for people to read; the monotonic one while it is unknown."""
         return self.host_s + (self._wall_offset_s or 0.0)
 
     @property
@@ -107,16 +107,16 @@ class ActionOutbox:
                 self.history = self.history.with_record(kind, facts)
 
     def take(self) -> list[Action]:
-        """The actions so far."""
+        """The actions since the last call."""
         out, self._out = self._out, []
         return out
 
     def ask(self, action: Action) -> None:
-        """One action more."""
+        """Append an action."""
         self._out.append(action)
 
     def record(self, kind: RecordKind, **facts: object) -> None:
-        """Append to the journal, behind what it lacks; the history takes it as given."""
+        """Append a record behind those still missing on the disk; the history counts it at once."""
         self.journal_again()
         transaction = self.history.open
         complete = {
@@ -128,7 +128,7 @@ class ActionOutbox:
         self._append(kind, complete, before)
 
     def journaled(self, kind: RecordKind) -> bool:
-        """A record of this kind is on the disk; whether nothing is left that is not."""
+        """A record of this kind is on the disk; returns whether none is missing any more."""
         self._answered(kind)
         self.journal_again()
         return not self._unjournaled and not self._asked
@@ -153,11 +153,11 @@ class ActionOutbox:
 
     @property
     def journal_again_s(self) -> float | None:
-        """When the records that the disk did not take are asked for again."""
+        """When the records that the disk did not take are tried again."""
         return self._journal_again_s if self._unjournaled else None
 
     def journal_again(self) -> None:
-        """Ask for them now, in their order."""
+        """Try the missing records again, in their order."""
         waiting, self._unjournaled = self._unjournaled, []
         for kind, facts in waiting:
             self._append(kind, facts, self.history)
@@ -193,11 +193,11 @@ class ActionOutbox:
             self.ask(Emit(RegisterWritten(self.at_s, self.host_s, number, old, new, outcome)))
 
     def in_force(self, registers: Mapping[int, Values] | None) -> None:
-        """From now on the device applies these; None: nobody knows."""
+        """The device applies these registers from now on; None: unknown."""
         self.ask(InForce(None if registers is None else dict(registers)))
 
     def run(self, what: str, purpose: Purpose, make: Callable[[], Procedure[object]]) -> None:
-        """Begin a procedure; its commands pass the gate at the newest time that was told."""
+        """Start a procedure; the gate judges each command at the newest host time."""
         self._runs += 1
         self.running = f"{what} {self._runs}"
         self.ask(

@@ -34,8 +34,7 @@ from ahrsd.writeback.states import (
     State,
 )
 from ahrsd.writeback.transaction import ProcedureOutcome, Transaction, check, roll_back, save, stage
-from ahrsd.writeback.trial import Trial
-from ahrsd.writeback.trial import TrialVerdict as Verdict
+from ahrsd.writeback.trial import Trial, TrialVerdict
 from drivers.vn100.procedures import Identity, Unit
 from drivers.vn100.registers import Values, same
 
@@ -191,7 +190,7 @@ class Flow:
             self.signal_if(Signal.GATES_PASSED, "all gates are met")
 
     def signal_if(self, signal: Signal, reason: str) -> None:
-        """A signal that is nothing to speak of where the state has no use for it."""
+        """Signal where the state knows it; elsewhere do nothing, without a note."""
         if signal in TABLE[self.state]:
             self.signal(signal, reason)
 
@@ -252,7 +251,7 @@ class Flow:
             self.void(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
 
     def void(self, reason: str) -> None:
-        """What was calibrated before holds no more: what is not in flash yet never gets there."""
+        """The calibration holds no more: what is not saved yet never will be."""
         if self.state in WITHOUT_TRANSACTION:
             self.signal_if(Signal.GATES_FAILED, reason)
             return
@@ -260,17 +259,17 @@ class Flow:
         self.roll_back("void", reason)
 
     def prove_again(self, reason: str) -> None:
-        """What was proven was so before a doubt."""
+        """A doubt came after the proof: the registers must be proven again."""
         if self.state in LIVED_WITH:
             self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
             self.passed, self.proven_to_s = "", None
             self.safe.proof_waits = f"{reason}: what is in force is on trial again"
 
-    def judge_proof(self, finding: Verdict, reason: str) -> None:
+    def judge_proof(self, finding: TrialVerdict, reason: str) -> None:
         """What is proven goes on being judged until it is saved."""
-        if finding is Verdict.FAILED:
+        if finding is TrialVerdict.FAILED:
             self.roll_back("trial", reason)
-        elif finding is Verdict.PASSED:
+        elif finding is TrialVerdict.PASSED:
             self.safe.proof_waits = ""
 
     # -- locks -------------------------------------------------------------------------------------
@@ -298,7 +297,7 @@ class Flow:
         self.safe.stillness.reset()
 
     def _enter_rest(self, reason: str) -> None:
-        """Nothing under way. A transaction that never sent a write ends here."""
+        """Nothing is under way; a transaction that never sent a write ends here."""
         self.proposal, self.approver = None, ""
         if self.outbox.history.last is RecordKind.PREPARED:
             self.outbox.record(RecordKind.ABORTED, reason=reason)
@@ -411,7 +410,7 @@ class Flow:
         endings[self.state](outcome)
 
     def another(self, unit: Unit) -> None:
-        """Another device has the cable: nothing that was judged here is for it."""
+        """Another device has the cable: forget all that was judged of the first one."""
         wanted = "nobody knew" if self.identity is None else str(self.identity.unit)
         self.outbox.note(
             "error", f"another device answers: {unit}, not {wanted}; nothing is written"
@@ -419,13 +418,13 @@ class Flow:
         self.look_closer(f"another device answers: {unit}")
 
     def look_closer(self, reason: str) -> None:
-        """What the device is or holds is not what it ought to: identify it, read it, compare."""
+        """The device differs from what was expected: identify it, read it, compare."""
         self.outbox.in_force(None)
         self.outbox.ask(IdentifyAgain())
         self.signal(Signal.IN_DOUBT, reason)
 
     def expected(self, read: Mapping[int, Values]) -> dict[int, Values]:
-        """What these registers hold, as far as is known."""
+        """The values that these registers are known to hold."""
         return {n: self.registers[n] for n in read if n in self.registers}
 
     def changed(self, numbers: tuple[int, ...]) -> None:

@@ -43,7 +43,7 @@ class JournalRecord(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StoredRecord:
-    """A journal record as an input brings it."""
+    """A journal record out of `JournalOpened`."""
 
     kind: str
     facts: dict[str, Any]

@@ -117,7 +117,7 @@ class WriteBack:
 
     @property
     def idle(self) -> bool:
-        """Nothing of ours is under way; a daemon that stops may go."""
+        """Nothing is under way that must end before the daemon may stop."""
         return not self._outbox.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
 
     def holds(self) -> list[str]:
@@ -339,7 +339,7 @@ class WriteBack:
         return self._answer()
 
     def on_estimator_failed(self, host_s: float) -> list[Action]:
-        """There is no estimate, nor what the gates said of it: what rests on it ends."""
+        """The estimator failed: estimate and verdict are gone, and what rests on them ends."""
         self._outbox.host_s = host_s
         self._safe.gates = self._safe.flash_gates = ()
         self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the estimator failed")
@@ -347,7 +347,7 @@ class WriteBack:
         return self._answer()
 
     def on_limits_changed(self, host_s: float) -> list[Action]:
-        """The gates have other limits: what they said before allows nothing."""
+        """The gates have other limits: their earlier verdict allows nothing any more."""
         self._outbox.host_s = host_s
         self._safe.gates = self._safe.flash_gates = ()
         self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the limits of the gates were changed")

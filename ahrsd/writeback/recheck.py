@@ -22,21 +22,21 @@ class Recheck:
     unanswered: bool = False
 
     def begin(self, host_s: float) -> None:
-        """The device was read, or is being read."""
+        """Restart the interval: the device was read, or is being read."""
         self.asked_s, self.due_s = host_s, host_s + self.interval_s
         self.unanswered = False
 
     def off(self) -> None:
-        """Nobody is there to be asked."""
+        """Stop asking: no device is there."""
         self.due_s = None
 
     def soon(self, host_s: float) -> None:
-        """Something is doubtful, or there was no answer."""
+        """Ask again soon: something is doubtful, or nobody answered."""
         if self.due_s is not None:
             self.due_s = min(self.due_s, max(host_s, self.asked_s + LEAST_S))
 
     def now(self, host_s: float) -> None:
-        """Something waits for it."""
+        """Ask now: something waits for the answer."""
         if self.due_s is not None:
             self.due_s = host_s
 
