@@ -63,12 +63,12 @@ def open_device(
     """A device that may be sent what `allow` lets through; its errors come as DeviceError."""
     with (
         driver_errors(),
-        Device(open_port(path, baud, may_query=True), allow, tap, _tell) as device,
+        Device(open_port(path, baud, may_query=True), allow, tap, _print_line_remarks) as device,
     ):
         yield device
 
 
-def _tell(event: Event) -> None:
+def _print_line_remarks(event: Event) -> None:
     """What a person should know of the line."""
     if isinstance(event, LineEchoes):
         click.echo(f"ahrsd: {ECHOES}", err=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from ahrsd.cli.running import DaemonPlace, place_options, tell
+from ahrsd.cli.running import DaemonPlace, place_options, print_answer
 
 
 @click.command()
@@ -17,4 +17,4 @@ def command(place: DaemonPlace, json_path: str | None) -> None:
     """
     from ahrsd.telemetry.explain import explain_lines
 
-    tell(place, "explain", json_path, explain_lines)
+    print_answer(place, "explain", json_path, explain_lines)

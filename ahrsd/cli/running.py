@@ -104,7 +104,7 @@ def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def tell(
+def print_answer(
     place: DaemonPlace,
     what: str,
     json_path: str | None,

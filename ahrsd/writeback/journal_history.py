@@ -109,7 +109,7 @@ class JournalHistory:
                 return replace(now, broken=kind.value)
             begun = replace(now, open=transaction, last=kind, last_at=at, holds=None)
             return begun._with_values(facts)
-        return now._counted(kind, facts, at)._moved(kind, facts, at)
+        return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
 
     def knows(self, number: int, values: Values) -> bool:
         """Whether a record has these values of this register, as found or as meant."""
@@ -146,7 +146,9 @@ class JournalHistory:
             changes["rollback_at"] = at
         return replace(self, **changes)
 
-    def _moved(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
+    def _with_transaction_at(
+        self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp
+    ) -> JournalHistory:
         """Where the open transaction stands; a record of another one says nothing about it."""
         if self.open is None or facts.get("txn", self.open.id) != self.open.id:
             return self
