@@ -71,12 +71,15 @@ def estimated(
 def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
     """The noise scaled so that the whole track's normalised innovation becomes 1, not its pieces'.
 
-    Both levels together; sigma_mag alone where the gyro's is given or at its cap.
+    Both levels together; sigma_mag alone where the gyro's is given or at its cap, and neither where
+    sigma_mag would be below its floor: what is missing to 1 is the magnetometer's.
     """
     model, factor = filtered.model, float(np.sqrt(filtered.normalised_innovation))
     if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
         return model
-    mag = max(model.sigma_mag_gauss * factor, _FLOOR_MAG_GAUSS)
+    mag = model.sigma_mag_gauss * factor
+    if mag < _FLOOR_MAG_GAUSS:
+        return replace(model, sigma_mag_gauss=_FLOOR_MAG_GAUSS)
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
         differenced = spec.shaken_gyro_rad_s or noise_of(filtered.track)[1]
@@ -139,10 +142,11 @@ def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> Nu
     if given_mag:
         return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
     free = _by_ratio(track, base, differenced, below)
+    if free.sigma_mag_gauss < _FLOOR_MAG_GAUSS:
+        at_floor = replace(base, sigma_mag_gauss=_FLOOR_MAG_GAUSS)
+        return _gyro_alone(track, at_floor, differenced, below)
     if free.sigma_gyro_rad_s <= _cap(differenced):
-        gyro = max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S)
-        mag = max(free.sigma_mag_gauss, _FLOOR_MAG_GAUSS)
-        return replace(free, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
+        return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
     return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
 
 
@@ -152,8 +156,11 @@ def _prior(sigma_gyro: float, differenced: float, below: float) -> float:
 
 
 def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+    most = np.log(_cap(differenced) / _FLOOR_MAG_GAUSS)
+
     def scaled(level: float) -> tuple[NullModel, float]:
-        tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * float(np.exp(level)))
+        ratio = float(np.exp(min(level, most)))
+        tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * ratio)
         done = run_filter(track, tried, sensitive=False)
         scale = max(done.normalised_innovation, 1e-12)
         count = 3 * int(np.count_nonzero(done.used))

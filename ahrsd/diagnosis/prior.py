@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.diagnosis.coarse import noise_of
-from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.diagnosis.innovation import TRACELESS, Filtered, nuisance_columns, sensitivities
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -101,6 +101,25 @@ def sphere_centre(mag: Array) -> Array:
     weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
     gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
     return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
+
+
+def ellipsoid(mag: Array) -> tuple[Array, Array] | None:
+    """Soft iron of trace 3 and hard iron (gauss) of the ellipsoid through the readings (N, 3).
+
+    |m|^2 + q.(m^T T m) = 2 m.u + c with the traceless directions T of a quadric I + q.T, least
+    squares: exact where the magnetometer has no noise, drawn to nothing.  None where it is open.
+    """
+    middle = mag.mean(axis=0)
+    m = mag - middle
+    squares = np.einsum("ni,aij,nj->na", m, TRACELESS, m)
+    columns = np.column_stack([-squares, 2.0 * m, np.ones(len(m))])
+    found = np.linalg.lstsq(columns, np.sum(m**2, axis=1), rcond=None)[0]
+    quadric = np.eye(3) + np.einsum("a,aij->ij", found[:5], TRACELESS)
+    values, vectors = np.linalg.eigh(quadric)
+    if values[0] <= 0.0:
+        return None
+    A = (vectors / np.sqrt(values)) @ vectors.T
+    return A * 3.0 / np.trace(A), middle + np.linalg.solve(quadric, found[5:8])
 
 
 def repetition_of(done: Filtered) -> float:
