@@ -23,7 +23,6 @@ from ahrsd.diagnosis.diagnosis import Check
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.gains import Gains
 from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, run_filter, sensitivities
 from ahrsd.diagnosis.noise import before, colour_of, tails_of
 from ahrsd.diagnosis.probabilities import student_quantile
@@ -318,20 +317,10 @@ def _filtered(tracks: Sequence[Track], fit: NullFit) -> Array:
         None if part is None else np.tile(part, (count, 1))
         for part in (fit.terms_mag, fit.terms_gyro)
     )
-    held = _tiled(fit.filtered, count)
     blind = np.tile(np.isnan(fit.filtered.track.mag_b_gauss).any(axis=1), count)
     joined = _joined(tracks)
     joined.mag_b_gauss[blind] = np.nan
-    return run_filter(joined, fit.model, mag, gyro, held=held, sensitive=False).whitened
-
-
-def _tiled(done: Filtered, copies: int) -> Filtered:
-    """The gains of the recording's own run, as often as there are copies of its motion."""
-    found = done.gains
-    gains = Gains(
-        np.tile(found.gain, (copies, 1, 1)), np.tile(found.innovation_covariance, (copies, 1, 1))
-    )
-    return replace(done, nominal_b=np.tile(done.nominal_b, (copies, 1)), gains=gains)
+    return run_filter(joined, fit.model, mag, gyro, sensitive=False).whitened
 
 
 def _joined(tracks: Sequence[Track]) -> Track:

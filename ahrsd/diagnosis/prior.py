@@ -22,7 +22,8 @@ PRIOR.flags.writeable = False
 TURNED = 0.1
 _BLOCKS = 40  # in which the scores are summed
 _REPEATED = 3.0  # repetition from which the prior is made to count
-_AT_REST_RAD_S = 1e-3  # what the mean of a resting gyro may differ from its bias
+#: what the mean of a resting gyro may differ from its bias, where the field shows that it rests
+_AT_REST_RAD_S = 1e-3
 _SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
 
 
@@ -55,15 +56,25 @@ def prior_of(track: Track) -> Prior:
     deviation[:8] *= np.clip(turned(track.mag_b_gauss) / TURNED, 0.02, 1.0)
     rest = rate_at_rest(track)
     if rest is not None:
-        mean[8:], deviation[8:] = rest, _AT_REST_RAD_S
+        mean[8:] = rest.rate_rad_s
+        deviation[8:] = np.minimum(np.hypot(_AT_REST_RAD_S, rest.unseen_rad_s), PRIOR[8:])
     return Prior(mean, deviation)
 
 
-def rate_at_rest(track: Track) -> Array | None:
-    """Mean gyro reading (3,) over the still seconds, None where fewer than a fifth are still.
+@dataclass(frozen=True, slots=True, eq=False)
+class Rest:
+    """Still seconds: the gyro's mean reading (3,), and the rate that the field may hide there."""
+
+    rate_rad_s: Array
+    unseen_rad_s: float
+
+
+def rate_at_rest(track: Track) -> Rest | None:
+    """What the gyro reads in the still seconds, None where fewer than a fifth are still.
 
     Still: neither the readings' scatter within the second nor the magnetometer's mean against the
-    second before is more than their noise.
+    second before is more than their noise.  What turns slower than that is unseen in one second;
+    in all of them together it is what their steps have beyond the noise, and twice its deviation.
     """
     mag_noise, gyro_noise = noise_of(track)
     rows = max(8, round(1.0 / max(track.step_s, 1e-6)))
@@ -80,7 +91,13 @@ def rate_at_rest(track: Track) -> Array | None:
     )
     if np.count_nonzero(still) < 0.2 * len(still):
         return None
-    return np.asarray(np.median(gyro[still].mean(axis=1), axis=0))
+    steps = np.square(moved[still & np.isfinite(moved)])
+    by_noise = 6.0 * mag_noise**2 / rows
+    beyond = max(float(np.mean(steps)) - by_noise, 0.0)
+    unseen = beyond + 2.0 * by_noise * np.sqrt(2.0 / (3.0 * len(steps)))
+    rate = np.median(gyro[still].mean(axis=1), axis=0)
+    size_gauss = max(track.usual_gauss, 1e-12)
+    return Rest(np.asarray(rate), float(np.sqrt(unseen)) / (size_gauss * rows * track.step_s))
 
 
 def turned(mag: Array) -> float:
