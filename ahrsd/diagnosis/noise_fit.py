@@ -25,8 +25,10 @@ _WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
 _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
 #: where readings are too far apart to be compared with each other
 _USUAL_MAG_GAUSS = 1e-3
+#: below the magnetometer's, what the filter leaves out (it is linear) would be more than the noise
 _FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 _PIECES, _PIECE_ROWS = 6, 400
+_FINE = 0.1  # of a logarithm: where no common scale puts right by how much a coarse parabola is off
 SAME = 0.02  # relative change of a noise level that changes nothing
 
 
@@ -193,7 +195,8 @@ def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float
         tried = replace(model, sigma_gyro_rad_s=float(np.exp(level)))
         return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced, below)
 
-    best = float(np.exp(_highest(of_gyro, np.log(differenced))))
+    rough = _highest(of_gyro, np.log(differenced))
+    best = float(np.exp(_highest(of_gyro, rough, _FINE)))
     return replace(
         model, sigma_gyro_rad_s=float(np.clip(best, _FLOOR_GYRO_RAD_S, _cap(differenced)))
     )
@@ -224,9 +227,8 @@ def _likelihood(track: Track, model: NullModel) -> float:
     return float(np.sum(run_filter(track, model, sensitive=False).log_likelihood))
 
 
-def _highest(function: Callable[[float], float], start: float) -> float:
-    """Where a smooth function of one number is highest: climb in steps of 0.7, then a parabola."""
-    step = 0.7
+def _highest(function: Callable[[float], float], start: float, step: float = 0.7) -> float:
+    """Where a smooth function of one number is highest: climb in steps, then a parabola."""
     middle, value = start, function(start)
     left, right = function(start - step), function(start + step)
     for _ in range(12):

@@ -43,6 +43,7 @@ _LAGS = 50
 _LEAST = 1e-12
 _TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
 _ROUNDED = "mag_quantisation"
+_ACROSS = 2.0 / 3.0  # of an innovation's three parts are across the field
 _BEYOND = 2.0  # times what noise has in means over segments
 
 
@@ -92,11 +93,14 @@ def noise_law(
     for begin, end in loud:
         within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
     law = forward.noise_of(fit.model, done)
+    steps = [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]
+    of_gyro = 0.0 if steps else _of_gyro(fit, law, terms, library, quick=done is quick)
     level = np.ones(len(within))
     for rows in (within, ~within):
         if np.any(rows & done.used):
-            level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
-    if steps := [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]:
+            of_mag = float(np.mean(done.whitened[rows & done.used] ** 2)) - of_gyro
+            level[rows] = np.sqrt(max(of_mag, 0.0) / (1.0 - of_gyro))
+    if steps:
         truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
 
         def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
@@ -118,6 +122,24 @@ def noise_law(
     found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
     colour, louder = before(colour_of(done), found)
     return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
+
+
+def _of_gyro(
+    fit: NullFit,
+    law: Noise,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+    *,
+    quick: bool,
+) -> float:
+    """Mean square of whitened innovations that the gyro's noise alone makes, two thirds at most.
+
+    The rest is the magnetometer's: along the field the gyro moves nothing.
+    """
+    silent = replace(law, mag_gauss=0.0, colour=())
+    (made,) = _innovations(fit, silent, terms, library, 1, _TRIAL_SEED)
+    seen = _quick(fit, made).whitened if quick else made
+    return min(float(np.mean(seen[fit.filtered.used] ** 2)), _ACROSS)
 
 
 def usual_noise(
