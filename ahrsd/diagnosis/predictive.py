@@ -231,7 +231,8 @@ def _losing(track: Track, made: Track, seed: int) -> Track:
         return made
     lost = np.random.default_rng([seed, len(made)]).poisson(expected)
     short = track.step_share * (lost - expected)
-    return replace(made, gyro_b_rad_s=made.gyro_b_rad_s * (1.0 - short)[:, None])
+    gyro = made.gyro_b_rad_s * (1.0 - short)[:, None]
+    return replace(made, gyro_b_rad_s=gyro, lost_turns=expected, step_share=track.step_share)
 
 
 def _inside(value: float, band: tuple[float, float]) -> bool:
@@ -333,7 +334,11 @@ def statistics(e: Array, scene: Scene) -> dict[str, float]:
 
 
 def _filtered(tracks: Sequence[Track], fit: NullFit) -> Array:
-    """Whitened innovations of tracks of the fit's own length, its terms taken out as in its run."""
+    """Whitened innovations of tracks of the fit's own length, its terms taken out as in its run.
+
+    Each has gains and nominal field of its own, as the recording has: by another field's direction
+    a loud gyro's noise would be laid to the field's size.
+    """
     count = len(tracks)
     mag, gyro = (
         None if part is None else np.tile(part, (count, 1))
@@ -350,6 +355,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
     first = tracks[0]
     length = first.duration_s + 10.0
     dt_s = np.concatenate([track.dt_s for track in tracks])
+    lost = [track.lost_turns for track in tracks if track.lost_turns is not None]
     return replace(
         first,
         time_s=np.concatenate([track.time_s + k * length for k, track in enumerate(tracks)]),
@@ -359,6 +365,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
         accel_b_m_s2=None,
         covariates={},
         runs=tuple(series.runs(dt_s)),
+        lost_turns=np.concatenate(lost) if lost else None,
     )
 
 
