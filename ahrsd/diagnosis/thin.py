@@ -27,7 +27,7 @@ from ahrsd.samples import Array
 #: turns, root mean square
 WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
 #: field that the gyro's noise of m samples turns up over the magnetometer's noise, at most; of the
-#: variance of an innovation neighbours share a hundredth there
+#: variance of an innovation neighbours share some three hundredths there
 CARRIED = 0.5
 
 
