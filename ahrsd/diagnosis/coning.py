@@ -15,6 +15,7 @@ import numpy as np
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.innovation import nuisance_columns, sensitivities
 from ahrsd.diagnosis.null import fit_null, unusable
+from ahrsd.diagnosis.shaken import carrying
 from ahrsd.diagnosis.thin import thinned, working_factor
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns, NullModel
@@ -67,7 +68,7 @@ def _part(track: Track, mended: Track, model: NullModel) -> tuple[float, float]:
 
     Beside the calibration and what a large error of the gyro's axes, scale or time would be.
     """
-    m = working_factor(track)
+    m = working_factor(track, carrying(track, model))
     work, other = thinned(track, m, model), thinned(mended, m, model)
     if unusable(work):
         return 0.0, np.inf

@@ -16,6 +16,10 @@ a second, the columns of a lag were the gyro's own noise: a lag of 15 nats in no
 Fields in regressors: one that is smoothed both ways has a part of the reading's own noise in it,
 more of it the poorer the gyro is.  A soft iron of 1.6 made of that explained a quarter of white
 innovations (e1e7b859 of `ring600c`).  What is foretold from the readings before has none.
+
+Changes of the field in regressors (a lag's, a low-pass's) are of a field that is smooth in the
+frame that the smoothed rates carry along, over as much time as these.  In the frame of a loud gyro
+the changes were its noise or the readings' own: a low-pass of 1800 nats in nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from ahrsd.diagnosis.innovation import Bearings, Filtered
+from ahrsd.diagnosis.innovation import Bearings, Filtered, carried_along
 from ahrsd.diagnosis.recursive import both_ways, gaussian
 from ahrsd.diagnosis.specific_force import without_noise
 from ahrsd.diagnosis.track import Track
@@ -38,6 +42,7 @@ from ahrsd.samples import Array
 
 DRIFT_S = 20.0
 SINK = 4.0
+_NARROWEST = 0.3  # samples: what is narrower changes nothing
 #: chance with which noise alone may stand above the floor at one frequency
 BY_CHANCE = 1e-5
 _SLOWEST_HZ = 0.5  # by segments of four seconds, no motion is told to be slower
@@ -74,13 +79,15 @@ def build_context(track: Track, fit: Fit) -> Context:
     runs = track.runs or (slice(0, len(track)),)
     smooth = smoothed_rate(rate, runs, track.step_s, done.model.sigma_gyro_rad_s)
     R_nb, levelled = attitude(track, done)
+    width = _width(rate, runs, track.step_s, done.model.sigma_gyro_rad_s)
+    smooth_b = smoothed_field(track, done.nominal_b, smooth, width)
     return Context(
         track=track,
         model=done.model,
         field_b=_foretold(done),
-        smooth_b=done.nominal_b,
+        smooth_b=smooth_b,
         rate_b_rad_s=smooth,
-        field_dot_b=np.cross(done.nominal_b, _at_the_sample(smooth, runs)),
+        field_dot_b=np.cross(smooth_b, _at_the_sample(smooth, runs)),
         R_nb=R_nb,
         world_levelled=levelled,
         force_b_m_s2=_force(track),
@@ -107,14 +114,30 @@ def smoothed_rate(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float)
     An axis whose rate is the same all along but for the gyro's noise keeps its mean: columns made
     of the noise would be held against what that very noise did to the field.
     """
-    width = 1.0 / (2 * np.pi * bandwidth_hz(rate, runs, dt_s, sigma) * dt_s)
+    width = _width(rate, runs, dt_s, sigma)
     out = rate.copy()
-    if width >= 0.3:
+    if width >= _NARROWEST:
         for run in runs:
             out[run] = _low_passed(rate[run], width)
     still = ~_changes(rate, runs, dt_s, sigma)
     out[:, still] = rate[:, still].mean(axis=0)
     return out
+
+
+def smoothed_field(track: Track, field_b: Array, smooth_rad_s: Array, width: float) -> Array:
+    """(N, 3) a field low-passed in the frame that smoothed rates (N, 3) carry along."""
+    if width < _NARROWEST:
+        return field_b
+    U = carried_along(track, smooth_rad_s)
+    carried = np.einsum("nij,nj->ni", U, field_b)
+    for run in track.runs or (slice(0, len(track)),):
+        carried[run] = _low_passed(carried[run], width)
+    return np.asarray(np.einsum("nji,nj->ni", U, carried))
+
+
+def _width(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> float:
+    """Samples of the Gaussian that passes the recording's own motion."""
+    return float(1.0 / (2 * np.pi * bandwidth_hz(rate, runs, dt_s, sigma) * dt_s))
 
 
 def _changes(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> NDArray[np.bool]:

@@ -98,7 +98,7 @@ def bearings(
     """The same as `run_filter` has with these arguments, for a tenth of the time."""
     motion = _motion(track, model, terms_gyro)
     layout, opens = _laid_out(track)
-    orientation = _orientation(layout, motion, opens)
+    orientation = _orientation(layout, motion.turn, opens)
     field = _readings(track, model, terms_mag)
     return Bearings(model, _nominal(field, orientation, layout, model, motion.dt_s), orientation)
 
@@ -122,7 +122,7 @@ def run_filter(
     """
     field, motion = _readings(track, model, terms_mag), _motion(track, model, terms_gyro)
     layout, opens = _laid_out(track)
-    blind, orientation = ~_complete(field), _orientation(layout, motion, opens)
+    blind, orientation = ~_complete(field), _orientation(layout, motion.turn, opens)
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
         linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
@@ -225,9 +225,16 @@ def _motion(track: Track, model: NullModel, terms: Array | None) -> _Motion:
     return _Motion(dt, turn, left * dt[:, None, None], off)
 
 
-def _orientation(layout: Layout, motion: _Motion, opens: NDArray[np.bool]) -> Array:
+def carried_along(track: Track, rate_b_rad_s: Array) -> Array:
+    """(N, 3, 3) body to the frame that these rates carry along, I at each run's first row."""
+    turn = so3.exp(-rate_b_rad_s * np.nan_to_num(track.dt_s, nan=0.0)[:, None])
+    layout, opens = _laid_out(track)
+    return _orientation(layout, turn, opens)
+
+
+def _orientation(layout: Layout, turn: Array, opens: NDArray[np.bool]) -> Array:
     """(N, 3, 3) body to the frame that the gyro carries along: all turns since a run began."""
-    turned = np.where(opens[:, None, None], np.eye(3), motion.turn)
+    turned = np.where(opens[:, None, None], np.eye(3), turn)
     before, total = products_before(layout, turned)
     start = np.empty_like(total)
     R = np.eye(3)

@@ -25,8 +25,10 @@ _WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
 _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
 #: where readings are too far apart to be compared with each other
 _USUAL_MAG_GAUSS = 1e-3
+#: below the magnetometer's, what the filter leaves out (it is linear) would be more than the noise
 _FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 _PIECES, _PIECE_ROWS = 6, 400
+_FINE = 0.1  # of a logarithm: where no common scale puts right by how much a coarse parabola is off
 SAME = 0.02  # relative change of a noise level that changes nothing
 
 
@@ -71,12 +73,15 @@ def estimated(
 def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
     """The noise scaled so that the whole track's normalised innovation becomes 1, not its pieces'.
 
-    Both levels together; sigma_mag alone where the gyro's is given or at its cap.
+    Both levels together; sigma_mag alone where the gyro's is given or at its cap, and neither where
+    sigma_mag would be below its floor: what is missing to 1 is the magnetometer's.
     """
     model, factor = filtered.model, float(np.sqrt(filtered.normalised_innovation))
     if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
         return model
-    mag = max(model.sigma_mag_gauss * factor, _FLOOR_MAG_GAUSS)
+    mag = model.sigma_mag_gauss * factor
+    if mag < _FLOOR_MAG_GAUSS:
+        return replace(model, sigma_mag_gauss=_FLOOR_MAG_GAUSS)
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
         differenced = spec.shaken_gyro_rad_s or noise_of(filtered.track)[1]
@@ -139,10 +144,11 @@ def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> Nu
     if given_mag:
         return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
     free = _by_ratio(track, base, differenced, below)
+    if free.sigma_mag_gauss < _FLOOR_MAG_GAUSS:
+        at_floor = replace(base, sigma_mag_gauss=_FLOOR_MAG_GAUSS)
+        return _gyro_alone(track, at_floor, differenced, below)
     if free.sigma_gyro_rad_s <= _cap(differenced):
-        gyro = max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S)
-        mag = max(free.sigma_mag_gauss, _FLOOR_MAG_GAUSS)
-        return replace(free, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
+        return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
     return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
 
 
@@ -152,8 +158,11 @@ def _prior(sigma_gyro: float, differenced: float, below: float) -> float:
 
 
 def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+    most = np.log(_cap(differenced) / _FLOOR_MAG_GAUSS)
+
     def scaled(level: float) -> tuple[NullModel, float]:
-        tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * float(np.exp(level)))
+        ratio = float(np.exp(min(level, most)))
+        tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * ratio)
         done = run_filter(track, tried, sensitive=False)
         scale = max(done.normalised_innovation, 1e-12)
         count = 3 * int(np.count_nonzero(done.used))
@@ -186,7 +195,8 @@ def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float
         tried = replace(model, sigma_gyro_rad_s=float(np.exp(level)))
         return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced, below)
 
-    best = float(np.exp(_highest(of_gyro, np.log(differenced))))
+    rough = _highest(of_gyro, np.log(differenced))
+    best = float(np.exp(_highest(of_gyro, rough, _FINE)))
     return replace(
         model, sigma_gyro_rad_s=float(np.clip(best, _FLOOR_GYRO_RAD_S, _cap(differenced)))
     )
@@ -217,9 +227,8 @@ def _likelihood(track: Track, model: NullModel) -> float:
     return float(np.sum(run_filter(track, model, sensitive=False).log_likelihood))
 
 
-def _highest(function: Callable[[float], float], start: float) -> float:
-    """Where a smooth function of one number is highest: climb in steps of 0.7, then a parabola."""
-    step = 0.7
+def _highest(function: Callable[[float], float], start: float, step: float = 0.7) -> float:
+    """Where a smooth function of one number is highest: climb in steps, then a parabola."""
     middle, value = start, function(start)
     left, right = function(start - step), function(start + step)
     for _ in range(12):

@@ -2,7 +2,10 @@
 
 `descent` finds the lowest cost from where it is set down.  The cold start descends on a thinned
 track (`coarse`) from two starts, a sphere and a linear fit with the gyro, with the gyro's noise
-inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.
+inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.  Where that noise
+turns up more field than the magnetometer's own, the size of the field says where the iron is, by a
+valley too narrow to be followed in straight steps: there it begins at the ellipsoid of the
+readings, as it is.
 
 A Gaussian prior (`prior`) keeps what the motion does not show.
 
@@ -23,11 +26,20 @@ from ahrsd.diagnosis import noise_fit
 from ahrsd.diagnosis.coarse import group_size, thinned
 from ahrsd.diagnosis.descent import FitProblem, FittedTerm, NullFit, descended
 from ahrsd.diagnosis.innovation import run_filter
-from ahrsd.diagnosis.prior import TURNED, prior_of, repetition_of, sphere_centre, turned
+from ahrsd.diagnosis.prior import (
+    TURNED,
+    ellipsoid,
+    prior_of,
+    repetition_of,
+    sphere_centre,
+    turned,
+)
+from ahrsd.diagnosis.thin import turned_up
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.estimator import chain
 from ahrsd.estimator.start import linear_start
+from ahrsd.samples import Array
 
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _FEWEST = 15  # steps that a fit needs
@@ -105,19 +117,35 @@ def cold_start(track: Track, spec: Spec) -> NullModel:
     quiet = first.sigma_gyro_rad_s / np.sqrt(size)
     problem = FitProblem(coarse, (), prior_of(track))
     best: NullFit | None = None
-    for model in _starts(coarse, replace(first, gyro_bias_rad_s=problem.prior.mean[8:])):
+    base = replace(first, gyro_bias_rad_s=problem.prior.mean[8:])
+    by_size = _by_size(coarse, replace(base, sigma_gyro_rad_s=quiet))
+    if by_size is not None:
+        best = descended(problem, by_size, _STEPS)
+        if best.filtered.normalised_innovation < _GOOD:
+            return _of_noise(best.model, first)
+    for model in _starts(coarse, base):
         fit = _loosely(problem, model, quiet)
         agreed = best is not None and abs(fit.cost - best.cost) < _WORTH
         if best is None or fit.cost < best.cost - _WORTH:
             best = fit
         if agreed or fit.filtered.normalised_innovation < _GOOD:
             break
-    found = first if best is None else best.model
-    return replace(
-        found,
-        sigma_mag_gauss=first.sigma_mag_gauss,
-        sigma_gyro_rad_s=first.sigma_gyro_rad_s,
-    )
+    return _of_noise(first if best is None else best.model, first)
+
+
+def _of_noise(model: NullModel, like: NullModel) -> NullModel:
+    """A model with the noise of another one."""
+    mag, gyro = like.sigma_mag_gauss, like.sigma_gyro_rad_s
+    return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
+
+
+def _by_size(track: Track, base: NullModel) -> NullModel | None:
+    """Where the field's size says more than its turns do, the iron that keeps it constant."""
+    mag = track.mag_b_gauss[np.isfinite(track.mag_b_gauss).all(axis=1)]
+    found = ellipsoid(mag) if turned_up(track, base) > 1.0 else None
+    if found is None or not _believable(*found):
+        return None
+    return replace(base, soft_iron=found[0], hard_iron_gauss=found[1])
 
 
 def _loosely(problem: FitProblem, model: NullModel, quiet: float) -> NullFit:
@@ -137,12 +165,17 @@ def _starts(track: Track, base: NullModel) -> list[NullModel]:
     out.append(base)
     well = turned(mag) > TURNED and seen.all()
     linear = linear_start(_epochs(track)) if well else None
-    if linear is not None and np.linalg.norm(linear[6:]) < _FARTHEST_GAUSS:
+    if linear is not None:
         A = chain.symmetric(linear[:6])
         A = A * 3 / np.trace(A)
-        if np.linalg.norm(A - np.eye(3)) < 1.0:
+        if _believable(A, linear[6:]):
             out.append(replace(base, soft_iron=A, hard_iron_gauss=linear[6:]))
     return out
+
+
+def _believable(soft_iron: Array, hard_iron_gauss: Array) -> bool:
+    near = np.linalg.norm(hard_iron_gauss) < _FARTHEST_GAUSS
+    return bool(near and np.linalg.norm(soft_iron - np.eye(3)) < 1.0)
 
 
 def _epochs(track: Track) -> list[chain.EpochData]:

@@ -23,7 +23,6 @@ from ahrsd.diagnosis.diagnosis import Check
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.gains import Gains
 from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, run_filter, sensitivities
 from ahrsd.diagnosis.noise import before, colour_of, tails_of
 from ahrsd.diagnosis.probabilities import student_quantile
@@ -44,6 +43,7 @@ _LAGS = 50
 _LEAST = 1e-12
 _TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
 _ROUNDED = "mag_quantisation"
+_ACROSS = 2.0 / 3.0  # of an innovation's three parts are across the field
 _BEYOND = 2.0  # times what noise has in means over segments
 
 
@@ -93,11 +93,14 @@ def noise_law(
     for begin, end in loud:
         within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
     law = forward.noise_of(fit.model, done)
+    steps = [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]
+    of_gyro = 0.0 if steps else _of_gyro(fit, law, terms, library, quick=done is quick)
     level = np.ones(len(within))
     for rows in (within, ~within):
         if np.any(rows & done.used):
-            level[rows] = np.sqrt(np.mean(done.whitened[rows & done.used] ** 2))
-    if steps := [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]:
+            of_mag = float(np.mean(done.whitened[rows & done.used] ** 2)) - of_gyro
+            level[rows] = np.sqrt(max(of_mag, 0.0) / (1.0 - of_gyro))
+    if steps:
         truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
 
         def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
@@ -119,6 +122,24 @@ def noise_law(
     found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
     colour, louder = before(colour_of(done), found)
     return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
+
+
+def _of_gyro(
+    fit: NullFit,
+    law: Noise,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+    *,
+    quick: bool,
+) -> float:
+    """Mean square of whitened innovations that the gyro's noise alone makes, two thirds at most.
+
+    The rest is the magnetometer's: along the field the gyro moves nothing.
+    """
+    silent = replace(law, mag_gauss=0.0, colour=())
+    (made,) = _innovations(fit, silent, terms, library, 1, _TRIAL_SEED)
+    seen = _quick(fit, made).whitened if quick else made
+    return min(float(np.mean(seen[fit.filtered.used] ** 2)), _ACROSS)
 
 
 def usual_noise(
@@ -210,7 +231,8 @@ def _losing(track: Track, made: Track, seed: int) -> Track:
         return made
     lost = np.random.default_rng([seed, len(made)]).poisson(expected)
     short = track.step_share * (lost - expected)
-    return replace(made, gyro_b_rad_s=made.gyro_b_rad_s * (1.0 - short)[:, None])
+    gyro = made.gyro_b_rad_s * (1.0 - short)[:, None]
+    return replace(made, gyro_b_rad_s=gyro, lost_turns=expected, step_share=track.step_share)
 
 
 def _inside(value: float, band: tuple[float, float]) -> bool:
@@ -312,26 +334,20 @@ def statistics(e: Array, scene: Scene) -> dict[str, float]:
 
 
 def _filtered(tracks: Sequence[Track], fit: NullFit) -> Array:
-    """Whitened innovations of tracks of the fit's own length, its terms taken out as in its run."""
+    """Whitened innovations of tracks of the fit's own length, its terms taken out as in its run.
+
+    Each has gains and nominal field of its own, as the recording has: by another field's direction
+    a loud gyro's noise would be laid to the field's size.
+    """
     count = len(tracks)
     mag, gyro = (
         None if part is None else np.tile(part, (count, 1))
         for part in (fit.terms_mag, fit.terms_gyro)
     )
-    held = _tiled(fit.filtered, count)
     blind = np.tile(np.isnan(fit.filtered.track.mag_b_gauss).any(axis=1), count)
     joined = _joined(tracks)
     joined.mag_b_gauss[blind] = np.nan
-    return run_filter(joined, fit.model, mag, gyro, held=held, sensitive=False).whitened
-
-
-def _tiled(done: Filtered, copies: int) -> Filtered:
-    """The gains of the recording's own run, as often as there are copies of its motion."""
-    found = done.gains
-    gains = Gains(
-        np.tile(found.gain, (copies, 1, 1)), np.tile(found.innovation_covariance, (copies, 1, 1))
-    )
-    return replace(done, nominal_b=np.tile(done.nominal_b, (copies, 1)), gains=gains)
+    return run_filter(joined, fit.model, mag, gyro, sensitive=False).whitened
 
 
 def _joined(tracks: Sequence[Track]) -> Track:
@@ -339,6 +355,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
     first = tracks[0]
     length = first.duration_s + 10.0
     dt_s = np.concatenate([track.dt_s for track in tracks])
+    lost = [track.lost_turns for track in tracks if track.lost_turns is not None]
     return replace(
         first,
         time_s=np.concatenate([track.time_s + k * length for k, track in enumerate(tracks)]),
@@ -348,6 +365,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
         accel_b_m_s2=None,
         covariates={},
         runs=tuple(series.runs(dt_s)),
+        lost_turns=np.concatenate(lost) if lost else None,
     )
 
 

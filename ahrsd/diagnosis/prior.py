@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.diagnosis.coarse import noise_of
-from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.diagnosis.innovation import TRACELESS, Filtered, nuisance_columns, sensitivities
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -22,7 +22,8 @@ PRIOR.flags.writeable = False
 TURNED = 0.1
 _BLOCKS = 40  # in which the scores are summed
 _REPEATED = 3.0  # repetition from which the prior is made to count
-_AT_REST_RAD_S = 1e-3  # what the mean of a resting gyro may differ from its bias
+#: what the mean of a resting gyro may differ from its bias, where the field shows that it rests
+_AT_REST_RAD_S = 1e-3
 _SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
 
 
@@ -55,15 +56,25 @@ def prior_of(track: Track) -> Prior:
     deviation[:8] *= np.clip(turned(track.mag_b_gauss) / TURNED, 0.02, 1.0)
     rest = rate_at_rest(track)
     if rest is not None:
-        mean[8:], deviation[8:] = rest, _AT_REST_RAD_S
+        mean[8:] = rest.rate_rad_s
+        deviation[8:] = np.minimum(np.hypot(_AT_REST_RAD_S, rest.unseen_rad_s), PRIOR[8:])
     return Prior(mean, deviation)
 
 
-def rate_at_rest(track: Track) -> Array | None:
-    """Mean gyro reading (3,) over the still seconds, None where fewer than a fifth are still.
+@dataclass(frozen=True, slots=True, eq=False)
+class Rest:
+    """Still seconds: the gyro's mean reading (3,), and the rate that the field may hide there."""
+
+    rate_rad_s: Array
+    unseen_rad_s: float
+
+
+def rate_at_rest(track: Track) -> Rest | None:
+    """What the gyro reads in the still seconds, None where fewer than a fifth are still.
 
     Still: neither the readings' scatter within the second nor the magnetometer's mean against the
-    second before is more than their noise.
+    second before is more than their noise.  What turns slower than that is unseen in one second;
+    in all of them together it is what their steps have beyond the noise, and twice its deviation.
     """
     mag_noise, gyro_noise = noise_of(track)
     rows = max(8, round(1.0 / max(track.step_s, 1e-6)))
@@ -80,7 +91,13 @@ def rate_at_rest(track: Track) -> Array | None:
     )
     if np.count_nonzero(still) < 0.2 * len(still):
         return None
-    return np.asarray(np.median(gyro[still].mean(axis=1), axis=0))
+    steps = np.square(moved[still & np.isfinite(moved)])
+    by_noise = 6.0 * mag_noise**2 / rows
+    beyond = max(float(np.mean(steps)) - by_noise, 0.0)
+    unseen = beyond + 2.0 * by_noise * np.sqrt(2.0 / (3.0 * len(steps)))
+    rate = np.median(gyro[still].mean(axis=1), axis=0)
+    size_gauss = max(track.usual_gauss, 1e-12)
+    return Rest(np.asarray(rate), float(np.sqrt(unseen)) / (size_gauss * rows * track.step_s))
 
 
 def turned(mag: Array) -> float:
@@ -101,6 +118,25 @@ def sphere_centre(mag: Array) -> Array:
     weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
     gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
     return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
+
+
+def ellipsoid(mag: Array) -> tuple[Array, Array] | None:
+    """Soft iron of trace 3 and hard iron (gauss) of the ellipsoid through the readings (N, 3).
+
+    |m|^2 + q.(m^T T m) = 2 m.u + c with the traceless directions T of a quadric I + q.T, least
+    squares: exact where the magnetometer has no noise, drawn to nothing.  None where it is open.
+    """
+    middle = mag.mean(axis=0)
+    m = mag - middle
+    squares = np.einsum("ni,aij,nj->na", m, TRACELESS, m)
+    columns = np.column_stack([-squares, 2.0 * m, np.ones(len(m))])
+    found = np.linalg.lstsq(columns, np.sum(m**2, axis=1), rcond=None)[0]
+    quadric = np.eye(3) + np.einsum("a,aij->ij", found[:5], TRACELESS)
+    values, vectors = np.linalg.eigh(quadric)
+    if values[0] <= 0.0:
+        return None
+    A = (vectors / np.sqrt(values)) @ vectors.T
+    return A * 3.0 / np.trace(A), middle + np.linalg.solve(quadric, found[5:8])
 
 
 def repetition_of(done: Filtered) -> float:

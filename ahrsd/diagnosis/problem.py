@@ -12,7 +12,7 @@ from ahrsd.diagnosis.delay import delayed_gyro
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.null import cold_start
-from ahrsd.diagnosis.shaken import quieter
+from ahrsd.diagnosis.shaken import carrying, quieter
 from ahrsd.diagnosis.thin import thinned, working_factor
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import NullModel
@@ -81,7 +81,7 @@ def problem_of(
     told = with_delta_angles(track, cold)
     notes = () if told is track else (MEAN_RATES,)
     track = told
-    m = working_factor(track)
+    m = working_factor(track, carrying(track, cold))
     work = thinned(track, m, cold)
     averaged = _readings(track) / max(_readings(work), 1)
     start = replace(

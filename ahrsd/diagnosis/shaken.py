@@ -55,6 +55,12 @@ def quieter(
     return (known, model) if found else None
 
 
+def carrying(track: Track, model: NullModel) -> NullModel:
+    """The model by whose noise readings are averaged: a shaken gyro's is not known, and taken for
+    none."""
+    return replace(model, sigma_gyro_rad_s=0.0) if shaken(track) else model
+
+
 def shaken(track: Track) -> bool:
     """Whether what the gyro's differences are is the motion's for the most part, not noise.
 

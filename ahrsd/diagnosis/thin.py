@@ -1,7 +1,9 @@
 """A track at a lower rate with next to all of its information.
 
 Every m samples become one: readings carried to the middle sample by the gyro and averaged there,
-the gyro's turns from middle to middle multiplied.  Noise stays white.  Carried needs a calibration,
+the gyro's turns from middle to middle multiplied.  Noise stays white as long as what the gyro's
+noise turns a group by is little beside the magnetometer's noise: carried and multiplied, the same
+noise is in the mean and in the turns on both sides of it.  Carried needs a calibration,
 h = C (m - b), turned, m = A h + b; one near the truth will do, since a group turns by a few degrees
 only.
 
@@ -24,6 +26,9 @@ from ahrsd.samples import Array
 #: rows per second that a search works with, and what is enough where a group of samples hardly
 #: turns, root mean square
 WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
+#: field that the gyro's noise of m samples turns up over the magnetometer's noise, at most; of the
+#: variance of an innovation neighbours share some three hundredths there
+CARRIED = 0.5
 
 
 def thin_factor(track: Track, wanted_hz: float) -> int:
@@ -33,12 +38,23 @@ def thin_factor(track: Track, wanted_hz: float) -> int:
     return max(1, int(rate_hz / wanted_hz))
 
 
-def working_factor(track: Track) -> int:
-    """The largest m for which a group hardly turns, or that leaves WORKING_HZ."""
+def working_factor(track: Track, model: NullModel) -> int:
+    """The largest m for which a group hardly turns, or that leaves WORKING_HZ, and stays white.
+
+    model: the noise of a sample
+    """
     least, most = (thin_factor(track, hz) for hz in (WORKING_HZ, SLOWEST_HZ))
     step = np.linalg.norm(track.gyro_b_rad_s, axis=1) * np.nan_to_num(track.dt_s)
     turn_rad = float(np.sqrt(np.mean(step**2)))
-    return next((m for m in range(most, least, -1) if m * turn_rad < GROUP_TURN_RAD), least)
+    found = next((m for m in range(most, least, -1) if m * turn_rad < GROUP_TURN_RAD), least)
+    white = CARRIED / max(turned_up(track, model), CARRIED / found)
+    return max(1, int(white + 1e-9))
+
+
+def turned_up(track: Track, model: NullModel) -> float:
+    """The field that the gyro's noise of one step turns up, over the magnetometer's noise."""
+    turned_gauss = model.sigma_gyro_rad_s * track.step_s * track.usual_gauss
+    return turned_gauss / model.sigma_mag_gauss
 
 
 def thinned(track: Track, m: int, model: NullModel, riding: Array | None = None) -> Track:

@@ -12,6 +12,7 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Heldout, Unexplained, Where, Whiteness
 from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.unknown import borne_out
 from ahrsd.simulation import Experiment
@@ -54,6 +55,28 @@ def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
     with_it = diagnose(_with_reference(_made(kind)))
     _agrees(with_it)
     assert with_it.to_json() == diagnose(track_of(_made(kind))).to_json()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        ("wam", "slow", 0, 5e-2, 5e-2),
+        ("wam", "slow", 3, 5e-2, 5e-2),
+        ("mam", "slow", 0, 5e-2, 5e-2),
+        ("wam", "slow", 0, 0.0, 5e-3),
+        ("mam", "rov", 1, 0.0, 5e-3),
+        ("wam", "slow", 0, 1e-4, 5e-2),
+        ("wam", "slow", 3, 1e-4, 5e-2),
+        ("mam", "rov", 1, 1e-4, 5e-2),
+    ],
+)
+def test_noise_far_from_the_usual_is_no_mismatch(
+    kind: tuple[str, str, int, float, float],
+) -> None:
+    """Fifty times the noise, a magnetometer without any, a gyro ten times as loud as that."""
+    found = diagnose(_with_reference(_made(kind)))
+    _agrees(found)
+    assert failed_checks(found) == []
 
 
 def _turned(track: Track) -> Track:

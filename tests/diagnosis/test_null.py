@@ -50,6 +50,39 @@ def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: fl
     assert 1e-3 < stats.chi2.sf(sum(squares), 22) < 1 - 1e-3
 
 
+@pytest.mark.parametrize("scenario", ["wam", "mam", "lam"])
+def test_a_gyro_louder_than_the_magnetometer_still_leads_to_the_iron(scenario: str) -> None:
+    """The field's size alone says where it is; straight steps from a sphere ended 0.1 away."""
+    made = experiment(
+        scenario, motion="slow", seed=0, samples=8000, sigma_mag=1e-4, sigma_gyro=0.05
+    )
+    fit = fit_null(track_of(made))
+    off = _difference(fit, true_model(made))
+    assert np.abs(off[:8]).max() < (0.01 if scenario == "lam" else 3e-4)
+    assert abs(fit.model.sigma_mag_gauss / 1e-4 - 1) < 0.06
+    assert abs(fit.model.sigma_gyro_rad_s / 0.05 - 1) < 0.03
+
+
+def test_a_magnetometer_without_noise_leaves_the_gyro_its_own() -> None:
+    """At its floor the magnetometer's noise is not the gyro's to make good."""
+    made = experiment("wam", motion="slow", seed=0, samples=6000, sigma_mag=0.0, sigma_gyro=5e-3)
+    fit = fit_null(track_of(made))
+    assert fit.model.sigma_mag_gauss == 2e-5
+    assert abs(fit.model.sigma_gyro_rad_s / 5e-3 - 1) < 0.05
+
+
+def test_slow_turns_in_loud_noise_are_no_rest() -> None:
+    """A step of the field that 0.05 gauss hides, from second to second, is no proof of a rest."""
+    made = experiment("wam", motion="slow", seed=3, samples=10_000, sigma_mag=0.05, sigma_gyro=0.05)
+    rest = rate_at_rest(track_of(made))
+    off = 0.0 if rest is None else rest.rate_rad_s - true_model(made).gyro_bias_rad_s
+    unseen = np.inf if rest is None else rest.unseen_rad_s
+    assert np.abs(off).max() < 2 * unseen
+    fit = fit_null(track_of(made))
+    found = np.abs(_difference(fit, true_model(made)))[8:]
+    assert np.max(found / np.sqrt(np.diag(fit.covariance))[8:11]) < 4
+
+
 def test_what_the_spec_says_stays() -> None:
     track = track_of(experiment(samples=3000))
     fit = fit_null(track, Spec(sigma_mag_gauss=2e-3, sigma_gyro_rad_s=7e-4))
@@ -177,7 +210,8 @@ def test_at_rest_the_gyro_reads_its_bias_and_nothing_runs_away() -> None:
     )
     rest = rate_at_rest(still)
     assert rest is not None
-    assert np.abs(rest - bias).max() < 1e-4
+    assert np.abs(rest.rate_rad_s - bias).max() < 1e-4
+    assert rest.unseen_rad_s < 1e-3
     assert rate_at_rest(track_of(experiment("lam", motion="slow", samples=3000))) is None
     fit = fit_null(still)
     assert np.abs(fit.model.soft_iron - np.eye(3)).max() < 0.05

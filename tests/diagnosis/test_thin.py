@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.thin import thin_factor, thinned
+from ahrsd.diagnosis.thin import thin_factor, thinned, working_factor
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import NullModel
 
@@ -100,3 +101,13 @@ def test_lost_turns_are_added_up_and_each_is_a_smaller_part_of_the_step():
     middle = np.arange(1, len(thin)) * 3 + 1
     np.testing.assert_allclose(thin.lost_turns[1:], 3 * (lost[middle] - lost[1]), atol=1e-12)
     assert thinned(track, 3, model([0.05, -0.02, 0.1])).lost_turns is None
+
+
+@pytest.mark.parametrize(("sigma_gyro", "samples"), [(5e-3, 3), (8e-3, 2), (5e-2, 1)])
+def test_rows_are_of_so_many_samples_as_stay_white(sigma_gyro: float, samples: int) -> None:
+    """At 25 Hz three, unless the gyro turns up more field in them than half of a reading's noise.
+
+    Three of a gyro of 0.05 rad/s beside 1 mG would share a tenth of their noise with the next.
+    """
+    made = experiment("mam", motion="slow", samples=3000, sigma_gyro=sigma_gyro)
+    assert working_factor(track_of(made), true_model(made)) == samples

@@ -241,6 +241,11 @@ def readings_of(context: Context) -> Readings:
     )
 
 
+def smooth_readings_of(context: Context) -> Readings:
+    """The same with the smooth field: the differences of the foretold one are the gyro's noise."""
+    return replace(readings_of(context), field_b=context.smooth_b)
+
+
 def left_over(context: Context) -> Array:
     """(N, 3) gauss, readings less what field and calibration make of them; 0 without a reading."""
     model = context.model

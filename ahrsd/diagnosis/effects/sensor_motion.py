@@ -8,7 +8,15 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import Effect, Linear, Parameter, Readings, Setting, readings_of
+from ahrsd.diagnosis.effects.base import (
+    Effect,
+    Linear,
+    Parameter,
+    Readings,
+    Setting,
+    readings_of,
+    smooth_readings_of,
+)
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -109,8 +117,8 @@ class MagLowPass(Linear):
         return tuple({"time_constant_s": tau} for tau in (0.03, 0.1, 0.3))
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of the smooth field: the differences of another would be its noise."""
-        return self.terms(replace(readings_of(context), field_b=context.smooth_b), setting)
+        """Of the smooth field."""
+        return self.terms(smooth_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """What the filter takes away, per second of its time constant."""
