@@ -68,10 +68,14 @@ class Vehicle(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HostClock:
-    """Monotonic host time in ns, `speed` times as fast as real time (1 but for demonstrations)."""
+    """Monotonic host time in ns, `speed` times as fast as real time (1 but for demonstrations).
+
+    patient_bytes: where time stands still while the device is not read, so much may lie unread
+    """
 
     speed: float = 1.0
     start_ns: int = field(default_factory=time.monotonic_ns)
+    patient_bytes: int | None = None
 
     def now_ns(self) -> int:
         """Nanoseconds, never falling."""
@@ -117,7 +121,7 @@ class Daemon:
         self._may_query = config.mode != "passive"
         said = None if config.device.baud == "auto" else config.device.baud
         known = baud or said or find_device(port_path, None, may_query=self._may_query).baud
-        self._link = SerialLink(port_path, known, clock.now_ns)
+        self._link = SerialLink(port_path, known, clock.now_ns, clock.patient_bytes)
         self._inbox = self._link.inbox
         if shell.worker is not None:
             shell.worker.woken = self._inbox.wake

@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from drivers.serial_port import (
 BACKLOG_BYTES = 4 << 20  # what waits costs this much memory at most: minutes at 200 Hz
 _READ_BYTES = 128  # what one read costs besides its data
 _POLL_S = 0.2
+_PATIENT_POLL_S = 0.001
 _JOIN_S = 2.0
 _PATIENT_S = 1.1  # where nothing may be asked: a stream of 1 Hz must be heard
 
@@ -51,10 +53,15 @@ class Lost:
 
 
 class Inbox:
-    """What was heard and not taken yet. One thread puts bytes, one takes; anybody may wake it."""
+    """What was heard and not taken yet. One thread puts bytes, one takes; anybody may wake it.
 
-    def __init__(self, limit_bytes: int = BACKLOG_BYTES) -> None:
-        self.limit_bytes = limit_bytes
+    patient_bytes: the reader waits while more than this is not taken yet, for a device whose time
+                   waits for its reader; None: it never waits, and a backlog beyond `limit_bytes` is
+                   a lost link
+    """
+
+    def __init__(self, limit_bytes: int = BACKLOG_BYTES, patient_bytes: int | None = None) -> None:
+        self.limit_bytes, self.patient_bytes = limit_bytes, patient_bytes
         self._queue: SimpleQueue[Bytes | Lost | None] = SimpleQueue()
         self._put_bytes = self._taken_bytes = 0  # each is written by one thread only
 
@@ -113,6 +120,9 @@ class SerialReader:
                 if (waiting := self._inbox.backlog_bytes) > self._inbox.limit_bytes:
                     reason = f"{waiting} bytes wait to be worked on: reading was given up"
                     break
+                if self._inbox.patient_bytes is not None and waiting > self._inbox.patient_bytes:
+                    time.sleep(_PATIENT_POLL_S)
+                    continue
                 if not self._port.wait_readable(_POLL_S):
                     continue
                 data = self._port.read()
@@ -144,9 +154,15 @@ def find_device(path: Path, baud: int | None, *, may_query: bool) -> BaudFound:
 class SerialLink:
     """One port, opened as often as it takes. Everything that it hears comes out of `inbox`."""
 
-    def __init__(self, path: Path, baud: int, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        baud: int,
+        now_ns: Callable[[], int],
+        patient_bytes: int | None = None,
+    ) -> None:
         self.path, self.baud = path, baud
-        self.inbox = Inbox()
+        self.inbox = Inbox(patient_bytes=patient_bytes)
         self._now_ns = now_ns
         self._port: SerialPort | None = None
         self._reader: SerialReader | None = None

@@ -71,6 +71,7 @@ _PLACE = {"latitude_deg": 42.0, "longitude_deg": 34.2, "date": datetime.date(202
 _REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `speed` times faster
 _REST_S = 10.0  # longer than the stops between pirouettes, which are too short for a save
 _LONGEST_AGE_S = 60.0  # of the vehicle's word, as far as the configuration goes
+_UNREAD_BYTES = 512  # then the world waits: some messages
 _WATCH_S = 0.5
 _CLOSE_S = 60.0  # real time at most for the files to be whole: nobody waits for a demo's end
 _STUCK_S = 120.0  # real time in which the emulated world goes on by nothing
@@ -141,7 +142,7 @@ def run_demo(
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder) / "vn100"
         with _emulated(setup, link, speed) as emulated:
-            clock = WorldClock(speed, world_s=emulated.device_s)
+            clock = WorldClock(speed, patient_bytes=_UNREAD_BYTES, world_s=emulated.device_s)
             shell = _shell(directory, config, clock, scene)
             scene.daemon = Daemon(config, shell, link, clock, AlwaysSafe())
             scene.power_cycle = emulated.power_cycle

@@ -351,7 +351,9 @@ class Stream:
         steps = self._timeline.extend(time_s, extracted.usable)
         self._note(steps)
         host_s = self._host(time_s, arrivals)
-        blocks = self._unbridged(sample_blocks(extractor, extracted, steps, host_s, self.epochs))
+        arrived_s = None if arrivals[-1] == 0.0 else arrivals
+        found = sample_blocks(extractor, extracted, steps, host_s, self.epochs, arrived_s)
+        blocks = self._unbridged(found)
         if steps.keep.any():
             self._left_out = not blocks or blocks[-1].time_s[-1] != time_s[steps.keep][-1]
         return blocks
@@ -364,8 +366,9 @@ class Stream:
         if extracted.time_s is None:
             return []
         steps = deepcopy(self._timeline).extend(extracted.time_s, extracted.usable)
-        host_s = self._line(steps.time_s, np.array(self._arrivals))
-        found = sample_blocks(extractor, extracted, steps, host_s, self.epochs)
+        arrivals = np.array(self._arrivals)
+        host_s = self._line(steps.time_s, arrivals)
+        found = sample_blocks(extractor, extracted, steps, host_s, self.epochs, arrivals)
         return [] if steps.restarts else self._unbridged(found)
 
     def _unbridged(self, blocks: list[SampleBlock]) -> list[SampleBlock]:

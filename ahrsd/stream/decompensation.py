@@ -16,7 +16,6 @@ message layout, `sample_blocks` joins both into what the estimator takes.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -168,17 +167,29 @@ class RegisterEpochs:
         """Nobody knows the registers, at whatever instant: the device may be another one."""
         self._epochs = [RegisterEpoch(self.now.number + 1, -np.inf, None)]
 
-    def at(self, host_s: float) -> RegisterEpoch:
-        """The epoch of an instant; before the oldest that is kept, that one."""
-        index = bisect_right(self._epochs, host_s, key=lambda epoch: epoch.since_s) - 1
-        return self._epochs[max(index, 0)]
+    def split(
+        self, host_s: Array, arrived_s: Array | None = None
+    ) -> list[tuple[slice, RegisterEpoch]]:
+        """Runs of (N,) ascending instants with one epoch each.
 
-    def split(self, host_s: Array) -> list[tuple[slice, RegisterEpoch]]:
-        """Runs of (N,) ascending instants with one epoch each."""
-        starts = [epoch.since_s for epoch in self._epochs[1:]]
-        cuts = np.searchsorted(host_s, np.array(starts, dtype=np.float64), side="left")
-        edges = sorted({0, *cuts.tolist(), len(host_s)})
-        return [(slice(a, b), self.at(float(host_s[a]))) for a, b in pairwise(edges) if b > a]
+        arrived_s: (N,) when they were heard. Where the registers changed between an instant and its
+        arrival, nobody knows on which side of the change it was (the instant is an estimate), so
+        its epoch is one whose registers are unknown.
+        """
+        starts = np.array([epoch.since_s for epoch in self._epochs[1:]], dtype=np.float64)
+        index = np.searchsorted(starts, host_s, side="right")
+        if arrived_s is not None:
+            index[np.searchsorted(starts, arrived_s, side="right") != index] = -1
+        edges = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), len(host_s)]
+        return [
+            (slice(a, b), self._epochs[k] if (k := int(index[a])) >= 0 else self._unsure)
+            for a, b in pairwise(edges)
+            if b > a
+        ]
+
+    @property
+    def _unsure(self) -> RegisterEpoch:
+        return RegisterEpoch(self.now.number, self.now.since_s, None)
 
 
 class MissingQuantityError(ValueError):
@@ -300,17 +311,19 @@ def sample_blocks(
     steps: TimelineSteps,
     host_s: Array,
     epochs: RegisterEpochs,
+    arrived_s: Array | None = None,
 ) -> list[SampleBlock]:
     """Raw samples, cut at gaps and where the registers changed; unusable ones are left out.
 
     steps: what `StreamTimeline.extend(time_s, extracted.usable)` said; host_s: (N,) the same
-    instants on the host's clock. Samples of an epoch whose registers nobody knows are dropped, and
-    what follows them begins anew.
+    instants on the host's clock; arrived_s: see `RegisterEpochs.split`. Samples of an epoch whose
+    registers nobody knows are dropped, and what follows them begins anew.
     """
     blocks: list[SampleBlock] = []
     kept = np.flatnonzero(steps.keep)
     after_unknown = False
-    for run, epoch in epochs.split(host_s[kept]):
+    arrived_s = None if arrived_s is None else arrived_s[kept]
+    for run, epoch in epochs.split(host_s[kept], arrived_s):
         if epoch.compensation is None:
             after_unknown = True
             continue

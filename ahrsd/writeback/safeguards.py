@@ -41,6 +41,7 @@ class Safeguards:
         self.proof_waits = ""  # why they must be proven again
         self.sampled_s: float | None = None  # host time of the newest sample
         self.examined_s: float | None = None  # and of the newest one in the estimate
+        self.asking_took_s = 0.0  # until the device had said who it is; samples came meanwhile
         self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
@@ -167,7 +168,7 @@ class Safeguards:
         if self.sampled_s is None or self.examined_s is None:
             return []
         late_s = self.sampled_s - self.examined_s
-        if late_s <= UNEXAMINED_S:
+        if late_s <= UNEXAMINED_S + self.asking_took_s:
             return []
         return [f"the newest {late_s:.0f} s of samples are not judged yet"]
 

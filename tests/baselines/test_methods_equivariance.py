@@ -18,7 +18,7 @@ DATA = simulate("wam", 5, n=4000, faster=2.0).data
 TURNED = ["magical-ls", "magical-nls", "twostep", "ellipsoid", "tls", "np", "fnp"]
 SHIFTED = [method for method in TURNED if method not in ("twostep", "magical-nls")]
 # where the iteration ends: TWOSTEP's first step and the trust region depend on the axes
-ATOL = {"magical-nls": 2e-4, "magical-ls": 1e-5, "twostep": 1e-6}
+ATOL = {"magical-nls": 5e-4, "magical-ls": 1e-5, "twostep": 1e-6}
 
 
 @pytest.mark.parametrize("method", TURNED)

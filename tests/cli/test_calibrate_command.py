@@ -14,7 +14,7 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import CONFIG_KEY, Config
 from ahrsd.config.text import print_config
 from ahrsd.core.core import Core
-from ahrsd.daemon.core_runner import Shell
+from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.inputs import LinkOpened, Received, RegistersKnown, Stop, Tick
 from ahrsd.offline.calibrate import calibrate
@@ -115,7 +115,9 @@ def record_daemon(path: Path, device: Emulator, seconds: float) -> Core:
     config = Config()
     core = Core(core_settings(config))
     with CaptureWriter(path, {CONFIG_KEY: print_config(config)}) as writer:
-        shell = Shell(core, capture=writer)
+        now_s = 0.0
+        keeper = JournalKeeper(journal_in(path.parent), lambda: round(now_s * 1e9))
+        shell = Shell(core, writer, keeper)
         device.receive(shell.feed(LinkOpened(1, "port", 115200)), 0.0)
         for step in range(round(seconds * 50)):
             now_s = (step + 1) / 50
@@ -137,7 +139,7 @@ def test_a_capture_of_the_daemon_replays_as_it_ran_and_calibrates_from_all_of_it
 ):
     device = binary_device(10, REGISTERS)
     path = tmp_path / "run.mcap"
-    live = record_daemon(path, device, 70.0)
+    live = record_daemon(path, device, 90.0)  # the newest ten wait for the device's answer
     assert live.registers[23] == pytest.approx(REGISTERS[23])
     assert CaptureReader(path).header[CONFIG_KEY]
     rows: list[int] = []
@@ -149,7 +151,7 @@ def test_a_capture_of_the_daemon_replays_as_it_ran_and_calibrates_from_all_of_it
     assert result.estimate is not None
     assert live.calibrator.estimate is not None
     assert result.estimate.samples > live.calibrator.estimate.samples + 200  # nothing is held out
-    assert 2700 < sum(rows) == result.estimate.samples
+    assert 3500 < sum(rows) == result.estimate.samples
     check_registers(result.json("magyc"), device.truth, true_fields)
 
 

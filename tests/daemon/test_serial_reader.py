@@ -60,6 +60,21 @@ def test_a_reader_that_is_followed_goes_on():
     assert reader.stop()
 
 
+def test_a_reader_that_may_wait_leaves_the_rest_in_the_port():
+    inbox, port = Inbox(patient_bytes=1000), Endless()
+    reader = SerialReader(port, inbox, lambda: 7)
+    heard = []
+    for _ in range(30):  # more than it reads by itself
+        heard += [inbox.get(5.0).data]
+    threading.Event().wait(0.05)
+    assert 1000 < inbox.backlog_bytes <= 1000 + 7 + 128
+    read_so_far = port.read_so_far
+    threading.Event().wait(0.05)
+    assert port.read_so_far == read_so_far
+    assert heard == [b"%06d\n" % k for k in range(30)]
+    assert reader.stop()
+
+
 def test_what_waits_can_be_taken_at_once_and_marks_are_nothing():
     inbox = Inbox()
     inbox.wake()

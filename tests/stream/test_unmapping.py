@@ -214,7 +214,8 @@ def test_epochs_split_a_block_where_registers_changed() -> None:
     assert epochs.begin(5.0, None).since_s == 13.0
     for k in range(3 * EPOCHS_KEPT):
         epochs.begin(20.0 + k, None)
-    assert epochs.at(-1.0).number == epochs.now.number - EPOCHS_KEPT + 1
+    ((_, oldest),) = epochs.split(np.array([-1.0]))
+    assert oldest.number == epochs.now.number - EPOCHS_KEPT + 1
 
 
 def rows(time_s: Array, mag: Array) -> list[tuple[float, ...]]:
@@ -266,6 +267,24 @@ def test_samples_under_unknown_registers_are_dropped_and_leave_a_gap() -> None:
     ]
     assert np.isnan(blocks[1].dt_s[0])
     assert blocks[1].dt_s[1:] == pytest.approx(0.1)
+
+
+def test_a_change_between_an_instant_and_its_arrival_leaves_the_sample_out() -> None:
+    """The instant is an estimate by the clock; a host that lags hears it behind the change."""
+    time_s = np.asarray(np.arange(9) * 0.1, float)
+    arrived_s = np.maximum(time_s, [0.0, 0.1, 0.4, 0.4, 0.4, 0.5, 0.6, 0.7, 0.8])
+    epochs = RegisterEpochs()
+    epochs.begin(0.0, Compensation.unknown())
+    epochs.begin(0.35, Compensation.unknown())
+    extractor = Extractor(PACKET)
+    extracted = extract(extractor, rows(time_s, np.ones((9, 3))))
+    steps = StreamTimeline().extend(time_s, extracted.usable)
+    blocks = sample_blocks(extractor, extracted, steps, time_s, epochs, arrived_s)
+    assert [(b.time_s.round(1).tolist(), b.epoch, b.gap_before) for b in blocks] == [
+        ([0.0, 0.1], 1, True),
+        ([0.4, 0.5, 0.6, 0.7, 0.8], 2, True),
+    ]
+    assert np.isnan(blocks[1].dt_s[0])
 
 
 def test_what_arrives_over_a_new_link_is_not_un_mapped_by_what_was_before_it() -> None:
