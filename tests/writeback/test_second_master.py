@@ -163,3 +163,15 @@ def test_a_capture_replays_to_the_same_decisions(binary):
     assert again.decisions.sha256 == run.core.decisions.sha256
     assert again.device_session.identity == run.core.device_session.identity
     assert again.device_session.identity.serial == SPARE
+
+
+def test_what_they_changed_in_ram_is_not_saved_along():
+    """Register 25 is none of ours: nothing is wrong with the values on trial, but VNWNV saves it."""
+    run = CabledRun(two_units(binary=True))
+    run.proven()
+    unit = run.cable.units[FIRST]
+    unit.ram[25] = THEIRS
+    run.park(60.0)
+    assert run.told("register 25 changed")
+    assert unit.saves == []
+    assert any("somebody else changed register 25" in text for text in run.core.writeback.holds())
