@@ -166,7 +166,7 @@ def test_a_capture_replays_to_the_same_decisions(binary):
 
 
 def test_what_they_changed_in_ram_is_not_saved_along():
-    """Register 25 is none of ours: nothing is wrong with the values on trial, but VNWNV saves it."""
+    """Register 25 is none of ours and what is proven stays right, but VNWNV would save it, too."""
     run = CabledRun(two_units(binary=True))
     run.proven()
     unit = run.cable.units[FIRST]
