@@ -35,7 +35,7 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import ProcedureOutcome, Transaction, check, roll_back, save, stage
 from ahrsd.writeback.trial import Trial, TrialVerdict
-from drivers.vn100.procedures import Identity, Unit
+from drivers.vn100.procedures import Identity, Unit, VerifyFailed
 from drivers.vn100.registers import Values, same
 
 RETRY_SAVE_S = 600.0  # after a save that was not sent
@@ -62,6 +62,7 @@ class Flow:
         self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
         self.waits_for_look = False  # all that a save lacks is that the device is asked again
         self._cause = "device"
+        self._left: dict[int, Values] = {}  # read back behind a write of ours that did not verify
         self._from_fault = self._resumed = False
         self._against_since_s: float | None = None
         self._since_s = 0.0
@@ -293,7 +294,7 @@ class Flow:
     # -- arriving ----------------------------------------------------------------------------------
 
     def _enter_reconciling(self, reason: str) -> None:
-        self.proposal, self.approver = None, ""
+        self.proposal, self.approver, self._left = None, "", {}
         self.safe.stillness.reset()
 
     def _enter_rest(self, reason: str) -> None:
@@ -344,7 +345,7 @@ class Flow:
         )
 
     def _enter_staging(self, reason: str) -> None:
-        self._cause = "device"
+        self._cause, self._left = "device", {}
         self.outbox.in_force(None)
         self.outbox.run("write", Purpose.STAGE, partial(stage, self.transaction()))
 
@@ -375,16 +376,17 @@ class Flow:
         self.outbox.run("save", Purpose.SAVE, make)
 
     def _enter_rolling_back(self, reason: str) -> None:
-        # what was read back as ours and holds something else by now is somebody else's; out of a
-        # FAULT a person has looked, and after a write that failed it is what that write left
+        # what holds neither the old value nor one that came from here is somebody else's; out of a
+        # FAULT a person has looked
         last = self.outbox.history.last
-        only_ours = last is not RecordKind.RAM_FAILED and not self._from_fault
         if last is not RecordKind.ROLLBACK:
             self.outbox.record(
                 RecordKind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
             )
         self.outbox.in_force(None)
-        make = partial(roll_back, self.transaction(), only_ours=only_ours)
+        make = partial(
+            roll_back, self.transaction(), only_ours=not self._from_fault, left=self._left
+        )
         self.outbox.run("roll back", Purpose.ROLL_BACK, make)
 
     def _enter_fault(self, reason: str) -> None:
@@ -471,9 +473,11 @@ class Flow:
                 self.outbox.ask(IdentifyAgain())
         self._set_up_stream()
 
-    def on_failure(self, reason: str) -> None:
+    def on_failure(self, error: Exception) -> None:
         """A procedure broke off: the device may be anywhere between old and new."""
-        saving = self.state is State.SAVING
+        reason, saving = str(error), self.state is State.SAVING
+        if isinstance(error, VerifyFailed):
+            self._left = {error.register: error.read}
         if self.state is State.STAGING:
             transaction = self.transaction()
             self.outbox.written(transaction.old, transaction.new, "failed")

@@ -436,7 +436,7 @@ class WriteBack:
         self._outbox.host_s = host_s
         if name == self._outbox.running:
             self._outbox.running = ""
-            self._flow.on_failure(str(error))
+            self._flow.on_failure(error)
             self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()
 

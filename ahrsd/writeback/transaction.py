@@ -149,16 +149,19 @@ def stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
     return quiet(_stage(transaction))
 
 
-def roll_back(transaction: Transaction, *, only_ours: bool) -> Procedure[ProcedureOutcome]:
+def roll_back(
+    transaction: Transaction, *, only_ours: bool, left: Mapping[int, Values] | None = None
+) -> Procedure[ProcedureOutcome]:
     """The old values again, read back; a register that has them is not written.
 
     Every register is tried before a failure is reported, and all of them also where the device does
     not let its output be paused: that makes replies slower, and is no reason to leave values in it.
 
-    only_ours: nothing is written where a register holds neither the old nor the new value, for
-    then somebody else wrote it
+    only_ours: nothing is written where a register holds neither the old nor the new value, nor
+               what is `left`, for then somebody else wrote it
+    left:      by register, what was read back behind a write of ours that did not verify
     """
-    return _roll_back(transaction, only_ours)
+    return _roll_back(transaction, only_ours, left or {})
 
 
 def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
@@ -224,12 +227,14 @@ def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
     return (yield from _read_all_back(transaction, transaction.new))
 
 
-def _roll_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureOutcome]:
+def _roll_back(
+    transaction: Transaction, only_ours: bool, left: Mapping[int, Values]
+) -> Procedure[ProcedureOutcome]:
     abandoned = False
     try:
         with suppress(NoReply, DeviceRefused):
             yield QUIET
-        return (yield from _put_back(transaction, only_ours))
+        return (yield from _put_back(transaction, only_ours, left))
     except GeneratorExit:  # dropped without an end: nobody is there to carry out a command
         abandoned = True
         raise
@@ -300,10 +305,12 @@ def _right_behind(
     return None
 
 
-def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureOutcome]:
+def _put_back(
+    transaction: Transaction, only_ours: bool, left: Mapping[int, Values]
+) -> Procedure[ProcedureOutcome]:
     if (other := (yield from _other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
-    if only_ours and (strange := (yield from _foreign_values(transaction))):
+    if only_ours and (strange := (yield from _foreign_values(transaction, left))):
         return ProcedureOutcome(False, strange)
     errors: dict[int, Exception] = {}
     for number, values in transaction.old.items():
@@ -320,13 +327,15 @@ def _put_back(transaction: Transaction, only_ours: bool) -> Procedure[ProcedureO
     return (yield from _read_all_back(transaction, transaction.old))
 
 
-def _foreign_values(transaction: Transaction) -> Procedure[tuple[int, ...]]:
-    """Registers that hold neither the old nor the new value, in two readings."""
+def _foreign_values(
+    transaction: Transaction, left: Mapping[int, Values]
+) -> Procedure[tuple[int, ...]]:
+    """Registers that hold neither the old nor the new value nor what is left, in two readings."""
     found: tuple[int, ...] = ()
     for _ in range(2):
         now = yield from read_registers(transaction.old)
-        old, new = differences(transaction.old, now), differences(transaction.new, now)
-        found = tuple(sorted(old.keys() & new.keys()))
+        ours = [transaction.old, transaction.new, {**transaction.old, **left}]
+        found = tuple(sorted(set.intersection(*(set(differences(own, now)) for own in ours))))
         if not found:
             return ()
     return found

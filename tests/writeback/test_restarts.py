@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from writeback_rig import Record
 
+from ahrsd.writeback.actions import IdentifyAgain
 from ahrsd.writeback.clocks import Stamp, restarted_since
 from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind
 from ahrsd.writeback.states import State
-from drivers.vn100.commands import Word, Write
+from drivers.vn100.commands import Read, Word, Write
+from drivers.vn100.procedures import WRITE_TRIES
 
 OTHER = (2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3)
 RECORD = Stamp(1.8e9, "one", 1000.0, 500.0)
@@ -322,6 +324,55 @@ def test_one_refusal_does_not_end_the_rollback_of_the_others(make_rig, what, how
         fault = rig.notes("error")[-1]
         assert f"register {what}:" in fault
         assert "$VNWRG,23,1,0,0" in fault
+
+
+@pytest.mark.parametrize("number", [23, 84])
+@pytest.mark.parametrize("how", ["silent", "no end"])
+def test_a_write_that_never_came_to_the_device_leaves_what_somebody_else_wrote(
+    make_rig, number, how
+):
+    """Theirs came between the check and the first write; then the device said nothing."""
+    rig = make_rig(Mode.STAGE)
+
+    def silent(command):
+        if rig.wb.state is not State.STAGING:
+            return False
+        rig.device.ram[number] = OTHER
+        if how == "no end":
+            rig.pass_time(60.0)
+        return True
+
+    rig.device.mute = silent
+    rig.whole_way()
+    assert rig.device.ram[number] == OTHER
+    assert not any(isinstance(command, Write) for command in rig.device.log)
+    assert rig.kinds[:3] == ["PREPARED", "RAM_FAILED", "ROLLBACK"]
+    assert rig.asked[-1] == IdentifyAgain()
+    rig.connect()
+    assert rig.kinds[3:] == ["LOCKED", "FOREIGN"]
+    assert rig.wb.state is State.LOCKED
+    assert rig.device.ram[number] == OTHER
+
+
+@pytest.mark.parametrize("number", [23, 84])
+def test_what_the_device_made_of_a_value_of_ours_is_put_back(make_rig, number):
+    """It stores something else than it was told: that is neither the old nor the new value."""
+    rig = make_rig(Mode.STAGE)
+    before, made = rig.device.held(), []
+
+    def alters(command):
+        ours = [c.values for c in rig.device.log if isinstance(c, Write) and c.register == number]
+        reads = isinstance(command, Read) and command.register == number
+        if reads and ours and rig.wb.state is State.STAGING:
+            rig.device.ram[number] = (*ours[-1][:-1], 1.5)
+            made.append(ours[-1])
+        return False
+
+    rig.device.mute = alters
+    rig.whole_way()
+    assert len(made) == WRITE_TRIES
+    assert rig.device.held() == before
+    assert rig.kinds == ["PREPARED", "RAM_FAILED", "ROLLBACK", "ROLLED_BACK"]
 
 
 # -- values of nobody ------------------------------------------------------------------------------
