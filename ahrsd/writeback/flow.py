@@ -62,7 +62,7 @@ class Flow:
         self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
         self.waits_for_look = False  # all that a save lacks is that the device is asked again
         self._cause = "device"
-        self._left: dict[int, Values] = {}  # read back behind a write of ours that did not verify
+        self._left: dict[int, Values] = {}  # by register, what the device made of ours
         self._from_fault = self._resumed = False
         self._against_since_s: float | None = None
         self._since_s = 0.0
@@ -476,7 +476,7 @@ class Flow:
     def on_failure(self, error: Exception) -> None:
         """A procedure broke off: the device may be anywhere between old and new."""
         reason, saving = str(error), self.state is State.SAVING
-        if isinstance(error, VerifyFailed):
+        if isinstance(error, VerifyFailed) and error.echoed:
             self._left = {error.register: error.read}
         if self.state is State.STAGING:
             transaction = self.transaction()

@@ -37,7 +37,7 @@ from drivers.vn100.procedures import (
     resume,
     save_settings,
 )
-from drivers.vn100.registers import Values, same
+from drivers.vn100.registers import Values, parse, same
 
 BEHIND_TRIES = 5  # to have a serial number and the command right behind it
 HSI_RESULT = 47  # changes by itself while the on-board estimator runs; nobody's setting
@@ -159,7 +159,7 @@ def roll_back(
 
     only_ours: nothing is written where a register holds neither the old nor the new value, nor
                what is `left`, for then somebody else wrote it
-    left:      by register, what was read back behind a write of ours that did not verify
+    left:      by register, what the device made of a value of ours
     """
     return _roll_back(transaction, only_ours, left or {})
 
@@ -220,7 +220,7 @@ def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
         return ProcedureOutcome(False, changed)
     written = False
     for number, values in transaction.new.items():
-        refused = yield from _write(transaction, number, values, written)
+        refused = yield from _write(transaction, number, transaction.old[number], values, written)
         if refused is not None:
             return refused
         written = True
@@ -255,31 +255,41 @@ def _read_all_back(
 
 
 def _write(
-    transaction: Transaction, number: int, values: Values, written: bool
+    transaction: Transaction, number: int, before: Values, values: Values, written: bool
 ) -> Procedure[ProcedureOutcome | None]:
     """Write a register of the transaction's device; the outcome where another one answers.
 
-    written: whether something was before
+    before: what it held until now; written: whether something was written before
 
     Each attempt is one command, and who answers is asked right before it: what takes over the cable
-    in the silence behind an attempt is not written. Raises VerifyFailed.
+    in the silence behind an attempt is not written. There is another attempt only where the
+    register still holds what it held: anything else is what the device made of the values, or
+    what somebody wrote or a restart brought back. Raises VerifyFailed.
     """
-    back: Values = ()
-    for _ in range(WRITE_TRIES):
-        command = _written_once(number, values)
+    echo: list[Values] = []
+    for attempt in range(1, WRITE_TRIES + 1):
+        command = _written_once(number, values, echo)
         if (other := (yield from _right_behind(transaction, command))) is not None:
             return ProcedureOutcome(False, other=other, written=written)
         written = True
         back = yield from read(number)
+        if not any(same(number, one, back[: len(one)]) for one in (before, values)):
+            back = yield from read(number)  # a reply may be altered
         if same(number, values, back[: len(values)]):
             return None
-    raise VerifyFailed(number, values, back)
+        if attempt == WRITE_TRIES or not same(number, before, back[: len(before)]):
+            break
+    echoed = any(same(number, one, back) for one in echo)
+    raise VerifyFailed(number, values, back, attempt, echoed=echoed)
 
 
-def _written_once(number: int, values: Values) -> Callable[[], Procedure[None]]:
+def _written_once(number: int, values: Values, echo: list[Values]) -> Callable[[], Procedure[None]]:
+    """The write, as often as asked; what the device answered goes into `echo`."""
+
     def write() -> Procedure[None]:
         with suppress(NoReply):  # carried out or not: a read says which
-            yield Write(number, values, once=True)
+            reply = yield Write(number, values, once=True)
+            echo.append(parse(number, reply.tokens))
 
     return write
 
@@ -316,8 +326,8 @@ def _put_back(
     for number, values in transaction.old.items():
         refused: ProcedureOutcome | None = None
         try:
-            if not same(number, values, (yield from read(number))):
-                refused = yield from _write(transaction, number, values, True)
+            if not same(number, values, (held := (yield from read(number)))):
+                refused = yield from _write(transaction, number, held, values, True)
         except (DeviceRefused, NoReply, TooLate, VerifyFailed) as error:
             errors[number] = error
         if refused is not None:

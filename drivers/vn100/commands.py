@@ -115,7 +115,8 @@ class Write:
 
     held: the device itself held these values, so they may go back whatever the manual says of them
     once: not repeated after a silence, in which another device may have taken over the cable, and
-          only sent right behind an answer (see `Session`); else TooLate
+          only sent right behind an answer (see `Session`); else TooLate. Its echo may show other
+          values: what the device made of them
     """
 
     register: int
@@ -132,9 +133,11 @@ class Write:
         return f"VNWRG,{format_command(self.register, self.values, held=self.held)}"
 
     def answered_by(self, reply: Reply) -> bool:
-        """Whether `reply` echoes these values; an echo of others is another program's."""
+        """Whether `reply` echoes these values, or with `once` any; else it is another program's."""
         values = _values(self.register, "VNWRG", reply)
-        return values is not None and same(self.register, self.values, values[: len(self.values)])
+        if values is None:
+            return False
+        return self.once or same(self.register, self.values, values[: len(self.values)])
 
     def __str__(self) -> str:
         return f"write of register {self.register}"

@@ -44,14 +44,25 @@ CONFIGURATION = tuple(sorted(_ESSENTIAL + _OPTIONAL))
 
 
 class VerifyFailed(SessionError):
-    """The device does not hold what was written: `sent` against `read`, after all tries."""
+    """The device does not hold what was written: `sent` against `read`, after `tries`.
 
-    def __init__(self, register: int, sent: Values, read: Values) -> None:
+    echoed: the device had answered the write with what was read: it made this of the values
+    """
+
+    def __init__(
+        self,
+        register: int,
+        sent: Values,
+        read: Values,
+        tries: int = WRITE_TRIES,
+        *,
+        echoed: bool = False,
+    ) -> None:
         super().__init__(
-            f"register {register} holds {read} after {WRITE_TRIES} writes of {sent}: "
+            f"register {register} holds {read} after {tries} write{'s' * (tries > 1)} of {sent}: "
             "the device is not as it was asked to be"
         )
-        self.register, self.sent, self.read = register, sent, read
+        self.register, self.sent, self.read, self.echoed = register, sent, read, echoed
 
 
 class RestoreFailed(SessionError):

@@ -13,7 +13,6 @@ from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind
 from ahrsd.writeback.states import State
 from drivers.vn100.commands import Read, Word, Write
-from drivers.vn100.procedures import WRITE_TRIES
 
 OTHER = (2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3)
 RECORD = Stamp(1.8e9, "one", 1000.0, 500.0)
@@ -356,23 +355,56 @@ def test_a_write_that_never_came_to_the_device_leaves_what_somebody_else_wrote(
 
 @pytest.mark.parametrize("number", [23, 84])
 def test_what_the_device_made_of_a_value_of_ours_is_put_back(make_rig, number):
-    """It stores something else than it was told: that is neither the old nor the new value."""
+    """It stores something else than it was told, and says so: neither the old nor the new value."""
     rig = make_rig(Mode.STAGE)
     before, made = rig.device.held(), []
 
     def alters(command):
-        ours = [c.values for c in rig.device.log if isinstance(c, Write) and c.register == number]
-        reads = isinstance(command, Read) and command.register == number
-        if reads and ours and rig.wb.state is State.STAGING:
-            rig.device.ram[number] = (*ours[-1][:-1], 1.5)
-            made.append(ours[-1])
+        ours = isinstance(command, Write) and command.register == number
+        if ours and rig.wb.state is State.STAGING:
+            rig.device.ram[number] = (*command.values[:-1], 1.5)
+            made.append(command.values)
         return False
 
     rig.device.mute = alters
     rig.whole_way()
-    assert len(made) == WRITE_TRIES
+    assert len(made) == 1  # once more would bring the same
     assert rig.device.held() == before
     assert rig.kinds == ["PREPARED", "RAM_FAILED", "ROLLBACK", "ROLLED_BACK"]
+
+
+@pytest.mark.parametrize("echo", [True, False])
+def test_a_restart_right_behind_a_write_brings_back_what_somebody_saved_and_it_stays(
+    make_rig, echo
+):
+    """Their values are in flash, others in RAM; the write is not repeated over them."""
+    rig = make_rig(Mode.STAGE)
+    rig.device.flash[84] = OTHER
+    restarted = []
+
+    def restarts(command):
+        if isinstance(command, Write) and command.register == 84 and not restarted:
+            if echo:
+                return False
+            rig.device.restart()
+            restarted.append(command)
+            return True
+        if isinstance(command, Read) and command.register == 84 and writes(rig) and not restarted:
+            rig.device.restart()
+            restarted.append(command)
+        return False
+
+    rig.device.mute = restarts
+    rig.whole_way()
+    assert len(restarted) == 1
+    assert [command.register for command in writes(rig)] == [23, 84]
+    assert rig.device.ram[84] == OTHER
+    rig.connect()
+    assert rig.kinds[-2:] == ["LOCKED", "FOREIGN"]
+
+
+def writes(rig):
+    return [command for command in rig.device.log if isinstance(command, Write)]
 
 
 # -- values of nobody ------------------------------------------------------------------------------
