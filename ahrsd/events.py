@@ -16,6 +16,18 @@ class Send:
     data: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class SendToClient:
+    """Write these bytes into the shared port of this name.
+
+    stream: whether its reader wants measurements from now on; None: as before
+    """
+
+    client: str
+    data: bytes
+    stream: bool | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SamplesSeen:
     """New samples, raw, with the correction that the newest estimate would apply to them."""
@@ -145,6 +157,7 @@ class Finished:
 
 Event = (
     Send
+    | SendToClient
     | SamplesSeen
     | Estimated
     | Judged

@@ -97,6 +97,26 @@ class Operator:
 
 
 @dataclass(frozen=True, slots=True)
+class ClientSent:
+    """Bytes that a program wrote into a shared port (`client`: the share's name), cut anywhere.
+
+    text: each byte as the character of its number
+    """
+
+    host_ns: int
+    client: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClientLeft:
+    """The program closed the shared port."""
+
+    host_ns: int
+    client: str
+
+
+@dataclass(frozen=True, slots=True)
 class RegistersKnown:
     """Registers that were in force, for recordings in which nobody asked the device for them."""
 
@@ -200,6 +220,8 @@ Input = (
     | Columns
     | TermsKnown
     | Operator
+    | ClientSent
+    | ClientLeft
     | RegistersKnown
     | Samples
     | EarlierSamples

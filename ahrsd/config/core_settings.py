@@ -9,6 +9,7 @@ from ahrsd.core.calibration_pipeline import CalibratorSettings
 from ahrsd.core.settings import CoreSettings
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import text_within
+from ahrsd.sharing.client_commands import SharePolicy
 from ahrsd.world_field import WorldField, world_field
 from ahrsd.writeback.policy import WriteBackPolicy
 
@@ -58,6 +59,7 @@ def core_settings(
         stream_rate_hz=stream_rate_hz,
         columns_max_age_s=config.terms.max_age_s,
         warm_start_s=config.estimator.warm_start_s,
+        shares=tuple(SharePolicy(s.name, s.owner, s.save, s.reset) for s in config.share),
     )
 
 

@@ -13,7 +13,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
 from ahrsd.config.sections import (
@@ -27,6 +27,7 @@ from ahrsd.config.sections import (
     MetricsSection,
     RerunSection,
     Section,
+    ShareSection,
     SocketSection,
     StillSection,
     TermsSection,
@@ -60,6 +61,7 @@ class Config(Section):
     state_directory: Path | None = None
     """Journals and captures; default: $STATE_DIRECTORY (systemd), else ~/.local/state/ahrsd."""
     device: DeviceSection = DeviceSection()
+    share: tuple[ShareSection, ...] = ()
     capture: CaptureSection = CaptureSection()
     rerun: RerunSection = RerunSection()
     socket: SocketSection = SocketSection()
@@ -73,6 +75,29 @@ class Config(Section):
     trial: TrialSection = TrialSection()
     still: StillSection = StillSection()
     budget: BudgetSection = BudgetSection()
+
+    @field_validator("share", mode="before")
+    @classmethod
+    def _tables(cls, value: object) -> object:
+        """TOML has lists only."""
+        if isinstance(value, dict) or (isinstance(value, list) and not _all_tables(value)):
+            raise ValueError("write [[share]], once for each port")
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _shares_fit(self) -> Config:
+        names = [share.name for share in self.share]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"share: {twice[0]} is there twice")
+        owners = [share.name for share in self.share if share.owner]
+        if len(owners) > 1:
+            raise ValueError(f"share: {' and '.join(owners)} are both owner; at most one can be")
+        if owners and self.device.configure_stream:
+            raise ValueError(
+                f"device.configure_stream: the outputs are set by the owner of {owners[0]}; set "
+                "it to false, or give that share owner = false"
+            )
+        return self
 
     @property
     def state(self) -> Path:
@@ -97,6 +122,10 @@ class Config(Section):
             **self.write_back.model_dump(),
             **self.budget.model_dump(),
         )
+
+
+def _all_tables(values: list[object]) -> bool:
+    return all(isinstance(value, dict) for value in values)
 
 
 CONFIG_KEY = "config"  # where a capture's header keeps the configuration it was made with
@@ -156,7 +185,8 @@ def _explain(detail: ErrorDetails) -> str:
         hint = f"did you mean {alike[0]}?" if alike else f"known are {names}"
         return f"{key} = {detail['input']!r}: unknown key; {hint}"
     if not location or detail["type"] == "value_error":
-        return f"{key}: {detail['msg'].removeprefix('Value error, ')}"
+        text = detail["msg"].removeprefix("Value error, ")
+        return f"{key}: {text}" if key else text
     if detail["type"] == "model_type":
         return f"{key} = {detail['input']!r}: this is a table, write [{key}]"
     words = _WORDS.get(detail["type"], detail["msg"].replace("Input should be", "must be"))

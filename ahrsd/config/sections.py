@@ -54,6 +54,34 @@ class DeviceSection(Section):
     """How long a reply may take before the question is asked again. [s]"""
 
 
+class ShareSection(Section):
+    """A port on which another program finds the device, as if it had it alone."""
+
+    pty: Path | None = None
+    """Path of the port; the other program opens it in place of the device's own."""
+    owner: bool = False
+    """Its program may set outputs and other settings of the device, in RAM; at most one may. The
+    others read and listen. Nobody writes what calibrates."""
+    save: Literal["refuse", "clean"] = "clean"
+    """What becomes of VNWNV of the owner; clean: sent once nothing unproven is in the device's RAM
+    (a calibration on trial is undone first)."""
+    reset: Literal["refuse", "announce"] = "announce"
+    """What becomes of VNRST of the owner."""
+    group: str | None = None
+    """Group that may open the port; default: the daemon's."""
+
+    @model_validator(mode="after")
+    def _has_a_port(self) -> ShareSection:
+        if self.pty is None:
+            raise ValueError("pty, the path of the port, is missing")
+        return self
+
+    @property
+    def name(self) -> str:
+        """How people and the log call it."""
+        return str(self.pty)
+
+
 class CaptureSection(Section):
     """The record of everything that came and went, raw."""
 

@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ahrsd.config.loading import Config
+from ahrsd.config.sections import ShareSection
 
 _WIDTH = 96
 _SIGNS = ((Ge, "ge", ">="), (Gt, "gt", ">"), (Le, "le", "<="), (Lt, "lt", "<"))
@@ -37,7 +38,8 @@ def print_config(config: Config) -> str:
     for name, section in _sections(config):
         lines += [""] * bool(lines)
         if name:
-            lines += [*_comment(type(section).__doc__ or ""), f"[{name}]"]
+            title = f"[[{name}]]" if name in _listed() else f"[{name}]"
+            lines += [*_comment(type(section).__doc__ or ""), title]
         for key, field in _keys(type(section)):
             value = getattr(section, key)
             allowed = _allowed(field)
@@ -49,8 +51,9 @@ def print_config(config: Config) -> str:
 def reference() -> str:
     """The reference of all keys, in Markdown."""
     lines = [_PREFACE]
-    for name, section in _sections(Config()):
+    for name, section in [*_sections(Config()), *_listed().items()]:
         title = f"## `[{name}]`" if name else "## Keys in front of all tables"
+        title = f"## `[[{name}]]`, as often as needed" if name in _listed() else title
         lines += [title, "", type(section).__doc__ or "", ""]
         lines += ["| key | default | allowed | effect |", "|---|---|---|---|"]
         for key, field in _keys(type(section)):
@@ -79,11 +82,18 @@ def _sections(config: Config) -> Iterator[tuple[str, BaseModel]]:
         value = getattr(config, name)
         if isinstance(value, BaseModel):
             yield name, value
+        elif name in _listed():
+            yield from ((name, one) for one in value)
+
+
+def _listed() -> dict[str, BaseModel]:
+    """Tables that may be there several times, with their defaults."""
+    return {"share": ShareSection.model_construct()}
 
 
 def _keys(section: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
     for name, field in section.model_fields.items():
-        if not isinstance(field.get_default(), BaseModel):
+        if not isinstance(field.get_default(), BaseModel) and name not in _listed():
             yield name, field
 
 

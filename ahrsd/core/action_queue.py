@@ -77,6 +77,11 @@ class ActionQueue:
         """Whether the queue waits for a record to be on the disk."""
         return self._awaiting_journal
 
+    @property
+    def wants_the_wire(self) -> bool:
+        """Whether a procedure waits until the session is idle."""
+        return self._procedure is not None or self._look is not None
+
     def add(self, actions: Iterable[Action]) -> None:
         """Append to the queue."""
         self._todo.extend(actions)

@@ -18,6 +18,7 @@ from ahrsd import events, inputs
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.core.action_queue import ActionQueue
 from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.clients import Clients
 from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.decision_log import DecisionLog
 from ahrsd.core.device_record import DeviceRecord
@@ -30,6 +31,7 @@ from ahrsd.core.device_session import (
     DeviceSession,
     Identified,
     Looked,
+    Served,
     StreamChanged,
     Unanswered,
 )
@@ -102,6 +104,7 @@ class Core:
         self._device_record = DeviceRecord()
         self._action_queue = ActionQueue(self.device_session, self.writeback, self.stream.forgive)
         self._trial: LiveTrial | None = None
+        self.clients = Clients(settings.shares, self.device_session, self.writeback)
         self._out: list[events.Event] = []
         self._answers: list[events.Answered] = []  # due once nothing waits for the journal
         if settings.policy.mode is Mode.PASSIVE:
@@ -115,6 +118,8 @@ class Core:
             inputs.LinkLost: self._link_lost,
             inputs.Interlock: lambda it: add(back.on_interlock(it.safe, self._host_s)),
             inputs.Operator: self._operator,
+            inputs.ClientSent: lambda it: self.clients.sent(it, self._host_s),
+            inputs.ClientLeft: self.clients.left,
             **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.take),
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
@@ -146,7 +151,8 @@ class Core:
     @property
     def deadline_ns(self) -> int | None:
         """When a `Tick` is wanted if nothing else arrives before, on the host's clock."""
-        due = [self.device_session.deadline_s, self.writeback.deadline_s]
+        parts = (self.device_session, self.writeback, self.clients)
+        due = [part.deadline_s for part in parts]
         known = [d for d in due if d is not None]
         return int(min(known) * 1e9) + 1 if known else None
 
@@ -269,6 +275,7 @@ class Core:
     def _fault(self, code: int) -> None:
         self.faults += 1
         self._note("warning", f"the device reports VNERR {code:02X}")
+        self.clients.fault(code)
         if code in (_WATCHDOG_RESET, _HARD_FAULT):
             self._device_reset(f"VNERR {code:02X}")
 
@@ -343,6 +350,8 @@ class Core:
                 if back.confirmed_s is not None:
                     for blocks, when in self.unconfirmed.confirm(back.confirmed_s):
                         self._examine(blocks, when)
+            case Served(result, error):
+                self._client_served(result, error)
             case StreamChanged(text, level):
                 self._flush()
                 self._watch.resumed(self._host_s)
@@ -377,6 +386,7 @@ class Core:
             for event in found:
                 self._on_device(event)
             acted = self._action_queue.work(self, self._host_s)
+            acted |= self._serve_clients()
             if self._stopping and not self._closing and self._action_queue.at_rest:
                 self._closing = acted = True
                 self.take(self.device_session.restore_and_close(self._host_s))
@@ -384,6 +394,30 @@ class Core:
                 break
         if output := self.device_session.session.take_output():
             self._out.append(events.Send(output))
+        for text in self.clients.take_notes():
+            self._note("warning", text)
+        self._out += self.clients.take_answers()
+
+    def _serve_clients(self) -> bool:
+        """Let a client's command have the wire; returns whether anything was done."""
+        free = not (self._action_queue.wants_the_wire or self._stopping)
+        actions, command = self.clients.next(self._host_s, free=free)
+        self._action_queue.add(actions)
+        if command is not None:
+            self.take(self.device_session.serve(command, self._host_s))
+        return bool(actions) or command is not None
+
+    def _client_served(self, result: object, error: Exception | None) -> None:
+        """What a client's command changed in the device."""
+        served = self.clients.served(result, error, self.registers, self._host_s)
+        if served.wrote:
+            self._flush()
+            self.registers = self.stream.registers = {**self.registers, **served.wrote}
+            self._watch.resumed(self._host_s)
+            self.stream.forget()
+        self._action_queue.add(served.actions)
+        if served.reset_by:
+            self._device_reset(f"{served.reset_by} reset it")
 
     def emit(self, event: events.Event) -> None:
         """A fact of the write-back."""

@@ -4,6 +4,7 @@
  CLOSED -> IDENTIFYING -> READING -> [KEEPING -> SETTING_UP] -> READY -> RESTORING -> DONE
                                                                 READY <-> RUNNING (the write-back)
                                                                 READY <-> LOOKING (who answers?)
+                                                                READY <-> SERVING (a client's)
 ```
 Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_outputs`).
 A device that stops sending although its output may be switched on is asked for it
@@ -20,6 +21,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from ahrsd.core.client_settings import ClientSettings
 from ahrsd.core.kept_outputs import KeptOutputs
 from ahrsd.writeback.journal_history import JournalRecord
 from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
@@ -31,8 +33,17 @@ from drivers.vn100.calibration_stream import (
     NotPutBack,
     configure_stream,
 )
-from drivers.vn100.commands import RESUME, Command, LinkGone, Pause, Procedure, SessionError
-from drivers.vn100.decode import Measurement
+from drivers.vn100.commands import (
+    RESUME,
+    Command,
+    LinkGone,
+    Pause,
+    Procedure,
+    Read,
+    SessionError,
+    Speech,
+)
+from drivers.vn100.decode import Measurement, Reply
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -76,6 +87,7 @@ class Phase(Enum):
     READY = "ready"
     RUNNING = "running a procedure"
     LOOKING = "asking who answers and what it holds"
+    SERVING = "asking for a client"
     RESTORING = "restoring"
     CLOSING = "noting that all is put back"
     DONE = "done"
@@ -128,6 +140,14 @@ class Looked:
 
 
 @dataclass(frozen=True, slots=True)
+class Served:
+    """A client's command was answered with `result` (a Reply), or ended with `error`."""
+
+    result: object
+    error: Exception | None
+
+
+@dataclass(frozen=True, slots=True)
 class Closed:
     """Everything is put back; `error` says what is not."""
 
@@ -135,7 +155,14 @@ class Closed:
 
 
 DeviceEvent = (
-    Identified | ConfigurationRead | StreamChanged | Unanswered | Completed | Looked | Closed
+    Identified
+    | ConfigurationRead
+    | StreamChanged
+    | Unanswered
+    | Completed
+    | Looked
+    | Served
+    | Closed
 )
 _ENDING = (Phase.RESTORING, Phase.CLOSING, Phase.DONE)
 
@@ -264,7 +291,7 @@ class DeviceSession:
         self._asking = Purpose.STREAM if self.change_stream else Purpose.ROLL_BACK
         self.phase = Phase.CLOSED
         self.identity: Identity | None = None
-        self.outputs = KeptOutputs()
+        self.outputs, self.clients = KeptOutputs(), ClientSettings()
         scale = max(1.0, reply_timeout_s / USUAL_REPLY_S)
         self.watchdog, self.limit = OutputWatchdog(scale), StopLimit(scale)
         self.session = Session(self._allowed, reply_timeout_s=reply_timeout_s)
@@ -276,11 +303,13 @@ class DeviceSession:
         self._touched = self._unanswered = self._unkept = False
         self._failure = "no answer in time"  # why something was not put back
         self._ask_again_s = ASK_AGAIN_S[0]
+        self._serving: Speech = RESUME
         self._own, self._foreign = "", 0  # layout of the session's output; others without it
         self._events: list[DeviceEvent] = []
 
     def _allowed(self, command: Command) -> bool:
-        if not permitted(command, self.mode, self.change_stream, self._purpose):
+        clients = self.clients.now
+        if not permitted(command, self.mode, self.change_stream, self._purpose, clients):
             return False
         return self._extra_gate is None or self._extra_gate(command)
 
@@ -292,7 +321,7 @@ class DeviceSession:
     @property
     def listening(self) -> bool:
         """Whether the device's output runs as it is, undisturbed by a procedure."""
-        return self.phase in (Phase.READY, Phase.LOOKING)
+        return self.phase in (Phase.READY, Phase.LOOKING, Phase.SERVING)
 
     @property
     def may_close(self) -> bool:
@@ -310,8 +339,8 @@ class DeviceSession:
     @property
     def session_keys(self) -> frozenset[int]:
         """Registers that this session, or one before it that was killed, changed."""
-        theirs = bool(self.outputs.left)
-        return frozenset(SESSION_SETTINGS) if self.change_stream or theirs else frozenset()
+        ours = SESSION_SETTINGS if self.change_stream or self.outputs.left else ()
+        return frozenset((*ours, *self.clients.now))
 
     def take_events(self) -> list[DeviceEvent]:
         """What happened since the last call."""
@@ -340,7 +369,7 @@ class DeviceSession:
             self._warn(self.outputs.describe_left(put_back=self.change_stream))
         if self.phase is Phase.KEEPING:
             self.outputs.keep()
-        return {**registers, **self.outputs.users}
+        return {**registers, **self.outputs.users, **self.clients.read(registers)}
 
     def journalled(self, kind: RecordKind, error: str, now_s: float) -> None:
         """A record of the user's outputs is on the disk, or is not."""
@@ -386,6 +415,8 @@ class DeviceSession:
     def _abandon(self, now_s: float) -> list[Event]:
         """End what runs without another byte; only the write-back is told how its own ended."""
         self._own = ""
+        if self.phase is Phase.SERVING:
+            self._events.append(Served(None, LinkGone()))
         if self.phase not in (Phase.RUNNING, Phase.RESTORING):
             self.phase = Phase.CLOSED
         return self._digest(self.session.link_lost(now_s), now_s)
@@ -408,10 +439,16 @@ class DeviceSession:
         return self._digest(self._start(look(unit, expected), Purpose.READ, now_s), now_s)
 
     def stop_looking(self, now_s: float) -> list[Event]:
-        """Something more urgent waits."""
-        if self.phase is not Phase.LOOKING:
+        """Something more urgent waits; a client's question too, but nothing that changes things."""
+        asks = self.phase is Phase.SERVING and isinstance(self._serving, Read)
+        if not (asks or self.phase is Phase.LOOKING):
             return []
         return self._digest(self.session.cancel(now_s), now_s)
+
+    def serve(self, command: Speech, now_s: float) -> list[Event]:
+        """Send a client's command, beside the running output; only while `idle`."""
+        self.phase, self._serving = Phase.SERVING, command
+        return self._digest(self._start(asked(command), Purpose.CLIENT, now_s), now_s)
 
     def cancel(self, name: str, now_s: float) -> list[Event]:
         """End the procedure of this name, if it runs; it may still send what puts things back."""
@@ -421,6 +458,9 @@ class DeviceSession:
 
     def set_up_again(self, now_s: float) -> list[Event]:
         """The user's own outputs are back for a save, or kept: set the session's up (again)."""
+        if self.clients.now and self.idle:
+            self.phase, wanted = Phase.SETTING_UP, dict(self.clients.now)
+            return self._digest(self._start(restore(wanted, wanted), Purpose.CLIENT, now_s), now_s)
         may = self.change_stream and self._writable
         if not (may and (self.idle or self.phase is Phase.KEEPING)):
             return []
@@ -551,6 +591,10 @@ class DeviceSession:
             self._ready(now_s)
             self._events.append(Looked(result if isinstance(result, Seen) else None, error))
             return []
+        if phase is Phase.SERVING:
+            self._ready(now_s)
+            self._events.append(Served(result, error))
+            return []
         if phase is Phase.CLOSED:
             return []
         if phase is Phase.RESTORING:
@@ -605,6 +649,7 @@ class DeviceSession:
             if result.serial != self._serial:
                 self._touched = False  # nothing of another device's is put back to this one
             self.identity, self._serial = result, result.serial
+            self.clients.of(result.serial)
             self._events.append(Identified(result))
             self.phase = Phase.READING
             twice = (*CALIBRATION, *(SESSION_SETTINGS if self.change_stream else ()))
@@ -632,6 +677,11 @@ def again_after(error: Exception) -> tuple[float, float] | None:
     if isinstance(error, NotPutBack):
         return PUT_BACK_AGAIN_S
     return None if isinstance(error, DoesNotFit | NoStream) else SET_UP_AGAIN_S
+
+
+def asked(command: Speech) -> Procedure[Reply]:
+    """One command and its reply."""
+    return (yield command)
 
 
 def identify_in(seconds: float) -> Procedure[Identity]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from ahrsd.core.calibration_pipeline import CalibratorSettings
 from ahrsd.gates import Level
+from ahrsd.sharing.client_commands import SharePolicy
 from ahrsd.writeback.policy import WriteBackPolicy
 
 BESIDE_KEY = "examined"  # in a capture's header where `beside` was set
@@ -23,6 +24,7 @@ class CoreSettings:
         those of everything.
     columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
     warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
+    shares: the ports on which other programs find the device
     beside: the slow part of the work is done beside the core (`estimation_queue`), not at once
     """
 
@@ -36,6 +38,7 @@ class CoreSettings:
     columns_max_age_s: float = 0.5
     beside: bool = False
     warm_start_s: float = 0.0
+    shares: tuple[SharePolicy, ...] = ()
 
     @property
     def level(self) -> Level:

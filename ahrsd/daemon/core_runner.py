@@ -117,7 +117,10 @@ class JournalKeeper:
 
 @dataclass(slots=True)
 class Shell:
-    """A core and its side taps; each tap may be absent."""
+    """A core and its side taps; each tap may be absent.
+
+    to_client: takes what is for a program on a shared port
+    """
 
     core: Core
     capture: CaptureWriter | None = None
@@ -127,6 +130,7 @@ class Shell:
     finished: bool = False
     folded: FoldedLog = field(default_factory=FoldedLog)
     worker: Worker | None = None
+    to_client: Callable[[events.SendToClient], None] | None = None
 
     def feed(self, item: Input) -> bytes:
         """One input through the core; returns what must be written to the port."""
@@ -157,6 +161,12 @@ class Shell:
                 if self.capture is not None:
                     self.capture.write_sent(host_ns, data)
                 return data
+            case events.SendToClient(client, data):
+                if self.capture is not None:
+                    fact = {"to": client, "data": data.decode("latin-1")}
+                    self.capture.write_event(host_ns, fact)
+                if self.to_client is not None:
+                    self.to_client(event)
             case events.OpenJournal(serial) if self.journal is not None:
                 waiting.append(self.journal.opened(serial))
             case events.JournalAppend() if self.journal is not None:

@@ -26,7 +26,8 @@ from ahrsd.daemon.health_log import Watch
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorInbox
 from ahrsd.daemon.recall import Recall
 from ahrsd.daemon.reloading import Change, Reloader
-from ahrsd.daemon.serial_link import Bytes, Lost, SerialLink, find_device
+from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink, find_device
+from ahrsd.daemon.shared_ports import SharedPorts
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
 from ahrsd.viewer.sink import RerunSink
@@ -168,6 +169,8 @@ class Daemon:
         with ExitStack() as leaving:
             leaving.callback(self.shell.folded.finish)
             leaving.callback(self._link.close)
+            if self.config.share:
+                self._share(leaving)
             leaving.push(self._after_a_bug)
             self._tell_wall()
             if self._terms:
@@ -176,6 +179,14 @@ class Daemon:
             while not self._stop_reason:
                 self._turn(_LONGEST_WAIT_S)
             self._finish()
+
+    def _share(self, leaving: ExitStack) -> None:
+        """Other programs find the device on ports of their own."""
+        ports = SharedPorts(self.config.share, self._inbox.add, self.clock.now_ns)
+        leaving.callback(ports.close)
+        self._link.share, self.shell.to_client = ports.heard, ports.send
+        names = ", ".join(share.name for share in self.config.share)
+        self.shell.say(logging.INFO, f"the device is shared on {names}", self.clock.now_ns())
 
     def _after_a_bug(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """On the way out: whatever it was, the device is put back; what was raised goes on."""
@@ -194,6 +205,8 @@ class Daemon:
             self._feed(inputs.Received(item.host_ns, item.data))
         elif isinstance(item, Lost):
             self._lost(item.host_ns, item.reason)
+        elif item is not None:
+            self._feed(item)
         # What is waited for may lie in the inbox or in the port already: a reply is late only
         # against what was taken, and a silence is one only where nothing waits to be read.
         now_ns = self.clock.now_ns() if item is None else item.host_ns
@@ -207,7 +220,7 @@ class Daemon:
             well = self.shell.worker is None or not self.shell.worker.stuck
             self._public.turn(self.shell.core, time.monotonic(), well=well)
 
-    def _wait(self, longest_s: float) -> Bytes | Lost | None:
+    def _wait(self, longest_s: float) -> Item | None:
         """The next bytes; while the estimator is behind they wait, and the rest goes on."""
         worker = self.shell.worker
         if worker is not None and worker.full and not self._stop_reason:
@@ -370,7 +383,9 @@ class Daemon:
 
     def _lost(self, host_ns: int, reason: str, *, heard: bool = True) -> None:
         for item in self._link.close():
-            if heard:  # before the link went
+            if not isinstance(item, Bytes):
+                self._feed(item)
+            elif heard:  # before the link went
                 self._feed(inputs.Received(item.host_ns, item.data))
         if self._stop_reason:  # the mark that `stop` left went with them
             self._inbox.wake()

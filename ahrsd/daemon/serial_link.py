@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
+from ahrsd.inputs import ClientLeft, ClientSent
 from drivers.serial_port import (
     LISTEN_S,
     SCANNED_BAUD,
@@ -52,8 +53,13 @@ class Lost:
     reason: str
 
 
+Item = Bytes | Lost | ClientSent | ClientLeft
+
+
 class Inbox:
     """What was heard and not taken yet. One thread puts bytes, one takes; anybody may wake it.
+
+    Inputs of other threads (`add`) come out between the bytes, in the order in which they came.
 
     patient_bytes: the reader waits while more than this is not taken yet, for a device whose time
                    waits for its reader; None: it never waits, and a backlog beyond `limit_bytes` is
@@ -62,7 +68,7 @@ class Inbox:
 
     def __init__(self, limit_bytes: int = BACKLOG_BYTES, patient_bytes: int | None = None) -> None:
         self.limit_bytes, self.patient_bytes = limit_bytes, patient_bytes
-        self._queue: SimpleQueue[Bytes | Lost | None] = SimpleQueue()
+        self._queue: SimpleQueue[Item | None] = SimpleQueue()
         self._put_bytes = self._taken_bytes = 0  # each is written by one thread only
 
     @property
@@ -81,11 +87,15 @@ class Inbox:
             self._put_bytes += len(item.data) + _READ_BYTES
         self._queue.put(item)
 
+    def add(self, item: ClientSent | ClientLeft) -> None:
+        """From the thread of the shared ports, which bounds what it adds."""
+        self._queue.put(item)
+
     def wake(self) -> None:
         """End a `get` that waits; safe in a signal handler."""
         self._queue.put(None)
 
-    def get(self, timeout_s: float) -> Bytes | Lost | None:
+    def get(self, timeout_s: float) -> Item | None:
         """The next one; None where nothing came in time, and after a `wake`."""
         try:
             item = self._queue.get(timeout=timeout_s)
@@ -95,20 +105,29 @@ class Inbox:
             self._taken_bytes += len(item.data) + _READ_BYTES
         return item
 
-    def rest(self) -> list[Bytes]:
-        """All bytes that wait; then it is empty."""
+    def rest(self) -> list[Bytes | ClientSent | ClientLeft]:
+        """All that waits but the loss of the link; then it is empty."""
         found = []
         while not self.empty:
-            if isinstance(item := self.get(0.0), Bytes):
+            if isinstance(item := self.get(0.0), Bytes | ClientSent | ClientLeft):
                 found.append(item)
         return found
 
 
 class SerialReader:
-    """Reads an open port into an inbox until it is lost or `stop` is called."""
+    """Reads an open port into an inbox until it is lost or `stop` is called.
 
-    def __init__(self, port: SerialPort, inbox: Inbox, now_ns: Callable[[], int]) -> None:
-        self._port, self._inbox, self._now_ns = port, inbox, now_ns
+    share: is given all that is read at once, and nothing (b"") where nothing came for a while
+    """
+
+    def __init__(
+        self,
+        port: SerialPort,
+        inbox: Inbox,
+        now_ns: Callable[[], int],
+        share: Callable[[bytes], None] | None = None,
+    ) -> None:
+        self._port, self._inbox, self._now_ns, self._share = port, inbox, now_ns, share
         self._stopping = False
         self._thread = threading.Thread(target=self._work, name="serial-reader", daemon=True)
         self._thread.start()
@@ -123,9 +142,9 @@ class SerialReader:
                 if self._inbox.patient_bytes is not None and waiting > self._inbox.patient_bytes:
                     time.sleep(_PATIENT_POLL_S)
                     continue
-                if not self._port.wait_readable(_POLL_S):
-                    continue
-                data = self._port.read()
+                data = self._port.read() if self._port.wait_readable(_POLL_S) else b""
+                if self._share is not None:  # other programs first: they wait for nothing else
+                    self._share(data)
                 if data:
                     self._inbox.put(Bytes(self._now_ns(), data))
         except PortLost as error:
@@ -164,6 +183,7 @@ class SerialLink:
         self.path, self.baud = path, baud
         self.inbox = Inbox(patient_bytes=patient_bytes)
         self._now_ns = now_ns
+        self.share: Callable[[bytes], None] | None = None  # see `SerialReader`
         self._port: SerialPort | None = None
         self._reader: SerialReader | None = None
         self._doubtful: itertools.cycle[int] | None = None
@@ -183,7 +203,7 @@ class SerialLink:
             self.baud = find_device(self.path, next(self._doubtful), may_query=may_query).baud
             self._doubtful = None
         self._port = SerialPort(self.path, self.baud)
-        self._reader = SerialReader(self._port, self.inbox, self._now_ns)
+        self._reader = SerialReader(self._port, self.inbox, self._now_ns, self.share)
 
     def has_more(self) -> bool:
         """Whether bytes lie in the port that the thread has not come to read."""
@@ -201,7 +221,7 @@ class SerialLink:
         ended = reader is None or reader.stop()
         return port if ended else None  # a descriptor in use must not be closed, and so used again
 
-    def close(self) -> list[Bytes]:
+    def close(self) -> list[Bytes | ClientSent | ClientLeft]:
         """Give the port back, and what was read and not taken yet; safe to call again."""
         port = self.take_port()
         if port is not None:

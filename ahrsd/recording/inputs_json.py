@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 
 from ahrsd.inputs import (
+    ClientLeft,
+    ClientSent,
     Columns,
     EarlierRun,
     EarlierSamples,
@@ -54,6 +56,8 @@ _TYPES = {
         Columns,
         TermsKnown,
         Operator,
+        ClientSent,
+        ClientLeft,
         RegistersKnown,
         Samples,
         EarlierSamples,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 from ahrsd.writeback.clocks import UNKNOWN, Stamp
-from ahrsd.writeback.reconcile import OF_OUTPUTS, OPEN, RecordKind
+from ahrsd.writeback.reconcile import OF_OTHERS, OPEN, RecordKind
 from ahrsd.writeback.transaction import Transaction
 from drivers.vn100.registers import Values, same
 
@@ -94,7 +94,7 @@ class JournalHistory:
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
         """The history after one more record."""
-        if kind in OF_OUTPUTS:
+        if kind in OF_OTHERS:
             return self
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)

@@ -61,6 +61,7 @@ _AWAITED = {
     State.STAGED: RecordKind.RAM_VERIFIED,
     State.SAVE_PREPARING: RecordKind.FLASH_SENT,
 }
+_BETWEEN = CHANGED_IN_RAM | {State.RECONCILING, State.PREPARING, State.CHECKING}
 _NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
 
@@ -119,6 +120,18 @@ class WriteBack:
     def idle(self) -> bool:
         """Nothing is under way that must end before the daemon may stop."""
         return not self._outbox.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
+
+    @property
+    def client_may_save(self) -> bool | None:
+        """Whether all of RAM may be saved for a client; None: not yet, or what is there is undone.
+
+        Never while nobody knows what the device holds.
+        """
+        if self.state in (State.FAULT, State.FLASH_TORN):
+            return False
+        if self.state in _BETWEEN or self._outbox.running:
+            return None
+        return True
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
@@ -392,6 +405,37 @@ class WriteBack:
                 self._flow.passed = reason if finding is TrialVerdict.PASSED else ""
                 if not self._flow.passed:
                     self._flow.proven_to_s = None
+        return self._answer()
+
+    def on_client_settings(
+        self,
+        session_keys: frozenset[int],
+        host_s: float,
+    ) -> list[Action]:
+        """A client set registers for its session: `session_keys` are all that hold such values."""
+        self._outbox.host_s, self._flow.session_keys = host_s, session_keys
+        return self._answer()
+
+    def on_client_wants_save(self, client: str, host_s: float) -> list[Action]:
+        """All of RAM is to be saved for a client: what is on trial is undone first."""
+        self._outbox.host_s = host_s
+        self._flow.roll_back("client", f"{client} saves, and nothing unproven is saved along")
+        return self._answer()
+
+    def on_client_saved(
+        self,
+        client: str,
+        saved: Mapping[int, Values],
+        session_keys: frozenset[int],
+        host_s: float,
+    ) -> list[Action]:
+        """All of RAM was saved for a client; `saved`: what clients had set is the user's now."""
+        self._outbox.host_s, self._flow.session_keys = host_s, session_keys
+        self._flow.registers = {**self._flow.registers, **saved}
+        if self._flow.identity is not None:
+            self._outbox.record(
+                RecordKind.CLIENT_SAVED, client=client, serial=self._flow.identity.serial
+            )
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:

@@ -7,6 +7,9 @@
 | STAGE | a transaction writes registers 23 and 84 in RAM | stage |
 | ROLL_BACK | a transaction puts them back | stage |
 | SAVE | session settings put back (with `configure_stream`), then VNWNV | commit |
+| CLIENT | what a program on a shared port asked for (`sharing.client_commands`) | passive |
+
+A client's settings, in RAM for its session, are put back for a save like the daemon's own.
 
 A mode is a ceiling that a person sets; what the machine does below it is decided elsewhere, and
 the interlock is asked there. This function is total: a command that no row names is refused.
@@ -14,13 +17,16 @@ the interlock is asked there. This function is total: a command that no row name
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import Enum, IntEnum
 from typing import Final
 
 from drivers.vn100.commands import Command, Pause, Read, Word, Write
 from drivers.vn100.procedures import SESSION_SETTINGS
+from drivers.vn100.registers import REGISTERS
 
 CALIBRATION: Final = (23, 84)
+GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # for no client: line rate and calibration
 
 
 class Mode(IntEnum):
@@ -40,6 +46,7 @@ class Purpose(Enum):
     STAGE = "stage"
     ROLL_BACK = "roll back"
     SAVE = "save"
+    CLIENT = "client"
 
 
 NEEDS: Final[dict[Purpose, Mode]] = {
@@ -48,6 +55,7 @@ NEEDS: Final[dict[Purpose, Mode]] = {
     Purpose.STAGE: Mode.STAGE,
     Purpose.ROLL_BACK: Mode.STAGE,
     Purpose.SAVE: Mode.COMMIT,
+    Purpose.CLIENT: Mode.PASSIVE,
 }
 WRITES: Final[dict[Purpose, tuple[int, ...]]] = {
     Purpose.READ: (),
@@ -55,6 +63,7 @@ WRITES: Final[dict[Purpose, tuple[int, ...]]] = {
     Purpose.STAGE: CALIBRATION,
     Purpose.ROLL_BACK: CALIBRATION,
     Purpose.SAVE: (),
+    Purpose.CLIENT: tuple(n for n, row in REGISTERS.items() if row.writable and n not in GUARDED),
 }
 WORDS: Final[dict[Purpose, tuple[str, ...]]] = {
     Purpose.READ: (),
@@ -62,18 +71,30 @@ WORDS: Final[dict[Purpose, tuple[str, ...]]] = {
     Purpose.STAGE: ("VNASY",),
     Purpose.ROLL_BACK: ("VNASY",),
     Purpose.SAVE: ("VNASY", "VNWNV"),
+    Purpose.CLIENT: ("VNWNV", "VNRST", "VNKMD", "VNKAD"),
 }
 
 
-def permitted(command: Command, mode: Mode, configure_stream: bool, purpose: Purpose) -> bool:
-    """Whether `command` may be sent. A pause sends nothing and is always permitted."""
+def permitted(
+    command: Command,
+    mode: Mode,
+    configure_stream: bool,
+    purpose: Purpose,
+    clients: Collection[int] = (),
+) -> bool:
+    """Whether `command` may be sent. A pause sends nothing and is always permitted.
+
+    clients: registers that hold a client's session settings
+    """
     if isinstance(command, Pause):
         return True
     if isinstance(command, Read):
-        return mode >= Mode.OBSERVE
+        return mode >= Mode.OBSERVE or purpose is Purpose.CLIENT
     if mode < NEEDS[purpose] or (purpose is Purpose.STREAM and not configure_stream):
         return False
     if isinstance(command, Write):
-        ours = purpose is Purpose.SAVE and configure_stream  # put back before VNWNV saves all
-        return command.register in (SESSION_SETTINGS if ours else WRITES[purpose])
+        if purpose is Purpose.SAVE:  # put back before VNWNV saves all
+            ours = SESSION_SETTINGS if configure_stream else ()
+            return command.register in ours or command.register in set(clients) - set(GUARDED)
+        return command.register in WRITES[purpose]
     return isinstance(command, Word) and command.word in WORDS[purpose]

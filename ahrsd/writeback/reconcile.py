@@ -46,6 +46,7 @@ class RecordKind(StrEnum):
     UNLOCKED = "UNLOCKED"
     OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
     OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
+    CLIENT_SAVED = "CLIENT_SAVED"  # a program on a shared port saved all of RAM
 
 
 OPEN: Final = (
@@ -58,6 +59,7 @@ OPEN: Final = (
     RecordKind.FLASH_ACKED,
 )
 OF_OUTPUTS: Final = (RecordKind.OUTPUTS_KEPT, RecordKind.OUTPUTS_BACK)
+OF_OTHERS: Final = (*OF_OUTPUTS, RecordKind.CLIENT_SAVED)  # says nothing about a transaction
 
 
 class DeviceContents(Enum):

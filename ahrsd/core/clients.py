@@ -1,0 +1,124 @@
+"""Programs on shared ports, and the rest of the core: when their commands go out, what follows.
+
+`sharing.arbiter` knows whose command is next and to whom an answer goes; here is what it means for
+the device session and the write-back: a save waits until nothing unproven is in the device's RAM,
+a write changes what is the user's, a reset is a restart that is known of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from ahrsd import events, inputs
+from ahrsd.core.device_session import DeviceSession
+from ahrsd.sharing.arbiter import Arbiter, Waiting
+from ahrsd.sharing.client_commands import UNAUTHORIZED, Kind, Refusal, SharePolicy
+from ahrsd.writeback.actions import Action
+from ahrsd.writeback.machine import WriteBack
+from drivers.vn100.commands import NoReply, Speech, Write
+from drivers.vn100.decode import Reply
+from drivers.vn100.registers import Values
+
+_UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"
+
+
+@dataclass(slots=True)
+class ServedEffects:
+    """What a client's command changed: registers, actions that follow, who restarted the device."""
+
+    wrote: dict[int, Values] = field(default_factory=dict)
+    actions: list[Action] = field(default_factory=list)
+    reset_by: str = ""
+
+
+class Clients:
+    """See the module."""
+
+    def __init__(
+        self, policies: Iterable[SharePolicy], session: DeviceSession, writeback: WriteBack
+    ) -> None:
+        self.arbiter = Arbiter(policies)
+        self._session, self._writeback = session, writeback
+
+    @property
+    def deadline_s(self) -> float | None:
+        """When `next` must be called at the latest."""
+        return self.arbiter.deadline_s
+
+    def sent(self, item: inputs.ClientSent, host_s: float) -> None:
+        """Bytes of a client."""
+        data = item.text.encode("latin-1", "replace")
+        self.arbiter.received(item.client, data, self._session.identity, host_s)
+
+    def left(self, item: inputs.ClientLeft) -> None:
+        """A client closed its port."""
+        self.arbiter.left(item.client)
+
+    def fault(self, code: int) -> None:
+        """The device reports an error of its own: each driver would have heard it."""
+        self.arbiter.tell_all(f"VNERR,{code:02X}")
+
+    def take_answers(self) -> list[events.Event]:
+        """Bytes for clients."""
+        return [
+            events.SendToClient(one.client, one.data, one.stream)
+            for one in self.arbiter.take_answers()
+        ]
+
+    def take_notes(self) -> list[str]:
+        """What a person should know of."""
+        return self.arbiter.take_notes()
+
+    def next(self, host_s: float, *, free: bool) -> tuple[list[Action], Speech | None]:
+        """The next command for the wire, where it is free, and what must happen before it."""
+        waiting = self.arbiter.first(host_s)
+        if waiting is None or not free or not self._session.idle:
+            return [], None
+        if waiting.asked.kind is Kind.SAVE and not (may := self._writeback.client_may_save):
+            if may is None:
+                return self._writeback.on_client_wants_save(waiting.client, host_s), None
+            self.arbiter.refuse_first(Refusal(UNAUTHORIZED, _UNKNOWN))
+            return [], None
+        return [], self.arbiter.begin().asked.command
+
+    def served(
+        self,
+        result: object,
+        error: Exception | None,
+        registers: Mapping[int, Values],
+        host_s: float,
+    ) -> ServedEffects:
+        """The command on the wire ended. `registers`: what the device held before it."""
+        effects, done = ServedEffects(), self.arbiter.ended(result, error)
+        if done is None:
+            return effects
+        if done.asked.kind is Kind.RESET and (isinstance(result, Reply) or _silent(error)):
+            effects.reset_by = done.client
+        elif isinstance(result, Reply):
+            self._changed(done, registers, host_s, effects)
+        return effects
+
+    def _changed(
+        self,
+        done: Waiting,
+        registers: Mapping[int, Values],
+        host_s: float,
+        effects: ServedEffects,
+    ) -> None:
+        command, settings = done.asked.command, self._session.clients
+        if isinstance(command, Write):
+            number, values = command.register, command.values
+            settings.written(number, values, registers.get(number))
+            effects.wrote = {number: values} if number in registers else {}
+            keys = self._session.session_keys
+            effects.actions = self._writeback.on_client_settings(keys, host_s)
+        elif done.asked.kind is Kind.SAVE:
+            saved = dict(settings.now)
+            settings.forget()
+            keys = self._session.session_keys
+            effects.actions = self._writeback.on_client_saved(done.client, saved, keys, host_s)
+
+
+def _silent(error: Exception | None) -> bool:
+    return isinstance(error, NoReply)

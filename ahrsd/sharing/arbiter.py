@@ -1,0 +1,211 @@
+"""Whose command is next on the wire, and to whom an answer goes. Pure; time is an argument.
+
+One command is on the wire at a time, the clients' in the order in which they came, and the daemon's
+own in between. What a client asks again while its question waits is absorbed: drivers repeat after
+50 ms what takes 60. A question that waited for longer than any driver waits for its answer is
+dropped: an answer that comes later would be taken for one to something else.
+
+A client that floods the port, sends half a line for ever or goes away costs nobody else anything:
+its line buffer and its questions are bounded.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+from ahrsd.sharing.client_commands import (
+    BAD_CHECKSUM,
+    IDENTITY,
+    ClientCommand,
+    Kind,
+    Refusal,
+    SharePolicy,
+    understand,
+)
+from drivers.vn100.commands import Read, Write
+from drivers.vn100.decode import Reply
+from drivers.vn100.deframer import Cause, Deframer
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.procedures import Identity
+from drivers.vn100.registers import Values, format_reply
+from drivers.vn100.sentences import encode
+
+PATIENCE_S = 2.5  # the longest that a known driver waits for an answer
+MOST_WAITING = 16  # commands of one client
+
+
+@dataclass(frozen=True, slots=True)
+class ToClient:
+    """Bytes for a client; `stream`: whether it wants measurements from now on, None: as before."""
+
+    client: str
+    data: bytes
+    stream: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """A command that waits for its turn, or is on the wire; `gone`: its client does not listen."""
+
+    client: str
+    asked: ClientCommand
+    since_s: float
+    gone: bool = False
+
+
+@dataclass(slots=True)
+class _Client:
+    policy: SharePolicy
+    lines: Deframer = field(default_factory=lambda: Deframer(host_side=True))
+    rate: Values | None = None  # of the line, as this client set it
+
+
+class Arbiter:
+    """See the module. `counts` is for people: commands, answers, what was absorbed or dropped."""
+
+    def __init__(self, policies: Iterable[SharePolicy]) -> None:
+        self.counts: Counter[str] = Counter()
+        self._clients = {policy.name: _Client(policy) for policy in policies}
+        self._queue: deque[Waiting] = deque()
+        self._under_way: Waiting | None = None
+        self._answers: list[ToClient] = []
+        self._notes: list[str] = []
+
+    @property
+    def deadline_s(self) -> float | None:
+        """When the oldest question has waited for too long."""
+        return self._queue[0].since_s + PATIENCE_S if self._queue else None
+
+    @property
+    def under_way(self) -> Waiting | None:
+        """The command that is on the wire."""
+        return self._under_way
+
+    def take_answers(self) -> list[ToClient]:
+        """What is due to clients since the last call."""
+        answers, self._answers = self._answers, []
+        return answers
+
+    def take_notes(self) -> list[str]:
+        """What a person should know of, since the last call."""
+        notes, self._notes = self._notes, []
+        return notes
+
+    # -- from the clients --------------------------------------------------------------------------
+
+    def received(self, name: str, data: bytes, identity: Identity | None, now_s: float) -> None:
+        """Bytes of a client, cut anywhere. `identity` is the device's, where it is known."""
+        client = self._clients.get(name)
+        if client is None:
+            return
+        found = client.lines.feed(data)
+        damaged = [s for s in client.lines.take_skipped() if s.cause is Cause.CHECKSUM]
+        for _ in damaged:
+            self._refuse(name, Refusal(BAD_CHECKSUM))
+        for sentence in found:
+            asked = understand(getattr(sentence, "body", ""), client.policy)
+            self.counts["commands"] += 1
+            if isinstance(asked, Refusal):
+                self._refuse(name, asked)
+            elif not self._answered_here(name, client, asked, identity):
+                self._wait(Waiting(name, asked, now_s))
+
+    def left(self, name: str) -> None:
+        """The client closed its port: what it asked is nobody's any more."""
+        if (client := self._clients.get(name)) is not None:
+            self._clients[name] = _Client(client.policy)
+        self._queue = deque(one for one in self._queue if one.client != name)
+        if self._under_way is not None and self._under_way.client == name:
+            self._under_way = replace(self._under_way, gone=True)
+
+    def _answered_here(
+        self, name: str, client: _Client, asked: ClientCommand, identity: Identity | None
+    ) -> bool:
+        """Answer what needs no device; whether that was possible."""
+        if asked.kind is Kind.STREAM:
+            self._say(name, encode(asked.body), asked.body.endswith("1"))
+        elif asked.kind is Kind.RATE and isinstance(asked.command, Write):
+            client.rate = asked.command.values
+            self._say(name, encode(asked.body))
+        elif asked.kind is Kind.RATE and client.rate is not None:
+            self._say(name, encode(f"VNRRG,{format_reply(5, client.rate)}"))
+        elif isinstance(asked.command, Read) and asked.kind is Kind.MEMORY and identity is not None:
+            return self._identify(name, asked.command.register, identity)
+        else:
+            return False
+        return True
+
+    def _identify(self, name: str, number: int, identity: Identity) -> bool:
+        known = (identity.model, identity.hardware, identity.serial, identity.firmware)
+        value = dict(zip(IDENTITY, known, strict=True))[number]
+        if value is None:
+            return False
+        self._say(name, encode(f"VNRRG,{format_reply(number, (value,))}"))
+        return True
+
+    def _wait(self, waiting: Waiting) -> None:
+        mine = [one for one in self._all() if one.client == waiting.client]
+        if any(one.asked.body == waiting.asked.body for one in mine):
+            self.counts["absorbed"] += 1
+        elif len(mine) >= MOST_WAITING:
+            self.counts["dropped"] += 1
+            self._notes.append(f"{waiting.client} sends faster than the device answers")
+        else:
+            self._queue.append(waiting)
+
+    def _all(self) -> list[Waiting]:
+        return [*([] if self._under_way is None else [self._under_way]), *self._queue]
+
+    # -- to and from the device --------------------------------------------------------------------
+
+    def first(self, now_s: float) -> Waiting | None:
+        """The next command for the wire, where none is on it; what waited too long is dropped."""
+        while self._queue and now_s - self._queue[0].since_s >= PATIENCE_S:
+            self.counts["dropped"] += 1
+            late = self._queue.popleft()
+            self._notes.append(f"{late.client}: {late.asked.command} got no turn in time")
+        return self._queue[0] if self._queue and self._under_way is None else None
+
+    def begin(self) -> Waiting:
+        """The first one goes on the wire. IndexError where nothing waits."""
+        self._under_way = self._queue.popleft()
+        return self._under_way
+
+    def ended(self, result: object, error: Exception | None) -> Waiting | None:
+        """What is on the wire was answered, refused, or not answered; returns it."""
+        done, self._under_way = self._under_way, None
+        if done is None:
+            return None
+        if done.gone:
+            return done
+        if isinstance(result, Reply):
+            self.counts["answered"] += 1
+            number = [] if result.register is None else [f"{result.register:02d}"]
+            self._say(done.client, encode(",".join([result.word, *number, *result.tokens])))
+        elif isinstance(error, DeviceRefused):
+            self._say(done.client, encode(f"VNERR,{error.code:02X}"))
+        else:
+            self.counts["unanswered"] += 1
+        return done
+
+    def refuse_first(self, refusal: Refusal) -> None:
+        """The first one is not to be sent, for this reason."""
+        if self._queue:
+            self._refuse(self._queue.popleft().client, refusal)
+
+    def tell_all(self, body: str) -> None:
+        """Something that the device said by itself."""
+        for name in self._clients:
+            self._say(name, encode(body))
+
+    def _refuse(self, name: str, refusal: Refusal) -> None:
+        self.counts["refused"] += 1
+        if refusal.why:
+            self._notes.append(f"{name}: {refusal.why}")
+        self._say(name, encode(f"VNERR,{refusal.code:02X}"))
+
+    def _say(self, name: str, data: bytes, stream: bool | None = None) -> None:
+        if name in self._clients:
+            self._answers.append(ToClient(name, data, stream))

@@ -1,0 +1,50 @@
+"""Device bytes into whole messages for clients, without the replies to commands.
+
+A driver needs a whole message before it can use any of it, so handing messages on when their last
+byte is there costs no time, and an answer of ours fits between any two of them. Every byte comes
+out, in order and once: in a message, as damage or noise where it stood, or as a reply, which is for
+whoever asked.
+"""
+
+from __future__ import annotations
+
+from drivers.vn100.deframer import Deframer, Sentence, Skipped
+from drivers.vn100.sentences import COMMAND_WORDS, REGISTER_WORDS
+
+_REPLIES = REGISTER_WORDS | COMMAND_WORDS | {"VNERR"}
+
+
+def is_reply(body: str) -> bool:
+    """Whether a line with this body answers a command."""
+    return body[:5] in _REPLIES
+
+
+class MessageSplitter:
+    """Of one link. `replies`: how many were kept back."""
+
+    def __init__(self) -> None:
+        self.replies = 0
+        self._deframer = Deframer()
+        self._held = b""  # bytes that did not come out yet
+        self._base = 0  # offset of the first of them in the stream
+
+    def feed(self, chunk: bytes) -> bytes:
+        """Take bytes, cut anywhere; whole messages, and what is none, for the clients."""
+        self._held += chunk
+        frames = self._deframer.feed(chunk)
+        pieces = sorted([*frames, *self._deframer.take_skipped()], key=lambda it: it.offset)
+        out = bytearray()
+        for piece in pieces:
+            length = len(piece.data) if isinstance(piece, Skipped) else piece.length
+            data, self._held = self._held[:length], self._held[length:]
+            self._base += length
+            if isinstance(piece, Sentence) and is_reply(piece.body):
+                self.replies += 1
+            else:
+                out += data
+        return bytes(out)
+
+    def silence(self) -> bytes:
+        """Nothing came for a while: what waits for more bytes is no message and comes out."""
+        self._deframer.drop_pending()
+        return self.feed(b"")
