@@ -112,7 +112,8 @@ class Clients:
             settings.written(number, values, registers.get(number))
             effects.wrote = {number: values} if number in registers else {}
             keys = self._session.session_keys
-            effects.actions = self._writeback.on_client_settings(keys, host_s)
+            clients = frozenset(settings.now)
+            effects.actions = self._writeback.on_client_settings(keys, clients, host_s)
         elif done.asked.kind is Kind.SAVE:
             saved = dict(settings.now)
             settings.forget()

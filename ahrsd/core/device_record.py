@@ -69,5 +69,6 @@ class DeviceRecord:
             self._journal,
             host_s,
             session_keys=device_session.session_keys,
+            clients=frozenset(device_session.clients.now),
             read_from_s=self._read_from_s,
         )

@@ -172,12 +172,13 @@ class WriteBack:
         host_s: float,
         *,
         session_keys: frozenset[int] = frozenset(),
+        clients: frozenset[int] = frozenset(),
         read_from_s: float = float("inf"),
     ) -> list[Action]:
         """The device was identified and read: at the start, after a reset, after a lost link.
 
-        registers:    all that were read; `session_keys` (which the daemon changes for its session)
-                      with the values that the user had
+        registers:    all that were read; `session_keys` (which the daemon changes for its session,
+                      or `clients` for theirs) with the values that the user had
         read_from_s:  when the reading of them began; see `on_uptime`
         journal:      this device's records, oldest first; None where they cannot be trusted
         """
@@ -187,6 +188,7 @@ class WriteBack:
         restarted = self._restarts.bind(identity.serial, read_from_s)
         self._safe.theirs = self._changed_by_others(identity, registers, session_keys, restarted)
         self._safe.bind(identity, registers, journal is not None)
+        self._safe.client_registers = clients
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
         self._outbox.in_force(registers)
         if self.state is not State.RECONCILING:
@@ -410,10 +412,15 @@ class WriteBack:
     def on_client_settings(
         self,
         session_keys: frozenset[int],
+        clients: frozenset[int],
         host_s: float,
     ) -> list[Action]:
-        """A client set registers for its session: `session_keys` are all that hold such values."""
+        """A client set registers, for its session.
+
+        session_keys: all that hold values of a session; clients: those of clients
+        """
         self._outbox.host_s, self._flow.session_keys = host_s, session_keys
+        self._safe.client_registers = clients
         return self._answer()
 
     def on_client_wants_save(self, client: str, host_s: float) -> list[Action]:
@@ -431,6 +438,7 @@ class WriteBack:
     ) -> list[Action]:
         """All of RAM was saved for a client; `saved`: what clients had set is the user's now."""
         self._outbox.host_s, self._flow.session_keys = host_s, session_keys
+        self._safe.client_registers = frozenset()
         self._flow.registers = {**self._flow.registers, **saved}
         if self._flow.identity is not None:
             self._outbox.record(

@@ -43,6 +43,7 @@ class Safeguards:
         self.examined_s: float | None = None  # and of the newest one in the estimate
         self.asking_took_s = 0.0  # until the device had said who it is; samples came meanwhile
         self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
+        self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
         self._is_ours = False
@@ -180,7 +181,8 @@ class Safeguards:
         mode = self.mode
         if purpose is Purpose.ROLL_BACK and self._is_ours:
             mode = self.policy.mode
-        if not permitted(command, mode, self.policy.configure_stream, purpose):
+        changes = self.policy.configure_stream
+        if not permitted(command, mode, changes, purpose, self.client_registers):
             return False
         if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
             return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_holds(host_s)

@@ -22,7 +22,6 @@ from drivers.vn100.commands import QUIET, NoReply, NotPermitted, Procedure, TooL
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.firmware import Profile, profile_of
 from drivers.vn100.procedures import (
-    SESSION_SETTINGS,
     WRITE_TRIES,
     RestoreFailed,
     Unit,
@@ -352,11 +351,10 @@ def _foreign_values(
 
 
 def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
-    keys = [number for number in SESSION_SETTINGS if number in session_keys]
     try:
         if (other := (yield from _other(transaction))) is not None:
             return ProcedureOutcome(False, other=other)
-        yield from restore(transaction.snapshot, keys)
+        yield from restore(transaction.snapshot, sorted(session_keys))
         outcome = yield from _compare(transaction, transaction.new, frozenset())
         if outcome.as_expected:
             outcome = yield from _read_all_back(transaction, transaction.new)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from cabled_units import Cable, Unit
+from cabled_units import Cable, Unit, sentence
 from planted_calibrator import PlantedCalibrator
 
 from ahrsd import events, inputs
@@ -57,13 +58,17 @@ def two_units(**options: Any) -> Cable:
 class CabledRun:
     """See the module."""
 
-    def __init__(self, cable: Cable, *, planted: bool = True, **policy: Any) -> None:
+    def __init__(
+        self, cable: Cable, *, planted: bool = True, shares: tuple[Any, ...] = (), **policy: Any
+    ) -> None:
         given: dict[str, Any] = {
             "mode": Mode.COMMIT, "trial": TRIAL, "still": StillPolicy(gyro_rad_s=0.02),
             **policy,
         }  # fmt: skip
         self.cable = cable
-        self.core = Core(core_settings(Config(), policy=WriteBackPolicy(**given)))
+        settings = core_settings(Config(), policy=WriteBackPolicy(**given))
+        self.core = Core(replace(settings, shares=shares))
+        self.heard: dict[str, bytes] = {share.name: b"" for share in shares}
         self.safe = True
         self.journal: dict[int, list[dict[str, Any]]] = {}
         self.notes: list[tuple[str, str]] = []
@@ -75,6 +80,7 @@ class CabledRun:
         assert self.until("OBSERVING"), self.notes
         if planted:
             self.run(3.0)
+            self.planted_at = len(self.taken)
             self.core.calibrator = PlantedCalibrator(self.core.calibrator, estimate())
 
     @property
@@ -94,6 +100,8 @@ class CabledRun:
                 match event:
                     case events.Send(data):
                         self.cable.receive(data)
+                    case events.SendToClient(client, data):
+                        self.heard[client] += data
                     case events.OpenJournal(serial):
                         self._serial = serial
                         records: list[Any] = list(self.journal.setdefault(serial, []))
@@ -106,6 +114,16 @@ class CabledRun:
                         self.notes.append((level, text))
                     case events.StateChanged(new=new):
                         self.states.append(new)
+
+    def say(self, client: str, *bodies: str) -> None:
+        """A program on a shared port writes these lines."""
+        text = "".join(sentence(body).decode() for body in bodies)
+        self.feed(inputs.ClientSent(self.now_ns, client, text))
+
+    def answers(self, client: str) -> list[str]:
+        """What it was answered since the last call, between $ and *."""
+        heard, self.heard[client] = self.heard[client], b""
+        return [line[1:].split("*")[0] for line in heard.decode().split("\r\n")[:-1]]
 
     def step(self) -> None:
         self.now_s += self.cable.step_s

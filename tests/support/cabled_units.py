@@ -91,6 +91,8 @@ class Unit:
             return self._register(word, int(rest[0]), rest[1:])
         if word == "VNASY":
             self.paused = rest == ["0"]
+        elif word == "VNRST":
+            self.restart()
         elif word == "VNWNV":
             self.flash = dict(self.ram)
             self.saves.append(dict(self.ram))
@@ -102,8 +104,8 @@ class Unit:
         if number not in self.ram:
             return sentence("VNERR,08")
         if word == "VNWRG":
-            self.ram[number] = ",".join(values)
-            self.writes.append((number, printed(",".join(values))))
+            self.ram[number] = text = ",".join(values)
+            self.writes.append((number, printed(text) if number in (23, 84) else text))
         text = self.ram[number]
         return sentence(f"{word},{number:02d},{printed(text) if number in (23, 84) else text}")
 

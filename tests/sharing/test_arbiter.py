@@ -1,0 +1,185 @@
+"""Whose command is next, and to whom an answer goes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cabled_units import sentence
+
+from ahrsd.sharing.arbiter import MOST_WAITING, PATIENCE_S, Arbiter, ToClient
+from ahrsd.sharing.client_commands import SharePolicy
+from drivers.vn100.commands import NoReply, Read, Write
+from drivers.vn100.decode import Reply
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.firmware import profile_of
+from drivers.vn100.procedures import Identity
+
+IDENTITY = Identity("VN-100S-CR", 8, 100130608, "3.1.0.0", profile_of("3.1.0.0"))
+
+
+@pytest.fixture
+def arbiter():
+    return Arbiter([SharePolicy("a", owner=True), SharePolicy("b")])
+
+
+def ask(arbiter, client, *bodies, at_s=0.0, identity=IDENTITY):
+    arbiter.received(client, b"".join(map(sentence, bodies)), identity, at_s)
+
+
+def told(arbiter):
+    return [(one.client, one.data) for one in arbiter.take_answers()]
+
+
+def test_identity_is_answered_from_memory_as_the_device_prints_it(arbiter):
+    ask(arbiter, "b", "VNRRG,01", "VNRRG,02", "VNRRG,03", "VNRRG,04")
+    assert told(arbiter) == [
+        ("b", b"$VNRRG,01,VN-100S-CR*35\r\n"),
+        ("b", b"$VNRRG,02,8*65\r\n"),
+        ("b", b"$VNRRG,03,0100130608*51\r\n"),
+        ("b", b"$VNRRG,04,3.1.0.0*77\r\n"),
+    ]
+    assert arbiter.first(0.0) is None
+
+
+def test_a_command_with_a_crc_and_in_pieces_is_one(arbiter):
+    for piece in (b"$VNRR", b"G,01*E1", b"5F\r\n"):
+        arbiter.received("a", piece, IDENTITY, 0.0)
+    assert told(arbiter) == [("a", b"$VNRRG,01,VN-100S-CR*35\r\n")]
+
+
+def test_before_the_device_is_known_it_is_asked(arbiter):
+    ask(arbiter, "a", "VNRRG,01", identity=None)
+    assert told(arbiter) == []
+    assert arbiter.first(0.0).asked.command == Read(1)
+
+
+def test_one_command_on_the_wire_in_the_order_of_arrival_and_each_answer_to_its_owner(arbiter):
+    ask(arbiter, "a", "VNWRG,07,20", "VNRRG,23")
+    ask(arbiter, "b", "VNRRG,23", "VNRRG,30")
+    sent = []
+    while arbiter.first(0.1) is not None:
+        waiting = arbiter.begin()
+        assert arbiter.first(0.1) is None  # while one is on the wire
+        command = waiting.asked.command
+        sent.append((waiting.client, command))
+        word = "VNWRG" if isinstance(command, Write) else "VNRRG"
+        arbiter.ended(Reply(word, command.register, (str(len(sent)),)), None)
+    assert sent == [("a", Write(7, (20,))), ("a", Read(23)), ("b", Read(23)), ("b", Read(30))]
+    bodies = ["VNWRG,07,1", "VNRRG,23,2", "VNRRG,23,3", "VNRRG,30,4"]
+    assert told(arbiter) == [
+        (client, sentence(body)) for client, body in zip("aabb", bodies, strict=True)
+    ]
+
+
+def test_a_refusal_is_for_who_asked_and_silence_for_nobody(arbiter):
+    ask(arbiter, "b", "VNRRG,74", "VNRRG,75")
+    arbiter.begin()
+    arbiter.ended(None, DeviceRefused(8))
+    arbiter.begin()
+    arbiter.ended(None, NoReply(Read(75)))
+    assert told(arbiter) == [("b", b"$VNERR,08*79\r\n")]
+    assert arbiter.counts["unanswered"] == 1
+
+
+def test_what_is_asked_again_while_it_waits_is_absorbed(arbiter):
+    ask(arbiter, "a", "VNRRG,30")
+    arbiter.begin()
+    for k in range(5):
+        ask(arbiter, "a", "VNRRG,30", at_s=0.05 * k)
+    assert arbiter.counts["absorbed"] == 5
+    arbiter.ended(Reply("VNRRG", 30, ("0",)), None)
+    assert len(told(arbiter)) == 1
+    ask(arbiter, "a", "VNRRG,30", at_s=0.3)  # answered: a new question
+    assert arbiter.first(0.3) is not None
+
+
+def test_the_rate_of_the_line_is_pretended(arbiter):
+    ask(arbiter, "b", "VNWRG,05,921600", "VNRRG,05")
+    assert told(arbiter) == [("b", sentence("VNWRG,05,921600")), ("b", sentence("VNRRG,05,921600"))]
+    ask(arbiter, "a", "VNRRG,05")
+    assert arbiter.first(0.0).asked.command == Read(5)  # it has set none itself
+
+
+def test_pausing_the_output_is_a_clients_own_matter(arbiter):
+    ask(arbiter, "b", "VNASY,0", "VNASY,1")
+    off, on = arbiter.take_answers()
+    assert off == ToClient("b", sentence("VNASY,0"), stream=False)
+    assert on == ToClient("b", sentence("VNASY,1"), stream=True)
+    assert arbiter.first(0.0) is None
+
+
+def test_a_question_that_waited_too_long_is_dropped_and_told(arbiter):
+    ask(arbiter, "a", "VNRRG,30", at_s=1.0)
+    assert arbiter.deadline_s == 1.0 + PATIENCE_S
+    assert arbiter.first(1.0 + PATIENCE_S) is None
+    assert arbiter.take_notes() == ["a: read of register 30 got no turn in time"]
+    assert arbiter.deadline_s is None
+
+
+def test_a_client_that_left_is_owed_nothing(arbiter):
+    ask(arbiter, "a", "VNRRG,30", "VNRRG,07")
+    arbiter.begin()
+    arbiter.received("a", b"$VNRRG", IDENTITY, 0.0)
+    arbiter.left("a")
+    arbiter.ended(Reply("VNRRG", 30, ("0",)), None)
+    assert told(arbiter) == []
+    assert arbiter.first(0.0) is None
+    ask(arbiter, "a", "VNRRG,01")  # whoever opens it next begins with a line of its own
+    assert told(arbiter) == [("a", b"$VNRRG,01,VN-100S-CR*35\r\n")]
+
+
+@pytest.mark.parametrize("garbage", [b"\x00" * 9000, b"$" * 9000, b"$VN" + b"A" * 9000])
+def test_garbage_and_half_a_command_for_ever_cost_nobody_anything(arbiter, garbage):
+    for k in range(0, len(garbage), 100):
+        arbiter.received("a", garbage[k : k + 100], IDENTITY, 0.0)
+    ask(arbiter, "b", "VNRRG,01")
+    assert ("b", b"$VNRRG,01,VN-100S-CR*35\r\n") in told(arbiter)
+    arbiter.received("a", b"\r\n", IDENTITY, 0.0)
+    ask(arbiter, "a", "VNRRG,04")
+    assert ("a", b"$VNRRG,04,3.1.0.0*77\r\n") in told(arbiter)
+
+
+def test_a_flood_is_bounded_and_the_other_is_next(arbiter):
+    for k in range(200):
+        ask(arbiter, "a", f"VNWRG,00,{k}")
+    ask(arbiter, "b", "VNRRG,30")
+    for _ in range(MOST_WAITING):
+        assert arbiter.begin().client == "a"
+        arbiter.ended(None, None)
+    assert arbiter.first(0.0).client == "b"
+    assert arbiter.counts["dropped"] == 200 - MOST_WAITING
+
+
+def test_an_unknown_client_is_nobody(arbiter):
+    ask(arbiter, "c", "VNRRG,01")
+    arbiter.left("c")
+    assert told(arbiter) == []
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_answers_go_to_who_asked_whatever_the_order(seed):
+    """Two clients and a device that answers, refuses or is silent: no answer is another's."""
+    rng = np.random.default_rng(seed)
+    arbiter = Arbiter([SharePolicy("a", owner=True), SharePolicy("b", owner=True)])
+    asked, now_s = {"a": set(), "b": set()}, 0.0
+    for step in range(400):
+        now_s += float(rng.exponential(0.05))
+        client = "ab"[rng.integers(0, 2)]
+        what = rng.integers(0, 5)
+        if what < 2:
+            tag = f"{client}{step}"
+            asked[client].add(tag)
+            ask(arbiter, client, f"VNWRG,00,{tag}", at_s=now_s)
+        elif what == 2 and arbiter.first(now_s) is not None:
+            arbiter.begin()
+        elif what == 3 and (way := arbiter.under_way) is not None:
+            how = rng.integers(0, 3)
+            reply = Reply("VNWRG", 0, tuple(map(str, way.asked.command.values)))
+            arbiter.ended(*[(reply, None), (None, DeviceRefused(7)), (None, None)][how])
+        elif rng.random() < 0.05:
+            arbiter.left(client)
+            asked[client].clear()
+        for one in arbiter.take_answers():
+            text = one.data.decode()
+            mine = asked[one.client]
+            assert text.startswith("$VNERR") or text.split(",")[2].split("*")[0] in mine

@@ -1,0 +1,115 @@
+"""What a client may have: the whole table, register by register and word by word."""
+
+from __future__ import annotations
+
+import pytest
+
+from ahrsd.sharing.client_commands import (
+    GUARDED,
+    ClientCommand,
+    Kind,
+    Refusal,
+    SharePolicy,
+    understand,
+)
+from ahrsd.writeback.permissions import Mode, Purpose, permitted
+from drivers.vn100.commands import Read, Word, Write
+from drivers.vn100.registers import REGISTERS, format_reply
+
+OWNER, LISTENER = SharePolicy("/a", owner=True), SharePolicy("/b")
+MATRIX = "1,0,0,0,1,0,0,0,1,0,0,0"
+
+
+@pytest.mark.parametrize("policy", [OWNER, LISTENER], ids=["owner", "listener"])
+@pytest.mark.parametrize("number", [23, 25, 26, 43, 44, 74, 84])
+def test_what_calibrates_is_written_for_nobody(policy, number):
+    row = REGISTERS[number]
+    values = next(iter(row.defaults.values()))
+    answer = understand(f"VNWRG,{format_reply(number, values)}", policy)
+    assert isinstance(answer, Refusal)
+    assert answer.code == 0x09
+    assert str(number) in answer.why
+    for mode in Mode:
+        assert not permitted(Write(number, values), mode, True, Purpose.CLIENT)
+
+
+@pytest.mark.parametrize("number", sorted(REGISTERS))
+def test_each_register_has_one_answer(number):
+    """Reads are for everybody, writes for the owner, and nothing guarded goes out."""
+    read = understand(f"VNRRG,{number:02d}", LISTENER)
+    assert isinstance(read, ClientCommand)
+    assert read.command == Read(number)
+    expected = Kind.MEMORY if number <= 4 and number else Kind.RATE if number == 5 else Kind.READ
+    assert read.kind is expected
+    row = REGISTERS[number]
+    for values in row.defaults.values():
+        body = f"VNWRG,{format_reply(number, values)}"
+        owners, others = understand(body, OWNER), understand(body, LISTENER)
+        if number == 5:
+            assert owners.kind is others.kind is Kind.RATE
+        elif row.writable and number not in GUARDED:
+            assert owners == ClientCommand(Kind.WRITE, body, Write(number, values))
+            assert permitted(owners.command, Mode.PASSIVE, False, Purpose.CLIENT)
+            assert others.code == 0x09
+        else:
+            assert owners.code == others.code == 0x09
+
+
+@pytest.mark.parametrize(
+    ("body", "kind"),
+    [
+        ("VNWNV", Kind.SAVE), ("VNRST", Kind.RESET), ("VNKMD,1", Kind.WRITE),
+        ("VNKAD,0", Kind.WRITE), ("VNASY,0", Kind.STREAM), ("VNASY,1", Kind.STREAM),
+    ],
+)  # fmt: skip
+def test_words_of_the_owner(body, kind):
+    answer = understand(body, OWNER)
+    assert isinstance(answer, ClientCommand)
+    assert answer.kind is kind
+    others = understand(body, LISTENER)
+    assert others == answer if kind is Kind.STREAM else others.code == 0x09
+
+
+FOR_NOBODY = ["VNRFS", "VNTAR", "VNSGB", "VNSFB", "VNSIH", "VNSPS", "VNFWU", "VNBLD", "VNSBL"]
+
+
+@pytest.mark.parametrize("word", FOR_NOBODY)
+def test_words_for_nobody(word):
+    answer = understand(word, OWNER)
+    assert (answer.code, word in answer.why) == (0x09, True)
+    if word in ("VNRFS", "VNTAR", "VNSGB"):
+        assert not permitted(Word(word), Mode.COMMIT, True, Purpose.CLIENT)
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        ("VNXYZ", 0x04), ("VNASY,2", 0x04), ("VNASY,x", 0x04), ("VNRRG", 0x05), ("VNRRG,", 0x05),
+        ("VNRRG,x", 0x08), ("VNRRG,199", 0x08), ("VNWRG,199,1", 0x08), ("VNRRG,06,9", 0x07),
+        ("VNWRG,01,X", 0x09), ("VNWRG,06", 0x05), ("VNWRG,06,x", 0x07), ("VNWRG,75,1", 0x05),
+        ("VNWRG,07,20,1,4", 0x06), ("", 0x04),
+    ],
+)  # fmt: skip
+def test_wrong_lines_get_the_error_of_the_device(body, code):
+    assert understand(body, OWNER).code == code
+
+
+def test_policies():
+    strict = SharePolicy("/a", owner=True, save="refuse", reset="refuse")
+    assert "save" in understand("VNWNV", strict).why
+    assert "reset" in understand("VNRST", strict).why
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "VNWRG,06,0", "VNWRG,07,20", "VNWRG,32,3,0,0,0,0,0,0,100000000,0",
+        "VNWRG,30,0,0,0,0,1,0,1", "VNWRG,75,3,40,1,7FFF", "VNWRG,76,0,0,0",
+        "VNWRG,85,0,4,4,4,4,0,3,3,3,0", "VNWRG,75,1,4,6,1,3E", "VNWRG,76,0,1,0",
+        "VNWRG,06,0,1", "VNWRG,75,1,20,01,0721", "VNWRG,75,3,40,29,7FFF,0210,000C",
+    ],
+)  # fmt: skip
+def test_what_real_drivers_set_at_their_start_goes_out(body):
+    answer = understand(body, OWNER)
+    assert isinstance(answer, ClientCommand), answer
+    assert answer.kind is Kind.WRITE

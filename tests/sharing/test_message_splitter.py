@@ -1,0 +1,76 @@
+"""Whole messages for clients: every byte once, in order, replies kept back, however it is cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cabled_units import crc16, sentence
+
+from ahrsd.sharing.message_splitter import MessageSplitter, is_reply
+
+REPLIES = ["VNRRG,01,VN-100T-CR", "VNWRG,06,0", "VNERR,03", "VNASY,1", "VNWNV", "VNRST", "VNTAR"]
+TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,+0.1,+0.2,+0.3")
+
+
+def packet(values: bytes) -> bytes:
+    head = bytes([0xFA, 0x01, 0x01, 0x00]) + values
+    return head + crc16(head[1:]).to_bytes(2, "big")
+
+
+def cut(stream: bytes, rng: np.random.Generator) -> list[bytes]:
+    at = np.sort(rng.integers(0, len(stream), size=rng.integers(0, 60)))
+    return [stream[a:b] for a, b in zip([0, *at], [*at, len(stream)], strict=True)]
+
+
+def test_a_message_comes_out_with_its_last_byte_and_not_before():
+    splitter = MessageSplitter()
+    assert splitter.feed(TEXT[:-1]) == b""
+    assert splitter.feed(TEXT[-1:]) == TEXT
+    one = packet(bytes(range(8)))
+    assert splitter.feed(one[:-1]) == b""
+    assert splitter.feed(one[-1:] + one[:3]) == one
+
+
+@pytest.mark.parametrize("body", REPLIES)
+def test_a_reply_between_messages_is_kept_back(body):
+    splitter = MessageSplitter()
+    assert splitter.feed(TEXT + sentence(body) + TEXT) == TEXT + TEXT
+    assert splitter.replies == 1
+    assert is_reply(body)
+    assert not is_reply("VNYMR,1")
+
+
+def test_a_damaged_reply_is_no_reply():
+    bad = b"$VNRRG,01,VN-100*00\r\n"
+    splitter = MessageSplitter()
+    assert splitter.feed(TEXT + bad + TEXT) + splitter.silence() == TEXT + bad + TEXT
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
+    rng = np.random.default_rng(seed)
+    stream, wanted = b"", b""
+    for _ in range(80):
+        kind = rng.integers(0, 5)
+        if kind == 0:
+            stream += sentence(REPLIES[rng.integers(0, len(REPLIES))])
+            continue
+        noise = rng.integers(0, 256, size=rng.integers(0, 20), dtype=np.uint8).tobytes()
+        # a byte that begins a message may swallow what follows, as on a real line
+        harmless = noise.replace(b"\xfa", b"").replace(b"$", b"")
+        piece = [TEXT, TEXT, packet(rng.bytes(8)), harmless][kind - 1]
+        stream, wanted = stream + piece, wanted + piece
+    splitter = MessageSplitter()
+    out = b"".join(splitter.feed(chunk) for chunk in cut(stream, rng)) + splitter.silence()
+    assert out == wanted
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_how_the_bytes_are_cut_changes_nothing(seed):
+    rng = np.random.default_rng(seed)
+    stream = rng.integers(0, 256, size=3000, dtype=np.uint8).tobytes() + TEXT * 3 + rng.bytes(500)
+    outs = []
+    for _ in range(3):
+        splitter = MessageSplitter()
+        outs.append(b"".join(map(splitter.feed, cut(stream, rng))) + splitter.silence())
+    assert outs[0] == outs[1] == outs[2] == stream
