@@ -8,19 +8,26 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
+import termios
 import time
+import tty
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from drivers_at_start import ROS2_DAWONN, SDK
 
 from ahrsd.config.loading import Config
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
+from drivers.vn100.sentences import encode
 
+ANSWER = re.compile(rb"\$(VN(?:RRG|WRG|ERR|ASY|WNV|RST)[^*\r]*)\*..\r\n")
 READ = rb"\$VNRRG,\d+(,\d)?\*[0-9A-F]{2}"
 PATIENCE_S = 60.0
 
@@ -52,7 +59,7 @@ def program(emulated, tmp_path):
     """`with program("--mode", "passive", output="imu") as (running, port)`."""
 
     @contextlib.contextmanager
-    def start(*options: str, **setup: object):
+    def start(*options: str, config: str = "", **setup: object):
         with emulated(**setup) as (device, port):
             heard, receive = bytearray(), device.receive
 
@@ -63,7 +70,7 @@ def program(emulated, tmp_path):
             device.receive = listen
             with (tmp_path / "log").open("wb") as log:
                 process = subprocess.Popen(
-                    [*command(tmp_path), "--port", port, *options], stdout=log, stderr=log
+                    [*command(tmp_path, config), "--port", port, *options], stdout=log, stderr=log
                 )
             try:
                 yield Running(process, tmp_path / "log", heard), port
@@ -74,9 +81,9 @@ def program(emulated, tmp_path):
     return start
 
 
-def command(folder: Path) -> list[str]:
+def command(folder: Path, more: str = "") -> list[str]:
     config = folder / "ahrsd.toml"
-    config.write_text(f'state_directory = "{folder}"\n[device]\nbaud = 115200\n')
+    config.write_text(f'state_directory = "{folder}"\n[device]\nbaud = 115200\n{more}')
     return [sys.executable, "-m", "ahrsd", "-v", "run", "--config", str(config)]
 
 
@@ -158,3 +165,57 @@ def test_frozen_for_seconds_it_goes_on_and_bridges_nothing(program, tmp_path):
     for length_s in gaps:  # samples that came before their registers are missing too
         assert np.min(np.abs(missing_s - length_s)) < 1e-6
     assert max(missing_s, default=0.0) == pytest.approx(max(gaps, default=0.0), abs=1e-6)
+
+
+# -- programs on shared ports ----------------------------------------------------------------------
+
+
+def driver_start(path: Path, lines: tuple[str, ...], *, crc: bool = False) -> list[str]:
+    """What a driver is answered that asks each again after 50 ms, as real ones do."""
+    port = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    tty.setraw(port)
+    answers = []
+    for line in lines:
+        termios.tcflush(port, termios.TCIFLUSH)
+        end_s, again_s, heard, found = time.monotonic() + PATIENCE_S, 0.0, b"", []
+        while not found:
+            now_s = time.monotonic()
+            assert now_s < end_s, line
+            if now_s >= again_s:
+                os.write(port, encode(line, crc=crc))
+                again_s = now_s + 0.05
+            if select.select([port], [], [], 0.005)[0]:
+                heard += os.read(port, 65536)
+            found = [a for a in ANSWER.findall(heard) if a.startswith(line[:8].encode())]
+        time.sleep(0.1)  # what was asked twice is answered by then
+        answers.append(found[0].decode())
+    os.close(port)
+    return answers
+
+
+def test_drivers_on_shared_ports_beside_the_working_daemon(program, tmp_path):
+    owner, log = tmp_path / "vn100", tmp_path / "logger"
+    shares = f'[[share]]\npty = "{owner}"\nowner = true\n[[share]]\npty = "{log}"\n'
+    with program(output="binary", config=shares) as (running, _):
+        running.until(lambda: owner.exists() and log.exists())
+        with ThreadPoolExecutor() as pool:
+            first = pool.submit(driver_start, owner, ROS2_DAWONN)
+            second = pool.submit(driver_start, log, ("VNRRG,01", "VNRRG,23", "VNRRG,03") * 5)
+            answers, others = first.result(), second.result()
+        sdk = driver_start(owner, SDK, crc=True)
+        assert running.stop() == 0
+    assert answers[:7] == [
+        "VNRRG,01,VN-100S-CR", "VNRRG,01,VN-100S-CR", "VNRRG,01,VN-100S-CR",
+        "VNRRG,04,3.1.0.0", "VNRRG,02,8", "VNRRG,03,0100130608", "VNRRG,00,",
+    ]  # fmt: skip
+    assert answers[7:9] == ["VNWRG,06,0", "VNWRG,07,20"]
+    assert answers[11] == "VNWRG,75,3,40,01,7FFF"
+    one = "VNRRG,23,1,0,0,0,1,0,0,0,1,0,0,0"
+    assert others == ["VNRRG,01,VN-100S-CR", one, "VNRRG,03,0100130608"] * 5
+    assert sdk == ["VNRRG,01,VN-100S-CR", "VNWRG,06,0,1", "VNWRG,75,1,20,01,0721"]
+    assert not owner.exists()
+    assert b"VNWRG,23" not in running.heard
+    assert b"VNWNV" not in running.heard
+    again = replay(captured(tmp_path), Config()).core.clients.arbiter
+    assert again.counts["commands"] >= len(ROS2_DAWONN) + len(SDK) + 15
+    assert again.counts["refused"] == 0
