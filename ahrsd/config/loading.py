@@ -62,6 +62,7 @@ class Config(Section):
     """Journals and captures; default: $STATE_DIRECTORY (systemd), else ~/.local/state/ahrsd."""
     device: DeviceSection = DeviceSection()
     share: tuple[ShareSection, ...] = ()
+    """Ports on which other programs find the device."""
     capture: CaptureSection = CaptureSection()
     rerun: RerunSection = RerunSection()
     socket: SocketSection = SocketSection()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from ahrsd import events, inputs
 from ahrsd.core.device_session import DeviceSession
-from ahrsd.sharing.arbiter import Arbiter, Waiting
+from ahrsd.sharing.arbiter import COUNTED, Arbiter, Waiting
 from ahrsd.sharing.client_commands import UNAUTHORIZED, Kind, Refusal, SharePolicy
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
@@ -69,6 +69,10 @@ class Clients:
     def take_notes(self) -> list[str]:
         """What a person should know of."""
         return self.arbiter.take_notes()
+
+    def counts(self, client: str) -> dict[str, int]:
+        """How many commands this client sent, and what became of them."""
+        return {what: self.arbiter.counts[client, what] for what in COUNTED}
 
     def next(self, host_s: float, *, free: bool) -> tuple[list[Action], Speech | None]:
         """The next command for the wire, where it is free, and what must happen before it."""

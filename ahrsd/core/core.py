@@ -59,7 +59,6 @@ from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.states import LIVED_WITH, State
 from ahrsd.writeback.trial_metrics import LiveTrial
 from drivers.vn100.decode import Measurement, Undecodable, Unused
-from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import Values
 from drivers.vn100.session import DeviceFault, LineEchoes, Stray
 from drivers.vn100.session import Event as SessionEvent
@@ -98,7 +97,6 @@ class Core:
         self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
         self._stopping, self._judged_anew = "", 0
         self._closing = self._unread = False
-        self._unit: Unit | None = None
         self._watch = StreamWatch()
         self.unconfirmed: UnconfirmedSamples[Circumstances] = UnconfirmedSamples()
         self._device_record = DeviceRecord()
@@ -313,25 +311,24 @@ class Core:
         self._compared = user_compensation(users)
         self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
 
-    def _identified(self, unit: Unit) -> None:
+    def _identified(self, event: Identified) -> None:
         """A device said who it is; what was estimated of another one is not for it."""
+        unit = event.identity.unit
         self._note("info", str(unit))
-        self._device_record.identified()
-        if self._unit not in (None, unit):
+        if (before := self._device_record.identified(unit)) not in (None, unit):
             self._flush()
             self.stream.forget()
             self._watch.resumed(self._host_s)
-            text = f"{self._unit} was here before: the calibration begins anew for this one"
+            text = f"{before} was here before: the calibration begins anew for this one"
             self._note("warning", f"another device, {unit}; {text}")
             self.calibrator = Calibrator(*self._from_scratch)
             self.warm.over("another device was here")
-        self._unit = unit
         self._out.append(events.OpenJournal(unit.serial))
 
     def _on_device(self, event: DeviceEvent) -> None:
         match event:
-            case Identified(identity):
-                self._identified(identity.unit)
+            case Identified():
+                self._identified(event)
             case ConfigurationRead(values):
                 self._flush()
                 self.unconfirmed.drop()  # it was asked for because something is not sure

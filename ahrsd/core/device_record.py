@@ -10,6 +10,7 @@ from ahrsd.inputs import JournalOpened
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.journal_history import StoredRecord, of_another_device
 from ahrsd.writeback.machine import WriteBack
+from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import COMPENSATING, Values, same
 
 
@@ -17,15 +18,17 @@ from drivers.vn100.registers import COMPENSATING, Values, same
 class DeviceRecord:
     """Waits for registers and journal of the device that was identified last."""
 
+    _unit: Unit | None = None
     _values: dict[int, Values] | None = None
     _journal: Sequence[StoredRecord] | None = field(default=None)
     _journal_known: bool = False
     _breaks: int = -1
     _read_from_s: float = float("inf")
 
-    def identified(self) -> None:
-        """A device said who it is: its journal is not open yet."""
-        self._journal_known = False
+    def identified(self, unit: Unit) -> Unit | None:
+        """A device said who it is: its journal is not open yet. Returns who was here before."""
+        before, self._unit, self._journal_known = self._unit, unit, False
+        return before
 
     def journal_read(self, item: JournalOpened) -> str:
         """Its journal; returns why it cannot be trusted, "" where it can."""

@@ -27,7 +27,6 @@ from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorInbox
 from ahrsd.daemon.recall import Recall
 from ahrsd.daemon.reloading import Change, Reloader
 from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink, find_device
-from ahrsd.daemon.shared_ports import SharedPorts
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
 from ahrsd.viewer.sink import RerunSink
@@ -182,9 +181,9 @@ class Daemon:
 
     def _share(self, leaving: ExitStack) -> None:
         """Other programs find the device on ports of their own."""
-        ports = SharedPorts(self.config.share, self._inbox.add, self.clock.now_ns)
+        ports = self._link.share(self.config.share)
         leaving.callback(ports.close)
-        self._link.share, self.shell.to_client = ports.heard, ports.send
+        self.shell.to_client = ports.send
         names = ", ".join(share.name for share in self.config.share)
         self.shell.say(logging.INFO, f"the device is shared on {names}", self.clock.now_ns())
 
@@ -364,6 +363,7 @@ class Daemon:
             viewer_fault="" if counters is None else counters.last_fault,
             interlock="none" if self._interlock is None else "safe" if self._safe else "not safe",
             complaints=tuple(text for text in self._complaints.values() if text),
+            shares=() if self._link.shared is None else self._link.shared.opened(),
             estimator_stuck=self.shell.worker is not None and self.shell.worker.stuck,
         )
 

@@ -14,11 +14,13 @@ import itertools
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
+from ahrsd.config.sections import ShareSection
+from ahrsd.daemon.shared_ports import SharedPorts
 from ahrsd.inputs import ClientLeft, ClientSent
 from drivers.serial_port import (
     LISTEN_S,
@@ -183,7 +185,7 @@ class SerialLink:
         self.path, self.baud = path, baud
         self.inbox = Inbox(patient_bytes=patient_bytes)
         self._now_ns = now_ns
-        self.share: Callable[[bytes], None] | None = None  # see `SerialReader`
+        self.shared: SharedPorts | None = None
         self._port: SerialPort | None = None
         self._reader: SerialReader | None = None
         self._doubtful: itertools.cycle[int] | None = None
@@ -203,7 +205,16 @@ class SerialLink:
             self.baud = find_device(self.path, next(self._doubtful), may_query=may_query).baud
             self._doubtful = None
         self._port = SerialPort(self.path, self.baud)
-        self._reader = SerialReader(self._port, self.inbox, self._now_ns, self.share)
+        share = None if self.shared is None else self.shared.heard
+        self._reader = SerialReader(self._port, self.inbox, self._now_ns, share)
+
+    def share(self, shares: Iterable[ShareSection]) -> SharedPorts:
+        """Other programs find the device on ports of their own; the caller closes them.
+
+        Raises ConfigError where one cannot be.
+        """
+        self.shared = SharedPorts(shares, self.inbox.add, self._now_ns)
+        return self.shared
 
     def has_more(self) -> bool:
         """Whether bytes lie in the port that the thread has not come to read."""

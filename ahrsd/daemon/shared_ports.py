@@ -120,9 +120,9 @@ class SharedPorts:
                 port.streams = item.stream
             port.write(item.data)
 
-    def open_names(self) -> list[str]:
-        """Ports that a program has open."""
-        return [name for name, port in self._ports.items() if port.open]
+    def opened(self) -> tuple[tuple[str, bool], ...]:
+        """Each port, and whether a program has it open."""
+        return tuple((name, port.open) for name, port in self._ports.items())
 
     def close(self) -> None:
         """Take the ports away; safe to call again."""
@@ -209,7 +209,7 @@ def _open_pty(share: ShareSection) -> int:
         tty.setraw(slave)
         os.set_blocking(master, False)
         target = os.ttyname(slave)
-        group = -1 if share.group is None else grp.getgrnam(share.group).gr_gid
+        group = os.getegid() if share.group is None else grp.getgrnam(share.group).gr_gid
         os.chown(target, -1, group)
         Path(target).chmod(_MODE)
         scratch = path.with_name(f".{path.name}.new")

@@ -34,6 +34,7 @@ from drivers.vn100.sentences import encode
 
 PATIENCE_S = 2.5  # the longest that a known driver waits for an answer
 MOST_WAITING = 16  # commands of one client
+COUNTED = ("commands", "answered", "refused", "absorbed", "dropped", "unanswered")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +64,10 @@ class _Client:
 
 
 class Arbiter:
-    """See the module. `counts` is for people: commands, answers, what was absorbed or dropped."""
+    """See the module. `counts`: by client and one of `COUNTED`."""
 
     def __init__(self, policies: Iterable[SharePolicy]) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[tuple[str, str]] = Counter()
         self._clients = {policy.name: _Client(policy) for policy in policies}
         self._queue: deque[Waiting] = deque()
         self._under_way: Waiting | None = None
@@ -106,10 +107,12 @@ class Arbiter:
             self._refuse(name, Refusal(BAD_CHECKSUM))
         for sentence in found:
             asked = understand(getattr(sentence, "body", ""), client.policy)
-            self.counts["commands"] += 1
+            self.counts[name, "commands"] += 1
             if isinstance(asked, Refusal):
                 self._refuse(name, asked)
-            elif not self._answered_here(name, client, asked, identity):
+            elif self._answered_here(name, client, asked, identity):
+                self.counts[name, "answered"] += 1
+            else:
                 self._wait(Waiting(name, asked, now_s))
 
     def left(self, name: str) -> None:
@@ -148,9 +151,9 @@ class Arbiter:
     def _wait(self, waiting: Waiting) -> None:
         mine = [one for one in self._all() if one.client == waiting.client]
         if any(one.asked.body == waiting.asked.body for one in mine):
-            self.counts["absorbed"] += 1
+            self.counts[waiting.client, "absorbed"] += 1
         elif len(mine) >= MOST_WAITING:
-            self.counts["dropped"] += 1
+            self.counts[waiting.client, "dropped"] += 1
             self._notes.append(f"{waiting.client} sends faster than the device answers")
         else:
             self._queue.append(waiting)
@@ -163,8 +166,8 @@ class Arbiter:
     def first(self, now_s: float) -> Waiting | None:
         """The next command for the wire, where none is on it; what waited too long is dropped."""
         while self._queue and now_s - self._queue[0].since_s >= PATIENCE_S:
-            self.counts["dropped"] += 1
             late = self._queue.popleft()
+            self.counts[late.client, "dropped"] += 1
             self._notes.append(f"{late.client}: {late.asked.command} got no turn in time")
         return self._queue[0] if self._queue and self._under_way is None else None
 
@@ -181,13 +184,13 @@ class Arbiter:
         if done.gone:
             return done
         if isinstance(result, Reply):
-            self.counts["answered"] += 1
+            self.counts[done.client, "answered"] += 1
             number = [] if result.register is None else [f"{result.register:02d}"]
             self._say(done.client, encode(",".join([result.word, *number, *result.tokens])))
         elif isinstance(error, DeviceRefused):
             self._say(done.client, encode(f"VNERR,{error.code:02X}"))
         else:
-            self.counts["unanswered"] += 1
+            self.counts[done.client, "unanswered"] += 1
         return done
 
     def refuse_first(self, refusal: Refusal) -> None:
@@ -201,7 +204,7 @@ class Arbiter:
             self._say(name, encode(body))
 
     def _refuse(self, name: str, refusal: Refusal) -> None:
-        self.counts["refused"] += 1
+        self.counts[name, "refused"] += 1
         if refusal.why:
             self._notes.append(f"{name}: {refusal.why}")
         self._say(name, encode(f"VNERR,{refusal.code:02X}"))

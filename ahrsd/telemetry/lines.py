@@ -15,6 +15,7 @@ Status = Mapping[str, Any]
 def status_lines(status: Status) -> list[str]:
     """How the daemon stands, for a person: device, stream, motion, estimate, write-back."""
     lines = [device_line(status), stream_line(status), errors_line(status)]
+    lines += share_lines(status)
     lines += [f"sensor: {text}" for text in status["sensors"]]
     lines += [motion_line(status), estimator_line(status), *estimate_lines_of(status)]
     lines += [f"warm start: {status.get('warm_start', '')}"]
@@ -32,6 +33,17 @@ def device_line(status: Status) -> str:
     name = "not asked" if device is None else f"{device['model']} serial {device['serial']}"
     firmware = "" if device is None else f", firmware {device['firmware']}"
     return f"device: {name}{firmware} on {link['port']} at {link['baud']} Bd"
+
+
+def share_lines(status: Status) -> list[str]:
+    """Ports on which other programs find the device, and what became of their commands."""
+    lines = []
+    for share in status.get("shares", ()):
+        others = [f"{share[what]} {what}" for what in ("refused", "dropped") if share[what]]
+        used = "in use" if share["open"] else "not open"
+        asked = counted(share["commands"], "command")
+        lines.append(f"share: {share['port']} {used}, " + ", ".join([asked, *others]))
+    return lines
 
 
 def stream_line(status: Status) -> str:

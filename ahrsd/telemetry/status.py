@@ -29,6 +29,7 @@ class LinkFacts:
     interlock: str = "none"  # none, safe, not safe
     complaints: tuple[str, ...] = ()  # what is wrong with files of the vehicle or of an operator
     estimator_stuck: bool = False
+    shares: tuple[tuple[str, bool], ...] = ()  # shared ports, and whether a program has each open
 
 
 class StatusMaker:
@@ -76,6 +77,10 @@ class StatusMaker:
             "gates": [_gate(gate, core.at_s) for gate in core.calibrator.gates],
             "write_back": _write_back(core),
             "interlock": link.interlock,
+            "shares": [
+                {"port": port, "open": is_open, **core.clients.counts(port)}
+                for port, is_open in link.shares
+            ],
             "complaints": list(link.complaints),
             "capture": {"file": link.capture, "error": link.capture_error},
             "viewer": {"dropped": link.viewer_dropped, "fault": link.viewer_fault},

@@ -194,13 +194,13 @@ def driver_start(path: Path, lines: tuple[str, ...], *, crc: bool = False) -> li
 
 
 def test_drivers_on_shared_ports_beside_the_working_daemon(program, tmp_path):
-    owner, log = tmp_path / "vn100", tmp_path / "logger"
-    shares = f'[[share]]\npty = "{owner}"\nowner = true\n[[share]]\npty = "{log}"\n'
+    owner, logger = tmp_path / "vn100", tmp_path / "logger"
+    shares = f'[[share]]\npty = "{owner}"\nowner = true\n[[share]]\npty = "{logger}"\n'
     with program(output="binary", config=shares) as (running, _):
-        running.until(lambda: owner.exists() and log.exists())
+        running.until(lambda: owner.exists() and logger.exists())
         with ThreadPoolExecutor() as pool:
             first = pool.submit(driver_start, owner, ROS2_DAWONN)
-            second = pool.submit(driver_start, log, ("VNRRG,01", "VNRRG,23", "VNRRG,03") * 5)
+            second = pool.submit(driver_start, logger, ("VNRRG,01", "VNRRG,23", "VNRRG,03") * 5)
             answers, others = first.result(), second.result()
         sdk = driver_start(owner, SDK, crc=True)
         assert running.stop() == 0
@@ -216,6 +216,8 @@ def test_drivers_on_shared_ports_beside_the_working_daemon(program, tmp_path):
     assert not owner.exists()
     assert b"VNWRG,23" not in running.heard
     assert b"VNWNV" not in running.heard
-    again = replay(captured(tmp_path), Config()).core.clients.arbiter
-    assert again.counts["commands"] >= len(ROS2_DAWONN) + len(SDK) + 15
-    assert again.counts["refused"] == 0
+    again = replay(captured(tmp_path), Config()).core.clients
+    counts = [again.counts(str(path)) for path in (owner, logger)]
+    assert counts[0]["commands"] >= len(ROS2_DAWONN) + len(SDK)
+    assert counts[1]["commands"] >= 15
+    assert [one["refused"] for one in counts] == [0, 0]

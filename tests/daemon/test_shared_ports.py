@@ -53,7 +53,7 @@ class Shared:
 
     def opened(self, number: int = 0) -> Program:
         program = Program(self.paths[number])
-        until(lambda: str(self.paths[number]) in self.ports.open_names())
+        until(lambda: self.ports.opened()[number][1])
         return program
 
     def text(self, number: int = 0) -> str:
@@ -121,7 +121,7 @@ def test_closed_and_opened_at_once_it_is_the_same_port(shared):
     one.close()
     again = Program(shared.paths[0])
     assert shared.paths[0].readlink() == target
-    until(shared.ports.open_names)
+    until(lambda: shared.ports.opened()[0][1])
     shared.ports.heard(TEXT)
     assert TEXT in again.read(len(TEXT))
     again.close()
@@ -141,7 +141,7 @@ def test_a_program_that_is_killed_leaves_the_name_usable(shared):
     command = [sys.executable, "-c", code, str(target)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as first:
         assert first.stdout.readline() == b"mine\n"
-        until(shared.ports.open_names)
+        until(lambda: shared.ports.opened()[0][1])
         first.kill()
     until(lambda: shared.paths[0].readlink() != target)
     again = shared.opened()

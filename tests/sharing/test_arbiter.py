@@ -78,7 +78,7 @@ def test_a_refusal_is_for_who_asked_and_silence_for_nobody(arbiter):
     arbiter.begin()
     arbiter.ended(None, NoReply(Read(75)))
     assert told(arbiter) == [("b", b"$VNERR,08*79\r\n")]
-    assert arbiter.counts["unanswered"] == 1
+    assert arbiter.counts["b", "unanswered"] == 1
 
 
 def test_what_is_asked_again_while_it_waits_is_absorbed(arbiter):
@@ -86,7 +86,7 @@ def test_what_is_asked_again_while_it_waits_is_absorbed(arbiter):
     arbiter.begin()
     for k in range(5):
         ask(arbiter, "a", "VNRRG,30", at_s=0.05 * k)
-    assert arbiter.counts["absorbed"] == 5
+    assert arbiter.counts["a", "absorbed"] == 5
     arbiter.ended(Reply("VNRRG", 30, ("0",)), None)
     assert len(told(arbiter)) == 1
     ask(arbiter, "a", "VNRRG,30", at_s=0.3)  # answered: a new question
@@ -147,7 +147,7 @@ def test_a_flood_is_bounded_and_the_other_is_next(arbiter):
         assert arbiter.begin().client == "a"
         arbiter.ended(None, None)
     assert arbiter.first(0.0).client == "b"
-    assert arbiter.counts["dropped"] == 200 - MOST_WAITING
+    assert arbiter.counts["a", "dropped"] == 200 - MOST_WAITING
 
 
 def test_an_unknown_client_is_nobody(arbiter):

@@ -119,5 +119,5 @@ class ClientHistory:
             answers = [answer[:8] for answer in run.answers(name)]
             if answers != ["VNRRG,01", "VNRRG,30"]:
                 self.wrong["hangs"] += 1
-        if run.cable.unit.paused:
+        if not run.until(lambda: not run.cable.unit.paused, 30.0):  # a save may be under way
             self.wrong["hangs"] += 1
