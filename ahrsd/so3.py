@@ -98,6 +98,16 @@ def products(R: Array) -> Array:
     return parts.reshape(-1, 3, 3)[:n]
 
 
+def compose(phi: Array) -> Array:
+    """Rotation vector of Exp(phi_1) Exp(phi_2) ... (body increments), for (N, n, 3)."""
+    if phi.shape[1] == 1:
+        return np.asarray(phi[:, 0])
+    R = exp(phi[:, 0])
+    for j in range(1, phi.shape[1]):
+        R = R @ exp(phi[:, j])
+    return log(R)
+
+
 def log(R: Array) -> Array:
     """Rotation vectors (..., 3) of rotation matrices (..., 3, 3); |phi| <= pi.
 
