@@ -13,7 +13,7 @@ from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.events import GateResult, Noted
 from ahrsd.evidence.collector import EvidenceCollector
-from ahrsd.evidence.history import Role
+from ahrsd.evidence.segments import Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
 from ahrsd.monitoring.online import Step, StepDetector

@@ -16,7 +16,7 @@ from ahrsd.montecarlo.accuracy import (
 )
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
 from ahrsd.simulation.experiment import measured
-from ahrsd.simulation.motion import rotation_nb
+from ahrsd.simulation.scenarios import rotation_nb
 
 EXPERIMENT = simulate(ScenarioSettings("mam", samples=500))
 TRUTH = EXPERIMENT.truth

@@ -9,8 +9,7 @@ import pytest
 
 from ahrsd.recording.table import read_table
 from ahrsd.simulation import ScenarioSettings, simulate
-from ahrsd.simulation.motion import quaternion
-from ahrsd.simulation.recorded import rotation
+from ahrsd.simulation.scenarios import quaternion, rotation
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 

@@ -7,7 +7,7 @@ import pytest
 from true_trajectory import predicted_directions
 
 from ahrsd.recording.table import read_table
-from ahrsd.simulation.recorded import LICHLYTER, integrate, rotation, simulate_recorded
+from ahrsd.simulation.scenarios import LICHLYTER, integrate, rotation, simulate_recorded
 
 
 def test_first_order_integration_turns_by_twice_the_arc_tangent_of_half_the_angle():

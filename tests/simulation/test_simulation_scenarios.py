@@ -11,8 +11,15 @@ from true_trajectory import predicted_directions
 from ahrsd import so3
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
-from ahrsd.simulation.motion import MOTIONS, SCENARIOS, SUBSTEPS, mean_rate, rotation_nb, sinusoids
-from ahrsd.simulation.scenarios import generator
+from ahrsd.simulation.scenarios import (
+    MOTIONS,
+    SCENARIOS,
+    SUBSTEPS,
+    generator,
+    mean_rate,
+    rotation_nb,
+    sinusoids,
+)
 
 SETS = [(scenario, motion) for scenario in SCENARIOS for motion in MOTIONS]
 

@@ -13,7 +13,7 @@ from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.simulation.motion import mean_rate, rotation_nb
+from ahrsd.simulation.scenarios import mean_rate, rotation_nb
 
 SOFT_IRON = np.array([[0.95, -0.03, 0.02], [-0.03, 1.04, -0.015], [0.02, -0.015, 1.02]])
 SOFT_IRON /= np.cbrt(np.linalg.det(SOFT_IRON))

@@ -8,7 +8,7 @@ mean rate w over the same step; v = w dt. Two things follow:
 * Messages that are missing without a trace in the bytes (`TurnWatch`): a host that reads too slowly
   loses whole lines. One step then turns several times further than the rate can explain. Measured
   on real recordings: 65 such steps in two walks whose logger lost a quarter of the lines, none in
-  seven others (tests/stream/test_stream_rate.py).
+  seven others (tests/stream/test_time_from_attitude.py).
 """
 
 from __future__ import annotations
