@@ -139,20 +139,11 @@ def _gravity(track: EvaluationTrack) -> Array:
     out = np.empty((len(track), 3))
     for a, b in zip(track.starts, track.ends(), strict=True):
         dt_s = np.diff(track.time_s[a:b], prepend=track.time_s[a])
-        R_0b = _turned(so3.exp(track.gyro_b_rad_s[a:b] * dt_s[:, None]))
+        R_0b = so3.products(so3.exp(track.gyro_b_rad_s[a:b] * dt_s[:, None]))
         force_0 = np.einsum("kij,kj->ki", R_0b, track.accel_b_m_s2[a:b])
         step_s = float(np.median(dt_s[1:])) if b - a > 1 else 1.0
         out[a:b] = np.einsum("kji,kj->ki", R_0b, _both_ways(force_0, step_s / _MEMORY_S))
     return out
-
-
-def _turned(steps: Array) -> Array:
-    """R_0b (N, 3, 3) of the rotations over the steps that end at each sample."""
-    R = np.empty_like(steps)
-    R[0] = np.eye(3)
-    for k in range(1, len(steps)):
-        R[k] = R[k - 1] @ steps[k]
-    return R
 
 
 def _both_ways(values: Array, share: float) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ahrsd import so3
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.evidence.refits import gyro_fit, size_fit
 from ahrsd.evidence.segments import Nodes
@@ -70,7 +71,9 @@ def heading_error_curve(
 
     `field_n_gauss` (3,) is in the units that `truth` produces.
     """
-    R_nb = _attitudes(np.linspace(0, 2 * np.pi, headings, endpoint=False), roll_rad, pitch_rad)
+    heading = np.linspace(0, 2 * np.pi, headings, endpoint=False)
+    pitch, roll = np.full(headings, pitch_rad), np.full(headings, roll_rad)
+    R_nb = so3.from_yaw_pitch_roll(heading, pitch, roll)
     raw_b_gauss = truth.undo(np.einsum("kji,j->ki", R_nb, field_n_gauss))
     seen_n = np.einsum("kij,kj->ki", R_nb, judged.apply(raw_b_gauss))
     off = np.arctan2(seen_n[:, 1], seen_n[:, 0]) - np.arctan2(field_n_gauss[1], field_n_gauss[0])
@@ -84,15 +87,6 @@ def worst_difference_deg(judged: Affine, truth: Affine, envelope: Envelope) -> f
         for roll, pitch in envelope.tilts_rad().tolist()
     ]
     return float(np.max(np.abs(curves)))
-
-
-def _attitudes(heading_rad: Array, roll_rad: float, pitch_rad: float) -> Array:
-    """(k, 3, 3) R_nb = Rz(heading) Ry(pitch) Rx(roll)."""
-    cr, sr, cp, sp = np.cos(roll_rad), np.sin(roll_rad), np.cos(pitch_rad), np.sin(pitch_rad)
-    tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-    c, s, zero, one = np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad, 1 + 0 * heading_rad
-    turn = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]]).transpose(2, 0, 1)
-    return np.asarray(turn @ tilt)
 
 
 _NAN = float("nan")

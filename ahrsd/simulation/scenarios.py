@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ahrsd import so3
 from ahrsd.samples import Array
@@ -41,18 +42,6 @@ MOTIONS: Mapping[str, tuple[str, tuple[tuple[float, float], ...]]] = MappingProx
 )
 
 
-def rotation_nb(roll: Array, pitch: Array, heading: Array) -> Array:
-    """R_nb (N, 3, 3) = Rz(heading) Ry(pitch) Rx(roll) of angles (N,) in rad."""
-    c1, s1 = np.cos(roll), np.sin(roll)
-    c2, s2 = np.cos(pitch), np.sin(pitch)
-    c3, s3 = np.cos(heading), np.sin(heading)
-    R = np.empty((len(roll), 3, 3))
-    R[:, 0] = np.stack([c3 * c2, c3 * s2 * s1 - s3 * c1, c3 * s2 * c1 + s3 * s1], axis=1)
-    R[:, 1] = np.stack([s3 * c2, s3 * s2 * s1 + c3 * c1, s3 * s2 * c1 - c3 * s1], axis=1)
-    R[:, 2] = np.stack([-s2, c2 * s1, c2 * c1], axis=1)
-    return R
-
-
 def sinusoids(
     scenario: str, motion: str, rng: np.random.Generator, samples: int, rate_hz: float
 ) -> Array:
@@ -67,7 +56,8 @@ def sinusoids(
     phase = rng.uniform(0.0, 2 * np.pi, 3)
     time_s = np.arange((samples - 1) * SUBSTEPS + 1) / (SUBSTEPS * rate_hz)
     angle = half_range * np.sin(2 * np.pi * frequency_hz * time_s[:, None] + phase)
-    return rotation_nb(*angle.T)
+    roll, pitch, heading = angle.T
+    return so3.from_yaw_pitch_roll(heading, pitch, roll)
 
 
 def mean_rate(R_nb: Array, substeps: int, dt_s: float) -> Array:
@@ -83,9 +73,7 @@ def mean_rate(R_nb: Array, substeps: int, dt_s: float) -> Array:
 
 def quaternion(R_nb: Array) -> Array:
     """Unit quaternions (N, 4), scalar first, sensor to world, continuous in sign, of (N, 3, 3)."""
-    half = so3.log(R_nb) / 2
-    t = np.linalg.norm(half, axis=1)
-    q = np.column_stack([np.cos(t), half * np.sinc(t / np.pi)[:, None]])
+    q = Rotation.from_matrix(R_nb).as_quat(canonical=True, scalar_first=True)
     flips = np.sign(np.sum(q[1:] * q[:-1], axis=1))
     q[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]
     return q
@@ -252,13 +240,6 @@ def integrate(rate_b_rad_s: Array, dt_s: Array) -> Array:
     return q
 
 
-def rotation(q: Array) -> Array:
-    """R_nb (N, 3, 3) of unit quaternions (N, 4), scalar first."""
-    w, v = q[:, :1, None], q[:, 1:]
-    K = so3.skew(v)
-    return np.asarray(np.eye(3) + 2 * w * K + 2 * K @ K)
-
-
 def simulate_recorded(
     time_s: Array,
     gyro_b_rad_s: Array,
@@ -281,7 +262,7 @@ def simulate_recorded(
     if not np.isfinite(gyro_b_rad_s).all():
         row = int(np.argmin(np.isfinite(gyro_b_rad_s).all(axis=1)))
         raise ValueError(f"gyro_b_rad_s of row {row} is not finite: {gyro_b_rad_s[row]}")
-    R_nb = rotation(integrate(gyro_b_rad_s, dt_s))
+    R_nb = Rotation.from_quat(integrate(gyro_b_rad_s, dt_s), scalar_first=True).as_matrix()
     turned = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:])
     rate = np.vstack([np.full((1, 3), np.nan), turned / dt_s[1:, None]])
     return measured(
