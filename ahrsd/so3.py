@@ -1,4 +1,14 @@
-"""Rotations, vectorised over the first axis: Exp, Log, skew and the left Jacobian.
+"""Rotations as arrays: what `scipy.spatial.transform.Rotation` does not have, or does slower.
+
+Quaternions are scipy's everywhere (`Rotation.from_quat`, `as_quat`). Here are
+
+* the left Jacobian, skew, tangent bases, running products: scipy has none of them;
+* Log: scipy's, which first makes a rotation of every matrix, takes up to 40 times as long;
+* yaw, pitch, roll to matrices: scipy's takes up to 30 times as long;
+* Exp, of the same terms as the Jacobian. Scipy's is faster, but its last digit is another, and on
+  that rest the recorded decisions of the estimator.
+
+`python tests/benchmarks/bench_rotations.py` prints these ratios.
 
 Exp(phi) = I + a [phi]x + b [phi]x^2,  a = sin(t)/t,  b = (1 - cos(t))/t^2,  t = |phi|
 Jl(phi)  = I + b [phi]x + c [phi]x^2,  c = (t - sin(t))/t^3
@@ -10,8 +20,9 @@ terms are below 1e-15 there.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ahrsd.samples import Array
+Array = NDArray[np.float64]
 
 _SMALL = 1e-3
 
@@ -96,6 +107,27 @@ def products(R: Array) -> Array:
     if n > part:
         parts[1:] = products(parts[:-1, -1])[:, None] @ parts[1:]
     return parts.reshape(-1, 3, 3)[:n]
+
+
+def from_yaw_pitch_roll(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """R_nb (N, 3, 3) = Rz(yaw) Ry(pitch) Rx(roll) of angles (N,) in rad."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    cr, sr = np.cos(roll), np.sin(roll)
+    R = np.empty((len(yaw), 3, 3))
+    R[:, 0] = np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], axis=1)
+    R[:, 1] = np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], axis=1)
+    R[:, 2] = np.stack([-sp, cp * sr, cp * cr], axis=1)
+    return R
+
+
+def compose(phi: Array) -> Array:
+    """Rotation vector of Exp(phi_1) Exp(phi_2) ... (body increments), for (N, n, 3)."""
+    if phi.shape[1] == 1:
+        return np.asarray(phi[:, 0])
+    R = exp(phi[:, 0])
+    for j in range(1, phi.shape[1]):
+        R = R @ exp(phi[:, j])
+    return log(R)
 
 
 def log(R: Array) -> Array:

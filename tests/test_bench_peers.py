@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ahrsd.montecarlo.methods import OURS, STREAM
-from ahrsd.montecarlo.runs import Plan
+from ahrsd.montecarlo.runs import OURS, STREAM, Plan
 
 BENCHMARKS = Path(__file__).parent / "benchmarks"
 FAKE = '''

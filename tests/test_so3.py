@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from ahrsd import so3
 
@@ -67,6 +68,20 @@ def test_left_jacobian_is_the_derivative_of_exp(axis, angle, direction):
     _, J = so3.exp_and_left_jacobian(phi)
     moved = so3.exp(phi + h * direction) @ so3.exp(phi - h * direction).T
     np.testing.assert_allclose(so3.log(moved) / (2 * h), J @ direction, atol=3e-9)
+
+
+def test_yaw_pitch_and_roll_are_turned_in_that_order():
+    angles = np.random.default_rng(3).uniform(-np.pi, np.pi, (50, 3))
+    expected = Rotation.from_euler("ZYX", angles).as_matrix()
+    np.testing.assert_allclose(so3.from_yaw_pitch_roll(*angles.T), expected, atol=2e-15)
+
+
+def test_composed_increments_are_turned_one_after_the_other():
+    phi = np.random.default_rng(4).normal(size=(20, 3, 3))
+    first, second, third = (Rotation.from_rotvec(phi[:, k]) for k in range(3))
+    np.testing.assert_allclose(
+        so3.exp(so3.compose(phi)), (first * second * third).as_matrix(), atol=1e-14
+    )
 
 
 def test_taylor_and_closed_form_meet():

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
-from ahrsd.baselines.metrics import corrected
+from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings, corrected
 from ahrsd.samples import Array
 
 MINIMUM_SAMPLES = 20

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.baselines.metrics import corrected
+from ahrsd.baselines.data import corrected
 from ahrsd.samples import Array, SampleBlock
 
 PIECES = 10

@@ -144,3 +144,17 @@ class MethodResult:
     reason: str
     iterations: int
     seconds: float
+
+
+def field_spread(corrected: Array) -> float:
+    """Standard deviation of |h| over its mean, of corrected fields (N, 3); 0 is perfect."""
+    size = np.linalg.norm(corrected, axis=1)
+    return float(np.std(size) / np.mean(size))
+
+
+def corrected(raw_b_gauss: Array, soft_iron: Array | None, hard_iron_gauss: Array) -> Array:
+    """A^-1 (m - b) of readings (N, 3); without a soft iron m - b."""
+    centred = raw_b_gauss - hard_iron_gauss
+    if soft_iron is None:
+        return centred
+    return np.asarray(np.linalg.solve(soft_iron, centred.T).T, dtype=np.float64)

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
-from ahrsd.baselines.factors import custom_factor, values_of, vector_of
+from ahrsd.baselines.graphs import custom_factor, values_of, vector_of
 from ahrsd.samples import Array
 
 NODES = (1, 3)

@@ -7,21 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ahrsd.baselines import (
-    ellipsoid,
-    fnp,
-    magfactor3,
-    magical_bfg,
-    magical_ifg,
-    magical_ls,
-    magical_nls,
-    magyc_bfg,
-    magyc_ifg,
-    np_constrained,
-    np_uncertain_field,
-    tls,
-    twostep,
-)
+from ahrsd.baselines import ellipsoid, magfactor3, magical, magyc, norm_preserving, twostep
 from ahrsd.baselines.checks import agrees_with_gyro, check_motion, usable
 from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodResult, MethodSettings
 from ahrsd.samples import Array, SampleBlock
@@ -48,22 +34,24 @@ _IRON = ("soft iron", "hard iron")
 _HARD = ("hard iron",)
 
 METHODS: dict[str, Method] = {
-    "magical-ls": Method(magical_ls.estimate, ("gyro",), _IRON, "[R] least squares, bias known"),
-    "magical-nls": Method(magical_nls.estimate, ("gyro",), _ALL, "[R] nonlinear least squares"),
-    "magical-bfg": Method(magical_bfg.estimate, ("gyro",), _ALL, "[R] batch factor graph"),
-    "magical-ifg": Method(magical_ifg.estimate, ("gyro",), _ALL, "[R] incremental factor graph"),
-    "magyc-bfg": Method(magyc_bfg.estimate, ("gyro",), _ALL, "[M] batch factor graph"),
-    "magyc-ifg": Method(magyc_ifg.estimate, ("gyro",), _ALL, "[M] incremental factor graph"),
+    "magical-ls": Method(magical.estimate_ls, ("gyro",), _IRON, "[R] least squares, bias known"),
+    "magical-nls": Method(magical.estimate_nls, ("gyro",), _ALL, "[R] nonlinear least squares"),
+    "magical-bfg": Method(magical.estimate_bfg, ("gyro",), _ALL, "[R] batch factor graph"),
+    "magical-ifg": Method(magical.estimate_ifg, ("gyro",), _ALL, "[R] incremental factor graph"),
+    "magyc-bfg": Method(magyc.estimate_bfg, ("gyro",), _ALL, "[M] batch factor graph"),
+    "magyc-ifg": Method(magyc.estimate_ifg, ("gyro",), _ALL, "[M] incremental factor graph"),
     "twostep": Method(twostep.estimate, ("field norm",), _IRON, "Alonso & Shuster 2002"),
     "ellipsoid": Method(ellipsoid.estimate, (), _IRON, "Fang et al. 2011, [R] appendix A"),
     "magfactor3": Method(
         magfactor3.estimate, ("attitude", "field"), ("scale", "hard iron"), "GTSAM", axes=2
     ),
-    "tls": Method(tls.estimate, ("field norm",), _HARD, "Crassidis & Cheng, [L] 2.25-2.32"),
-    "np": Method(np_constrained.estimate, ("field norm",), _HARD, "[L] 2.33-2.37"),
-    "fnp": Method(fnp.estimate, ("field norm",), _HARD, "[L] 2.38-2.55"),
+    "tls": Method(
+        norm_preserving.estimate_tls, ("field norm",), _HARD, "Crassidis & Cheng, [L] 2.25-2.32"
+    ),
+    "np": Method(norm_preserving.estimate_np, ("field norm",), _HARD, "[L] 2.33-2.37"),
+    "fnp": Method(norm_preserving.estimate_fnp, ("field norm",), _HARD, "[L] 2.38-2.55"),
     "np-uncertain-field": Method(
-        np_uncertain_field.estimate, ("field norm",), _HARD, "[L] 2.56-2.73"
+        norm_preserving.estimate_np_uncertain_field, ("field norm",), _HARD, "[L] 2.56-2.73"
     ),
 }
 

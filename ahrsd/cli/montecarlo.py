@@ -121,8 +121,7 @@ def _plans(
     hard_iron_as_read: bool,
 ) -> list[Plan]:
     """One plan per scenario, motion, noise and hard iron that were asked for."""
-    from ahrsd.montecarlo.methods import known_methods
-    from ahrsd.montecarlo.runs import Plan, plans
+    from ahrsd.montecarlo.runs import Plan, known_methods, plans
 
     everyone = known_methods() if _ALL in methods else ()
     chosen = tuple(dict.fromkeys(name for name in (*everyone, *methods) if name != _ALL))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap
     from ahrsd.samples import Array
     from ahrsd.simulation import Experiment
-    from ahrsd.simulation.disturbance import Disturbances
+    from ahrsd.simulation.scenarios import Disturbances
 
 _STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
 _MG, _MRAD = 1e-3, 1e-3
@@ -118,7 +118,7 @@ def _simulate_scenario(wanted: _Options) -> None:
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
     """The scenario's experiment, and what makes the same one again."""
     from ahrsd.simulation import Iron, ScenarioSettings, simulate
-    from ahrsd.simulation.disturbance import Disturbances
+    from ahrsd.simulation.scenarios import Disturbances
     from ahrsd.simulation.tabular import settings_json
 
     if wanted.scenario is None:
@@ -158,9 +158,7 @@ def _recorded(path: Path, wanted: _Options, disturbances: Disturbances) -> Exper
     import numpy as np
 
     from ahrsd.recording.table import read_table
-    from ahrsd.simulation.disturbance import disturbed
-    from ahrsd.simulation.recorded import simulate_recorded
-    from ahrsd.simulation.scenarios import generator
+    from ahrsd.simulation.scenarios import disturbed, generator, simulate_recorded
 
     table = read_table(path, columns=wanted.columns)
     ends = np.array([*table.starts, len(table.rows)])

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.estimator import change
+from ahrsd.estimator.model_checks import change_message
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.events import GateResult, Noted
 from ahrsd.evidence.collector import EvidenceCollector
-from ahrsd.evidence.history import Role
+from ahrsd.evidence.segments import Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
 from ahrsd.monitoring.online import Step, StepDetector
@@ -130,7 +130,7 @@ class Calibrator:
         at_s = self.estimator.restarted_s
         if estimate is not None and at_s is not None and at_s != self._heeded_s:
             self._heeded_s = at_s
-            self._void = change.change_message(at_s)
+            self._void = change_message(at_s)
             self._begin_anew([self._void])
 
     def _begin_anew(self, notes: list[str]) -> None:

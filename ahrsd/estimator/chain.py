@@ -28,49 +28,399 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbtrf, dtbtrs
 
-from ahrsd.estimator.elimination import Interior, eliminated
-from ahrsd.estimator.rows import (
-    Averaging,
-    Chain,
-    EpochData,
-    FieldPart,
-    MotionPart,
-    Noise,
-    Rows,
-    interior,
-    parts,
-    robust_weights,
-    symmetric,
-    symmetric_columns,
-    upper_triangle,
-)
+from ahrsd import so3
 from ahrsd.samples import Array
 
-__all__ = [
-    "Averaging",
-    "Chain",
-    "EpochData",
-    "Noise",
-    "Quadratic",
-    "Rows",
-    "interior",
-    "linearise",
-    "linearise_all",
-    "move",
-    "parts",
-    "robust_weights",
-    "squares",
-    "start_directions",
-    "symmetric",
-    "symmetric_columns",
-    "upper_triangle",
-]
+# -- Epochs in a row, and the residuals of field and motion ----------------------------------------
+#
+# Epochs as rows: what they measured, and the residuals of field and motion with derivatives.
+#
+# Several epochs, each where it is to be linearised, are put in one row and handled together: a few
+# operations on long arrays instead of many on short ones.
+
+_ROWS = np.array([0, 0, 0, 1, 1, 2])
+_COLS = np.array([0, 1, 2, 1, 2, 2])
+
+
+def symmetric(m6: Array) -> Array:
+    """3x3 matrix of its upper triangle row by row, [00 01 02 11 12 22]."""
+    M = np.empty((3, 3))
+    M[_ROWS, _COLS] = m6
+    M[_COLS, _ROWS] = m6
+    return M
+
+
+def upper_triangle(M: Array) -> Array:
+    """The inverse of `symmetric`; the lower triangle is ignored."""
+    return np.asarray(M[_ROWS, _COLS])
+
+
+def symmetric_columns(u: Array) -> Array:
+    """d(M u)/d[M (6)] of vectors u (N, 3): (N, 3, 6)."""
+    out = np.zeros((len(u), 3, 6))
+    for j, (r, c) in enumerate(zip(_ROWS, _COLS, strict=True)):
+        out[:, r, j] = u[:, c]
+        if r != c:
+            out[:, c, j] = u[:, r]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Per-step standard deviations: field in gauss, mean rate in rad/s."""
+
+    mag_gauss: float
+    gyro_rad_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Averaging:
+    """Rows whose field is a mean over several steps (`epoch_data.grouped`).
+
+    count (n,) steps in a row, turn (n, 3, 3) mean rotation P from the row's direction u to those of
+    its steps: the row measured M P u + b with the noise of one step / sqrt(count); spread_s (n,)
+    root of the sum of squared steps of time on the way from the row before: the gyro's noise;
+    rate_b_rad_s (n, 3) mean of its steps.
+    """
+
+    count: Array
+    turn: Array
+    spread_s: Array
+    rate_b_rad_s: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochData:
+    """What an epoch measured. Row 0 is the border shared with the previous epoch (or a fresh start,
+    then `measures_first`); angle and dt of row 0 are not used.
+
+    field_b_gauss (n, 3), angle_b_rad (n, 3), dt_s (n,), down_b (n, 3) unit or nan, time_s (n,)
+    linked (n,) is 0 for rows that the gyro does not link to the row before, else 1; None: all are.
+    """
+
+    field_b_gauss: Array
+    angle_b_rad: Array
+    dt_s: Array
+    down_b: Array
+    time_s: Array
+    measures_first: bool
+    linked: Array | None = None
+    averaging: Averaging | None = None
+
+    def __len__(self) -> int:
+        return len(self.dt_s)
+
+    @property
+    def count(self) -> Array | float:
+        """Steps that a row's field is the mean of."""
+        return 1.0 if self.averaging is None else self.averaging.count
+
+    @property
+    def steps(self) -> int:
+        """How many steps it holds."""
+        return len(self) if self.averaging is None else int(self.averaging.count.sum())
+
+    def seen(self, directions: Array) -> Array:
+        """What the field of each row is the image of: directions (n, 3) or tangents (n, 3, 2)."""
+        if self.averaging is None:
+            return directions
+        if directions.ndim == 3:
+            return np.asarray(self.averaging.turn @ directions)
+        return times(self.averaging.turn, directions)
+
+    def field_error(self, u: Array, x: Array) -> Array:
+        """Field less its prediction at directions u (n, 3) and x = [M6, b]; gauss."""
+        return np.asarray(self.field_b_gauss - self.seen(u) @ symmetric(x[:6]) - x[6:9])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """An epoch and where it is to be linearised: directions u (n, 3), gyro bias (3,) in rad/s.
+
+    weights (n,) are those of the field residuals, None for 1.
+    """
+
+    data: EpochData
+    u: Array
+    bias: Array
+    noise: Noise
+    weights: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Chains in one row, N rows in all; the motion into the first row of each links nothing.
+
+    Arrays of vectors and matrices have the row as their last axis (`linearise_all` runs over long
+    axes). first, last (E,): where each begins and ends; per row: field_b_gauss, angle_b_rad, u,
+    bias (3, N), dt_s (N,); stiff (N,) 1 / (spread of the gyro's noise), 0 where nothing links;
+    count (N,), turn (3, 3, N) or None as in `Averaging`; mag_gauss (N,) noise of a step; weights
+    (N,) of the field; measured (N,) 0 where the field was counted by the epoch before.
+    """
+
+    first: Index
+    last: Index
+    field_b_gauss: Array
+    angle_b_rad: Array
+    dt_s: Array
+    u: Array
+    bias: Array
+    stiff: Array
+    count: Array
+    turn: Array | None
+    mag_gauss: Array
+    weights: Array
+    measured: Array
+
+    @staticmethod
+    def of(chains: Sequence[Chain]) -> Rows:
+        """Epochs one after the other."""
+        data = [c.data for c in chains]
+        sizes = np.array([len(d) for d in data])
+        first = np.cumsum(sizes) - sizes
+        linked = np.concatenate([np.ones(len(d)) if d.linked is None else d.linked for d in data])
+        linked[first] = 0.0
+        own = [d.averaging for d in data]
+        dt = np.concatenate([d.dt_s for d in data])
+        spread, count, turn = dt, np.ones(len(dt)), None
+        if any(o is not None for o in own):
+            each = [
+                (np.ones(n), np.broadcast_to(np.eye(3), (n, 3, 3)), d.dt_s)
+                if o is None
+                else (o.count, o.turn, o.spread_s)
+                for d, o, n in zip(data, own, sizes, strict=True)
+            ]
+            count, turn, spread = (np.concatenate(own) for own in zip(*each, strict=True))
+            turn = np.ascontiguousarray(turn.transpose(1, 2, 0))
+        gyro = np.repeat([c.noise.gyro_rad_s for c in chains], sizes)
+        measured = np.ones(len(dt))
+        measured[first] = [d.measures_first for d in data]
+        weights = np.concatenate(
+            [np.ones(len(c.data)) if c.weights is None else c.weights for c in chains]
+        )
+        return Rows(
+            first,
+            first + sizes - 1,
+            _columns([d.field_b_gauss for d in data]),
+            _columns([d.angle_b_rad for d in data]),
+            dt,
+            _columns([c.u for c in chains]),
+            np.repeat(np.array([c.bias for c in chains]).T, sizes, axis=1),
+            linked / (gyro * spread),
+            count,
+            turn,
+            np.repeat([c.noise.mag_gauss for c in chains], sizes),
+            weights,
+            measured,
+        )
+
+
+def _columns(pieces: Sequence[Array]) -> Array:
+    return np.ascontiguousarray(np.concatenate(pieces).T)
+
+
+def robust_weights(residual: Array, limit_gauss: Array | float) -> Array:
+    """1 for residuals (3, N) within the limit, (limit / size)^2 beyond: outliers lose weight."""
+    size2 = np.maximum(np.sum(residual * residual, axis=0), 1e-24)
+    return np.asarray(np.minimum(1.0, limit_gauss**2 / size2))
+
+
+def times(J: Array, v: Array) -> Array:
+    """J_k v_k for stacks of matrices (n, i, j) and vectors (n, j)."""
+    return np.asarray((J @ v[:, :, None])[:, :, 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldPart:
+    """Whitened field residuals with their derivatives: (3, 12, N), d r/d d_k (2), x (9), r (1)."""
+
+    J: Array
+    tangents: Array
+    weights: Array
+    seen: Array  # (2, N) squared sizes of the columns of M P_k T_k
+
+    @property
+    def r(self) -> Array:
+        """Residuals (3, N)."""
+        return self.J[:, 11]
+
+    @property
+    def own(self) -> Array:
+        """d r/d d_k (3, 2, N)."""
+        return self.J[:, :2]
+
+    @property
+    def by_x(self) -> Array:
+        """d r/d x (3, 9, N)."""
+        return self.J[:, 2:11]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionPart:
+    """Whitened motion residuals, (2, 6, N): d q/d d_(k-1) (2), d q/d w_b (3), q (1).
+
+    Row k is the motion from row k - 1 to row k; row 0 is zero. -d q/d d_k = scale I.
+    """
+
+    J: Array
+    scale: Array
+
+    @property
+    def q(self) -> Array:
+        """Residuals (2, N)."""
+        return self.J[:, 5]
+
+    @property
+    def prev(self) -> Array:
+        """d q/d d_(k-1) (2, 2, N)."""
+        return self.J[:, :2]
+
+    @property
+    def by_bias(self) -> Array:
+        """d q/d w_b (2, 3, N)."""
+        return self.J[:, 2:5]
+
+
+def parts(rows: Rows, x: Array, outlier_sigma: float | None = None) -> tuple[FieldPart, MotionPart]:
+    """Residuals of field and motion with their derivatives; see `linearise_all`."""
+    frame = so3.frames(rows.u)
+    return _field(rows, frame, x, outlier_sigma), _motion(rows, frame)
+
+
+def _field(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> FieldPart:
+    seen = frame if rows.turn is None else np.einsum("ijn,jkn->ikn", rows.turn, frame)
+    image = (symmetric(x[:6]) @ seen.reshape(3, -1)).reshape(seen.shape)
+    error = rows.field_b_gauss - image[:, 2] - x[6:9, None]
+    weights = rows.weights
+    if outlier_sigma is not None:
+        limit = outlier_sigma * rows.mag_gauss / np.sqrt(rows.count)
+        weights = robust_weights(error, limit)
+    scale = np.sqrt(weights * rows.count * rows.measured) / rows.mag_gauss
+    J = np.zeros((3, 12, error.shape[1]))
+    np.multiply(image[:, :2], -scale, out=J[:, :2])
+    direction = seen[:, 2] * -scale
+    for j, (r, c) in enumerate(zip(_ROWS, _COLS, strict=True)):
+        J[r, 2 + j], J[c, 2 + j] = direction[c], direction[r]
+    for r in range(3):
+        J[r, 8 + r] = -scale
+    np.multiply(error, scale, out=J[:, 11])
+    own = image[:, :2]
+    return FieldPart(J, frame[:, :2], weights, np.sum(own * own, axis=0))
+
+
+def _motion(rows: Rows, frame: Array) -> MotionPart:
+    dt = rows.dt_s
+    R, Jl = so3.columns_exp_and_left_jacobian(rows.bias * dt - rows.angle_b_rad)
+    turned = np.einsum("ijn,jkn->ikn", R[:, :, 1:], frame[:, :, :-1])
+    across = frame[:, :2, 1:] * rows.stiff[1:]
+    moved = np.einsum("jin,jkn->ikn", across, turned)
+    J = np.zeros((2, 6, frame.shape[2]))
+    J[:, :2, 1:], J[:, 5, 1:] = moved[:, :2], moved[:, 2]
+    (x, y, z), (p, q, r) = turned[:, 2] * dt[1:], across
+    beside = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
+    np.einsum("jin,jkn->ikn", beside, Jl[:, :, 1:], out=J[:, 2:5, 1:])
+    return MotionPart(J, rows.stiff)
+
+
+def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
+    """Diagonal blocks (2, 2, N), blocks above them (2, 2, N - 1), and the border columns
+    (2, 13, N): x (9), bias (3), gradient.
+    """
+    scale = motion.scale
+    own = np.einsum("rin,rjn->ijn", field.own, field.J)
+    prev = np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], motion.J[:, :, 1:])
+    diag = own[:, :2].copy()
+    for i in range(2):
+        diag[i, i] += scale**2
+    diag[:, :, :-1] += prev[:, :2]
+    border = np.empty((2, 13, len(scale)))
+    border[:, :9] = own[:, 2:11]
+    np.multiply(motion.J[:, 2:], -scale, out=border[:, 9:])
+    border[:, 12] += own[:, 11]
+    border[:, 9:, :-1] += prev[:, 2:]
+    return diag, -scale[1:] * motion.prev[:, :, 1:].transpose(1, 0, 2), border
+
+
+# -- The interior eliminated -----------------------------------------------------------------------
+#
+# Block tridiagonal chains of 2x2 blocks: their interior eliminated onto what is shared.
+#
+# Several chains are handled as one whose couplings between them are zero. Each keeps its first and
+# its last block. The interior's Hessian is factored as L L^T (banded); with Y = L^-1 B, B what
+# couples the interior to the rest and its gradient, the Schur complement takes Y^T Y away, and a
+# step of the interior costs one more triangular solution, for one column.
+
+Index = NDArray[np.intp]
+_SHARED = 12  # columns of what all blocks couple to; then come the first and the last block
+_GRADIENT = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Interior:
+    """L (4, 2 n) in LAPACK's lower banded storage and Y (2 n, 17), without the border blocks."""
+
+    factor: Array
+    half: Array
+
+    def step(self, z: Array) -> Array:
+        """Moves (n, 2) of the interior where the 16 numbers that it couples to move by z."""
+        right = self.half[:, :_GRADIENT] @ z + self.half[:, _GRADIENT]
+        solved, _ = dtbtrs(self.factor, -right[:, None], uplo="L", trans="T", overwrite_b=1)
+        return np.asarray(solved.reshape(-1, 2))
+
+    def part(self, first: int, last: int) -> Interior:
+        """A copy of what lies between two border blocks, given where they are."""
+        rows = slice(2 * first + 2, 2 * last)
+        return Interior(self.factor[:, rows].copy(order="F"), self.half[rows].copy(order="F"))
+
+
+def eliminated(diag: Array, upper: Array, border: Array, first: Index, last: Index) -> Interior:
+    """Of chains in one row: blocks (2, 2, N), those above them (2, 2, N - 1), border (2, 13, N).
+
+    border: coupling to the 12 shared numbers, and the gradient; first, last: rows of each chain's
+    border blocks, whose rows of the result mean nothing. LinAlgError where a direction is not
+    determined.
+    """
+    n = diag.shape[2]
+    right = np.zeros((_GRADIENT + 1, n, 2))
+    right[:_SHARED] = border[:, :_SHARED].transpose(1, 2, 0)
+    right[_GRADIENT] = border[:, _SHARED].T
+    right[:, first], right[:, last] = 0.0, 0.0
+    right[_SHARED : _SHARED + 2, first + 1] = upper[:, :, first].transpose(0, 2, 1)
+    right[_SHARED + 2 : _GRADIENT, last - 1] = upper[:, :, last - 1].transpose(1, 2, 0)
+    diag, upper = diag.copy(), upper.copy()
+    diag[:, :, first] = diag[:, :, last] = np.eye(2)[:, :, None]
+    upper[:, :, first] = upper[:, :, last - 1] = 0.0
+    return Interior(*halfway(diag, upper, right))
+
+
+def halfway(diag: Array, upper: Array, right: Array) -> tuple[Array, Array]:
+    """L, banded, of a symmetric block tridiagonal matrix, and L^-1 times right (columns, N, 2)."""
+    factor, info = dpbtrf(band(diag, upper), lower=1, overwrite_ab=1)
+    if info != 0:
+        raise np.linalg.LinAlgError(f"directions of an epoch are not determined (dpbtrf {info})")
+    half, _ = dtbtrs(factor, right.reshape(len(right), -1).T, uplo="L", overwrite_b=1)
+    return factor, half
+
+
+def band(diag: Array, upper: Array) -> Array:
+    """Lower banded storage (4, 2n) of a symmetric block tridiagonal matrix with 2x2 blocks."""
+    out = np.zeros((4, 2 * diag.shape[2]), order="F")
+    out[0, 0::2], out[0, 1::2] = diag[0, 0], diag[1, 1]
+    out[1, 0::2] = diag[1, 0]
+    out[1, 1:-1:2] = upper[1, 0]
+    out[2, 0:-2:2], out[2, 1:-2:2] = upper[0, 0], upper[1, 1]
+    out[3, 0:-2:2] = upper[0, 1]
+    return out
+
 
 FIRST = slice(12, 14)
 LAST = slice(14, 16)
 WIDTH = 16
-_SPOKEN = np.r_[0:12, 16]  # of the 17 numbers, gradient last: those that all directions couple to
+_COUPLED = np.r_[0:12, 16]  # of the 17 numbers, gradient last: those that all directions couple to
 _FIELD = np.ix_(np.r_[0:9, 16], np.r_[0:9, 16])
 _MOTION = np.ix_(np.r_[9:12, 16], np.r_[9:12, 16])
 
@@ -165,8 +515,8 @@ def _sums(
         sums[k][_MOTION] += squares(motion.J[:, 2:, a:b])
     for where, ends in ((FIRST, rows.first), (LAST, rows.last)):
         sums[:, where, where] = diag[:, :, ends].transpose(2, 0, 1)
-        sums[:, where, _SPOKEN] = border[:, :, ends].transpose(2, 0, 1)
-        sums[:, _SPOKEN, where] = border[:, :, ends].transpose(2, 1, 0)
+        sums[:, where, _COUPLED] = border[:, :, ends].transpose(2, 0, 1)
+        sums[:, _COUPLED, where] = border[:, :, ends].transpose(2, 1, 0)
     return sums
 
 

@@ -1,17 +1,33 @@
-"""An epoch in the window: what it measured, where it was linearised, and the factor it became."""
+"""An epoch in the window: what it measured, where it was linearised, and the factor it became.
+
+And what it says beyond that factor: of the noise, of the model's misfit, of an instrument's turned
+axes, lag and scale, and whether it contradicts a calibration that is sure.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import is_not
 
 import numpy as np
 
 from ahrsd.estimator import chain, noise
-from ahrsd.estimator.factors import Factor, Node, at_borders, gap_factor
-from ahrsd.estimator.graph import Graph
-from ahrsd.estimator.misfit import MisfitScore, scores
-from ahrsd.estimator.systematic import Cells
+from ahrsd.estimator.chain import halfway
+from ahrsd.estimator.epoch_data import rates, spread
+from ahrsd.estimator.graph import (
+    BORDERS,
+    Y_A,
+    C,
+    Factor,
+    Graph,
+    Node,
+    Stack,
+    Step,
+    at_borders,
+    gap_factor,
+)
+from ahrsd.estimator.noise import DirectionCells
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -33,7 +49,7 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron and instrument (`instrument.py`): H (17, 17), g (17,) at c."""
+    """Quadratic of an epoch in iron and instrument (see `instrument`): H (17, 17), g (17,) at c."""
 
     H: Array
     g: Array
@@ -55,7 +71,7 @@ class WindowEpoch:
     """One epoch in the window: what it is, directions, noise, and its factor.
 
     used: the noise that it was linearised with; usual: that of the window then; instrument: set
-    by `instrument.linearise_instrument`.
+    by `linearise_instrument`.
     """
 
     piece: EpochContent
@@ -67,7 +83,7 @@ class WindowEpoch:
     score: MisfitScore | None = None
     instrument: InstrumentInformation | None = None
     _residuals: noise.Residuals | None = None
-    _cells: Cells | None = None
+    _cells: DirectionCells | None = None
 
     @property
     def data(self) -> chain.EpochData:
@@ -90,10 +106,10 @@ class WindowEpoch:
         return self.quadratic.weights
 
     @property
-    def cells(self) -> Cells:
+    def cells(self) -> DirectionCells:
         """Where its directions were."""
         if self._cells is None:
-            self._cells = Cells.of(self.u, self.data.count)
+            self._cells = DirectionCells.of(self.u, self.data.count)
         return self._cells
 
     @property
@@ -114,7 +130,9 @@ class WindowEpoch:
 def scores_of(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
     """What epochs ask for, found once where each was linearised."""
     new = [e for e in epochs if e.score is None]
-    for epoch, score in zip(new, scores([e.factor for e in new]) if new else [], strict=True):
+    for epoch, score in zip(
+        new, misfit_scores([e.factor for e in new]) if new else [], strict=True
+    ):
         epoch.score = score
     return [e.score for e in epochs if e.score is not None]
 
@@ -164,3 +182,383 @@ class Snapshot:
     nodes: dict[int, Node]
     epochs: list[WindowEpoch]
     factors: list[Factor]
+
+
+# -- Misfit ----------------------------------------------------------------------------------------
+#
+# How much more the epochs disagree than their covariances allow: 1 for a perfect model.
+#
+# At the optimum an epoch's gradient r_i on (c, bias) has the covariance S_i (its information) if
+# the model is right, so r_i^T S_i^-1 r_i averages to its rank, less what the fit used up. Coloured
+# noise, a wandering field or a lag make it larger, and the covariance of the estimate is multiplied
+# by it.
+
+_KEEP = np.r_[0:12]
+_USED = 12.0  # parameters that the fit took from the misfit_scores
+_MEMORY = 0.98  # per epoch that left the window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MisfitScore:
+    """What an epoch asks of z = [c, bias] (12,) from where it was linearised, its borders at best.
+
+    The whitened gradient is `asked` (12,) there and `turning` (12, 12) z more elsewhere.
+
+    freedom: degrees of freedom; directions of which the epoch says nothing ask for nothing.
+    """
+
+    asked: Array
+    turning: Array
+    freedom: float
+
+
+def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
+    """Of several epochs' factors."""
+    H, g = np.array([f.H for f in factors]), np.array([f.g for f in factors])
+    cross = H[:, _KEEP[:, None], BORDERS]
+    gain = cross @ np.linalg.pinv(H[:, BORDERS[:, None], BORDERS], rcond=1e-12, hermitian=True)
+    S = H[:, _KEEP[:, None], _KEEP] - gain @ np.swapaxes(cross, 1, 2)
+    r = g[:, _KEEP] - (gain @ g[:, BORDERS, None])[:, :, 0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), 1e-30))
+    values, vectors = np.linalg.eigh(S * scale[:, :, None] * scale[:, None, :])
+    good = values > 1e-4
+    root = np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0)
+    whiten = root[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
+    asked = (whiten @ r[:, :, None])[:, :, 0]
+    freedom = np.count_nonzero(good, axis=1).astype(float)
+    return [MisfitScore(*each) for each in zip(asked, whiten @ S, freedom, strict=True)]
+
+
+class Misfit:
+    """Scores of the epochs that left the window, and the figure with those that are in it."""
+
+    def __init__(self) -> None:
+        self._sum = 0.0
+        self._count = 0.0
+
+    def remember(self, factor: Factor, score: MisfitScore, graph: Graph) -> None:
+        """An epoch leaves the window: keep its score."""
+        bias = graph.nodes[factor.a].bias
+        s, n = _squares([factor], [score], graph.c, bias[None])
+        self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
+
+    def value(
+        self,
+        factors: Sequence[Factor],
+        scores: Sequence[MisfitScore],
+        graph: Graph,
+        step: Step,
+    ) -> tuple[float, float]:
+        """Mean square of the scores per degree of freedom, where `step` leads, and its sigma by
+        chance were the model right.
+
+        At the joint optimum, not at the present values: what all epochs ask for together is not
+        disagreement.
+        """
+        dc, dy = step
+        biases = np.array([graph.nodes[f.a].bias + dy[f.a][:3] for f in factors])
+        s, n = _squares(factors, scores, graph.c + dc, biases)
+        total, count = self._sum + s, self._count + n
+        freedom = max(count - _USED, 0.2 * count, 1.0)
+        return total / freedom, float(np.sqrt(2.0 / freedom))
+
+
+def _squares(
+    factors: Sequence[Factor], scores: Sequence[MisfitScore], c: Array, biases: Array
+) -> tuple[float, float]:
+    """Sum of squares of what is asked for at c and the biases (N, 3), and degrees of freedom."""
+    z = np.empty((len(factors), 12))
+    z[:, :9] = c - np.array([f.point.c for f in factors])
+    z[:, 9:] = biases - np.array([f.point.a.bias for f in factors])
+    turning = np.array([s.turning for s in scores])
+    asked = np.array([s.asked for s in scores]) + (turning @ z[:, :, None])[:, :, 0]
+    return float(np.sum(asked * asked)), sum(s.freedom for s in scores)
+
+
+# -- Instrument ------------------------------------------------------------------------------------
+#
+# What an instrument may have besides iron and bias: turned axes, a lag, a wrong scale of angles.
+#
+# Turn: the magnetometer's axes are taken to be the gyro's. If they are not, the rate in the
+# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi. Derivative:
+# dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt) [phi]x.
+#
+# Lag: a reading of the field that is tau late is that of the direction u(t - tau). With du/dt = -w
+# x u its derivative is dr/dtau = -M (w x u) / s_m.
+#
+# Scale: the gyro's angles are (1 + s) times too small if its unit or the time between samples is
+# wrong: a host's clock, messages lost without a trace. Whoever turns a full circle sees it; what is
+# estimated with it means nothing. dq/ds = -(dq/dw_b / dt) phi.
+#
+# One Gauss-Newton step from the answer gives them beside M, b and the bias. On fast motion one
+# looks like another, so they are asked for together. Every epoch stands alone here, its borders
+# free.
+
+TURN, LAG, SCALE = slice(12, 15), 15, 16
+_SIZE = 17
+_OF_ANGLE = np.r_[12:15, 16]
+_FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
+_MOTION = np.ix_(np.r_[9:15, SCALE, _SIZE], np.r_[9:15, SCALE, _SIZE])
+_PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
+_MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
+_LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
+_WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instrument:
+    """Step (17,) from the answer in [M (6), b (3), w_b (3), theta (3), tau, s], and its covariance.
+
+    misfit: how much the epochs still disagree after the step; it is in the covariance
+    """
+
+    step: Array
+    covariance: Array
+    misfit: float
+
+    @property
+    def lag_s(self) -> tuple[float, float]:
+        """Further lag of the field, and its sigma."""
+        return self._of(LAG)
+
+    @property
+    def misscaled(self) -> float:
+        """Share of themselves by which the gyro's angles are too small; 0: they may be right."""
+        scale, sigma = self._of(SCALE)
+        return scale if abs(scale) > max(_MISSCALED, _MISSCALED_SIGMAS * sigma) else 0.0
+
+    def _of(self, row: int) -> tuple[float, float]:
+        return float(self.step[row]), float(np.sqrt(self.covariance[row, row]))
+
+
+InformationStack = tuple[Array, Array]
+"""H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
+
+
+class InstrumentInformations:
+    """Quadratics of the epochs with motion around the present estimate, computed once."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[list[object], InformationStack] | None = None
+
+    def of(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+        """LinAlgError where none has motion, or its directions are not determined."""
+        at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
+        kept = self._kept
+        if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
+            moving = [epoch for epoch in epochs if epoch.turned]
+            if not moving:
+                raise np.linalg.LinAlgError("no epoch with motion")
+            kept = self._kept = (at, _informations(moving, graph))
+        return kept[1]
+
+
+class FoldedInformation:
+    """Information on iron, turn, lag and scale from epochs that left the window, as one Gaussian.
+
+    The gyro's bias walks, so each epoch had its own, which is eliminated.
+    """
+
+    def __init__(self) -> None:
+        self._H: Array = np.zeros((_SIZE, _SIZE))
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, 0, lag, 0]
+
+    @staticmethod
+    def of_iron(graph: Graph, lag_s: float) -> FoldedInformation:
+        """Information on the iron from the epochs folded into the graph; none on a lag."""
+        H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).here())
+        gain = H[C, Y_A] @ np.linalg.pinv(H[Y_A, Y_A], rcond=1e-12, hermitian=True)
+        own_H, own_g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
+        own_H[C, C], own_g[C] = H[C, C] - gain @ H[Y_A, C], g[C] - gain @ g[Y_A]
+        past = FoldedInformation()
+        past._add(own_H, own_g, graph.c, lag_s)
+        return past
+
+    @staticmethod
+    def of_lag(lag_s: float, sigma_s: float) -> FoldedInformation:
+        """A lag is known, and nothing of the iron."""
+        past = FoldedInformation()
+        past._H[LAG, LAG] = 1.0 / sigma_s**2
+        past._eta[LAG] = lag_s / sigma_s**2
+        return past
+
+    def with_epoch(
+        self, told: InstrumentInformation, lag_s: float, sigma_bias: float
+    ) -> FoldedInformation:
+        """With one epoch more, which was linearised at this lag; sigma_bias in rad/s."""
+        bias = slice(9, 12)
+        own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
+        gain = np.linalg.solve(own, told.H[bias]).T
+        H, g = told.H - gain @ told.H[bias], told.g - gain @ told.g[bias]
+        keep = np.zeros(_SIZE)
+        keep[_LASTING] = 1.0
+        past = FoldedInformation()
+        past._H, past._eta = self._H.copy(), self._eta.copy()
+        past._add(H * np.outer(keep, keep), g * keep, told.c, lag_s)
+        return past
+
+    def _add(self, H: Array, g: Array, c: Array, lag_s: float) -> None:
+        self._H = self._H + H
+        self._eta = self._eta + H @ _place(c, lag_s) - g
+
+    def at(self, c: Array, lag_s: float) -> tuple[Array, Array]:
+        """H (17, 17) and gradient (17,) there."""
+        return self._H, self._H @ _place(c, lag_s) - self._eta
+
+
+def _place(c: Array, lag_s: float) -> Array:
+    x = np.zeros(_SIZE)
+    x[:9], x[LAG] = c, lag_s
+    return x
+
+
+def linearise_instrument(epochs: Sequence[WindowEpoch], graph: Graph) -> None:
+    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet."""
+    silent = [epoch for epoch in epochs if epoch.turned and epoch.instrument is None]
+    if silent:
+        _informations(silent, graph)
+
+
+def lag_known(
+    epochs: Sequence[WindowEpoch], graph: Graph, past: FoldedInformation, sigma_bias: float
+) -> Lag:
+    """Sigma of the lag that is taken out of the field, from all data.  LinAlgError: unobservable.
+
+    The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
+    the lag, so what both make adds up.
+    """
+    linearise_instrument(epochs, graph)
+    H = believed(graph, sigma_bias)[0] + past.at(graph.c, 0.0)[0]
+    H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
+    sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
+    return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lag:
+    """1-sigma of a lag, and by how much [M, b, w_b] (12,) would be wrong were it one sigma off."""
+
+    sigma_s: float
+    spread: Array
+
+
+def _inverse(H: Array) -> Array:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
+    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale))
+
+
+def instrument(
+    epochs: InformationStack,
+    graph: Graph,
+    sigma_bias: float,
+    before: tuple[Array, Array] | None = None,
+) -> Instrument:
+    """Misalignment, lag and scale from the epochs of a settled window and those before it.
+
+    LinAlgError where the motion does not tell.
+    """
+    H, g = believed(graph, sigma_bias)
+    if before is not None:
+        H, g = H + before[0], g + before[1]
+    H, g = H + epochs[0].sum(axis=0), g + epochs[1].sum(axis=0)
+    covariance = _inverse(H)
+    step = -covariance @ g
+    misfit = max(1.0, disagreement(*epochs, step))
+    return Instrument(step, misfit * covariance, misfit)
+
+
+def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
+    """H (17, 17) and gradient (17,) of what is known without the epochs."""
+    H, g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
+    pull = graph.temper * graph.anchor[1] + graph.hold
+    H[:9, :9], g[:9] = pull, pull @ (graph.c - graph.anchor[0])
+    prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
+    H[9:, 9:] = np.diag(graph.temper / np.square(prior))
+    return H, g
+
+
+def disagreement(H: Array, g: Array, steps: Array) -> float:
+    """Mean square per degree of freedom of the gradients of epochs (N, n, n), (N, n) after steps.
+
+    steps (n,), or (N, n) where each takes its own.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
+    values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
+    good = values > _WEAKEST
+    left = scale * (g + (H @ np.broadcast_to(steps, g.shape)[:, :, None])[:, :, 0])
+    asked = (np.swapaxes(vectors, 1, 2) @ left[:, :, None])[:, :, 0]
+    count = int(np.count_nonzero(good))
+    return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
+
+
+def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    rows = chain.Rows.of(
+        [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
+    )
+    field, motion = chain.parts(rows, graph.c)
+    turn = _of_angle(motion.by_bias / rows.dt_s, rows.angle_b_rad)
+    seen = np.concatenate([e.data.seen(e.u) for e in epochs])
+    rate = np.concatenate([rates(e.data) for e in epochs])
+    swept = chain.symmetric(graph.c[:6]) @ np.cross(rate, seen).T
+    late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
+    diag, upper, border = chain.interior(field, motion)
+    columns = np.zeros((2, _SIZE + 1, len(rate)))
+    columns[:, :12], columns[:, _SIZE] = border[:, :12], border[:, 12]
+    columns[:, _OF_ANGLE] = -motion.scale * turn
+    columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
+    columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
+    _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
+    J = np.concatenate([field.by_x, late[:, None], field.r[:, None]], axis=1)
+    K = np.concatenate([motion.by_bias, turn, motion.q[:, None]], axis=1)
+    H = np.zeros((len(epochs), _SIZE + 1, _SIZE + 1))
+    for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
+        Y = half[2 * a : 2 * b]
+        H[k] = -(Y.T @ Y)
+        H[k][_FIELD] += chain.squares(J[:, :, a:b])
+        H[k][_MOTION] += chain.squares(K[:, :, a:b])
+    for epoch, own in zip(epochs, H, strict=True):
+        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
+    return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+
+
+def _of_angle(by_angle: Array, angle: Array) -> Array:
+    """dq/dtheta and dq/ds, (2, 4, N), of dq/dphi (2, 3, N) and phi (3, N)."""
+    (x, y, z), (p, q, r) = by_angle.transpose(1, 0, 2), angle
+    turn = [y * r - z * q, z * p - x * r, x * q - y * p]  # by_angle [phi]x
+    return np.array([*turn, -(x * p + y * q + z * r)]).transpose(1, 0, 2)
+
+
+# -- A contradiction -------------------------------------------------------------------------------
+#
+# A magnet that passes disturbs some rows; one that stays with the sensor disturbs them all, and
+# another hard iron explains what it does (`model_checks.py`).
+
+_MOST_ROWS = 0.6
+_ATTITUDES = 0.1  # rad, spread of the field's direction over the rows that contradict
+_EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
+_FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
+
+
+def contradicts(
+    epoch: WindowEpoch, c: Array, covariance: Array, usual: chain.Noise, limit_sigma: float
+) -> bool:
+    """Most of its rows are beyond what noise and the covariance (9, 9) of c allow, and b mends it.
+
+    They must be of more than one attitude: in one, another iron and another place are the same.
+
+    Its directions must still be where the epoch was linearised, at c.
+    """
+    u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
+    J = chain.symmetric_columns(epoch.data.seen(u))
+    J = np.concatenate([J, np.broadcast_to(np.eye(3), (len(u), 3, 3))], axis=2)
+    known = np.sum((J @ covariance) * J, axis=(1, 2))
+    error = np.sum(epoch.data.field_error(u, c) ** 2, axis=1)
+    beyond = error > limit_sigma**2 * (usual.mag_gauss**2 / epoch.data.count + known)
+    if not epoch.turned or float(np.mean(beyond)) <= _MOST_ROWS:
+        return False
+    if spread(u[beyond]) < _ATTITUDES:
+        return False
+    q = epoch.quadratic
+    H, g = q.H[np.ix_(_FREE, _FREE)], q.g[_FREE]
+    explained = 0.5 * g @ np.linalg.lstsq(H, g, rcond=1e-12)[0]
+    return bool(explained > _EXPLAINED * q.cost)

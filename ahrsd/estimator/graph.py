@@ -14,27 +14,272 @@ pivots are alike, and what is left on c and the newest node (14 numbers) is solv
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import is_not
 
 import gtsam
 import numpy as np
 
-from ahrsd.estimator.factors import (
-    NODE,
-    SIZE,
-    Y_A,
-    Y_B,
-    C,
-    Factor,
-    LinearisationPoint,
-    Node,
-    Stack,
-    retract_nodes,
-)
-from ahrsd.estimator.retraction import Moments, retract
+from ahrsd import so3
+from ahrsd.estimator import chain
 from ahrsd.samples import Array
+
+# -- Nodes and factors -----------------------------------------------------------------------------
+#
+# Quadratic factors between the calibration and the nodes between epochs, and their re-basing.
+#
+# Variables: c = [M (6), b (3)] and, per node between epochs, y = [gyro bias (3), border direction
+# (2, in the node's tangent plane)]. A factor remembers where it was linearised; `Stack` expresses
+# factors around the present values: the calibration and the bias move additively, a direction moved
+# from u0 to u is T0^T (u - u0) away in the old tangent plane, and T0^T T turns the new tangents
+# into the old ones.
+
+C = slice(0, 9)
+NODE = 5
+Y_A = slice(9, 14)
+Y_B = slice(14, 19)
+SIZE = 19
+_BIAS = slice(9, 12)
+BORDERS = np.r_[12:14, 17:19]
+_CHAIN_BORDERS = np.r_[chain.FIRST, chain.LAST]
+_TOKEN = 1.0  # information on a direction, 1/rad^2
+# where chain.Quadratic's 16 numbers go among the factor's 19
+_FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
+_AMONG = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """Border between two epochs: the gyro bias from here on (rad/s) and the field's direction.
+
+    Its arrays are never written to: nodes are replaced, and shared until then.
+    """
+
+    bias: Array
+    direction: Array
+    tangent: Array
+
+    @staticmethod
+    def at(bias: Array, direction: Array) -> Node:
+        """A node with a tangent basis of its direction."""
+        return Node(bias.copy(), direction.copy(), so3.tangent_basis(direction[None])[0])
+
+    def retracted(self, step: Array) -> Node:
+        """The node after a step (5,), on the sphere."""
+        return retract_nodes([self], step[None])[0]
+
+    def turned(self, R: Array) -> Node:
+        """The node with its direction and tangents turned by R (3, 3)."""
+        return Node(self.bias, R @ self.direction, R @ self.tangent)
+
+
+def retract_nodes(nodes: Sequence[Node], steps: Array) -> list[Node]:
+    """Nodes after their steps (N, 5), all at once."""
+    bias = np.array([n.bias for n in nodes]) + steps[:, :3]
+    T = np.array([n.tangent for n in nodes])
+    direction = np.array([n.direction for n in nodes]) + (T @ steps[:, 3:, None])[:, :, 0]
+    direction /= np.sqrt(np.sum(direction * direction, axis=1, keepdims=True))
+    return [Node(*each) for each in zip(bias, direction, so3.tangent_basis(direction), strict=True)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearisationPoint:
+    """Where a factor was linearised."""
+
+    c: Array
+    a: Node
+    b: Node
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Factor:
+    """cost + g^T z + z^T H z / 2 with z = [c (9), y_a (5), y_b (5)] around `point`.
+
+    Factors on c and one node leave the other node's rows zero. `walk` is the information of the
+    random walk of the gyro bias between the nodes, 1/(rad/s)^2, 0 for none.
+    """
+
+    a: int
+    b: int
+    H: Array
+    g: Array
+    point: LinearisationPoint
+    walk: float = 0.0
+
+
+class Stack:
+    """Factors around the present values, all at once: z (F, 19), how far each is from its `point`.
+
+    `nodes` are the present ones by index.
+    """
+
+    def __init__(self, factors: Sequence[Factor], c: Array, nodes: Mapping[int, Node]) -> None:
+        self._H = np.array([f.H for f in factors])
+        self._g = np.array([f.g for f in factors])
+        self._walk = np.array([f.walk for f in factors])
+        self._tilt = np.empty((2, len(factors), 2, 2))
+        self.z = np.empty((len(factors), SIZE))
+        self.z[:, C] = c - np.array([f.point.c for f in factors])
+        sides = (
+            (9, [nodes[f.a] for f in factors], [f.point.a for f in factors]),
+            (14, [nodes[f.b] for f in factors], [f.point.b for f in factors]),
+        )
+        for k, (at, now, old) in enumerate(sides):
+            moved = np.array([n.direction for n in now]) - np.array([n.direction for n in old])
+            back = np.swapaxes(np.array([n.tangent for n in old]), 1, 2)
+            self.z[:, at : at + 3] = np.array([n.bias for n in now]) - [n.bias for n in old]
+            self.z[:, at + 3 : at + 5] = (back @ moved[:, :, None])[:, :, 0]
+            self._tilt[k] = back @ np.array([n.tangent for n in now])
+        self._walked = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
+
+    def rises(self) -> Array:
+        """Costs (F,) above those at each factor's `point`, the walk of the bias included."""
+        pulled = (self._H @ self.z[:, :, None])[:, :, 0]
+        walks = 0.5 * self._walk * np.sum(self._walked**2, axis=1)
+        return np.asarray(np.sum((self._g + 0.5 * pulled) * self.z, axis=1) + walks)
+
+    def here(self) -> tuple[Array, Array]:
+        """H (F, 19, 19) and gradients (F, 19) around the present values."""
+        J = np.tile(np.eye(SIZE), (len(self.z), 1, 1))
+        J[:, 12:14, 12:14], J[:, 17:19, 17:19] = self._tilt
+        Jt = np.swapaxes(J, 1, 2)
+        H = Jt @ self._H @ J
+        g = (Jt @ (self._g[:, :, None] + self._H @ self.z[:, :, None]))[:, :, 0]
+        i, j = np.arange(9, 12), np.arange(14, 17)
+        H[:, i, i] += self._walk[:, None]
+        H[:, j, j] += self._walk[:, None]
+        H[:, i, j] -= self._walk[:, None]
+        H[:, j, i] -= self._walk[:, None]
+        g[:, i] -= self._walk[:, None] * self._walked
+        g[:, j] += self._walk[:, None] * self._walked
+        return H, g
+
+
+def epoch_factor(
+    q: chain.Quadratic,
+    a: int,
+    point: LinearisationPoint,
+    walk: float,
+    *,
+    rest: Array | None = None,
+    drawn: tuple[bool, bool] = (False, False),
+) -> Factor:
+    """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
+
+    One at rest does not calibrate, it speaks of the gyro's bias only, and that whatever c is: the
+    rate that was read is the bias, across the field's direction `rest` (3,), a mean over the epoch.
+    What seems to be said along it comes from the noise of the directions. Its borders keep a token
+    of information, to stay determined. The first and the last, as `drawn` says, are drawn by it to
+    where the epoch wants them; one that an epoch with motion shares is not.
+    """
+    H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+    H[_AMONG] = q.H
+    g[_FROM_CHAIN] = q.g
+    if rest is not None:
+        gain = np.linalg.solve(H[BORDERS][:, BORDERS], np.c_[H[BORDERS][:, _BIAS], g[BORDERS]])
+        cross = H[_BIAS][:, BORDERS]
+        wanted = at_borders(q) * np.repeat(drawn, 2)
+        H_bias, g_bias = H[_BIAS, _BIAS] - cross @ gain[:, :3], g[_BIAS] - cross @ gain[:, 3]
+        across = np.eye(3) - np.outer(rest, rest)
+        H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+        H[_BIAS, _BIAS], g[_BIAS] = across @ H_bias @ across, across @ g_bias
+        H[BORDERS, BORDERS], g[BORDERS] = _TOKEN, -_TOKEN * wanted
+    return Factor(a, a + 1, H, g, point, walk)
+
+
+def at_borders(q: chain.Quadratic) -> Array:
+    """Where an epoch alone wants its borders (4,), first and last, from where they are.
+
+    A direction that it does not tell stays: against that a rad of doubt is nothing.
+    """
+    H, g = q.H[_CHAIN_BORDERS][:, _CHAIN_BORDERS], q.g[_CHAIN_BORDERS]
+    return np.asarray(-np.linalg.solve(H + np.eye(len(g)), g), dtype=np.float64)
+
+
+def chain_step(z: Array, *, calibrates: bool = True) -> Array:
+    """The 16 numbers of `chain.move` out of a factor's 19; only the bias for `not calibrates`."""
+    step = np.array(z[_FROM_CHAIN])
+    if not calibrates:
+        step[C], step[12:] = 0.0, 0.0
+    return step
+
+
+def gap_factor(a: int, c: Array, node_a: Node, node_b: Node, walk: float) -> Factor:
+    """Across a gap, between nodes a and a + 1, only the gyro bias is linked."""
+    point = LinearisationPoint(c.copy(), node_a, node_b)
+    return Factor(a, a + 1, np.zeros((SIZE, SIZE)), np.zeros(SIZE), point, walk)
+
+
+def bias_prior(node: int, c: Array, at: Node, sigma_bias: float) -> Factor:
+    """Prior on the first node's gyro bias (rad/s)."""
+    H = np.zeros((SIZE, SIZE))
+    H[9:12, 9:12] = np.eye(3) / sigma_bias**2
+    return Factor(node, node, H, np.zeros(SIZE), LinearisationPoint(c.copy(), at, at))
+
+
+# -- The calibration's retraction ------------------------------------------------------------------
+#
+# How the calibration moves by a finite step: along the valley of the likelihood, not straight.
+#
+# Where motion is nearly planar the data fix the field's directions u_k up to a common shift along
+# the turn's axis. With C = M^-1 and d = C b, u_k = (C m_k - d) / r, and that family is linear in
+# (C, d) up to the common scale r; in (M, b) it is strongly curved, and a Gauss-Newton step leaves
+# it at once. So a step dc of [M (6), b (3)] is taken in (C, d), and the scale is restored from the
+# field's moments. To first order nothing changes: derivatives, sigmas and the optimum are those of
+# [M, b].
+
+
+class Moments:
+    """First and second moments of the field that the calibration was estimated from."""
+
+    def __init__(self) -> None:
+        self._count = 0.0
+        self._sum: Array = np.zeros(3)
+        self._squares: Array = np.zeros((3, 3))
+
+    def take(self, field: Array) -> None:
+        """Add rows (n, 3) in gauss."""
+        self._count += len(field)
+        self._sum = self._sum + field.sum(axis=0)
+        self._squares = self._squares + field.T @ field
+
+    def mean_square(self, C: Array, d: Array) -> float:
+        """Mean of |C m - d|^2, 0 before the first row."""
+        if self._count == 0:
+            return 0.0
+        total = np.sum((C @ self._squares) * C) - 2 * d @ C @ self._sum + self._count * d @ d
+        return float(total / self._count)
+
+
+def retract(c: Array, dc: Array, moments: Moments) -> Array:
+    """c = [M (6), b (3)] after a step dc; plainly c + dc where C would not stay positive."""
+    M, dM = chain.symmetric(c[:6]), chain.symmetric(dc[:6])
+    C = np.linalg.inv(M)
+    dC = -C @ dM @ C
+    d, dd = C @ c[6:], dC @ c[6:] + C @ dc[6:]
+    if np.linalg.eigvalsh(C + dC)[0] <= 0:
+        return np.asarray(c + dc)
+    scale = np.sqrt(1.0 + moments.mean_square(dC, dd))
+    new = np.linalg.inv((C + dC) / scale)
+    return np.concatenate([chain.upper_triangle(new), new @ (d + dd) / scale])
+
+
+def curvature(c: Array, covariance: Array, moments: Moments) -> Array:
+    """What the valley's curvature adds to the covariance (9, 9) of c.
+
+    One sigma along a principal direction ends q beside the straight line, t sigmas t^2 q: of a
+    standard normal t that has the mean square 3 q q^T.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    added = np.zeros((9, 9))
+    for value, vector in zip(values, vectors.T, strict=True):
+        step = np.sqrt(max(float(value), 0.0)) * scale * vector
+        q = (retract(c, step, moments) + retract(c, -step, moments)) / 2 - c
+        added += 3 * np.outer(q, q)
+    return added
 
 
 class SingularError(ValueError):
@@ -45,6 +290,7 @@ _C = gtsam.symbol("c", 0)
 # Unit of the gyro bias inside GTSAM: (rad/s) / 100, which brings its pivots near the directions'.
 _UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.0]
 _BADLY = 0.1
+BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
 _HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
@@ -91,8 +337,8 @@ class Graph:
 
     `anchor` is what is believed of c without data, its mean (9,) and information (9, 9); it is
     never folded, because its weight against the data changes: `temper` multiplies its information
-    (see `misfit`), and `hold` (9, 9) is added to it, which keeps the directions of c that nothing
-    determines at the mean.
+    (see `epoch.Misfit`), and `hold` (9, 9) is added to it, which keeps the directions of c that
+    nothing determines at the mean.
     """
 
     def __init__(self, c: Array, belief: Array, first: Node, prior: Factor) -> None:
@@ -205,7 +451,7 @@ class Graph:
         return -(covariance @ g)[C], information
 
     def move(self, dc: Array, dy: dict[int, Array]) -> None:
-        """Move all values by a step, the calibration along its valley (`retraction.py`)."""
+        """Move all values by a step, the calibration along its valley (`retract`)."""
         self.c = retract(self.c, dc, self.moments)
         steps = np.array([dy[j] for j in self.nodes])
         self.nodes = dict(

@@ -13,16 +13,18 @@ from copy import copy
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.estimator import chain, change, intake, noise, summary
-from ahrsd.estimator.factors import Node
-from ahrsd.estimator.graph import SingularError, whitening
-from ahrsd.estimator.instrument import Instrument, InstrumentInformations, instrument
-from ahrsd.estimator.intake import Intake
-from ahrsd.estimator.misalignment import Misalignment, misalignment
+from ahrsd.estimator import chain, noise, summary
+from ahrsd.estimator.epoch import Instrument, InstrumentInformations, instrument
+from ahrsd.estimator.epoch_builder import EpochBuilder, check_samples, with_border
+from ahrsd.estimator.graph import Node, SingularError, curvature, whitening
+from ahrsd.estimator.model_checks import (
+    Misalignment,
+    change_message,
+    divided,
+    misalignment,
+)
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
-from ahrsd.estimator.retraction import curvature
-from ahrsd.estimator.search import search
-from ahrsd.estimator.window import Window
+from ahrsd.estimator.window import Window, search
 from ahrsd.samples import Array, SampleBlock
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
@@ -68,7 +70,7 @@ class Estimator:
         self._at_once = at_once
         self._new: list[chain.EpochData] = []  # epochs that are not in the window yet
         self._last: chain.EpochData | None = None  # the newest one
-        self._intake = Intake(self.parameters)
+        self._builder = EpochBuilder(self.parameters)
         self._window: Window | None = None
         self._whitening = np.eye(12)
         self._down: deque[Array] = deque(maxlen=64)
@@ -88,17 +90,17 @@ class Estimator:
         A block must not span a gap (`SampleBlock`). Raises ValueError, which names the row, where
         a field, rate or step is not a finite number; nothing of the block is then taken.
         """
-        intake.check(block)
+        check_samples(block)
         gap = block.gap_before and len(block) > 0
-        closed = self._intake.gap(float(block.time_s[0])) if gap else []
-        closed += self._intake.add(block)
+        closed = self._builder.gap(float(block.time_s[0])) if gap else []
+        closed += self._builder.add(block)
         for data in closed:
             self._append(data)
         return bool(closed)
 
     def interrupt(self) -> bool:
         """Close the epoch with what is pending; what follows does not share one with it."""
-        data = self._intake.interrupt()
+        data = self._builder.interrupt()
         if data is not None:
             self._append(data)
         return data is not None
@@ -123,7 +125,7 @@ class Estimator:
 
     def _append(self, data: chain.EpochData) -> None:
         if self._last is not None and not data.measures_first:
-            data = intake.with_border(data, self._last)
+            data = with_border(data, self._last)
         self._last = data
         self._down.append(data.down_b[len(data) // 2])
         self._new.append(data)
@@ -187,9 +189,9 @@ class Estimator:
             return window
         p = self.parameters
         try:
-            said = self._informations.of(window.epochs, window.graph)
-            found = change.divided(
-                said, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
+            informations = self._informations.of(window.epochs, window.graph)
+            found = divided(
+                informations, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
             )
         except np.linalg.LinAlgError:
             return window
@@ -265,9 +267,11 @@ class Estimator:
 
     def _instrument(self, window: Window) -> Instrument | None:
         try:
-            said = self._informations.of(window.epochs, window.graph)
+            informations = self._informations.of(window.epochs, window.graph)
             before = window.past.at(window.graph.c, window.lag_s)
-            return instrument(said, window.graph, self.parameters.prior_gyro_bias_rad_s, before)
+            return instrument(
+                informations, window.graph, self.parameters.prior_gyro_bias_rad_s, before
+            )
         except np.linalg.LinAlgError:
             return None
 
@@ -285,7 +289,7 @@ class Estimator:
 
         An epoch that is under way counts as far as it is, if it is long enough to be one.
         """
-        if self._new or (self._window and self._intake.pending >= MIN_EPOCH_STEPS):
+        if self._new or (self._window and self._builder.pending >= MIN_EPOCH_STEPS):
             return self._copy().finish()
         return self._answer()
 
@@ -301,14 +305,14 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            said = self._informations.of(window.epochs, window.graph)
-            return misalignment(said, window.graph, self.parameters.prior_gyro_bias_rad_s)
+            informations = self._informations.of(window.epochs, window.graph)
+            return misalignment(informations, window.graph, self.parameters.prior_gyro_bias_rad_s)
         except np.linalg.LinAlgError:
             return None
 
     def _copy(self) -> Estimator:
         other = copy(self)
-        other._intake, other._down = self._intake.copy(), self._down.copy()
+        other._builder, other._down = self._builder.copy(), self._down.copy()
         other._new, other._informations = list(self._new), InstrumentInformations()
         other._window = None if self._window is None else self._window.copy()
         return other
@@ -334,7 +338,7 @@ class Estimator:
         K[:9, :9] = J
         down, dip = summary.attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
         heading = summary.heading_sigma_deg(graph.c, covariance, down, dip)
-        averaged = self._intake.averaged
+        averaged = self._builder.averaged
         return Estimate(
             soft_iron=A,
             hard_iron_gauss=b,
@@ -347,8 +351,8 @@ class Estimator:
             misfit=window.found_misfit,
             heading_sigma_deg=heading,
             observability=observed,
-            samples=self._intake.samples,
-            duration_s=self._intake.duration_s,
+            samples=self._builder.samples,
+            duration_s=self._builder.duration_s,
             converged=bool(
                 self._agreed
                 and window.step_sigmas < _SETTLED
@@ -356,7 +360,7 @@ class Estimator:
                 and self._misscaled == 0.0
                 and self._doubted_s is None
             ),
-            warnings=() if self.restarted_s is None else (change.change_message(self.restarted_s),),
+            warnings=() if self.restarted_s is None else (change_message(self.restarted_s),),
             mag_lag_s=window.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,

@@ -8,7 +8,7 @@ import numpy as np
 
 from ahrsd.calibration import Observability
 from ahrsd.estimator import chain
-from ahrsd.estimator.window import BLIND
+from ahrsd.estimator.graph import BLIND
 from ahrsd.samples import Array
 
 _NAMES = (

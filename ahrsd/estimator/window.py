@@ -1,10 +1,11 @@
 """The window: epochs that can still be linearised again, and the graph that joins them.
 
 Two ways to move the estimate. `track` is a plain Gauss-Newton step after which only what it pays to
-linearise again is (`staleness.py`): the steady state, whose cost does not depend on
-how long the run has been. `optimise` linearises everything and takes a step only if the true cost
-falls (Levenberg-Marquardt): for searching, and whenever a tracking step would be large. `track`
-spends at most _WORK linearisations per epoch on average; what is left over waits.
+linearise again is (`outdated`): the steady state, whose cost does not depend on how long the run
+has been. `optimise` linearises everything and takes a step only if the true cost falls
+(Levenberg-Marquardt): for searching, and whenever a tracking step would be large. `track` spends at
+most _WORK linearisations per epoch on average; what is left over waits. `search` lets other starts
+descend on a part of the window.
 
 Directions of the calibration that the data do not determine are held at the prior's mean, so that
 noise and model errors cannot make them wander (`Graph.hold_blind`).
@@ -12,28 +13,330 @@ noise and model errors cannot make them wander (`Graph.hold_blind`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
-from ahrsd.estimator import chain
-from ahrsd.estimator.change import contradicts
-from ahrsd.estimator.epoch import LinearisationPlan, Snapshot, WindowEpoch, place_borders, scores_of
-from ahrsd.estimator.factors import Node, Stack
-from ahrsd.estimator.graph import SingularError, sigmas
-from ahrsd.estimator.instrument import FoldedInformation, Lag, lag_known
-from ahrsd.estimator.linearised import Linearised
+from ahrsd import so3
+from ahrsd.estimator import chain, noise, start
+from ahrsd.estimator.epoch import (
+    FoldedInformation,
+    Lag,
+    LinearisationPlan,
+    Misfit,
+    Snapshot,
+    WindowEpoch,
+    contradicts,
+    grown,
+    lag_known,
+    linearise_instrument,
+    place_borders,
+    scores_of,
+)
+from ahrsd.estimator.epoch_data import (
+    delayed,
+    group_size,
+    grouped,
+    joined,
+    rates,
+    spread,
+    thinned,
+    turned,
+)
+from ahrsd.estimator.graph import (
+    BLIND,
+    Graph,
+    LinearisationPoint,
+    Moments,
+    Node,
+    SingularError,
+    Stack,
+    bias_prior,
+    chain_step,
+    epoch_factor,
+    retract,
+    sigmas,
+)
+from ahrsd.estimator.noise import DirectionCells, variance_inflation
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.estimator.staleness import bends, drifts, outdated
-from ahrsd.estimator.systematic import excess
 from ahrsd.samples import Array
+
+_WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
+_GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
+_GUESSES = 64  # epochs whose first guess of the noise is remembered
+_ANOTHER_REST = 0.02  # rad between two directions at rest
+
+
+class Linearised:
+    """Epochs, each where it was linearised; `graph.c` = [M (6), b (3)] in gauss is the answer."""
+
+    def __init__(
+        self,
+        parameters: EstimatorParameters,
+        c: Array,
+        belief: Array,
+        first: Node,
+        usual: chain.Noise,
+    ) -> None:
+        self.parameters = parameters
+        self.usual = usual
+        self.epochs: list[WindowEpoch] = []
+        self.misfit = Misfit()
+        self.folded = False
+        self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
+        self.past = FoldedInformation()  # of what was folded since there is a lag
+        self._folded_cells = DirectionCells()
+        self._rest: Array | None = None
+        self._work = 0
+        self._waiting: list[
+            tuple[chain.EpochData, bool]
+        ] = []  # not attached yet; with motion or not
+        self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
+        self._guess = usual  # the middle of them
+        prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
+        self.graph = Graph(c, belief, first, prior)
+
+    def copy(self) -> Self:
+        """A copy that goes its own way."""
+        other = copy(self)
+        other.graph, other.epochs = self.graph.copy(), list(self.epochs)
+        other._guesses, other.misfit = self._guesses.copy(), copy(self.misfit)
+        other._waiting = list(self._waiting)
+        return other
+
+    # -- growing and forgetting ------------------------------------------------------------------
+
+    def take(self, new: Sequence[chain.EpochData]) -> int:
+        """New epochs of single steps, linked to the one before unless `measures_first`.
+
+        They wait to be attached until the answer moves; returns how many have motion.
+        """
+        size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
+        guesses = [noise.first_guess(data, self.parameters) for data in new]
+        bias = self.graph.nodes[self.graph.last].bias
+        moving = [turned(data, bias) for data in new]
+        for data, moves in zip(new, moving, strict=True):
+            if moves:
+                self.graph.moments.take(data.field_b_gauss)
+        self._guesses.extend(guesses)
+        self._guess = noise.median(self._guesses)
+        sizes = [group_size(d, guess, size) for d, guess in zip(new, guesses, strict=True)]
+        coarse = grouped(new, sizes)
+        if self.lag_s != 0.0:
+            coarse = [delayed(data, self.lag_s) for data in coarse]
+        self._waiting += zip(coarse, moving, strict=True)
+        return sum(moving)
+
+    @property
+    def data(self) -> list[chain.EpochData]:
+        """Of all epochs, those that wait too."""
+        return [epoch.data for epoch in self.epochs] + [data for data, _ in self._waiting]
+
+    def join(self) -> None:
+        """Attach what waits, at the present values."""
+        waiting, self._waiting = self._waiting, []
+        if waiting:
+            self.attach([data for data, _ in waiting], [moving for _, moving in waiting])
+
+    def learn_from(self, other: Linearised) -> None:
+        """First guesses of the noise and moments of the field, for a part of the other's data."""
+        self._guesses, self._guess = other._guesses.copy(), other._guess
+        self.graph.moments = other.graph.moments
+
+    def attach(self, new: Sequence[chain.EpochData], moving: Sequence[bool]) -> None:
+        """Epochs whose steps are grouped already, and whether they calibrate."""
+        walk = self.parameters.bias_walk_rad_s_sqrt_s
+        pieces = [grown(self.graph, d, walk, moving=m) for d, m in zip(new, moving, strict=True)]
+        self._work = min(self._work + _WORK * len(new), max(_MOST_WORK, _WORK * len(new)))
+        begun = self._linearised([LinearisationPlan(piece, u, self.usual) for piece, u in pieces])
+        self.epochs += begun
+        self.graph.factors += [epoch.factor for epoch in begun]
+        place_borders(self.graph, begun)
+
+    def fold(self) -> None:
+        """Fold the oldest epochs until the window has its size."""
+        while (
+            len(self.epochs) > 1
+            and sum(e.data.steps for e in self.epochs) > self.parameters.window_steps
+        ):
+            old = self.epochs.pop(0)
+            self.folded |= old.turned
+            if old.turned:
+                self._folded_cells += old.cells
+            self._remember_lag(old)
+            self.misfit.remember(old.factor, scores_of([old])[0], self.graph)
+            while self.graph.first < self.epochs[0].a:
+                self.graph.fold_oldest()
+
+    def _remember_lag(self, old: WindowEpoch) -> None:
+        """Keep what an epoch that leaves the window knows of the lag, where one is taken out."""
+        if not old.turned or self.lag_s == 0.0:
+            return
+        if old.instrument is None:  # the others will be asked soon; together it is cheaper
+            linearise_instrument([old, *self.epochs], self.graph)
+        if old.instrument is not None:
+            sigma_bias = self.parameters.prior_gyro_bias_rad_s
+            self.past = self.past.with_epoch(old.instrument, self.lag_s, sigma_bias)
+
+    # -- linearisation ---------------------------------------------------------------------------
+
+    def _linearised(
+        self, places: Sequence[LinearisationPlan], outlier_sigma: float | None = None
+    ) -> list[WindowEpoch]:
+        """Epochs at the present values; with `outlier_sigma` at weights of their own."""
+        self._work -= len(places)
+        graph, chains = self.graph, []
+        for at in places:
+            first, last = graph.nodes[at.piece.a], graph.nodes[at.piece.a + 1]
+            at.u[0], at.u[-1] = first.direction, last.direction
+            chains.append(chain.Chain(at.piece.data, at.u, first.bias, at.used, at.weights))
+        found = chain.linearise_all(chains, graph.c, outlier_sigma=outlier_sigma)
+        pieces = [e.piece for e in self.epochs] + [at.piece for at in places]
+        moving = {j for piece in pieces if piece.turned for j in (piece.a, piece.a + 1)}
+        out = []
+        for at, q in zip(places, found, strict=True):
+            a, rest = at.piece.a, None if at.piece.turned else self._resting(at.u)
+            point = LinearisationPoint(graph.c, graph.nodes[a], graph.nodes[a + 1])
+            drawn = (a not in moving, a + 1 not in moving)
+            factor = epoch_factor(q, a, point, at.piece.walk, rest=rest, drawn=drawn)
+            out.append(WindowEpoch(at.piece, at.u, at.used, self.usual, q, factor))
+        return out
+
+    def _resting(self, u: Array) -> Array:
+        """Direction at rest: that of the last rest unless it is clearly another.
+
+        Differences that are only noise would seem to say something of the bias along the field.
+        """
+        mean = u.mean(axis=0)
+        mean /= np.linalg.norm(mean)
+        if self._rest is None or float(np.linalg.norm(mean - self._rest)) > _ANOTHER_REST:
+            self._rest = mean
+        return self._rest
+
+    def _replace(
+        self, which: Sequence[int], places: Sequence[LinearisationPlan], **weighing: float
+    ) -> None:
+        if not which:
+            return
+        factors = self.graph.factors
+        where = {id(factor): i for i, factor in enumerate(factors)}
+        for k, new in zip(which, self._linearised(places, **weighing), strict=True):
+            factors[where[id(self.epochs[k].factor)]] = new.factor
+            self.epochs[k] = new
+
+    def _moved_directions(self, which: Sequence[int]) -> list[Array]:
+        """Directions of these epochs where the present values put them."""
+        graph, epochs = self.graph, [self.epochs[k] for k in which]
+        if not epochs:
+            return []
+        z = Stack([e.factor for e in epochs], graph.c, graph.nodes).z
+        return [
+            chain.move(e.u, e.quadratic, chain_step(own, calibrates=e.turned))
+            for e, own in zip(epochs, z, strict=True)
+        ]
+
+    def refresh(self, which: Sequence[int]) -> None:
+        """Linearise epochs again at the present values, with fresh noise and outlier weights."""
+        epochs, p = [self.epochs[k] for k in which], self.parameters
+        places = [
+            LinearisationPlan(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
+            for e, u in zip(epochs, self._moved_directions(which), strict=True)
+        ]
+        self._replace(which, places, outlier_sigma=p.outlier_sigma)
+        found = [e.residuals for e in self.epochs]
+        self.usual = noise.at_least(
+            noise.pooled(found, self._guess, self.parameters), _GYRO_LEAST * self._guess.gyro_rad_s
+        )
+
+    def delay(self, lag_s: float) -> None:
+        """Take the field to be `lag_s` late in every epoch of the window, and in those to come.
+
+        The directions turn back by as much, so that they fit the fields as well as before.
+        """
+        if self.lag_s == 0.0 and self.folded:
+            self.past = FoldedInformation.of_iron(self.graph, lag_s)
+        graph, more, everyone = self.graph, lag_s - self.lag_s, range(len(self.epochs))
+        places = []
+        for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):
+            back = so3.exp(-more * rates(epoch.data))
+            u = (back @ u[:, :, None])[:, :, 0]
+            if epoch.a == graph.first:
+                graph.turn_first(back[0])
+            elif epoch.data.measures_first:
+                graph.nodes[epoch.a] = Node.at(graph.nodes[epoch.a].bias, u[0])
+            graph.nodes[epoch.a + 1] = Node.at(graph.nodes[epoch.a + 1].bias, u[-1])
+            data = delayed(epoch.data, more)
+            places.append(
+                LinearisationPlan(replace(epoch.piece, data=data), u, epoch.used, epoch.weights)
+            )
+        self._replace(everyone, places)
+        self.lag_s = lag_s
+
+
+# -- Which epochs are worth linearising again ------------------------------------------------------
+#
+# Which epochs are worth linearising again, after the calibration moved away from where they were.
+#
+# An epoch's factor is exact to second order, so a straight move costs nothing, however many sigmas
+# long. What counts is by how much the way there is curved (`graph.retract`), in sigmas: linearising
+# again moves the answer by about that. An epoch at rest knows nothing of the calibration. There the
+# gyro's bias counts: at another one its directions drift, which seems to be noise of the field.
+
+_WORTH = 0.02  # sigmas
+_ANOTHER_NOISE, _EXACTLY = 0.1, 0.04  # of the gyro's level, that an epoch may have assumed else
+
+_DRIFTED = 0.3  # of the field's noise: what a bias other than assumed makes of a rest
+
+
+def bends(epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information: Array) -> Array:
+    """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest."""
+    known: dict[int, float] = {}
+    for epoch in epochs:
+        at = epoch.factor.point.c
+        if epoch.turned and id(at) not in known:
+            known[id(at)] = sigmas(retract(at, c - at, moments) - c, information)
+    return np.array([known[id(e.factor.point.c)] if e.turned else 0.0 for e in epochs])
+
+
+def drifts(epochs: Sequence[WindowEpoch], nodes: Mapping[int, Node], usual: chain.Noise) -> Array:
+    """How far directions at rest drift over their epoch by another bias than it assumed, (E,).
+
+    In units of the field's noise; 0 with motion.
+    """
+    out = np.zeros(len(epochs))
+    for k, epoch in enumerate(epochs):
+        if not epoch.turned:
+            at = epoch.factor.point
+            length_s = float(epoch.data.time_s[-1] - epoch.data.time_s[0])
+            angle = float(np.linalg.norm(nodes[epoch.a].bias - at.a.bias)) * length_s
+            size = float(np.cbrt(np.linalg.det(chain.symmetric(at.c[:6]))))
+            out[k] = angle * size / usual.mag_gauss
+    return out
+
+
+def outdated(
+    epochs: Sequence[WindowEpoch],
+    bent: Array,
+    drifted: Array,
+    usual: chain.Noise,
+    *,
+    exactly: bool,
+) -> list[int]:
+    """Epochs that were left too far behind, or assumed another noise of the gyro than `usual`."""
+    assumed = np.array([e.usual.gyro_rad_s for e in epochs])
+    limit = _EXACTLY if exactly else _ANOTHER_NOISE
+    other = np.abs(assumed / usual.gyro_rad_s - 1.0) > limit
+    return [int(k) for k in np.flatnonzero((bent > _WORTH) | (drifted > _DRIFTED) | other)]
+
 
 _SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
 _LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
-BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
 _FINISH_WORK = 20  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
@@ -59,7 +362,7 @@ class Window(Linearised):
         super().__init__(parameters, c, belief, first, usual)
         self.found_misfit = 1.0
         self.step_sigmas = float(np.inf)
-        self.loud = 1.0  # what searching found the model to leave over (`search.Found`)
+        self.loud = 1.0  # what searching found the model to leave over (`SearchResult.loud`)
         self._damping = _DAMPING
         self._covariance = belief  # of c, when it was last weighed
 
@@ -290,4 +593,129 @@ class Window(Linearised):
     def _repeating(self) -> float:
         """By how much errors that repeat with the attitude shrink the information."""
         cells = sum((e.cells for e in self.epochs if e.turned), self._folded_cells)
-        return excess(cells, self.usual.mag_gauss, self._guess.mag_gauss)
+        return variance_inflation(cells, self.usual.mag_gauss, self._guess.mag_gauss)
+
+
+# -- Other starts ----------------------------------------------------------------------------------
+#
+# Other starting points: do they lead to a better answer, and do they agree?
+#
+# The likelihood has more than one valley when motion is poor. So now and then several starts
+# descend on a part of the window (the epochs whose field varied most, all in one chain with cuts in
+# it; of an epoch of single steps every k-th field, rotations between them composed exactly): the
+# device's present calibration, a linear fit, a sphere, and the answer as it stands. The lowest
+# wins; it may be called sure only if two starts that know nothing of each other arrive there.
+
+_EPOCHS = 6
+_STEPS = 128  # rows per epoch, at most twice that
+_DESCENT = 8  # Levenberg-Marquardt steps per start
+_NEAR = 0.1  # sigmas from the best so far at which a descent need not go on
+_SAME = 1.0  # sigmas within which two answers are one
+_LOUD = 2.0  # residual variance over that of the fields' differences that the model left over
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchResult:
+    """Best calibration c (9,) and gyro bias (3,).
+
+    away:   sigmas between it and the answer as it stands
+    gain:   in log likelihood over where a descent from the answer as it stands leads
+    apart:  sigmas from it within which two starts that know nothing of each other ended
+    loud:   residual variance that even the best leaves over that of the fields' differences, at
+            which the starts descend; 1 where the model explains the data
+    """
+
+    c: Array
+    bias: Array
+    away: float
+    gain: float
+    apart: float
+    loud: float
+
+    @property
+    def agreed(self) -> bool:
+        """Two starts that know nothing of each other arrived at the best."""
+        return self.apart < _SAME
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Reached:
+    cost: float
+    c: Array
+    bias: Array
+    information: Array | None
+    loud: float
+
+
+def search(
+    parameters: EstimatorParameters,
+    window: Window,
+    present_bias: Array,
+    data: Sequence[chain.EpochData],
+) -> SearchResult:
+    """Descend from every start on a thinned copy of `data`; `window` itself is not touched."""
+    graph = window.graph
+    present, information = graph.anchor
+    belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    chosen = sorted(
+        sorted(range(len(data)), key=lambda k: -spread(data[k].field_b_gauss))[:_EPOCHS]
+    )
+    first = Node.at(present_bias, np.array([1.0, 0.0, 0.0]))
+    thin = Window(parameters, present, belief, first, window.usual)
+    thin.learn_from(window)
+    thin.graph.temper = graph.temper
+    if window.loud > 1.0:
+        thin.graph.hold = graph.hold
+    thin.attach(
+        [joined([thinned(data[k], max(1, len(data[k]) // _STEPS)) for k in chosen])], [True]
+    )
+    whole = [data[k] for k in chosen]
+    fields = np.vstack([d.field_b_gauss for d in whole])
+    own = _descend(thin, graph.c, graph.nodes[graph.last].bias, None)
+    starts = [start.linear_start(whole), start.sphere_start(fields)]
+    best, independent = own, []
+    if np.array_equal(graph.c, present):
+        independent.append(own)
+    else:
+        starts.insert(0, present)
+    known = [c for c in starts if c is not None]
+    if window.loud > 1.0:
+        known = [graph.with_held(c) for c in known]
+    for c in known:
+        if _positive(c):
+            independent.append(_descend(thin, c, present_bias, best))
+            best = min(best, independent[-1], key=lambda r: r.cost)
+    loud = best.loud if best.loud > _LOUD else 1.0
+    away = _distance(graph.c, best, graph.temper * loud if loud > 1.0 else 1.0)
+    apart = sorted(_distance(r.c, best, graph.temper * loud) for r in independent)
+    gain = (own.cost - best.cost) / loud
+    return SearchResult(best.c, best.bias, away, gain, (*apart, np.inf)[1], loud)
+
+
+def _positive(c: Array) -> bool:
+    return bool(np.linalg.eigvalsh(chain.symmetric(c[:6]))[0] > 0.0)
+
+
+def _descend(thin: Window, c: Array, bias: Array, best: _Reached | None) -> _Reached:
+    """Downhill from c, until it is clear that this leads to the best so far."""
+    thin.restart_at(c, bias)
+
+    def near(at: Array) -> bool:
+        return best is not None and _distance(at, best, 1.0) < _NEAR
+
+    cost = thin.optimise(_DESCENT, near)
+    graph = thin.graph
+    try:
+        information = np.asarray(np.linalg.inv(graph.covariance()[:9, :9]), dtype=np.float64)
+    except (SingularError, np.linalg.LinAlgError):
+        information = None
+    found = thin.epochs[0].residuals
+    loud = found.mag_gauss2 / found.mag_freedom / thin.usual.mag_gauss**2
+    bias_reached = graph.nodes[graph.last].bias.copy()
+    return _Reached(cost, graph.c.copy(), bias_reached, information, loud)
+
+
+def _distance(c: Array, best: _Reached, temper: float) -> float:
+    if best.information is None:
+        return float(np.inf)
+    return sigmas(c - best.c, best.information / temper)

@@ -1,8 +1,8 @@
 """What a calibration is worth on a recording: before and after, judged by what can be known.
 
-`track` is the recording as arrays, `stored` the calibration, `references` what the heading is
-compared with, `tilt` which way is up; `heading`, `field` and `dead_reckoning` are the figures,
-`judging` all of them together, `spoken` as JSON and as a table.
+`track` is the recording as arrays, with which way is up; `stored` the calibration, `references`
+what the heading is compared with; `heading` and `dead_reckoning` are figures, `judging` has those
+of the field and all of them together, `text` says them as JSON and as a table.
 
 Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """

@@ -9,15 +9,49 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from ahrsd.evaluation import dead_reckoning, tilt
+from ahrsd.baselines.data import field_spread
+from ahrsd.evaluation import dead_reckoning
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
-from ahrsd.evaluation.field import FieldFigures, field_figures
-from ahrsd.evaluation.heading import HeadingFigures, compare
+from ahrsd.evaluation.heading import FOLDS, HeadingFigures, compare
 from ahrsd.evaluation.references import Fixes, HeadingReference
 from ahrsd.evaluation.stored import StoredCalibration
-from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
 from ahrsd.samples import Array
 from ahrsd.world_field import WorldField
+
+# -- Size of the field -----------------------------------------------------------------------------
+#
+# Size of the corrected field: its spread, and the error of the norm constraint.
+#
+# Spread is [R] 4.4, std |h| / mean |h|. [L]'s constraint is |h_k| = |H_k|; where the world's field
+# is not known the mean of |h| stands for |H|, and the error is then about that.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldFigures:
+    """Of one calibration. constraint_*: of |h| - |H|, |H| the mean of |h| unless it was given."""
+
+    mean_gauss: float
+    spread: float
+    fold_spread: tuple[float, ...]
+    constraint_rms_gauss: float
+    constraint_worst_gauss: float
+    size_gauss: Array
+
+
+def field_figures(field_b: Array, world_gauss: float | None) -> FieldFigures:
+    """Figures of corrected fields (N, 3) in gauss."""
+    size = np.linalg.norm(field_b, axis=1)
+    error = size - (float(np.mean(size)) if world_gauss is None else world_gauss)
+    return FieldFigures(
+        mean_gauss=float(np.mean(size)),
+        spread=field_spread(field_b),
+        fold_spread=tuple(field_spread(part) for part in np.array_split(field_b, FOLDS)),
+        constraint_rms_gauss=float(np.sqrt(np.mean(error**2))),
+        constraint_worst_gauss=float(np.max(np.abs(error))),
+        size_gauss=size,
+    )
+
 
 _LONG_GAP_S = 1.0
 T = TypeVar("T")
@@ -91,7 +125,7 @@ def judge(
     *,
     fixes: Fixes | None = None,
     world: WorldField | None = None,
-    tilt_source: tilt.Tilt = "auto",
+    tilt_source: Tilt = "auto",
 ) -> Evaluation:
     """Judge `calibration` on a recording.
 
@@ -135,12 +169,12 @@ def _both(fields: Pair[Array], figures: Callable[[Array], T]) -> Pair[T]:
 
 def _up(
     track: EvaluationTrack,
-    source: tilt.Tilt,
+    source: Tilt,
     references: Sequence[HeadingReference],
     said: list[str],
 ) -> tuple[Array | None, str]:
     try:
-        up_b, found = tilt.up_b(track, source)
+        up_b, found = up_directions(track, source)
     except EvaluationError as error:
         if source != "auto":
             raise

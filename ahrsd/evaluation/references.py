@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.samples import Array
@@ -129,7 +130,7 @@ def optical(track: EvaluationTrack) -> HeadingReference | None:
     known = np.isfinite(norms) & (norms > 0.5)
     if np.count_nonzero(known) < _LEAST_INSTANTS:
         return None
-    R_wb = _matrices(q[known] / norms[known, None])
+    R_wb = Rotation.from_quat(q[known], scalar_first=True).as_matrix()
     up_w = np.array([0.0, 0.0, 1.0])
     if track.has_accel:
         force_w = np.mean(np.einsum("kij,kj->ki", R_wb, track.accel_b_m_s2[known]), axis=0)
@@ -173,14 +174,3 @@ def column(track: EvaluationTrack, name: str) -> HeadingReference:
     return HeadingReference(
         f"column {name}", not device, track.time_s[known], values[known], detail=detail
     )
-
-
-def _matrices(q: Array) -> Array:
-    """R (N, 3, 3) of unit quaternions (N, 4), scalar first, body to world."""
-    w, x, y, z = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.asarray(np.moveaxis(np.array(rows), -1, 0))

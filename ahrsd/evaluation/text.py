@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
-from ahrsd.evaluation.field import FieldFigures
 from ahrsd.evaluation.heading import HeadingFigures, rms_difference
-from ahrsd.evaluation.judging import Evaluation, HeadingJudged, Reckoned
+from ahrsd.evaluation.judging import Evaluation, FieldFigures, HeadingJudged, Reckoned
 
 SCHEMA = "ahrsd.evaluation/1"
 SCHEMA_OF_MANY = "ahrsd.evaluations/1"

@@ -2,19 +2,20 @@
 
 ::
 
-    samples ─▶ history (segments, every 4th held out) ─▶ attitude (gyro + gravity, no compass)
-                 │                                          ├─▶ heading  held-out error
-                 │                                          ├─▶ field    size, dip, drift
-                 │                                          ├─▶ coverage attitudes shown
-                 │                                          └─▶ refits   halves, second opinion
-                 └─▶ stillness (gyro bias at rest)          prediction: heading change over headings
+    samples ─▶ segments (every 4th held out; attitude by gyro and gravity, no compass)
+                 ├─▶ heading    held-out error
+                 ├─▶ field      size, dip, drift
+                 ├─▶ coverage   attitudes shown
+                 ├─▶ refits     halves, second opinion
+                 ├─▶ stillness  gyro bias at rest
+                 └─▶ comparison heading change over headings, against the calibration in force
 
-`EvidenceCollector` runs it all; `ahrsd.gates` judges the `Evidence`.
+`EvidenceCollector` runs it all; `values` is what it finds, and what `ahrsd.gates` judges.
 """
 
 from ahrsd.evidence.collector import EvidenceCollector
-from ahrsd.evidence.history import HistoryParameters, Role
-from ahrsd.evidence.prediction import Envelope, heading_error_curve, worst_difference_deg
+from ahrsd.evidence.comparison import Envelope, heading_error_curve, worst_difference_deg
+from ahrsd.evidence.segments import HistoryParameters, Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 
 __all__ = [

@@ -11,13 +11,28 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.evidence import comparison
-from ahrsd.evidence.attitude import AttitudeTrack, Nodes, nodes_at, track
-from ahrsd.evidence.coverage import UNKNOWN_MOTION, coverage
-from ahrsd.evidence.field import UNKNOWN_FIELD, field_facts
-from ahrsd.evidence.heading import NO_PROOF, field_0, gyro_heading_rad, prove
-from ahrsd.evidence.history import HistoryParameters, Role, SegmentHistory
+from ahrsd.evidence.coverage import coverage
+from ahrsd.evidence.field import field_facts
+from ahrsd.evidence.heading import field_0, gyro_heading_rad, prove
+from ahrsd.evidence.segments import (
+    AttitudeTrack,
+    HistoryParameters,
+    Nodes,
+    Role,
+    SegmentHistory,
+    nodes_at,
+    track,
+)
 from ahrsd.evidence.stillness import rest
-from ahrsd.evidence.values import BasisFacts, EstimateFacts, Evidence, HealthFacts
+from ahrsd.evidence.values import (
+    NO_PROOF,
+    UNKNOWN_FIELD,
+    UNKNOWN_MOTION,
+    BasisFacts,
+    EstimateFacts,
+    Evidence,
+    HealthFacts,
+)
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.world_field import WorldField
 

@@ -2,53 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 
-from ahrsd.evidence.attitude import Bools, Nodes
-from ahrsd.evidence.heading import SECTOR_DEG, SECTORS, sectors
+from ahrsd.evidence.heading import sectors
+from ahrsd.evidence.segments import Nodes
+from ahrsd.evidence.values import SECTOR_DEG, SECTORS, Bools, Coverage, Regime
 from ahrsd.samples import Array
 
-Regime = Literal["3D", "partial", "2D", "none", "unknown"]
 PLANAR_DEG = 5.0
 FREE_DEG = 30.0
 _ANY_DEG = 45.0  # of heading, below which there was no motion to speak of
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Coverage:
-    """Motion of the whole history.
-
-    heading_deg: ten-degree sectors visited, times ten; roll_deg, pitch_deg: half of the range
-    regime: 3D (tilts by 30 deg and more), 2D (within 5 deg of its mean tilt), partial (between),
-    none (turned less than 45 deg), unknown (no accelerometer)
-    turn: what is missing, e.g. "turn left about 120 deg more"; empty where nothing is
-    """
-
-    heading_deg: float
-    roll_deg: float
-    pitch_deg: float
-    regime: Regime
-    turn: str
-
-    @property
-    def tilts(self) -> str:
-        """The tilts so far, in words."""
-        if not np.isfinite([self.roll_deg, self.pitch_deg]).all():
-            return "tilt not known yet"
-        return f"so far roll +-{self.roll_deg:.0f}, pitch +-{self.pitch_deg:.0f} deg"
-
-
-_NAN = float("nan")
-UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been recorded yet")
-
-
 def coverage(nodes: Nodes, heading_rad: Array) -> Coverage:
     """Coverage of all segments; `heading_rad` (N,) is their `gyro_heading_rad`."""
     if not nodes.has_gravity:
-        return Coverage(_NAN, _NAN, _NAN, "unknown", "add acceleration to the stream")
+        return Coverage(
+            float("nan"), float("nan"), float("nan"), "unknown", "add acceleration to the stream"
+        )
     seen = sectors(heading_rad)
     down_b = nodes.down_b
     roll_deg = _half_range(np.degrees(np.unwrap(np.arctan2(down_b[:, 1], down_b[:, 2]))))

@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.attitude import Nodes
+from ahrsd.evidence.segments import Nodes
+from ahrsd.evidence.values import FieldFacts
 from ahrsd.samples import Array
 
 _ROUGH_M_S2 = 0.5  # rms of |force| - gravity above which a segment's dip is not compared
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FieldFacts:
-    """The corrected field; nan where unknown (dip: the stream has no accelerometer).
-
-    spread: standard deviation over mean of the magnitude
-    wander_gauss, inclination_wander_deg: largest difference of a segment from the median segment
-    temperature_range_c: over the segments
-    """
-
-    mean_gauss: float
-    min_gauss: float
-    max_gauss: float
-    spread: float
-    inclination_deg: float
-    wander_gauss: float
-    inclination_wander_deg: float
-    temperature_range_c: float
-
-
-UNKNOWN_FIELD = FieldFacts(*[float("nan")] * 8)
 
 
 def field_facts(nodes: Nodes, correction: Affine) -> FieldFacts:

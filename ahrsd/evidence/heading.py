@@ -9,43 +9,19 @@ averaged over one second: noise of single samples is no calibration error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.attitude import NODE_RATE_HZ, Bools, Nodes
+from ahrsd.evidence.segments import NODE_RATE_HZ, Nodes
+from ahrsd.evidence.values import NO_PROOF, SECTOR_DEG, SECTORS, Bools, HeadingProof
 from ahrsd.samples import Array
 
-SECTOR_DEG = 10.0
-SECTORS = round(360.0 / SECTOR_DEG)
 _PER_MEAN = round(NODE_RATE_HZ)
 _BLOCK = 10  # one-second means in one block of the bootstrap
 _DRAWS = 500
 _SEED = 23
 _LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading
 _TYPICAL_DIP_RAD = np.radians(65.0)  # where gravity is not known
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeadingProof:
-    """Before and after on the same held-out segments, in degrees; nan where there are none.
-
-    windows: held-out segments that turned enough to say anything; sectors (36,): headings seen
-    closure_deg: change of the error over one full turn
-    gain_lower_deg: lower end of the 95 % interval of rms before minus rms after
-    """
-
-    windows: int
-    sectors: Bools
-    rms_before_deg: float
-    rms_after_deg: float
-    max_after_deg: float
-    closure_deg: float
-    gain_lower_deg: float
-
-
-NO_PROOF = HeadingProof(0, np.zeros(SECTORS, dtype=bool), *[float("nan")] * 5)
 
 
 def prove(

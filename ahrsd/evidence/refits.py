@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.attitude import Nodes
+from ahrsd.evidence.segments import Nodes
 from ahrsd.samples import Array
 
 _PRIOR_MATRIX = 0.3

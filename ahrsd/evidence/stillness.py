@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.evidence.history import Segment
+from ahrsd.evidence.segments import Segment
 from ahrsd.samples import Array
 
 STILL_GYRO_RAD_S = 0.01

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ahrsd.evidence.coverage import Coverage
-from ahrsd.evidence.field import FieldFacts
-from ahrsd.evidence.heading import SECTOR_DEG, HeadingProof
-
+Bools = NDArray[np.bool_]
+Regime = Literal["3D", "partial", "2D", "none", "unknown"]
+SECTOR_DEG = 10.0
+SECTORS = round(360.0 / SECTOR_DEG)
 _NAMED = 3
+_NAN = float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,76 @@ class EstimateFacts:
     unobservable: tuple[str, ...]
     score: float
     heading_sigma_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """Motion of the whole history.
+
+    heading_deg: ten-degree sectors visited, times ten; roll_deg, pitch_deg: half of the range
+    regime: 3D (tilts by 30 deg and more), 2D (within 5 deg of its mean tilt), partial (between),
+    none (turned less than 45 deg), unknown (no accelerometer)
+    turn: what is missing, e.g. "turn left about 120 deg more"; empty where nothing is
+    """
+
+    heading_deg: float
+    roll_deg: float
+    pitch_deg: float
+    regime: Regime
+    turn: str
+
+    @property
+    def tilts(self) -> str:
+        """The tilts so far, in words."""
+        if not np.isfinite([self.roll_deg, self.pitch_deg]).all():
+            return "tilt not known yet"
+        return f"so far roll +-{self.roll_deg:.0f}, pitch +-{self.pitch_deg:.0f} deg"
+
+
+UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been recorded yet")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldFacts:
+    """The corrected field; nan where unknown (dip: the stream has no accelerometer).
+
+    spread: standard deviation over mean of the magnitude
+    wander_gauss, inclination_wander_deg: largest difference of a segment from the median segment
+    temperature_range_c: over the segments
+    """
+
+    mean_gauss: float
+    min_gauss: float
+    max_gauss: float
+    spread: float
+    inclination_deg: float
+    wander_gauss: float
+    inclination_wander_deg: float
+    temperature_range_c: float
+
+
+UNKNOWN_FIELD = FieldFacts(*[float("nan")] * 8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadingProof:
+    """Before and after on the same held-out segments, in degrees; nan where there are none.
+
+    windows: held-out segments that turned enough to say anything; sectors (36,): headings seen
+    closure_deg: change of the error over one full turn
+    gain_lower_deg: lower end of the 95 % interval of rms before minus rms after
+    """
+
+    windows: int
+    sectors: Bools
+    rms_before_deg: float
+    rms_after_deg: float
+    max_after_deg: float
+    closure_deg: float
+    gain_lower_deg: float
+
+
+NO_PROOF = HeadingProof(0, np.zeros(SECTORS, dtype=bool), *[float("nan")] * 5)
 
 
 @dataclass(frozen=True, slots=True)

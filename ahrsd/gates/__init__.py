@@ -6,8 +6,7 @@ saved; UNATTENDED - RAM without an operator. For a field engineer: docs/referenc
 
 from ahrsd.gates.judging import for_level, guards_a_write, holds, judge, limit_of
 from ahrsd.gates.limits import GateLimits
-from ahrsd.gates.row import Gate, Level
-from ahrsd.gates.table import GATES
+from ahrsd.gates.table import GATES, Gate, Level
 
 __all__ = [
     "GATES",

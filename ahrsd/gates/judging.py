@@ -13,8 +13,7 @@ from operator import attrgetter
 from ahrsd.events import GateResult
 from ahrsd.evidence.values import Evidence
 from ahrsd.gates.limits import GateLimits
-from ahrsd.gates.row import Gate, Level
-from ahrsd.gates.table import GATES
+from ahrsd.gates.table import GATES, Gate, Level
 
 _ROUNDING = 1e-6  # of the limit: 10 Hz that is summed up to 9.9999999 is 10 Hz
 

@@ -23,7 +23,7 @@ from ahrsd.diagnosis.hygiene import hygiene
 from ahrsd.diagnosis.model_file import RepairedModel
 from ahrsd.diagnosis.roles import prepared
 from ahrsd.errors import AhrsdError
-from ahrsd.estimator.misalignment import Misalignment
+from ahrsd.estimator.model_checks import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
 from ahrsd.offline.diagnose import checked, track_of
 from ahrsd.offline.replay import Replayed, replay

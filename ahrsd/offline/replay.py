@@ -25,7 +25,7 @@ from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
 from ahrsd.recording.opening import Recording, RecordingKind, open_recording
 from ahrsd.stream.assembler import NoSamplesError
-from ahrsd.stream.rate import rate_of
+from ahrsd.stream.time_from_attitude import rate_of
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.deframer import Cause

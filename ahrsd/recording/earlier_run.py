@@ -22,7 +22,7 @@ import numpy as np
 
 from ahrsd.core.warm_start import MOST_ROWS, too_old
 from ahrsd.errors import RecordingError
-from ahrsd.estimator.steps import StepAverager, samples_per_step
+from ahrsd.estimator.epoch_builder import StepAverager, samples_per_step
 from ahrsd.inputs import (
     EarlierRun,
     EarlierSamples,

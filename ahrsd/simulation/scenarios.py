@@ -1,15 +1,155 @@
-"""The experiments of [R] chapter 5: WAM, MAM, LAM, in "slow" and in "rov" motion."""
+"""The theses' experiments: WAM, MAM and LAM of [R] chapter 5, and [L]'s along a recorded gyro.
+
+The motion of [R] is "slow" or "rov"; what goes wrong on real streams can be added to it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ahrsd.simulation import motion
-from ahrsd.simulation.disturbance import Disturbances, disturbed
-from ahrsd.simulation.experiment import Experiment, measured
-from ahrsd.simulation.truth import Iron, Truth
+from ahrsd import so3
+from ahrsd.samples import Array
+from ahrsd.simulation.experiment import Experiment, Iron, Truth, measured
+
+# -- How the sensor turns --------------------------------------------------------------------------
+#
+# How the sensor turns: sinusoids in roll, pitch and heading ([R] chapter 5).
+#
+#     angle_i(t) = A_i sin(2 pi f_i t + phi_i),   phi_i uniform in 0..2 pi, f_i uniform per run
+#
+# [R] gives the half-ranges A_i and no frequencies. "slow" has those of the authors' early code, in
+# which the field's derivative is buried in noise; "rov" the peak rates 2 pi f_i A_i of their later
+# code.
+
+
+SUBSTEPS = 8  # per sample; the attitude itself is exact at every one of them
+
+#: Half-ranges of roll, pitch and heading in degrees: wide, medium and low angular movement.
+SCENARIOS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
+    {"wam": (180.0, 180.0, 180.0), "mam": (5.0, 45.0, 180.0), "lam": (5.0, 15.0, 90.0)}
+)
+#: Ranges per angle from which each run draws, and whether they are frequencies or peak rates.
+MOTIONS: Mapping[str, tuple[str, tuple[tuple[float, float], ...]]] = MappingProxyType(
+    {
+        "slow": ("frequency_hz", ((5e-3, 10e-3), (5e-3, 8e-3), (4e-3, 8e-3))),
+        "rov": ("peak_rate_rad_s", ((0.05, 0.08), (0.1, 0.3), (0.2, 0.4))),
+    }
+)
+
+
+def sinusoids(
+    scenario: str, motion: str, rng: np.random.Generator, samples: int, rate_hz: float
+) -> Array:
+    """Attitude R_nb ((samples - 1) * SUBSTEPS + 1, 3, 3) at the sub-steps; row 0 is sample 0.
+
+    Raises KeyError for an unknown scenario or motion.
+    """
+    half_range = np.radians(SCENARIOS[scenario])
+    kind, ranges = MOTIONS[motion]
+    drawn = np.array([rng.uniform(low, high) for low, high in ranges])
+    frequency_hz = drawn if kind == "frequency_hz" else drawn / (2 * np.pi * half_range)
+    phase = rng.uniform(0.0, 2 * np.pi, 3)
+    time_s = np.arange((samples - 1) * SUBSTEPS + 1) / (SUBSTEPS * rate_hz)
+    angle = half_range * np.sin(2 * np.pi * frequency_hz * time_s[:, None] + phase)
+    roll, pitch, heading = angle.T
+    return so3.from_yaw_pitch_roll(heading, pitch, roll)
+
+
+def mean_rate(R_nb: Array, substeps: int, dt_s: float) -> Array:
+    """Mean body rate (N, 3) in rad/s over the step that ends at each sample; row 0 is nan.
+
+    R_nb ((N - 1) * substeps + 1, 3, 3): the mean is the sum of the sub-steps' rotation vectors over
+    the step, which is what a gyroscope that integrates its signal reports.
+    """
+    increment = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:])
+    angle = increment.reshape(-1, substeps, 3).sum(axis=1)
+    return np.vstack([np.full((1, 3), np.nan), angle / dt_s])
+
+
+def quaternion(R_nb: Array) -> Array:
+    """Unit quaternions (N, 4), scalar first, sensor to world, continuous in sign, of (N, 3, 3)."""
+    q = Rotation.from_matrix(R_nb).as_quat(canonical=True, scalar_first=True)
+    flips = np.sign(np.sum(q[1:] * q[:-1], axis=1))
+    q[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]
+    return q
+
+
+# -- What goes wrong on real streams ---------------------------------------------------------------
+#
+# What goes wrong on real streams, kept simple: outliers, a magnet passing by, a step, a gap.
+
+
+_STEP_AXIS = np.array([1.0, -1.0, 1.0]) / np.sqrt(3.0)
+_MAGNET_AXIS = np.array([0.6, 0.0, 0.8])
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbances:
+    """None of them by default. Times are seconds after the first sample.
+
+    outlier_fraction: of the samples, each off by `outlier_gauss` in a random direction
+    magnet_at_s:      a magnet passes: a bump of `magnet_gauss`, `magnet_length_s` long (raised
+                      cosine), along a fixed axis of the sensor
+    step_at_s:        the hard iron steps by `step_gauss` and stays; `Truth` has the last value
+    gap_at_s:         no samples for `gap_length_s`
+    """
+
+    outlier_fraction: float = 0.0
+    outlier_gauss: float = 0.1
+    magnet_at_s: float | None = None
+    magnet_length_s: float = 10.0
+    magnet_gauss: float = 0.1
+    step_at_s: float | None = None
+    step_gauss: float = 0.03
+    gap_at_s: float | None = None
+    gap_length_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where the fraction of outliers is no fraction."""
+        if not 0.0 <= self.outlier_fraction <= 1.0:
+            raise ValueError(f"outlier_fraction is {self.outlier_fraction}: it must be in 0..1")
+
+
+def disturbed(experiment: Experiment, wanted: Disturbances, rng: np.random.Generator) -> Experiment:
+    """The experiment with what is wanted added; the very same object where nothing is."""
+    if wanted == Disturbances():
+        return experiment
+    time_s = experiment.samples.time_s - experiment.samples.time_s[0]
+    raw = experiment.samples.raw_b_gauss.copy()
+    truth = experiment.truth
+    if wanted.outlier_fraction > 0:
+        raw += _outliers(len(raw), wanted, rng)
+    if wanted.magnet_at_s is not None:
+        phase = np.clip((time_s - wanted.magnet_at_s) / wanted.magnet_length_s, 0.0, 1.0)
+        bump = wanted.magnet_gauss * (1 - np.cos(2 * np.pi * phase)) / 2
+        raw += bump[:, None] * _MAGNET_AXIS
+    if wanted.step_at_s is not None:
+        step = wanted.step_gauss * _STEP_AXIS
+        raw[time_s >= wanted.step_at_s] += step
+        truth = replace(truth, hard_iron_gauss=truth.hard_iron_gauss + step)
+    samples = replace(experiment.samples, raw_b_gauss=raw)
+    changed = replace(experiment, samples=samples, truth=truth)
+    if wanted.gap_at_s is None:
+        return changed
+    inside = (time_s > wanted.gap_at_s) & (time_s < wanted.gap_at_s + wanted.gap_length_s)
+    return changed.taken(~inside)
+
+
+def _outliers(count: int, wanted: Disturbances, rng: np.random.Generator) -> Array:
+    hit = rng.random(count) < wanted.outlier_fraction
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return np.asarray(wanted.outlier_gauss * hit[:, None] * direction)
+
+
+# -- The experiments of [R] ------------------------------------------------------------------------
+#
+# The experiments of [R] chapter 5: WAM, MAM, LAM, in "slow" and in "rov" motion.
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +173,7 @@ class ScenarioSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that cannot be."""
-        for name, known in (("scenario", motion.SCENARIOS), ("motion", motion.MOTIONS)):
+        for name, known in (("scenario", SCENARIOS), ("motion", MOTIONS)):
             value = getattr(self, name)
             if value not in known:
                 raise ValueError(f"no {name} {value!r}; there are {', '.join(known)}")
@@ -60,14 +200,77 @@ def generator(seed: int, purpose: int) -> np.random.Generator:
 def simulate(settings: ScenarioSettings) -> Experiment:
     """Make the experiment."""
     s = settings
-    fine = motion.sinusoids(s.scenario, s.motion, generator(s.seed, 0), s.samples, s.rate_hz)
+    fine = sinusoids(s.scenario, s.motion, generator(s.seed, 0), s.samples, s.rate_hz)
     made = measured(
         f"{s.scenario} {s.motion}, seed {s.seed}",
         s.iron,
-        fine[:: motion.SUBSTEPS],
-        motion.mean_rate(fine, motion.SUBSTEPS, 1.0 / s.rate_hz),
+        fine[::SUBSTEPS],
+        mean_rate(fine, SUBSTEPS, 1.0 / s.rate_hz),
         np.arange(1, s.samples + 1) / s.rate_hz,
         (s.noise_mag_gauss, s.noise_gyro_rad_s),
         (generator(s.seed, 1), generator(s.seed, 2)),
     )
     return disturbed(made, s.disturbances, generator(s.seed, 3))
+
+
+# -- The experiment of [L] -------------------------------------------------------------------------
+#
+# [L]'s experiment: a recorded gyro stream moves the sensor, the field is simulated.
+#
+# [L] (2.13), first order with normalisation:   q+ = q + (dt / 2) q (x) (0, w),   q = q+ / |q+|
+# reading:                                      B_k = A_k H + b + noise,  A_k = attitude of q_k
+
+
+LICHLYTER = Iron(soft_iron=np.eye(3), gyro_bias_rad_s=np.zeros(3), offset_behind_iron=True)
+
+
+def integrate(rate_b_rad_s: Array, dt_s: Array) -> Array:
+    """Quaternions (N, 4), scalar first, sensor to world, from rates (N, 3) and steps (N,).
+
+    Row 0 is the identity and its rate is not used: a rate belongs to the step that ends at it.
+    """
+    q = np.empty((len(dt_s), 4))
+    q[0] = (1.0, 0.0, 0.0, 0.0)
+    half = rate_b_rad_s * dt_s[:, None] / 2
+    for k in range(1, len(dt_s)):
+        w, v = q[k - 1, 0], q[k - 1, 1:]
+        q[k, 0] = w - v @ half[k]
+        q[k, 1:] = v + w * half[k] + np.cross(v, half[k])
+        q[k] /= np.linalg.norm(q[k])
+    return q
+
+
+def simulate_recorded(
+    time_s: Array,
+    gyro_b_rad_s: Array,
+    *,
+    iron: Iron = LICHLYTER,
+    seed: int = 0,
+    noise_mag_gauss: float = 1e-3,
+    noise_gyro_rad_s: float = 0.0,
+) -> Experiment:
+    """An experiment on the motion of a recorded gyro stream without gaps: (N,) and (N, 3).
+
+    [L] calls the recorded rates true. First-order integration turns by 2 atan(|w| dt / 2) and not
+    by |w| dt, so the true rate is taken from the attitude it gives: both agree to the last digit.
+    Raises ValueError where the time does not increase or a rate is not finite.
+    """
+    dt_s = np.concatenate([[np.nan], np.diff(time_s)])
+    if not np.all(dt_s[1:] > 0):
+        row = int(np.flatnonzero(~(dt_s[1:] > 0))[0]) + 1
+        raise ValueError(f"time_s of row {row} does not increase: {time_s[row]}")
+    if not np.isfinite(gyro_b_rad_s).all():
+        row = int(np.argmin(np.isfinite(gyro_b_rad_s).all(axis=1)))
+        raise ValueError(f"gyro_b_rad_s of row {row} is not finite: {gyro_b_rad_s[row]}")
+    R_nb = Rotation.from_quat(integrate(gyro_b_rad_s, dt_s), scalar_first=True).as_matrix()
+    turned = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:])
+    rate = np.vstack([np.full((1, 3), np.nan), turned / dt_s[1:, None]])
+    return measured(
+        f"recorded gyro stream, seed {seed}",
+        iron,
+        R_nb,
+        rate,
+        np.asarray(time_s, dtype=np.float64),
+        (noise_mag_gauss, noise_gyro_rad_s),
+        (generator(seed, 1), generator(seed, 2)),
+    )

@@ -9,8 +9,7 @@ import numpy as np
 
 from ahrsd.samples import Array
 from ahrsd.simulation.experiment import Experiment
-from ahrsd.simulation.motion import quaternion
-from ahrsd.simulation.scenarios import ScenarioSettings
+from ahrsd.simulation.scenarios import ScenarioSettings, quaternion
 from drivers.vn100.sentences import encode_sentence
 
 

@@ -16,15 +16,14 @@ damage in front of each, never by what else came with them.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ahrsd.evidence.values import HealthFacts
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.stream.counters import Gaps, StreamFacts
 from ahrsd.stream.decompensation import (
     Extracted,
     Extractor,
@@ -35,10 +34,57 @@ from ahrsd.stream.decompensation import (
 )
 from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, StreamTimeline, TimelineSteps
 from ahrsd.stream.output_rates import RateWatch, offered_rate, rate_by_registers, rate_of_arrivals
-from ahrsd.stream.rate import TurnWatch, attitude_columns
+from ahrsd.stream.time_from_attitude import TurnWatch, attitude_columns
 from drivers.vn100.binary import BinaryLayout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
+
+
+@dataclass(slots=True)
+class StreamFacts:
+    """Counters of a stream.
+
+    unusable: samples that were saturated or not finite
+    damaged:  messages that were recognised and refused
+    expected: samples that would be there had none been lost
+    duration_s: steps and gaps together; time of which nobody knows the length is not in it
+    """
+
+    samples: int = 0
+    unusable: int = 0
+    damaged: int = 0
+    expected: float = 0.0
+    duration_s: float = 0.0
+    layout: str = ""
+    rate_hz: float = float("nan")
+    rate_source: str = ""
+
+
+class Gaps:
+    """Gaps in order. keep: how many of the first and how many of the newest stay; None: all.
+
+    count, length_s: of every gap, also of those that were let go
+    """
+
+    def __init__(self, keep: int | None = None) -> None:
+        self.keep = keep
+        self.count = 0
+        self.length_s = 0.0
+        self._first: list[Gap] = []
+        self._newest: deque[Gap] = deque(maxlen=keep)
+
+    def add(self, gap: Gap) -> None:
+        """One more."""
+        self.count += 1
+        self.length_s += gap.length_s
+        first = self.keep is None or len(self._first) < self.keep
+        (self._first if first else self._newest).append(gap)
+
+    @property
+    def kept(self) -> list[Gap]:
+        """Those that stay, oldest first."""
+        return [*self._first, *self._newest]
+
 
 FACTORY_RATE_HZ = 40.0
 _BLOCK_S, _LEAST_ROWS, _MOST_ROWS = 0.25, 4, 256

@@ -6,18 +6,17 @@ import gtsam
 import numpy as np
 import pytest
 
-from ahrsd.baselines import fnp, magfactor3, magical_bfg, magical_nls, magyc_bfg, tls, twostep
+from ahrsd.baselines import magfactor3, magical, magyc, twostep
 from ahrsd.baselines.data import MethodError
-from ahrsd.baselines.factors import custom_factor, values_of, variable
-from ahrsd.baselines.graphs import SIGMA, factors
-from ahrsd.baselines.kinematic import residual
+from ahrsd.baselines.graphs import SIGMA, custom_factor, factors, values_of, variable
+from ahrsd.baselines.kinematic import Kinematics, residual
+from ahrsd.baselines.norm_preserving import fnp_rows, tls_rows
 from ahrsd.baselines.soft_iron import cholesky, triangle, unit_volume
-from ahrsd.baselines.windows import Kinematics
 
 RNG = np.random.default_rng(7)
 KIN = Kinematics(*(RNG.normal(size=(6, 3)) for _ in range(3)))
-MODELS = {"magical-nls": magical_nls.model(), "magical-bfg": magical_bfg.model(),
-          "magyc-bfg": magyc_bfg.model()}  # fmt: skip
+MODELS = {"magical-nls": magical.unit_volume_model(), "magical-bfg": magical.triangle_model(),
+          "magyc-bfg": magyc.cholesky_model()}  # fmt: skip
 
 
 def numeric(function, x, step=1e-6):
@@ -88,7 +87,7 @@ def test_magfactor3():
     assert np.allclose(J, numeric(lambda v: magfactor3.residual(v, body, raw)[0], x), atol=1e-8)
 
 
-@pytest.mark.parametrize("rows", [tls.rows, fnp.rows])
+@pytest.mark.parametrize("rows", [tls_rows, fnp_rows])
 def test_norm_methods(rows):
     field, norms, b = RNG.normal(size=(6, 3)), RNG.uniform(0.5, 1, 6), np.array([3.0, -1.0, 0.5])
     assert np.allclose(

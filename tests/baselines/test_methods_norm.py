@@ -9,8 +9,13 @@ import pytest
 from scipy.optimize import minimize
 from simulation import FIELD, HARD_IRON, UNIT_SOFT_IRON, simulate
 
-from ahrsd.baselines import MethodSettings, np_constrained, np_uncertain_field, run, tls
-from ahrsd.baselines.sphere import linear_centre
+from ahrsd.baselines import MethodSettings, norm_preserving, run
+from ahrsd.baselines.norm_preserving import (
+    linear_centre,
+    solve_np,
+    solve_np_uncertain_field,
+    tls_rows,
+)
 
 SIZE = float(np.linalg.norm(FIELD))
 
@@ -46,7 +51,7 @@ def test_they_agree_where_the_given_magnitude_is_far_off(wrong):
 
 def test_the_readings_that_preserve_the_norm_are_the_same():
     field, norms = noisy_sphere(200)
-    b, B, _ = np_constrained.solve(field, norms, linear_centre(field))
+    b, B, _ = solve_np(field, norms, linear_centre(field))
     assert np.allclose(np.linalg.norm(B - b, axis=1), norms, atol=1e-12)
     away = field - b
     nearest = b + away * (norms / np.linalg.norm(away, axis=1))[:, None]
@@ -69,14 +74,14 @@ def test_a_general_solver_agrees_on_the_constrained_problem():
         constraints={"type": "eq", "fun": constraint}, options={"ftol": 1e-15, "maxiter": 500},
     )  # fmt: skip
     assert found.success
-    b, _, _ = np_constrained.solve(field, norms, linear_centre(field))
+    b, _, _ = solve_np(field, norms, linear_centre(field))
     assert np.allclose(b, found.x[:3], atol=2e-6)
 
 
 def test_alternating_ends_at_the_minimum_of_its_own_cost():
     field, norms = noisy_sphere(60, noise=0.02)
     s2, h2 = 0.02**2, 0.03**2 * np.linspace(0.2, 3, 60)
-    b, _ = np_uncertain_field.solve(field, norms, s2 / (s2 + h2), linear_centre(field))
+    b, _ = solve_np_uncertain_field(field, norms, s2 / (s2 + h2), linear_centre(field))
 
     def cost(b):
         """Both terms of the cost with B' at its best, found by brute force along the direction."""
@@ -100,7 +105,7 @@ def test_alternating_in_full_ends_at_the_same_place():
         rho = np.linalg.norm(d, axis=1)
         B = (share * rho + (1 - share) * norms)[:, None] * d / rho[:, None]
         b = np.mean(field - B, axis=0)
-    quick, turns = np_uncertain_field.solve(field, norms, np.full(300, 1 - share), b * 0)
+    quick, turns = solve_np_uncertain_field(field, norms, np.full(300, 1 - share), b * 0)
     assert np.allclose(quick, b, atol=1e-9)
     assert turns < 80
 
@@ -137,13 +142,13 @@ def test_total_least_squares_differs_from_norm_preservation_in_second_order_only
     difference = np.linalg.norm(a - b)
     assert 0 < difference < 1e-6
     assert np.linalg.norm(a - HARD_IRON) < 3e-4
-    assert tls.rows(a, field, norms)[0].shape == (400,)
+    assert tls_rows(a, field, norms)[0].shape == (400,)
 
 
 def test_iterations_that_do_not_end_are_said(monkeypatch):
     data = simulate("lam", 0, n=3000).data
-    monkeypatch.setattr(np_constrained, "_MAX_ITERATIONS", 2)
-    monkeypatch.setattr(np_uncertain_field, "_MAX_TURNS", 2)
+    monkeypatch.setattr(norm_preserving, "_NP_MAX_ITERATIONS", 2)
+    monkeypatch.setattr(norm_preserving, "_MAX_TURNS", 2)
     for method, words in (("np", "no end after 2 iterations"), ("np-uncertain-field", "2 turns")):
         result = run(method, data)
         assert not result.converged

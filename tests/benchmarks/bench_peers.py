@@ -32,8 +32,7 @@ from peers_table import best_peers, set_lines, time_lines, verdict_lines
 from ahrsd.baselines import MethodError
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.montecarlo.accuracy import MethodAnswer
-from ahrsd.montecarlo.methods import OURS, STREAM
-from ahrsd.montecarlo.runs import Plan, Record, run_many, scored
+from ahrsd.montecarlo.runs import OURS, STREAM, Plan, Record, run_many, scored
 from ahrsd.montecarlo.summary import SummaryRow, summarise
 from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 

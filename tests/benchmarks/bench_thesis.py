@@ -4,8 +4,8 @@
 
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023. Its experiment is simulated as its tables were made:
 b = m_b, 1 mG and 5 mrad/s while calibrating, 10 mG while headings are judged. It does not print the
-frequencies of its motion, so both candidates are run (`ahrsd.simulation.motion`). A figure counts
-as reproduced where it lies within one standard deviation over our runs of their mean.
+frequencies of its motion, so both candidates are run (`ahrsd.simulation.scenarios`). A figure
+counts as reproduced where it lies within one standard deviation over our runs of their mean.
 """
 
 from __future__ import annotations

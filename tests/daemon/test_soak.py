@@ -17,7 +17,7 @@ import pytest
 from scipy.stats import theilslopes
 
 from ahrsd.evidence.collector import EvidenceCollector
-from ahrsd.evidence.history import HistoryParameters
+from ahrsd.evidence.segments import HistoryParameters
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.emulator.scenarios import Setup

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ahrsd.config.loading import Config
-from ahrsd.estimator import change
+from ahrsd.estimator.model_checks import divided
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.table import read_table
@@ -123,6 +123,6 @@ def test_two_parts_that_differ_amid_other_trouble_make_the_answer_as_uncertain(s
     H = np.tile(np.eye(17), (24, 1, 1))
     away = 7.0 * rng.standard_normal((24, 17))
     away[12:, 6:9] += step_sigma / np.sqrt(3)
-    found = change.divided((H, -away), graph, 1.0, 1e3)
+    found = divided((H, -away), graph, 1.0, 1e3)
     assert found.first is None
     assert found.parted == pytest.approx(parted, rel=0.1)

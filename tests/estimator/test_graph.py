@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.estimator.factors import (
+from ahrsd.estimator.graph import (
     NODE,
     SIZE,
     C,
     Factor,
+    Graph,
     LinearisationPoint,
     Node,
+    SingularError,
     Stack,
     bias_prior,
     chain_step,
     epoch_factor,
     gap_factor,
 )
-from ahrsd.estimator.graph import Graph, SingularError
 
 SIGMA = np.r_[np.full(6, 0.3), np.full(3, 0.5)]
 

@@ -7,8 +7,8 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.estimator import chain
-from ahrsd.estimator.grouping import group_size, grouped
-from ahrsd.estimator.systematic import Cells, excess
+from ahrsd.estimator.epoch_data import group_size, grouped
+from ahrsd.estimator.noise import DirectionCells, variance_inflation
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
 B = np.array([0.1, -0.2, 0.05])
@@ -98,12 +98,12 @@ def test_the_size_of_a_group(noise, speed, expected):
 def test_what_repeats_with_the_attitude_counts_once_per_cell():
     ring = np.linspace(0, 2 * np.pi, 1200, endpoint=False)
     level = np.column_stack([np.cos(ring), np.sin(ring), np.full(1200, 0.05)])
-    cells = Cells.of(level, 5.0) + Cells.of(level, 5.0)
+    cells = DirectionCells.of(level, 5.0) + DirectionCells.of(level, 5.0)
     assert cells.visited == 12
     assert cells.steps == 12_000
-    assert excess(cells, 1e-3, 1e-3) == 1.0  # white
-    assert excess(cells, 1e-2, 1e-3) == pytest.approx(1000 * (1 - 1.5e-2))
-    assert excess(Cells(), 1e-2, 1e-3) == 1.0
+    assert variance_inflation(cells, 1e-3, 1e-3) == 1.0  # white
+    assert variance_inflation(cells, 1e-2, 1e-3) == pytest.approx(1000 * (1 - 1.5e-2))
+    assert variance_inflation(DirectionCells(), 1e-2, 1e-3) == 1.0
 
 
 def test_several_epochs_at_once_are_grouped_as_each_by_itself():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ahrsd.estimator.intake import Intake
+from ahrsd.estimator.epoch_builder import EpochBuilder
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import SampleBlock
 
@@ -31,7 +31,7 @@ def circling(rate_rad_s, sideways_m_s2):
 
 
 def tilts_deg(block):
-    (data,) = Intake(EstimatorParameters()).add(block)
+    (data,) = EpochBuilder(EstimatorParameters()).add(block)
     return np.degrees(np.arccos(data.down_b[:, 2]))
 
 
@@ -53,5 +53,5 @@ def test_a_gyro_bias_cancels_in_the_middle():
 def test_without_an_accelerometer_nothing_is_down():
     block = circling(0.1, 0.0)
     silent = replace(block, accel_b_m_s2=np.full((N, 3), np.nan))
-    (data,) = Intake(EstimatorParameters()).add(silent)
+    (data,) = EpochBuilder(EstimatorParameters()).add(silent)
     assert np.isnan(data.down_b).all()

@@ -12,7 +12,7 @@ import pytest
 from ahrsd import so3
 from ahrsd.config.loading import Config
 from ahrsd.estimator import chain
-from ahrsd.estimator.lag import delayed, rates
+from ahrsd.estimator.epoch_data import delayed, rates
 from ahrsd.estimator.online import Estimator
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.offline.calibrate import calibrate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd.estimator import chain
-from ahrsd.estimator.retraction import Moments, curvature, retract
+from ahrsd.estimator.graph import Moments, curvature, retract
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
 B = np.array([0.1, -0.2, 0.05])

@@ -9,7 +9,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.estimator import chain, start
-from ahrsd.estimator.excitation import turned
+from ahrsd.estimator.epoch_data import turned
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
 B = np.array([0.1, -0.2, 0.05])

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from vehicle import DECLINATION_DEG, FIELD_N, HARD_IRON, SOFT_IRON
 
 from ahrsd.evaluation import EvaluationError, judge
-from ahrsd.evaluation.field import field_figures
 from ahrsd.evaluation.heading import HeadingFigures, compare, rms_difference
+from ahrsd.evaluation.judging import field_figures
 from ahrsd.evaluation.references import (
     column,
     course,
@@ -21,7 +21,7 @@ from ahrsd.evaluation.references import (
     optical,
 )
 from ahrsd.evaluation.text import evaluation_json, evaluation_lines
-from ahrsd.evaluation.tilt import up_b
+from ahrsd.evaluation.track import up_directions
 from ahrsd.heading import wrapped
 from ahrsd.world_field import world_field
 
@@ -159,7 +159,7 @@ def test_gravity_is_steadier_than_the_accelerometer_and_forgives_a_gyro_bias(veh
     )
 
     def worst_deg(kind):
-        up, _ = up_b(track, kind)
+        up, _ = up_directions(track, kind)
         cosine = np.sum(up * true, axis=1) / (
             np.linalg.norm(up, axis=1) * np.linalg.norm(true, axis=1)
         )
@@ -167,7 +167,7 @@ def test_gravity_is_steadier_than_the_accelerometer_and_forgives_a_gyro_bias(veh
 
     assert worst_deg("accelerometer") > 11.0
     assert worst_deg("gravity") < 1.0
-    assert up_b(track, "auto")[1] == "gravity"
+    assert up_directions(track, "auto")[1] == "gravity"
 
 
 def test_dead_reckoning_with_a_doppler_log_follows_the_slip(vehicle, perfect):

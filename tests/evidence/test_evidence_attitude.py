@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ahrsd.evidence.attitude import nodes_at, track
-from ahrsd.evidence.history import SegmentHistory
+from ahrsd.evidence.segments import SegmentHistory, nodes_at, track
 
 
 def segments(scene):

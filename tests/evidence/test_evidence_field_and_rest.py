@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.history import SegmentHistory
+from ahrsd.evidence.segments import SegmentHistory
 from ahrsd.evidence.stillness import rest, stretches
 from ahrsd.samples import SampleBlock
 from ahrsd.world_field import WorldField

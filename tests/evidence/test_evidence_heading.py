@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
+from ahrsd.evidence.comparison import Envelope, heading_error_curve, worst_difference_deg
 from ahrsd.evidence.coverage import turn_advice
 from ahrsd.evidence.heading import SECTORS, sectors
-from ahrsd.evidence.prediction import Envelope, heading_error_curve, worst_difference_deg
 
 LEVEL = np.array([0.25, 0.0, 0.433])
 

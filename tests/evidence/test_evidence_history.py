@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ahrsd.evidence.history import HistoryParameters, SegmentHistory
+from ahrsd.evidence.segments import HistoryParameters, SegmentHistory
 from ahrsd.samples import SampleBlock
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ahrsd import so3
 from ahrsd.montecarlo.accuracy import (
     MethodAnswer,
     expected_heading_deg,
@@ -16,7 +17,6 @@ from ahrsd.montecarlo.accuracy import (
 )
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
 from ahrsd.simulation.experiment import measured
-from ahrsd.simulation.motion import rotation_nb
 
 EXPERIMENT = simulate(ScenarioSettings("mam", samples=500))
 TRUTH = EXPERIMENT.truth
@@ -65,7 +65,8 @@ def test_geodesic_is_affine_invariant():
 def test_a_hard_iron_across_the_field_turns_a_level_heading_by_its_angle():
     """A level sensor without soft iron that turns once; b along x of 5 % of the level field."""
     n = 3600
-    R = rotation_nb(np.zeros(n), np.zeros(n), np.linspace(0, 2 * np.pi, n, endpoint=False))
+    heading = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    R = so3.from_yaw_pitch_roll(heading, np.zeros(n), np.zeros(n))
     iron = Iron(
         soft_iron=np.eye(3),
         pseudo_hard_iron_gauss=np.array([0.01, 0.0, 0.0]),

@@ -9,8 +9,7 @@ import pytest
 
 from ahrsd.errors import AhrsdError
 from ahrsd.montecarlo.accuracy import FIGURES, HEADINGS
-from ahrsd.montecarlo.methods import is_known, known_methods
-from ahrsd.montecarlo.runs import Plan, run_many, run_one
+from ahrsd.montecarlo.runs import Plan, is_known, known_methods, run_many, run_one
 from ahrsd.montecarlo.summary import (
     BOUNDED,
     PARAMETERS,

@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ahrsd.recording.table import read_table
 from ahrsd.simulation import ScenarioSettings, simulate
-from ahrsd.simulation.motion import quaternion
-from ahrsd.simulation.recorded import rotation
+from ahrsd.simulation.scenarios import quaternion
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 
@@ -27,7 +27,9 @@ def test_tables_keep_every_digit_and_say_the_truth(run, tmp_path, suffix):
     assert np.array_equal(table.rows.accel_b_m_s2, expected.samples.accel_b_m_s2)
     assert table.starts == (0,)
     q = np.column_stack([table.rows.covariates[f"ref_q{part}"] for part in "wxyz"])
-    assert rotation(q) == pytest.approx(expected.R_nb, abs=1e-12)
+    assert Rotation.from_quat(q, scalar_first=True).as_matrix() == pytest.approx(
+        expected.R_nb, abs=1e-12
+    )
     truth = json.loads((tmp_path / f"x{suffix}.truth.json").read_text())
     assert np.array(truth["soft_iron"]) == pytest.approx(expected.truth.soft_iron)
     assert truth["hard_iron_gauss"] == pytest.approx([0.0376, 0.1094, 0.113])

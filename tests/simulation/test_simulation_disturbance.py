@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd.simulation import ScenarioSettings, simulate
-from ahrsd.simulation.disturbance import Disturbances
+from ahrsd.simulation.scenarios import Disturbances
 
 
 def made(**wanted):

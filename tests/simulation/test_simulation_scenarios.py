@@ -11,8 +11,14 @@ from true_trajectory import predicted_directions
 from ahrsd import so3
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
-from ahrsd.simulation.motion import MOTIONS, SCENARIOS, SUBSTEPS, mean_rate, rotation_nb, sinusoids
-from ahrsd.simulation.scenarios import generator
+from ahrsd.simulation.scenarios import (
+    MOTIONS,
+    SCENARIOS,
+    SUBSTEPS,
+    generator,
+    mean_rate,
+    sinusoids,
+)
 
 SETS = [(scenario, motion) for scenario in SCENARIOS for motion in MOTIONS]
 
@@ -69,7 +75,7 @@ def test_mean_rate_is_the_mean_of_the_rate_over_the_step():
     assert mean_rate(steps, SUBSTEPS, dt)[1:] == pytest.approx(np.tile(rate, (n - 1, 1)))
     # pure roll at a rate that grows linearly: the mean is that of the middle of the step
     t = np.arange((n - 1) * SUBSTEPS + 1) * dt / SUBSTEPS
-    rolling = rotation_nb(0.5 * t**2, 0 * t, 0 * t)
+    rolling = so3.from_yaw_pitch_roll(0 * t, 0 * t, 0.5 * t**2)
     middle = (np.arange(n - 1) + 0.5) * dt
     assert mean_rate(rolling, SUBSTEPS, dt)[1:, 0] == pytest.approx(middle)
 

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ahrsd import so3
 from ahrsd.calibration import Estimate
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.simulation.motion import mean_rate, rotation_nb
+from ahrsd.simulation.scenarios import mean_rate
 
 SOFT_IRON = np.array([[0.95, -0.03, 0.02], [-0.03, 1.04, -0.015], [0.02, -0.015, 1.02]])
 SOFT_IRON /= np.cbrt(np.linalg.det(SOFT_IRON))
@@ -100,7 +101,8 @@ def drive(
     """A recording of these pieces; the magnetometer has a new reading every `hold` samples."""
     rng = np.random.default_rng(seed)
     shift = round(lag_s * rate_hz * _SUBSTEPS)
-    fine = rotation_nb(*angles(pieces, rate_hz * _SUBSTEPS, rng).T)
+    roll, pitch, heading = angles(pieces, rate_hz * _SUBSTEPS, rng).T
+    fine = so3.from_yaw_pitch_roll(heading, pitch, roll)
     count = (len(fine) - 1) // _SUBSTEPS
     fine = fine[: count * _SUBSTEPS + 1]
     now = np.arange(count + 1) * _SUBSTEPS

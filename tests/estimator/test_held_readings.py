@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.estimator.held import HeldReadings, rows_per_reading
-from ahrsd.estimator.intake import Intake
+from ahrsd.estimator.epoch_builder import EpochBuilder, HeldReadings, rows_per_reading
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import SampleBlock
@@ -124,7 +123,7 @@ def test_held_readings_with_gaps_and_any_split():
     rows = recorded(100.0, 10, seconds=60.0)
     found = []
     for size in (50, 177):
-        intake = Intake(EstimatorParameters(epoch_steps=64))
+        intake = EpochBuilder(EstimatorParameters(epoch_steps=64))
         closed = []
         for first, last in ((0, 2500), (2700, 4000), (4100, 4130), (4200, 6000)):
             for k in range(first, last, size):

@@ -10,11 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ahrsd import so3
-from ahrsd.estimator import intake
-from ahrsd.estimator.intake import Intake
+from ahrsd.estimator.epoch_builder import (
+    EpochBuilder,
+    StepAverager,
+    check_samples,
+    join,
+    samples_per_step,
+    split,
+)
+from ahrsd.estimator.epoch_data import joined, thinned
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.estimator.search import joined, thinned
-from ahrsd.estimator.steps import StepAverager, join, samples_per_step, split
 from ahrsd.samples import SampleBlock
 
 DT = 0.005
@@ -91,7 +96,7 @@ def test_any_split_gives_the_same_epochs(cuts):
     parameters = EstimatorParameters(epoch_steps=64)
     epochs = []
     for chosen in ([], cuts):
-        gate = Intake(parameters)
+        gate = EpochBuilder(parameters)
         found = [data for b in blocks(samples, chosen) for data in gate.add(b)]
         epochs.append((found, gate.samples, gate.duration_s, gate.averaged))
     assert epochs[0][1:] == epochs[1][1:]
@@ -104,14 +109,14 @@ def test_any_split_gives_the_same_epochs(cuts):
 
 def test_samples_one_by_one_give_the_same_epochs():
     samples = rows(400)
-    gates = [Intake(EstimatorParameters(epoch_steps=64)) for _ in range(2)]
+    gates = [EpochBuilder(EstimatorParameters(epoch_steps=64)) for _ in range(2)]
     (whole,) = gates[0].add(block(samples, gap=True))
     found = [d for b in blocks(samples, range(400)) for d in gates[1].add(b)]
     np.testing.assert_array_equal(found[0].angle_b_rad, whole.angle_b_rad)
 
 
 def test_a_gap_ends_the_epoch_and_starts_afresh():
-    gate = Intake(EstimatorParameters(epoch_steps=128))
+    gate = EpochBuilder(EstimatorParameters(epoch_steps=128))
     (first,) = gate.add(block(rows(1000), gap=True))
     assert (first.measures_first, len(first)) == (True, 129)
     rest = gate.interrupt()  # 200 steps of 5 samples: 71 are left
@@ -121,7 +126,7 @@ def test_a_gap_ends_the_epoch_and_starts_afresh():
 
 
 def test_a_piece_too_short_for_an_epoch_is_dropped():
-    gate = Intake(EstimatorParameters(epoch_steps=128))
+    gate = EpochBuilder(EstimatorParameters(epoch_steps=128))
     assert gate.add(block(rows(319), gap=True)) == []
     assert gate.interrupt() is None
     assert gate.duration_s == pytest.approx(318 * DT, rel=0.01)
@@ -147,23 +152,23 @@ def good():
 def test_bad_samples_are_named(good, column, value, text):
     good[4, column] = value
     with pytest.raises(ValueError, match=text):
-        intake.check(block(good, gap=True))
+        check_samples(block(good, gap=True))
 
 
 def test_an_unknown_step_is_allowed_after_a_gap_only(good):
-    intake.check(block(good, gap=True))
+    check_samples(block(good, gap=True))
     with pytest.raises(ValueError, match="dt_s of row 0"):
         good[0, 1] = np.nan
-        intake.check(block(good, gap=False))
+        check_samples(block(good, gap=False))
 
 
 def test_missing_specific_force_is_no_error(good):
     good[:, 8:11] = np.nan
-    intake.check(block(good, gap=True))
+    check_samples(block(good, gap=True))
 
 
 def test_thinning_composes_rotations_and_keeps_fields():
-    gate = Intake(EstimatorParameters(epoch_steps=64))
+    gate = EpochBuilder(EstimatorParameters(epoch_steps=64))
     samples = rows(330)
     samples[:, 1] = 0.03
     data = gate.add(block(samples, gap=True))[0]

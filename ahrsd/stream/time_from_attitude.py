@@ -8,7 +8,7 @@ mean rate w over the same step; v = w dt. Two things follow:
 * Messages that are missing without a trace in the bytes (`TurnWatch`): a host that reads too slowly
   loses whole lines. One step then turns several times further than the rate can explain. Measured
   on real recordings: 65 such steps in two walks whose logger lost a quarter of the lines, none in
-  seven others (tests/stream/test_stream_rate.py).
+  seven others (tests/stream/test_time_from_attitude.py).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def rate_from_attitude(
 
     A rate within 4 % of one that the device offers is that rate.
     """
-    R = _rotations(ypr_rad)
+    R = so3.from_yaw_pitch_roll(*ypr_rad.T)
     dt_s = _median_step(R, gyro_rad_s, least)
     if dt_s is None and least == _LEAST_PAIRS:
         dt_s = _strong_step(R, gyro_rad_s)
@@ -195,18 +195,6 @@ def _at_most(ypr_rad: Array) -> Array:
 
 def _turned(ypr_rad: Array) -> Array:
     """Angles (N - 1,) between neighbours of (N, 3) attitudes."""
-    R = _rotations(ypr_rad)
+    R = so3.from_yaw_pitch_roll(*ypr_rad.T)
     trace = np.einsum("nij,nij->n", R[:-1], R[1:])  # of R_k^T R_(k+1): 1 + 2 cos(angle)
     return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
-
-
-def _rotations(ypr_rad: Array) -> Array:
-    """R_nb of yaw, pitch, roll (3-2-1)."""
-    y, p, r = ypr_rad.T
-    cy, sy, cp, sp, cr, sr = np.cos(y), np.sin(y), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
-    rows = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-    return np.stack([value for row in rows for value in row], axis=1).reshape(-1, 3, 3)

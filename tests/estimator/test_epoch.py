@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.estimator.factors import SIZE, Factor, LinearisationPoint, Node
-from ahrsd.estimator.misfit import Misfit, scores
+from ahrsd.estimator.epoch import Misfit, misfit_scores
+from ahrsd.estimator.graph import SIZE, Factor, LinearisationPoint, Node
 
 EPOCHS = 20
 
@@ -24,7 +24,7 @@ def _misfit(rng, louder=1.0):
     nodes = dict.fromkeys(range(EPOCHS + 1), node)
     graph = SimpleNamespace(c=np.zeros(9), nodes=nodes)
     still = np.zeros(9), dict.fromkeys(nodes, np.zeros(5))
-    return Misfit().value(factors, scores(factors), graph, still)
+    return Misfit().value(factors, misfit_scores(factors), graph, still)
 
 
 def test_sigma_of_the_misfit_by_chance():
