@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.evaluation import dead_reckoning, tilt
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.field import FieldFigures, field_figures
@@ -167,8 +168,9 @@ def _reckoned(
     gaps = track.time_s[list(track.starts[1:])] - track.time_s[[k - 1 for k in track.starts[1:]]]
     if np.any(gaps > _LONG_GAP_S):
         said.append(
-            f"{np.count_nonzero(gaps > _LONG_GAP_S)} gaps of more than {_LONG_GAP_S:g} s are in "
-            "the dead reckoning, as straight lines"
+            f"in the dead reckoning, as straight lines: "
+            f"{counted(int(np.count_nonzero(gaps > _LONG_GAP_S)), 'gap')} of more than "
+            f"{_LONG_GAP_S:g} s"
         )
     figures = _both(
         fields, lambda b: dead_reckoning.reckon(track, b, up_b, velocity, inside, way_m)

@@ -134,7 +134,7 @@ def test_a_logger_that_was_started_again_writes_its_names_again(tmp_path):
     table = read_table(path)
     assert len(table.rows) == 380
     assert table.starts == (0, 200)
-    assert "the line of names comes 1 times more" in table.notes[0]
+    assert "left out amid the rows: 1 more line of names" in table.notes[0]
 
 
 def test_few_rows_with_another_number_of_cells_are_left_out_and_many_are_not(tmp_path):
