@@ -7,8 +7,8 @@ from pathlib import Path
 from ahrsd.counting import counted
 
 PROJECT = Path(__file__).parent.parent
-THINGS = "sample row line message column record gap reading thing packet place finding".split()
-PLURAL = re.compile(rf" (?:(?!holds)\w+ )?(?:{'|'.join(THINGS)})s\b")
+THINGS = "sample|row|line|message|column|record|gap|reading|thing|packet|place|finding"
+PLURAL = re.compile(rf" (?:(?!holds)\w+ )?(?:{THINGS})s\b")
 #: in front of a number that is a limit or a whole, and so never one
 LIMIT = re.compile(r"(?:of|of over|than|least|most|every|all|first|newest|needs|limit) $")
 

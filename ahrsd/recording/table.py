@@ -280,9 +280,10 @@ class _TableRows:
         if fitted is None:
             return time_s
         self.starts = fitted.starts
+        scatter_ms = float(f"{1e3 * fitted.scatter_s:.2g}")
         self.notes.append(
-            f"the time stamps are a host's, they scatter by {1e3 * fitted.scatter_s:.2g} ms about "
-            f"a regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
+            f"the time stamps are a host's, they scatter by {scatter_ms:g} ms about a "
+            f"regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
         )
         return fitted.time_s
 

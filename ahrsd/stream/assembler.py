@@ -402,8 +402,9 @@ class Stream:
         share = 100.0 * turns.missing / (turns.missing + self.by_layout[self.facts.layout])
         self._turns_said = (
             f"messages are missing without a trace in the bytes: at "
-            f"{counted(turns.places, 'place')} the device turned further than its rate explains (about {share:.0f} % of all are "
-            "missing); the steps there are left out; was the recording computer too slow?"
+            f"{counted(turns.places, 'place')} the device turned further than its rate explains "
+            f"(about {share:.0f} % of all are missing); the steps there are left out; was the "
+            "recording computer too slow?"
         )
         self.warnings[self._turns_said] = None
 
