@@ -88,8 +88,8 @@ CASES = (
 
 #: cases that are tried in other files
 ELSEWHERE = {
-    "cli/test_field_cases_live.py": "f01 f02 f03 f04 f06 f07 f09 f25 f38".split(),
-    "recording/test_ros_recordings.py": "f14 f15".split(),
+    "cli/test_field_cases_live.py": ["f01", "f02", "f03", "f04", "f06", "f07", "f09", "f25", "f38"],
+    "recording/test_ros_recordings.py": ["f14", "f15"],
 }
 
 
