@@ -66,6 +66,9 @@ def test_it_leaves_exactly_these_files(done):
     assert body["schema"] == "ahrsd.calibration/1"
     assert body["converged"] is True
     assert sorted(body["registers"]) == ["23", "84"]
+    factory = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    assert body["registers_in_force"] == {"23": factory, "84": factory}
+    assert body["device"] == {"serial": 100130608}  # so `registers write --from` knows which
     page = (directory / "report.html").read_text()
     assert page.index("before and after") < page.index("Field strength")  # the picture comes first
 

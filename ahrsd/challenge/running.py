@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +30,7 @@ from ahrsd.errors import AhrsdError
 OURS = "ahrsd"
 RIVALS = ("stlsq", "lasso-bic", "ruptures")
 _TIMEOUT_S = 600.0
+_TRIED = 10  # cases that say nothing of any tool: one that answered none of so many cannot run here
 _NOT_FOUND = 127  # the exit code that every shell gives to a program that it cannot start
 #: last words of a tool that lacks a package: of our rivals, and of any program in Python
 _LACKS = re.compile(r"\S+ needs [\w.]+; install |(ModuleNotFoundError|ImportError):")
@@ -82,8 +83,21 @@ def refuse_unable(tool: str) -> None:
         )
 
 
-def _is_answered(path: Path) -> bool:
-    return path.exists() and could_not_run(read_object(path)) is None
+def answered_nothing(records: Iterable[Json]) -> str | None:
+    """The last words of a tool that has no answer to any of these cases; None where it has one."""
+    found = list(records)
+    if not found or any(isinstance(record.get("answer"), dict) for record in found):
+        return None
+    return str(found[-1].get("failure") or "no answer")
+
+
+def _kept(folder: Path, cases: Sequence[str]) -> dict[str, Json]:
+    """The answers of a run that was stopped, without those of a tool that could not run."""
+    paths = {case: folder / f"{case}.json" for case in cases}
+    found = {case: read_object(path) for case, path in paths.items() if path.exists()}
+    if answered_nothing(found.values()):
+        return {}
+    return {case: record for case, record in found.items() if could_not_run(record) is None}
 
 
 def run(
@@ -105,24 +119,35 @@ def run(
     called = name or (tool if tool in (OURS, *RIVALS) else Path(command[0]).name)
     folder = trial.answers(called)
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [case for case in trial.cases if not _is_answered(folder / f"{case}.json")]
-    finished = len(trial.cases) - len(missing)
+    records = _kept(folder, trial.cases)
     if done is not None:
-        done(finished, len(trial.cases))
+        done(len(records), len(trial.cases))
+    for case, record in _answers(
+        trial, [c for c in trial.cases if c not in records], command, jobs
+    ):
+        records[case] = record
+        why = could_not_run(record)
+        if len(records) >= min(_TRIED, len(trial.cases)):
+            why = why or answered_nothing(records.values())
+        if why:
+            raise AhrsdError(f"{called} cannot run here: {why}; no answers were closed")
+        write_object(folder / f"{case}.json", record)
+        if done is not None:
+            done(len(records), len(trial.cases))
+    return close_answers(trial, called)
+
+
+def _answers(
+    trial: Round, cases: Sequence[str], command: list[str], jobs: int
+) -> Iterator[tuple[str, Json]]:
+    """Case and record as they come; what has not begun is dropped where the caller stops."""
     with ThreadPoolExecutor(jobs) as pool:
-        waiting = {pool.submit(_answer, trial, case, command): case for case in missing}
+        waiting = {pool.submit(_answer, trial, case, command): case for case in cases}
         try:
             for future in as_completed(waiting):
-                record = future.result()
-                if why := could_not_run(record):
-                    raise AhrsdError(f"{called} cannot run here: {why}; no answers were closed")
-                write_object(folder / f"{waiting[future]}.json", record)
-                finished += 1
-                if done is not None:
-                    done(finished, len(trial.cases))
+                yield waiting[future], future.result()
         finally:
             pool.shutdown(cancel_futures=True)
-    return close_answers(trial, called)
 
 
 def _answer(trial: Round, case: str, command: list[str]) -> Json:

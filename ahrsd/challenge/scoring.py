@@ -8,7 +8,7 @@ from typing import Any
 from ahrsd.challenge.answers import ToolAnswer, read_answer
 from ahrsd.challenge.judge import ORDER, judge
 from ahrsd.challenge.report import html, markdown
-from ahrsd.challenge.running import OURS, could_not_run
+from ahrsd.challenge.running import OURS, answered_nothing, could_not_run
 from ahrsd.challenge.scores import ToolResult, error_rate, scores
 from ahrsd.challenge.sealing import Json, Round, open_key, read_object, write_object
 from ahrsd.errors import AhrsdError
@@ -19,9 +19,13 @@ def unable(trial: Round) -> dict[str, str]:
     found: dict[str, str] = {}
     for tool in trial.tools():
         folder = trial.answers(tool)
-        whys = [could_not_run(read_object(folder / f"{case}.json")) for case in trial.cases]
-        if lacking := [why for why in whys if why]:
-            found[tool] = f"it could not run on {len(lacking)} of {len(whys)} cases: {lacking[0]}"
+        records = [read_object(folder / f"{case}.json") for case in trial.cases]
+        if lacking := [why for why in map(could_not_run, records) if why]:
+            found[tool] = (
+                f"it could not run on {len(lacking)} of {len(records)} cases: {lacking[0]}"
+            )
+        elif why := answered_nothing(records):
+            found[tool] = f"it could not run on {len(records)} of {len(records)} cases: {why}"
     return found
 
 

@@ -93,7 +93,7 @@ def command(
         write_json(json_path, result.json(method))
     if json_path != "-":
         click.echo(f"{result.name}: {counted(result.samples, 'sample')}, method {method}")
-        for line in estimate_lines(result.estimate):
+        for line in estimate_lines(result.estimate, result.wrong):
             click.echo(line)
         for text in result.all_warnings():
             click.echo(f"  warning: {text}")

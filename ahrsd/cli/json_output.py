@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -31,6 +32,13 @@ def refuse_unwritable(target: str | Path | None) -> None:
         raise AhrsdError(f"{path}: {path.parent} is no folder; make it first")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise AhrsdError(f"{path}: cannot be written: permission denied; name another file")
+    if not path.exists():  # a folder may say that it is writable and take no file
+        try:
+            descriptor, made = tempfile.mkstemp(prefix=f".{path.name}", dir=path.parent)
+            os.close(descriptor)
+            Path(made).unlink()
+        except OSError as error:
+            raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
     if path.is_file():
         click.echo(f"{path}: exists and will be replaced", err=True)
 

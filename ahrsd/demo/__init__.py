@@ -36,7 +36,7 @@ from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.report import EventCollector, HeadingError, write_report
 from ahrsd.report.calibration_json import calibration_json
-from ahrsd.report.summary import heading_errors
+from ahrsd.report.summary import heading_errors, serial_of
 from ahrsd.samples import Array
 from ahrsd.viewer.sink import RerunSink
 from ahrsd.writeback.states import State
@@ -268,9 +268,10 @@ def _leave(directory: Path, seed: int, result: DemoResult, scene: DemoScene, cor
     body = calibration_json(
         "capture.mcap",
         result.estimate,
-        {_MAG: result.present.to_register()},
+        scene.in_force or core.registers,
         heading=heading_errors(core),
         warnings=list(core.stream.warnings),
+        serial=serial_of(core),
     )
     (directory / "calibration.json").write_text(json.dumps(body, indent=1) + "\n")
     _report(directory / "report.html", seed, result, scene.collector)

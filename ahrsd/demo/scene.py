@@ -45,6 +45,7 @@ class DemoScene:
     """Listens to the core's events; `daemon` and `power_cycle` are set before it begins.
 
     seconds: device time at most;  say: takes a line;  live: samples since the write
+    in_force: what the device held when the candidate was approved
     """
 
     seconds: float
@@ -58,6 +59,7 @@ class DemoScene:
     estimate: Estimate | None = None
     approved: Estimate | None = None
     proposed: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
+    in_force: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
     live: list[tuple[Array, Array]] = field(default_factory=list)
     shown: set[int] = field(default_factory=set)
     written: bool = False
@@ -136,6 +138,7 @@ class DemoScene:
         if proposal is None:
             return
         self.approved, self.proposed = self.estimate, dict(proposal.new)
+        self.in_force = dict(self.daemon.shell.core.registers)
         self._line("", f"the operator approves candidate {proposal.id}, which is to send:")
         for line in proposal.lines:
             self.say(" " * 27 + line)

@@ -62,15 +62,20 @@ class BatchResult:
         """Warnings of recording and stream."""
         turned = self.misalignment
         return [
-            *(f"{words}: put this right and calibrate again" for words in self.wrong),
+            *(f"{words}: put this right and calibrate again" for words in self._wrong_besides),
             *warnings_of(self.core, self.warnings),
             *(self.estimate.warnings if self.estimate is not None else ()),
             *([] if turned is None or not turned.significant else [_misalignment_text(turned)]),
         ]
 
+    @property
+    def _wrong_besides(self) -> tuple[str, ...]:
+        """What is wrong and is not told already as the reason why it has not converged."""
+        return self.wrong if self.estimate is None or self.converged else ()
+
     def reasons(self) -> list[str]:
         """Why it has not converged; empty where it has."""
-        return why_not_converged(self.estimate)
+        return why_not_converged(self.estimate, self.wrong)
 
     def json(self, method: str) -> dict[str, object]:
         """The contract's calibration.json."""
@@ -83,6 +88,7 @@ class BatchResult:
             gyro_is_raw=not self.core.stream.compensated_gyro,
             warnings=self.all_warnings(),
             serial=serial_of(self.core),
+            wrong=self.wrong,
         )
 
     def write_report(self, path: Path) -> None:

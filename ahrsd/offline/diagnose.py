@@ -72,7 +72,8 @@ def load_track(
     if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
         raise RecordingError(
             path,
-            f"is too short to diagnose: {len(track)} samples in {track.duration_s:.1f} s",
+            f"is too short to diagnose: {counted(len(track), 'sample')} in "
+            f"{track.duration_s:.1f} s",
             f"record at least {SHORTEST_S:.0f} s and {FEWEST_ROWS} samples, better some minutes",
         )
     return track, [*notes, *said, *_of_its_rate(track, said_hz)]

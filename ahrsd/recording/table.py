@@ -280,9 +280,10 @@ class _TableRows:
         if fitted is None:
             return time_s
         self.starts = fitted.starts
+        scatter_ms = float(f"{1e3 * fitted.scatter_s:.2g}")
         self.notes.append(
-            f"the time stamps are a host's, they scatter by {1e3 * fitted.scatter_s:.2g} ms about "
-            f"a regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
+            f"the time stamps are a host's, they scatter by {scatter_ms:g} ms about a "
+            f"regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
         )
         return fitted.time_s
 
@@ -462,7 +463,7 @@ def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_
         raise RecordingError(
             path,
             f"row {wrong[0] + first_row}, column {printable(source.column)}: empty, nan or "
-            f"infinite ({len(wrong)} rows in all)",
+            f"infinite ({counted(len(wrong), 'row')} in all)",
             "leave such rows out; a missing row is a gap, which is understood",
         )
     return values if factor == 1.0 else values * factor
@@ -574,7 +575,9 @@ def _covariates(table: pyarrow.Table, found: Resolved) -> tuple[dict[str, Array]
 
 def _check_length(path: Path, rows: int) -> None:
     if rows < MINIMUM_ROWS:
-        raise RecordingError(path, f"has {rows} rows, {MINIMUM_ROWS} are needed", "record longer")
+        raise RecordingError(
+            path, f"has {counted(rows, 'row')}, {MINIMUM_ROWS} are needed", "record longer"
+        )
 
 
 def _doubles(columns: list[Array]) -> NDArray[np.bool]:
@@ -602,7 +605,7 @@ def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
         raise RecordingError(
             path,
             f"row {numbers[row + 1]}, column time_s: time {word} "
-            f"({time_s[row]:g} to {time_s[row + 1]:g} s; {len(wrong)} such rows)",
+            f"({time_s[row]:g} to {time_s[row + 1]:g} s; {counted(len(wrong), 'such row')})",
             remedy,
         )
     median_s = float(np.median(step_s))

@@ -197,6 +197,53 @@ def test_a_tool_that_lacks_a_package_is_stopped_and_its_answers_are_not_closed(s
     assert list(trial.answers("mine").iterdir()) == []
 
 
+def test_a_tool_that_answers_nothing_is_no_rival_whatever_it_says(sealed, tmp_path):
+    """No list of words: a module that is not there, a library, a licence, a crash on every case."""
+    trial, key_path, _ = sealed
+    silent = tmp_path / "silent.py"
+    silent.write_text("import sys; sys.exit('licence expired')")
+    tool = f"{sys.executable} {silent} {{case}} {{json}}"
+    with pytest.raises(AhrsdError, match=r"^mine cannot run here: licence expired; no answers"):
+        run(trial, tool, name="mine")
+    assert trial.tools() == []
+    working = f"{sys.executable} {tmp_path / 'fake.py'} {{case}} {{spec}} {{json}}"
+    run(trial, working, name="mine")  # what failed is asked again
+    records = {
+        case: sealing.read_object(trial.answers("mine") / f"{case}.json") for case in trial.cases
+    }
+    assert {case for case, record in records.items() if record["answer"]} == {
+        "null0000",
+        "step0000",
+    }
+    folder = trial.answers("older")
+    folder.mkdir()
+    for case in trial.cases:  # as earlier versions closed them
+        record = {"case": case, "exit": 1, "failure": "licence expired", "answer": None}
+        sealing.write_object(folder / f"{case}.json", record)
+    sealing.close_answers(trial, "older")
+    assert [one.tool for one in score(trial, key_path, tmp_path / "out")] == ["mine"]
+    written = json.loads((tmp_path / "out" / "score.json").read_text())
+    why = "it could not run on 3 of 3 cases: licence expired"
+    assert written["not_scored"] == {"older": why}
+
+
+def test_a_tool_that_answers_none_of_ten_cases_is_not_asked_the_rest(tmp_path):
+    folder, key_path, asked = tmp_path / "round", tmp_path / "key.json", tmp_path / "asked"
+    cases = [case(f"null{k:04}", "null") for k in range(25)]
+    for entry in cases:
+        (folder / entry["id"]).mkdir(parents=True)
+        (folder / entry["id"] / "case.csv.gz").write_bytes(entry["id"].encode())
+        (folder / entry["id"] / "spec.json").write_text("{}")
+    key = {"schema": "ahrsd.challenge.key/1", "ring": "full", "seed": 1, "cases": cases}
+    key_path.write_text(json.dumps(key))
+    silent = tmp_path / "silent.py"
+    silent.write_text(f"open({str(asked)!r}, 'a').write('x'); raise SystemExit('segmentation')")
+    trial = sealing.seal(folder, key_path)
+    with pytest.raises(AhrsdError, match="silent cannot run here: segmentation"):
+        run(trial, f"{sys.executable} {silent} {{case}} {{json}}", name="silent")
+    assert 10 <= len(asked.read_text()) <= 12
+
+
 def test_answers_of_a_tool_that_could_not_run_are_never_scored(sealed, tmp_path):
     """As earlier versions left them: closed, every case with what the rival lacks."""
     trial, key_path, tool = sealed

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
 from ahrsd.printable import printable
@@ -240,7 +241,7 @@ def listed(path: Path, suffix: str) -> list[str]:
     except damages() as error:
         raise _refused(path, suffix, error) from error
     return [
-        f"{printable(topic)}  {printable(kind)}  {count} messages"
+        f"{printable(topic)}  {printable(kind)}  {counted(count, 'message')}"
         + (f", {count / seconds:.3g} Hz" if seconds > 0 else "")
         for topic, kind, count in sorted(rows)
     ]
@@ -383,8 +384,8 @@ def _raw(path: Path, found: _Found, topics: list[str]) -> RawBytes:
         )  # fmt: skip
     received = found.raw[topics[0]].received
     note = (
-        f"{len(received)} messages of {printable(topics[0])} are what the device sent: used with "
-        "the recorder's times"
+        f"what the device sent is in {counted(len(received), 'message')} of "
+        f"{printable(topics[0])}: used with the recorder's times"
     )
     facts = {"source": topics[0], "clock": "the recorder's, of each message"}
     return RawBytes(received, [note], facts)
