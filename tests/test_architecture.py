@@ -25,7 +25,6 @@ IO_MODULES = {
 # Modules that touch the world; every other one is pure and takes time as an argument.
 SHELL = (
     "ahrsd.__main__",
-    "ahrsd.challenge",
     "ahrsd.cli",
     "ahrsd.config",
     "ahrsd.daemon",
