@@ -2,7 +2,7 @@
 
 `data` says what a report may contain, `collector` fills the part that follows from the core's
 events, `figures` draws (the only importer of matplotlib, loaded when a report is written), `page`
-puts it on a page.
+puts it on a page, `template` renders the HTML in `templates/`.
 
     collector = EventCollector()
     for event in core_events: collector.add(event)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ahrsd.counting import counted
+from ahrsd.report.template import render
 
 if TYPE_CHECKING:
     from blind_trials.answers import ClaimedEffect
@@ -30,13 +31,13 @@ def markdown(head: dict[str, Any], results: Sequence[ToolResult]) -> str:
 
 def html(head: dict[str, Any], results: Sequence[ToolResult]) -> str:
     """The same as one self-contained page."""
-    body = [f"<h1>{escape(_title(head))}</h1><p>{escape(_facts(head))}</p>"]
-    for heading, words, (columns, rows) in _sections(results):
-        body.append(f"<h2>{escape(heading)}</h2>" + (f"<p>{escape(words)}</p>" if words else ""))
-        body.append(f"<div><table><thead>{_cells(columns, 'th')}</thead><tbody>")
-        body += [_cells(row, "td") for row in rows]
-        body.append("</tbody></table></div>")
-    return _PAGE.format(title=escape(_title(head)), body="\n".join(body))
+    return render(
+        "trial.html",
+        Path(__file__).with_name("templates"),
+        title=_title(head),
+        facts=_facts(head),
+        sections=_sections(results),
+    )
 
 
 def _title(head: dict[str, Any]) -> str:
@@ -129,24 +130,3 @@ def _planted(effect: dict[str, Any]) -> str:
 
 def _row(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-def _cells(cells: Iterable[str], kind: str) -> str:
-    return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in cells) + "</tr>"
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
-<style>
-body {{ font: 15px/1.45 system-ui, sans-serif; margin: 1.5rem auto; max-width: 75rem;
-  padding: 0 1rem; color: #1b1f24; background: #fff; }}
-div {{ overflow-x: auto; }}
-table {{ border-collapse: collapse; font-size: 13px; }}
-th, td {{ text-align: left; vertical-align: top; padding: .25rem .6rem;
-  border-bottom: 1px solid #d8dee4; }}
-th {{ background: #f3f5f7; }}
-</style></head><body>
-{body}
-</body></html>
-"""
