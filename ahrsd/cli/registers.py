@@ -1,10 +1,20 @@
-"""`ahrsd registers`: the device's registers and their journal."""
+"""`ahrsd registers`: the device's registers and their journal.
+
+A register's values for a person: by the names of the fields, in short numbers, with units.
+
+23  Magnetometer Calibration
+    c [1 0 0; 0 1 0; 0 0 1]  b [0.12 -0.08 0.06] gauss
+75  Binary Output Register 1
+    async_mode 3  rate_divisor 40  groups 29  field_word [7FFF 0210 000C]
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Callable, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,7 +25,6 @@ from ahrsd.cli.device_access import PORT, describe, open_device
 from ahrsd.cli.json_output import refuse_unwritable, write_text
 from ahrsd.cli.register_changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.cli.register_sources import Sources, calibrated, find, journals, newest_in_force
-from ahrsd.cli.register_text import described
 from ahrsd.config.loading import default_state_directory
 from ahrsd.counting import counted
 from ahrsd.daemon.journal import (
@@ -37,6 +46,7 @@ from drivers.vn100.procedures import (
     read_present,
     read_registers,
 )
+from drivers.vn100.register_codec import Register, RegisterField, Value
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,
@@ -101,7 +111,7 @@ def read(port: Path, ids: tuple[int, ...], baud: int | None, json_path: str | No
         click.echo(f"{identity.model}, serial {identity.serial}, firmware {identity.firmware}")
         for number, row in values.items():
             click.echo(f"{number:3}  {REGISTERS[number].name}")
-            click.echo(f"     {_text(number, row)}")
+            click.echo(f"     {described(number, row)}")
     if json_path == "-":
         click.echo(_json(values, identity), nl=False)
     elif json_path:
@@ -142,8 +152,8 @@ def diff(
     )
     for number in different:
         click.echo(f"{number:3}  {REGISTERS[number].name}")
-        click.echo(f"  -  {_text(number, before[number])}")
-        click.echo(f"  +  {_text(number, after[number])}")
+        click.echo(f"  -  {described(number, before[number])}")
+        click.echo(f"  +  {described(number, after[number])}")
     click.echo(f"{counted(len(shared), 'register')} compared, {len(different)} differ")
     raise SystemExit(EXIT_NO if different else EXIT_DONE)
 
@@ -350,9 +360,9 @@ def _show(identity: Identity, present: Changes, changes: Changes) -> None:
     click.echo(f"{identity.model}, serial {identity.serial}, firmware {identity.firmware}")
     for number, values in present.items():
         click.echo(f"{number:3}  {REGISTERS[number].name}")
-        click.echo(f"  now  {_text(number, values)}")
+        click.echo(f"  now  {described(number, values)}")
         if number in changes:
-            click.echo(f"  new  {_text(number, changes[number])}")
+            click.echo(f"  new  {described(number, changes[number])}")
         else:
             click.echo("  holds the wanted values already")
 
@@ -362,14 +372,52 @@ def _print_record(record: Record) -> None:
     click.echo(f"{record.seq:4}  {record.time}  {record.kind:12}  {' '.join(words)}".rstrip())
     for which in ("old", "new"):
         for number, values in register_values(record, which).items():
-            click.echo(f"      {which}  {number:3}  {_text(number, values)}")
+            click.echo(f"      {which}  {number:3}  {described(number, values)}")
     for line in wrg_lines(record):
         click.echo(f"      to go back send  {line}")
 
 
-def _text(number: int, values: Values) -> str:
-    return described(number, values)
-
-
 def _state(given: Path | None) -> Path:
     return given or default_state_directory()
+
+
+_PLACE = re.compile(r"(_[xyznedw]|_?[0-9]{1,2})$")  # of a value in its vector or matrix
+_MATRIX, _ROW = 9, 3
+_DIGITS = {"f32": 6, "f64": 9}  # 6 are all that the device prints of an f32
+
+
+def described(number: int, values: Values) -> str:
+    """The values on one line."""
+    register = REGISTERS[number]
+    if register.opaque:
+        return " ".join(map(str, values)) + "  (fields are not documented)"
+    pairs = list(zip(_fields(register, len(values)), values, strict=False))
+    parts = []
+    for (name, unit), group in groupby(pairs, key=lambda pair: (_stem(pair[0]), pair[0].unit)):
+        texts = [_short(field, value) for field, value in group]
+        text = texts[0] if len(texts) == 1 else f"[{_rows(texts)}]"
+        parts.append(" ".join(part for part in (name, text, unit) if part))
+    return "  ".join(parts)
+
+
+def _fields(register: Register, count: int) -> list[RegisterField]:
+    fields = list(register.fields)
+    return fields + fields[-1:] * (count - len(fields)) if register.repeated else fields
+
+
+def _stem(field: RegisterField) -> str:
+    return _PLACE.sub("", field.name)
+
+
+def _rows(texts: list[str]) -> str:
+    """A matrix has its rows apart."""
+    step = _ROW if len(texts) == _MATRIX else len(texts)
+    return "; ".join(" ".join(texts[at : at + step]) for at in range(0, len(texts), step))
+
+
+def _short(field: RegisterField, value: Value) -> str:
+    if isinstance(value, str):
+        return value or '""'
+    if field.kind.startswith("hex"):
+        return f"{int(value):0{2 if field.kind == 'hex8' else 4}X}"
+    return f"{value:.{_DIGITS[field.kind]}g}" if field.kind in _DIGITS else str(value)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.gates import guards_a_write
-from ahrsd.report.data import EstimateHistory, HeadingError, RegisterChange, ReportData
+from ahrsd.report.contents import EstimateHistory, HeadingError, RegisterChange, ReportData
 from ahrsd.report.template import Picture, number, picture, render
 from ahrsd.writeback.composition import register_lines
 

@@ -39,7 +39,7 @@ from ahrsd.report import (
     figures,
     write_report,
 )
-from ahrsd.report.collector import KEPT
+from ahrsd.report.contents import KEPT
 from ahrsd.report.figures import _binned, _settled_range, clouds
 from ahrsd.report.template import number
 from ahrsd.samples import SampleBlock

@@ -15,7 +15,7 @@ from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES, Level, guards_a_write
-from ahrsd.report.data import ReportData
+from ahrsd.report.contents import ReportData
 from ahrsd.report.page import write_report
 from ahrsd.report.summary import (
     _gate_lines,

@@ -1,4 +1,5 @@
-"""What `ahrsd evaluate` reads: samples, calibration.json, a reference, position and date."""
+"""A calibration judged on a recording: samples, calibration.json, references, position and date
+are read here, `ahrsd.evaluation` judges."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import datetime
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +17,28 @@ from ahrsd.calibration import Affine
 from ahrsd.config.loading import Config
 from ahrsd.errors import RecordingError
 from ahrsd.evaluation import (
+    Evaluation,
     EvaluationError,
     EvaluationTrack,
+    HeadingReference,
     StoredCalibration,
+    judge,
     parse_calibration,
     parse_calibrations,
     tracked,
 )
-from ahrsd.evaluation.references import Fixes, fixes_from_degrees
+from ahrsd.evaluation.references import (
+    Fixes,
+    column,
+    course,
+    device_heading,
+    fixes_from_degrees,
+    fixes_of_track,
+    optical,
+)
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
+from ahrsd.printable import printable
 from ahrsd.recording.bytestream import read_chunks
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_BYTES, TABLE_ROWS, refuse_beyond
@@ -44,6 +58,80 @@ _GPS_SUFFIX = ".gps.csv.gz"
 _CHUNK_BYTES = 1 << 18
 _GPS_TIME = ("t_s", "time_s")
 _GPS_PLACE = ("lat_deg", "lon_deg")
+
+
+def evaluate(
+    recording: Path,
+    calibration_path: Path,
+    *,
+    method: str | None = None,
+    reference_path: Path | None = None,
+    heading_column: str | None = None,
+    position: str | None = None,
+    date: str | None = None,
+    model: str = "wmm",
+    tilt: str = "auto",
+    least_speed_m_s: float = 4.0,
+    rate_hz: float | None = None,
+    columns: ColumnMap | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[list[Evaluation], dict[str, str]]:
+    """The evaluations of a calibration on a recording, and by method why one is none.
+
+    One evaluation, or with method "all" one for each calibration in the file, in its order. Raises
+    AhrsdError.
+    """
+    calibrations, without = read_calibrations(calibration_path, method)
+    world = place_and_date(position, date, model)  # type: ignore[arg-type]
+    track, said = read_track(recording, Config(), rate_hz, progress, columns)
+    beside, fixes, place = _beside(reference_path or gps_beside(recording), track)
+    if place is not None and world is None and date is not None:
+        world = place_and_date(place, date, model)  # type: ignore[arg-type]
+        said.append(f"the position is that of the middle GPS fix: {place}")
+    track, fixes = beside, fixes or fixes_of_track(beside)
+    references, more = _references(track, fixes, heading_column, least_speed_m_s)
+    found = [
+        judge(
+            printable(recording.name, 200),
+            track,
+            replace(calibration, remarks=(*said, *more, *calibration.remarks)),
+            references,
+            fixes=fixes,
+            world=world,
+            tilt_source=tilt,  # type: ignore[arg-type]
+        )
+        for calibration in calibrations
+    ]
+    return found, without
+
+
+def _beside(
+    path: Path | None, track: EvaluationTrack
+) -> tuple[EvaluationTrack, Fixes | None, str | None]:
+    """The track with the columns of another file, or its fixes and the place of the middle one."""
+    if path is None:
+        return track, None, None
+    if not is_gps(path):
+        return with_columns_of(track, path), None, None
+    fixes, place = read_fixes(path)
+    return track, fixes, place
+
+
+def _references(
+    track: EvaluationTrack, fixes: Fixes | None, heading_column: str | None, least_speed_m_s: float
+) -> tuple[list[HeadingReference], list[str]]:
+    """What there is to compare with, best first, and why something is not."""
+    said: list[str] = []
+    found: list[HeadingReference] = []
+    if heading_column is not None:
+        found.append(column(track, heading_column))
+    if fixes is not None:
+        try:
+            found.append(course(fixes, least_speed_m_s))
+        except EvaluationError as error:
+            said.append(str(error))
+    found += [one for one in (optical(track), device_heading(track)) if one is not None]
+    return found, said
 
 
 def read_track(

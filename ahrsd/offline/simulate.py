@@ -1,8 +1,10 @@
-"""What `ahrsd simulate` does beyond its scenarios: effects in them, and repaired models."""
+"""Recordings that are simulated: effects in an experiment, a repaired model along a measured
+motion, and the files that hold them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import gzip
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ahrsd.diagnosis import forward, roles
@@ -12,8 +14,11 @@ from ahrsd.diagnosis.model_file import RepairedModel
 from ahrsd.errors import AhrsdError
 from ahrsd.offline.diagnose import load_track
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.table import TABLE_SUFFIXES, is_table, write_table
 from ahrsd.samples import Array
-from ahrsd.simulation import Experiment
+from ahrsd.simulation import Experiment, tabular
+
+STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
 
 
 def with_effects(
@@ -55,3 +60,31 @@ def along(
     for name, unit, values in sensors:
         written |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
     return written | done.covariates, [*notes, *refused]
+
+
+def write_experiment(path: Path, experiment: Experiment) -> None:
+    """A table, or a byte stream of VNYMR sentences, as the name says.  AhrsdError otherwise."""
+    further = experiment.samples.covariates
+    if is_table(path):
+        write_columns(path, {**tabular.columns(experiment), **further})
+        return
+    if not path.name.endswith(STREAM_SUFFIXES):
+        known = ", ".join((*TABLE_SUFFIXES, *STREAM_SUFFIXES))
+        raise AhrsdError(f"{path}: unknown kind of file; the name must end in one of {known}")
+    if further:
+        raise AhrsdError(
+            f"{path}: a byte stream has no place for {', '.join(further)}; write a table"
+        )
+    content = b"".join(tabular.sentences(experiment))
+    try:
+        path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
+    """A table.  AhrsdError where it cannot be written."""
+    try:
+        write_table(path, columns)
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
