@@ -31,7 +31,7 @@ from ahrsd.demo.emulated import (
     read_back,
     run_watched,
 )
-from ahrsd.demo.result import DemoResult, conclude, figures, lines, verdict, write_files
+from ahrsd.demo.result import GYRO, MAG, DemoResult, conclude, figures, lines, verdict, write_files
 from ahrsd.demo.scene import DemoScene
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.viewer.sink import RerunSink
@@ -104,13 +104,15 @@ def run_demo(
         with emulated_device(setup, link, speed) as emulated:
             clock = WorldClock(speed, patient_bytes=UNREAD_BYTES, world_s=emulated.device_s)
             shell = _shell(directory, config, clock, scene)
-            scene.daemon = Daemon(config, shell, link, clock, AlwaysSafe())
+            daemon = Daemon(config, shell, link, clock, AlwaysSafe())
+            scene.stop, scene.operate = daemon.stop, daemon.operate
+            scene.candidate = lambda: shell.core.writeback.proposal
             scene.power_cycle = emulated.power_cycle
             try:
-                run_watched(scene.daemon, emulated, _LONGEST * seconds + _SPARE_S)
+                run_watched(daemon, emulated, _LONGEST * seconds + _SPARE_S)
             finally:
                 close_shell(shell, time.monotonic() + _CLOSE_S)
-            registers = read_back(link)
+            registers = read_back(link, (MAG, GYRO))
     result = conclude(truth, registers, scene, shell.core)
     write_files(directory, seed, result, scene, shell.core)
     return result

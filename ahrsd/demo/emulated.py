@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import read_registers
 
 BAUD = 115200
-MAG, GYRO = 23, 84
 UNREAD_BYTES = 512  # then the world waits: some messages
 _WATCH_S = 0.5
 _STUCK_S = 120.0  # real time in which the emulated world goes on by nothing
@@ -98,8 +97,8 @@ def run_watched(daemon: Daemon, emulated: EmulatorProcess, longest_s: float) -> 
         raise DeviceError(f"the demo ended early: {trouble[0]}", EXIT_BUSY)
 
 
-def read_back(link: Path) -> dict[int, tuple[float, ...]]:
-    """What the device holds now, by a connection of its own."""
+def read_back(link: Path, registers: Iterable[int]) -> dict[int, tuple[float, ...]]:
+    """What the device holds in registers now, by a connection of its own."""
     with SerialPort(link, BAUD) as port, Device(port) as device:
-        values = device.run(read_registers((MAG, GYRO)), 10.0)
+        values = device.run(read_registers(registers), 10.0)
     return {number: tuple(map(float, v)) for number, v in values.items()}
