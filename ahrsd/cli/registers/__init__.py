@@ -20,11 +20,11 @@ from typing import TypeVar
 
 import click
 
-from ahrsd.cli import register_locks
 from ahrsd.cli.device_access import PORT, describe, open_device
 from ahrsd.cli.json_output import refuse_unwritable, write_text
-from ahrsd.cli.register_changes import Changes, apply, gate, save_to_flash, to_write
-from ahrsd.cli.register_sources import Sources, calibrated, find, journals, newest_in_force
+from ahrsd.cli.registers import locks
+from ahrsd.cli.registers.changes import Changes, apply, gate, save_to_flash, to_write
+from ahrsd.cli.registers.sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.config.loading import default_state_directory
 from ahrsd.counting import counted
 from ahrsd.daemon.journal import (
@@ -90,8 +90,8 @@ def command() -> None:
     """
 
 
-command.add_command(register_locks.lock)
-command.add_command(register_locks.unlock)
+command.add_command(locks.lock)
+command.add_command(locks.unlock)
 
 
 @command.command()
@@ -311,7 +311,7 @@ def _change(
             raise JournalError(f"{journal.path}: {other}; nothing was written")
         changes, why = wanted(device, journal)
         if "undoes" not in why:  # what goes back to where it was is not locked out
-            register_locks.refuse_locked(journal)
+            locks.refuse_locked(journal)
         present = device.run(read_registers(changes))
         changes = to_write(present, changes)
         _show(identity, present, changes)
