@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from ahrsd.cli.json_output import refuse_unwritable, write_json
+from ahrsd.cli.output_files import refuse_unwritable, write_json
 from ahrsd.config.loading import Config, load_config
 from ahrsd.daemon.operator_inbox import VERBS
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, AhrsdError, DeviceError
