@@ -1,4 +1,4 @@
-"""Tables of samples: CSV (plain or gzipped) and Parquet, checked before anything uses them.
+"""Tables of samples: CSV (plain or gzipped) and Parquet, written, and checked where they are read.
 
 Columns: time_s, mag_{x,y,z}_gauss, gyro_{x,y,z}_rad_s, optional accel_{x,y,z}_m_s2 (specific
 force); every other numeric column is a covariate and keeps its name, text columns are left out.
@@ -14,6 +14,7 @@ there is a gap.
 
 from __future__ import annotations
 
+import gzip
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ from typing import NoReturn
 
 import numpy as np
 import pyarrow
+import pyarrow.csv
+import pyarrow.parquet
 from numpy.typing import NDArray
 
 from ahrsd import so3
@@ -664,3 +667,32 @@ def _steps(time_s: Array, known: tuple[int, ...] = ()) -> tuple[Array, tuple[int
     gap[[row - 1 for row in known if row > 0]] = True
     dt_s = np.concatenate([[np.nan], np.where(gap, np.nan, step_s)])
     return dt_s, (0, *(np.flatnonzero(gap) + 1).tolist())
+
+
+TABLE_SUFFIXES = (".csv", ".csv.gz", ".parquet")
+
+
+def is_table(path: Path) -> bool:
+    """Whether the name asks for a table."""
+    return path.name.endswith(TABLE_SUFFIXES)
+
+
+def write_table(
+    path: Path, columns: Mapping[str, Array], facts: Mapping[str, str] | None = None
+) -> None:
+    """Write columns of equal length, every digit of them.  Raises OSError.
+
+    facts: for the metadata of a Parquet file. The gzip header carries no time, so the same columns
+    give the same bytes.
+    """
+    table = pyarrow.table(dict(columns))
+    if facts:
+        table = table.replace_schema_metadata(dict(facts))
+    if path.suffix == ".parquet":
+        pyarrow.parquet.write_table(table, path)
+        return
+    sink = pyarrow.BufferOutputStream()
+    sink.write((",".join(columns) + "\n").encode())  # the writer's own header would be quoted
+    pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(include_header=False))
+    content = sink.getvalue().to_pybytes()
+    path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)

@@ -11,7 +11,7 @@ from ahrsd.diagnosis.aligned import align
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.diagnose import load_spec, load_track
-from ahrsd.recording.table_writer import write_table
+from ahrsd.recording.table import write_table
 from ahrsd.simulation import ScenarioSettings, simulate
 
 

@@ -20,8 +20,8 @@ from ahrsd.errors import RecordingError
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import parse_columns
 from ahrsd.recording.foreign import formats
+from ahrsd.recording.foreign.ros import DEFINITIONS
 from ahrsd.recording.foreign.sensors import Choice
-from ahrsd.recording.foreign.vectornav_messages import DEFINITIONS
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 
