@@ -60,9 +60,8 @@ IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.daemon.service": 23,
     "ahrsd.daemon.daemon": 18,
     "ahrsd.writeback.machine": 18,
-    "ahrsd.baselines.registry": 16,
 }
-LONGEST_CHAIN = 22  # modules, each of which imports the next; the aim is 12
+LONGEST_CHAIN = 21  # modules, each of which imports the next; the aim is 12
 
 
 @cache
