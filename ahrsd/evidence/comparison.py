@@ -89,6 +89,8 @@ def worst_difference_deg(judged: Affine, truth: Affine, envelope: Envelope) -> f
     return float(np.max(np.abs(curves)))
 
 
+# -- The candidate beside the calibration in force -------------------------------------------------
+
 _NAN = float("nan")
 _VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move
 _BIAS_FLOOR_RAD_S = 3e-4  # a smaller change of the bias needs no better rest than this one
