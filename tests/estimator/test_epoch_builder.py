@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd import so3
@@ -71,6 +71,7 @@ def test_steps_are_the_exact_composition():
     assert steps.dt_s[3] == pytest.approx(samples[13:18, 1].sum())
 
 
+@settings(deadline=None)
 @given(st.sampled_from([1, 3, 5]), st.lists(st.integers(1, 99), max_size=12))
 def test_any_split_gives_the_same_steps(n, cuts):
     samples = rows(100)
@@ -90,6 +91,7 @@ def test_split_is_undone_by_join():
     np.testing.assert_array_equal(join([front, back]).angle_b_rad, steps.angle_b_rad)
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(1, 999), max_size=20))
 def test_any_split_gives_the_same_epochs(cuts):
     """The rate too is measured on the same samples, one-sample blocks included."""
