@@ -41,3 +41,17 @@ class SampleBlock:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def part(self, rows: slice | NDArray[np.intp], *, gap_before: bool) -> SampleBlock:
+        """These rows, the further columns too, of the same register epoch."""
+        return SampleBlock(
+            time_s=self.time_s[rows],
+            dt_s=self.dt_s[rows],
+            host_s=self.host_s[rows],
+            raw_b_gauss=self.raw_b_gauss[rows],
+            gyro_b_rad_s=self.gyro_b_rad_s[rows],
+            accel_b_m_s2=self.accel_b_m_s2[rows],
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+            epoch=self.epoch,
+            gap_before=gap_before,
+        )

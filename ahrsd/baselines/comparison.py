@@ -58,20 +58,12 @@ def halves(blocks: Sequence[SampleBlock]) -> Halves:
 
 
 def _cut(block: SampleBlock, rows: slice, *, gap: bool) -> SampleBlock:
-    dt_s = block.dt_s[rows].copy()
-    if gap and len(dt_s):
-        dt_s[0] = np.nan
-    return replace(
-        block,
-        time_s=block.time_s[rows],
-        dt_s=dt_s,
-        host_s=block.host_s[rows],
-        raw_b_gauss=block.raw_b_gauss[rows],
-        gyro_b_rad_s=block.gyro_b_rad_s[rows],
-        accel_b_m_s2=block.accel_b_m_s2[rows],
-        covariates={name: values[rows] for name, values in block.covariates.items()},
-        gap_before=gap,
-    )
+    part = block.part(rows, gap_before=gap)
+    if not (gap and len(part)):
+        return part
+    dt_s = part.dt_s.copy()
+    dt_s[0] = np.nan
+    return replace(part, dt_s=dt_s)
 
 
 def spread_of(

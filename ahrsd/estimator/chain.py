@@ -417,6 +417,8 @@ def band(diag: Array, upper: Array) -> Array:
     return out
 
 
+# -- An epoch's quadratic --------------------------------------------------------------------------
+
 FIRST = slice(12, 14)
 LAST = slice(14, 16)
 WIDTH = 16

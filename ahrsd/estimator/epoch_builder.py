@@ -234,6 +234,8 @@ class HeldReadings:
         return row
 
 
+# -- Epochs ----------------------------------------------------------------------------------------
+
 _RATE_ROWS = 33
 _LONGEST_GAP_S = 60.0  # after a longer one the gyro's bias may have moved
 _SPARE = 2  # steps by which the count of what waits may be wrong

@@ -282,6 +282,9 @@ def curvature(c: Array, covariance: Array, moments: Moments) -> Array:
     return added
 
 
+# -- The graph -------------------------------------------------------------------------------------
+
+
 class SingularError(ValueError):
     """The graph has a direction that neither data nor prior determine."""
 

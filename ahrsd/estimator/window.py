@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
@@ -69,9 +68,22 @@ _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and th
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
 _ANOTHER_REST = 0.02  # rad between two directions at rest
+_SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
+_LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
+_MAX_STEPS = 12
+_MAX_TRACKS = 6
+_FINISH_WORK = 20  # linearisations per epoch at the end of a recording
+_WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
+_RESTART_WORK = 5  # linearisations per epoch that a restart is worth
+_DAMPING, _DAMPING_FAR = 1e-3, 1e2
+_STILL = 1e12  # damping at which the calibration stays where it is
+_DAMPING_LIMITS = (1e-9, 1e6)
+_SHORT, _STRAIGHT = 5.0, 0.02  # sigmas of a step, and by how much it is curved, to be foreseen
+_CHANCE = 2.0  # sigmas of the misfit by chance from which it counts
+_GAIN = 0.05  # of log likelihood: less is not worth another step
 
 
-class Linearised:
+class Window:
     """Epochs, each where it was linearised; `graph.c` = [M (6), b (3)] in gauss is the answer."""
 
     def __init__(
@@ -99,8 +111,13 @@ class Linearised:
         self._guess = usual  # the middle of them
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, belief, first, prior)
+        self.found_misfit = 1.0
+        self.step_sigmas = float(np.inf)
+        self.loud = 1.0  # what searching found the model to leave over (`SearchResult.loud`)
+        self._damping = _DAMPING
+        self._covariance = belief  # of c, when it was last weighed
 
-    def copy(self) -> Self:
+    def copy(self) -> Window:
         """A copy that goes its own way."""
         other = copy(self)
         other.graph, other.epochs = self.graph.copy(), list(self.epochs)
@@ -142,7 +159,7 @@ class Linearised:
         if waiting:
             self.attach([data for data, _ in waiting], [moving for _, moving in waiting])
 
-    def learn_from(self, other: Linearised) -> None:
+    def learn_from(self, other: Window) -> None:
         """First guesses of the noise and moments of the field, for a part of the other's data."""
         self._guesses, self._guess = other._guesses.copy(), other._guess
         self.graph.moments = other.graph.moments
@@ -276,95 +293,7 @@ class Linearised:
         self._replace(everyone, places)
         self.lag_s = lag_s
 
-
-# -- Which epochs are worth linearising again ------------------------------------------------------
-#
-# Which epochs are worth linearising again, after the calibration moved away from where they were.
-#
-# An epoch's factor is exact to second order, so a straight move costs nothing, however many sigmas
-# long. What counts is by how much the way there is curved (`graph.retract`), in sigmas: linearising
-# again moves the answer by about that. An epoch at rest knows nothing of the calibration. There the
-# gyro's bias counts: at another one its directions drift, which seems to be noise of the field.
-
-_WORTH = 0.02  # sigmas
-_ANOTHER_NOISE, _EXACTLY = 0.1, 0.04  # of the gyro's level, that an epoch may have assumed else
-
-_DRIFTED = 0.3  # of the field's noise: what a bias other than assumed makes of a rest
-
-
-def bends(epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information: Array) -> Array:
-    """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest."""
-    known: dict[int, float] = {}
-    for epoch in epochs:
-        at = epoch.factor.point.c
-        if epoch.turned and id(at) not in known:
-            known[id(at)] = sigmas(retract(at, c - at, moments) - c, information)
-    return np.array([known[id(e.factor.point.c)] if e.turned else 0.0 for e in epochs])
-
-
-def drifts(epochs: Sequence[WindowEpoch], nodes: Mapping[int, Node], usual: chain.Noise) -> Array:
-    """How far directions at rest drift over their epoch by another bias than it assumed, (E,).
-
-    In units of the field's noise; 0 with motion.
-    """
-    out = np.zeros(len(epochs))
-    for k, epoch in enumerate(epochs):
-        if not epoch.turned:
-            at = epoch.factor.point
-            length_s = float(epoch.data.time_s[-1] - epoch.data.time_s[0])
-            angle = float(np.linalg.norm(nodes[epoch.a].bias - at.a.bias)) * length_s
-            size = float(np.cbrt(np.linalg.det(chain.symmetric(at.c[:6]))))
-            out[k] = angle * size / usual.mag_gauss
-    return out
-
-
-def outdated(
-    epochs: Sequence[WindowEpoch],
-    bent: Array,
-    drifted: Array,
-    usual: chain.Noise,
-    *,
-    exactly: bool,
-) -> list[int]:
-    """Epochs that were left too far behind, or assumed another noise of the gyro than `usual`."""
-    assumed = np.array([e.usual.gyro_rad_s for e in epochs])
-    limit = _EXACTLY if exactly else _ANOTHER_NOISE
-    other = np.abs(assumed / usual.gyro_rad_s - 1.0) > limit
-    return [int(k) for k in np.flatnonzero((bent > _WORTH) | (drifted > _DRIFTED) | other)]
-
-
-_SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
-_LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
-_MAX_STEPS = 12
-_MAX_TRACKS = 6
-_FINISH_WORK = 20  # linearisations per epoch at the end of a recording
-_WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
-_RESTART_WORK = 5  # linearisations per epoch that a restart is worth
-_DAMPING, _DAMPING_FAR = 1e-3, 1e2
-_STILL = 1e12  # damping at which the calibration stays where it is
-_DAMPING_LIMITS = (1e-9, 1e6)
-_SHORT, _STRAIGHT = 5.0, 0.02  # sigmas of a step, and by how much it is curved, to be foreseen
-_CHANCE = 2.0  # sigmas of the misfit by chance from which it counts
-_GAIN = 0.05  # of log likelihood: less is not worth another step
-
-
-class Window(Linearised):
-    """Epochs and graph, and how the answer moves over them."""
-
-    def __init__(
-        self,
-        parameters: EstimatorParameters,
-        c: Array,
-        belief: Array,
-        first: Node,
-        usual: chain.Noise,
-    ) -> None:
-        super().__init__(parameters, c, belief, first, usual)
-        self.found_misfit = 1.0
-        self.step_sigmas = float(np.inf)
-        self.loud = 1.0  # what searching found the model to leave over (`SearchResult.loud`)
-        self._damping = _DAMPING
-        self._covariance = belief  # of c, when it was last weighed
+    # -- moving the answer ------------------------------------------------------------------------
 
     @property
     def untried(self) -> bool:
@@ -594,6 +523,62 @@ class Window(Linearised):
         """By how much errors that repeat with the attitude shrink the information."""
         cells = sum((e.cells for e in self.epochs if e.turned), self._folded_cells)
         return variance_inflation(cells, self.usual.mag_gauss, self._guess.mag_gauss)
+
+
+# -- Which epochs are worth linearising again ------------------------------------------------------
+#
+# Which epochs are worth linearising again, after the calibration moved away from where they were.
+#
+# An epoch's factor is exact to second order, so a straight move costs nothing, however many sigmas
+# long. What counts is by how much the way there is curved (`graph.retract`), in sigmas: linearising
+# again moves the answer by about that. An epoch at rest knows nothing of the calibration. There the
+# gyro's bias counts: at another one its directions drift, which seems to be noise of the field.
+
+_WORTH = 0.02  # sigmas
+_ANOTHER_NOISE, _EXACTLY = 0.1, 0.04  # of the gyro's level, that an epoch may have assumed else
+
+_DRIFTED = 0.3  # of the field's noise: what a bias other than assumed makes of a rest
+
+
+def bends(epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information: Array) -> Array:
+    """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest."""
+    known: dict[int, float] = {}
+    for epoch in epochs:
+        at = epoch.factor.point.c
+        if epoch.turned and id(at) not in known:
+            known[id(at)] = sigmas(retract(at, c - at, moments) - c, information)
+    return np.array([known[id(e.factor.point.c)] if e.turned else 0.0 for e in epochs])
+
+
+def drifts(epochs: Sequence[WindowEpoch], nodes: Mapping[int, Node], usual: chain.Noise) -> Array:
+    """How far directions at rest drift over their epoch by another bias than it assumed, (E,).
+
+    In units of the field's noise; 0 with motion.
+    """
+    out = np.zeros(len(epochs))
+    for k, epoch in enumerate(epochs):
+        if not epoch.turned:
+            at = epoch.factor.point
+            length_s = float(epoch.data.time_s[-1] - epoch.data.time_s[0])
+            angle = float(np.linalg.norm(nodes[epoch.a].bias - at.a.bias)) * length_s
+            size = float(np.cbrt(np.linalg.det(chain.symmetric(at.c[:6]))))
+            out[k] = angle * size / usual.mag_gauss
+    return out
+
+
+def outdated(
+    epochs: Sequence[WindowEpoch],
+    bent: Array,
+    drifted: Array,
+    usual: chain.Noise,
+    *,
+    exactly: bool,
+) -> list[int]:
+    """Epochs that were left too far behind, or assumed another noise of the gyro than `usual`."""
+    assumed = np.array([e.usual.gyro_rad_s for e in epochs])
+    limit = _EXACTLY if exactly else _ANOTHER_NOISE
+    other = np.abs(assumed / usual.gyro_rad_s - 1.0) > limit
+    return [int(k) for k in np.flatnonzero((bent > _WORTH) | (drifted > _DRIFTED) | other)]
 
 
 # -- Other starts ----------------------------------------------------------------------------------

@@ -54,6 +54,8 @@ def field_figures(field_b: Array, world_gauss: float | None) -> FieldFigures:
     )
 
 
+# -- All figures, before and after -----------------------------------------------------------------
+
 _LONG_GAP_S = 1.0
 T = TypeVar("T")
 

@@ -4,11 +4,10 @@
 
     samples ─▶ segments (every 4th held out; attitude by gyro and gravity, no compass)
                  ├─▶ heading    held-out error
-                 ├─▶ field      size, dip, drift
                  ├─▶ coverage   attitudes shown
                  ├─▶ refits     halves, second opinion
                  ├─▶ stillness  gyro bias at rest
-                 └─▶ comparison heading change over headings, against the calibration in force
+                 └─▶ comparison size, dip and drift of its field; against the calibration in force
 
 `EvidenceCollector` runs it all; `values` is what it finds, and what `ahrsd.gates` judges.
 """

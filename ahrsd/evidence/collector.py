@@ -12,7 +12,6 @@ import numpy as np
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.evidence import comparison
 from ahrsd.evidence.coverage import coverage
-from ahrsd.evidence.field import field_facts
 from ahrsd.evidence.heading import field_0, gyro_heading_rad, prove
 from ahrsd.evidence.segments import (
     AttitudeTrack,
@@ -90,7 +89,7 @@ class EvidenceCollector:
         if nodes is not None:
             heading_rad = gyro_heading_rad(nodes, field_0(nodes, judged))
             motion = coverage(nodes, heading_rad)
-            field = field_facts(nodes, judged)
+            field = comparison.field_facts(nodes, judged)
             proof = prove(nodes, heading_rad, judged, present, _LEAST_TURN_DEG)
         envelope = comparison.envelope(motion, field, world)
         still = rest(self._history.segments)

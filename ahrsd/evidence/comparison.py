@@ -89,12 +89,15 @@ def worst_difference_deg(judged: Affine, truth: Affine, envelope: Envelope) -> f
     return float(np.max(np.abs(curves)))
 
 
+# -- The candidate beside the calibration in force -------------------------------------------------
+
 _NAN = float("nan")
 _VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move
 _BIAS_FLOOR_RAD_S = 3e-4  # a smaller change of the bias needs no better rest than this one
 _MOST_BIAS_SIGMA_RAD_S = 3e-4  # an estimate that knows less must not agree with everything
 _LEAST_NOISE_GAUSS = 2e-4
 _FACTORY = 1e-6
+_ROUGH_M_S2 = 0.5  # rms of |force| - gravity above which a segment's dip is not compared
 
 
 def envelope(motion: Coverage, field: FieldFacts, world: WorldField | None) -> Envelope:
@@ -102,6 +105,30 @@ def envelope(motion: Coverage, field: FieldFacts, world: WorldField | None) -> E
     and the tilts driven."""
     dip = np.radians(field.inclination_deg) if world is None else world.inclination_rad
     return Envelope(field.mean_gauss, float(dip), motion.roll_deg, motion.pitch_deg)
+
+
+def field_facts(nodes: Nodes, correction: Affine) -> FieldFacts:
+    """Facts about the field that `correction` makes of all segments."""
+    h_b = correction.apply(nodes.raw_b_gauss)
+    size = np.linalg.norm(h_b, axis=1)
+    sine = np.sum(h_b * nodes.down_b, axis=1) / size
+    dip_deg = nodes.mean(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
+    calm = dip_deg[nodes.rough_m_s2 < _ROUGH_M_S2]
+    temperatures = np.array([t.segment.temperature_c for t in nodes.tracks])
+    return FieldFacts(
+        mean_gauss=float(np.mean(size)),
+        min_gauss=float(np.min(size)),
+        max_gauss=float(np.max(size)),
+        spread=float(np.std(size) / np.mean(size)),
+        inclination_deg=float(np.median(calm)) if len(calm) else float("nan"),
+        wander_gauss=_wander(nodes.mean(size)),
+        inclination_wander_deg=_wander(calm),
+        temperature_range_c=float(np.ptp(temperatures)),
+    )
+
+
+def _wander(values: Array) -> float:
+    return float(np.max(np.abs(values - np.median(values)))) if len(values) else float("nan")
 
 
 def in_scale_of(model: Affine, correction: Affine) -> Affine:

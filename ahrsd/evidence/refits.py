@@ -1,6 +1,6 @@
 """Two independent fits that check an estimate: one from the gyro, one from the field's size.
 
-Gyro fit (for halves of the data). With R_0k from `attitude`, the corrected field of a segment must
+Gyro fit (for halves of the data). With R_0k of `segments`, the corrected field of a segment must
 not move: R_0k (C m_k - c) = f_s, c = C b. Linear in (C, c); f_s is removed by centring. C = 0 would
 do, so the trace of C is held: C = C0 + sum x_i E_i over the five traceless symmetric E_i. Noise in
 the regressor m pulls C towards 0 with the weight n sigma^2; its pull on the right-hand side is

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -101,9 +101,8 @@ class SegmentHistory:
         for slot, (a, b) in enumerate(pairwise(cuts), start=first):
             role = self._role_of(slot)
             if b > a:
-                part = _rows(block, a, b)
-                gap = part.gap_before or role != before
-                parts.append((role, replace(part, gap_before=gap)))
+                gap = (block.gap_before and a == 0) or role != before
+                parts.append((role, block.part(slice(a, b), gap_before=gap)))
                 before = role
         return parts
 
@@ -209,20 +208,6 @@ def _smooth(angle: Array) -> Array:
     """Angles summed over about a second, so that noise does not count as turning."""
     whole = max(1, len(angle) // 25 * 25)
     return np.asarray(angle[:whole].reshape(-1, min(25, whole), 3).sum(axis=1))
-
-
-def _rows(block: SampleBlock, a: int, b: int) -> SampleBlock:
-    return replace(
-        block,
-        time_s=block.time_s[a:b],
-        dt_s=block.dt_s[a:b],
-        host_s=block.host_s[a:b],
-        raw_b_gauss=block.raw_b_gauss[a:b],
-        gyro_b_rad_s=block.gyro_b_rad_s[a:b],
-        accel_b_m_s2=block.accel_b_m_s2[a:b],
-        covariates={name: values[a:b] for name, values in block.covariates.items()},
-        gap_before=block.gap_before and a == 0,
-    )
 
 
 # -- Attitude inside a segment ---------------------------------------------------------------------

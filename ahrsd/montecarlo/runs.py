@@ -118,6 +118,9 @@ _FORMAT = 2  # of a record: bounds hold `sigma` and headings
 _THREADS = "OPENBLAS_NUM_THREADS"
 
 
+# -- Runs ------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True)
 class Plan:
     """What every run does.

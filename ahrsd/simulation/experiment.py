@@ -136,19 +136,10 @@ class Experiment:
         """The rows for which `rows` (N,) bool is true; steps over left-out rows become unknown."""
         index = np.flatnonzero(rows)
         new = index[np.flatnonzero(np.diff(index) > 1) + 1]
-        s = self.samples
-        dt_s = s.dt_s.copy()
+        dt_s = self.samples.dt_s.copy()
         dt_s[new] = np.nan
         dt_s[index[:1]] = np.nan
-        kept = SampleBlock(
-            time_s=s.time_s[index],
-            dt_s=dt_s[index],
-            host_s=s.host_s[index],
-            raw_b_gauss=s.raw_b_gauss[index],
-            gyro_b_rad_s=s.gyro_b_rad_s[index],
-            accel_b_m_s2=s.accel_b_m_s2[index],
-            gap_before=True,
-        )
+        kept = replace(self.samples, dt_s=dt_s).part(index, gap_before=True)
         return Experiment(
             self.name,
             kept,
@@ -163,19 +154,7 @@ class Experiment:
         starts = self.starts
         for start, end in zip(starts, [*starts[1:], len(self)], strict=True):
             for at in range(start, end, rows):
-                yield _cut(self.samples, slice(at, min(at + rows, end)), at == start)
-
-
-def _cut(s: SampleBlock, rows: slice, gap_before: bool) -> SampleBlock:
-    return SampleBlock(
-        time_s=s.time_s[rows],
-        dt_s=s.dt_s[rows],
-        host_s=s.host_s[rows],
-        raw_b_gauss=s.raw_b_gauss[rows],
-        gyro_b_rad_s=s.gyro_b_rad_s[rows],
-        accel_b_m_s2=s.accel_b_m_s2[rows],
-        gap_before=gap_before,
-    )
+                yield self.samples.part(slice(at, min(at + rows, end)), gap_before=at == start)
 
 
 def measured(

@@ -1,12 +1,13 @@
-"""Averaging of fast streams, the intake, and thinning for the search."""
+"""Samples to steps and epochs: any split gives the same. Where down is on a vehicle that turns."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd import so3
@@ -70,6 +71,7 @@ def test_steps_are_the_exact_composition():
     assert steps.dt_s[3] == pytest.approx(samples[13:18, 1].sum())
 
 
+@settings(deadline=None)
 @given(st.sampled_from([1, 3, 5]), st.lists(st.integers(1, 99), max_size=12))
 def test_any_split_gives_the_same_steps(n, cuts):
     samples = rows(100)
@@ -89,6 +91,7 @@ def test_split_is_undone_by_join():
     np.testing.assert_array_equal(join([front, back]).angle_b_rad, steps.angle_b_rad)
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(1, 999), max_size=20))
 def test_any_split_gives_the_same_epochs(cuts):
     """The rate too is measured on the same samples, one-sample blocks included."""
@@ -182,3 +185,49 @@ def test_thinning_composes_rotations_and_keeps_fields():
     both = joined([thin, thin])
     assert len(both) == 2 * len(thin)
     np.testing.assert_array_equal(np.flatnonzero(both.linked == 0), [0, len(thin)])
+
+
+RATE_HZ, N = 33.0, 600
+
+
+def circling(rate_rad_s, sideways_m_s2):
+    """A level vehicle on a circle: the force of the bend is constant in its own frame."""
+    dt = np.full(N, 1 / RATE_HZ)
+    dt[0] = np.nan
+    time_s = np.arange(N) / RATE_HZ
+    return SampleBlock(
+        time_s=time_s,
+        dt_s=dt,
+        host_s=time_s,
+        raw_b_gauss=np.tile([0.2, 0.0, 0.4], (N, 1)),
+        gyro_b_rad_s=np.tile([0.0, 0.0, rate_rad_s], (N, 1)),
+        accel_b_m_s2=np.tile([0.0, sideways_m_s2, -9.81], (N, 1)),
+        gap_before=True,
+    )
+
+
+def tilts_deg(block):
+    (data,) = EpochBuilder(EstimatorParameters()).add(block)
+    return np.degrees(np.arccos(data.down_b[:, 2]))
+
+
+def test_a_bend_is_no_tilt():
+    turns_per_epoch = 3
+    rate = turns_per_epoch * 2 * np.pi * RATE_HZ / 512
+    assert np.max(tilts_deg(circling(rate, 3.0))) < 0.3
+    assert tilts_deg(circling(0.0, 3.0)) == pytest.approx(np.degrees(np.arctan2(3.0, 9.81)))
+
+
+def test_a_gyro_bias_cancels_in_the_middle():
+    block = circling(0.0, 0.0)
+    biased = replace(block, gyro_b_rad_s=np.tile([5e-3, 0.0, 0.0], (N, 1)))
+    tilt = tilts_deg(biased)
+    assert tilt[len(tilt) // 2] < 0.05
+    assert tilt[0] > 1.0
+
+
+def test_without_an_accelerometer_nothing_is_down():
+    block = circling(0.1, 0.0)
+    silent = replace(block, accel_b_m_s2=np.full((N, 3), np.nan))
+    (data,) = EpochBuilder(EstimatorParameters()).add(silent)
+    assert np.isnan(data.down_b).all()
