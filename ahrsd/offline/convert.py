@@ -15,7 +15,6 @@ import numpy as np
 
 from ahrsd import __version__
 from ahrsd.config.loading import Config
-from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import replay
@@ -58,7 +57,7 @@ def listed(path: Path) -> list[str]:
     lines = [f"{recording.name} is a {recording.kind.value}"]
     if recording.table is not None:
         rows = recording.table.rows
-        lines.append(f"{counted(len(rows), 'row')} over {rows.time_s[-1] - rows.time_s[0]:.1f} s")
+        lines.append(f"rows: {len(rows)}, {rows.time_s[-1] - rows.time_s[0]:.1f} s")
         lines += [f"column {name}" for name in (TIME, *MAG, *GYRO, *sorted(rows.covariates))]
     return lines
 
