@@ -246,7 +246,7 @@ class RateHeard:
 
     def __str__(self) -> str:
         what = f"{self.received} bytes, no message" if self.received else "silence"
-        return f"{self.baud}: {f'{self.messages} messages' if self.messages else what}"
+        return f"{self.baud}: {f'messages: {self.messages}' if self.messages else what}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,36 +19,45 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 PROJECT = Path(__file__).parent.parent
-RECORDINGS = PROJECT.parent / "shared" / "recordings"
+SHARED = PROJECT.parent / "shared"
+RECORDINGS = SHARED / "recordings"
+
+#: what a clone does not have: marker, or fixture, of the tests that read it; folder; what it holds
+ABSENT = {
+    "recordings": (RECORDINGS, "the real recordings"),
+    "field_cases": (SHARED / "field-cases", "the field cases"),
+}
 
 #: what a test module has, or a test asks for, that opens ports, sockets and processes
 REAL = {"subprocess", "socket", "pty", "serial", "threading", "EmulatorProcess", "PtyEmulator"}
 REAL_FIXTURES = {"live", "emulated", "small_disk"}
 
 
-def _needs_recordings(item: pytest.Item) -> bool:
-    marked = item.get_closest_marker("recordings") is not None
-    return marked or "recordings" in getattr(item, "fixturenames", ())
+def _needs(item: pytest.Item, kind: str) -> bool:
+    marked = item.get_closest_marker(kind) is not None
+    return marked or kind in getattr(item, "fixturenames", ())
 
 
 def _one_skip_a_file(items: list[pytest.Item]) -> list[pytest.Item]:
-    """Where the real recordings are absent: one skip for all tests of a file that need them.
+    """Where what lies beside the project is absent: one skip for all tests of a file that need it.
 
-    A clone has no recordings; a skip for each of a hundred parameters would hide any other skip.
+    A clone has none of it; a skip for each of a hundred parameters would hide any other skip.
     """
-    by_file: dict[Path, list[pytest.Item]] = {}
+    by_file: dict[tuple[str, Path], list[pytest.Item]] = {}
     for item in items:
-        if _needs_recordings(item):
-            by_file.setdefault(item.path, []).append(item)
-    for first, *others in by_file.values():
-        why = f"the real recordings (../shared/recordings) are not here: {1 + len(others)} of this"
-        first.add_marker(pytest.mark.skip(reason=f"{why} file need them"))
+        for kind, (folder, _) in ABSENT.items():
+            if not folder.is_dir() and _needs(item, kind):
+                by_file.setdefault((kind, item.path), []).append(item)
+    for (kind, _), (first, *others) in by_file.items():
+        folder, what = ABSENT[kind]
+        why = f"{what} (../shared/{folder.name}) are not here: {1 + len(others)} of this file need"
+        first.add_marker(pytest.mark.skip(reason=f"{why} them"))
     return [other for _, *others in by_file.values() for other in others]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tests without their recordings are told file by file; real ports get a second try."""
-    if not RECORDINGS.is_dir() and (left_out := _one_skip_a_file(items)):
+    """Tests without their files are told file by file; real ports get a second try."""
+    if left_out := _one_skip_a_file(items):
         config.hook.pytest_deselected(items=left_out)
         out = set(left_out)
         items[:] = [item for item in items if item not in out]

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import rerun_cli
 
-from ahrsd import demo
 from ahrsd.config.loading import Config
-from ahrsd.demo import FILES, demo_config, lines, run_demo
+from ahrsd.demo import FILES, demo_config, emulated, lines, run_demo
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay
 from drivers.vn100.emulator.process import EmulatorProcess
@@ -66,6 +65,9 @@ def test_it_leaves_exactly_these_files(done):
     assert body["schema"] == "ahrsd.calibration/1"
     assert body["converged"] is True
     assert sorted(body["registers"]) == ["23", "84"]
+    factory = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    assert body["registers_in_force"] == {"23": factory, "84": factory}
+    assert body["device"] == {"serial": 100130608}  # so `registers write --from` knows which
     page = (directory / "report.html").read_text()
     assert page.index("before and after") < page.index("Field strength")  # the picture comes first
 
@@ -109,7 +111,7 @@ def test_a_device_that_dies_ends_it(tmp_path, monkeypatch):
             super().__init__(*args, **options)
             processes.append(self._process)
 
-    monkeypatch.setattr(demo, "EmulatorProcess", Mortal)
+    monkeypatch.setattr(emulated, "EmulatorProcess", Mortal)
     said = threading.Event()
 
     def kill():
@@ -144,14 +146,13 @@ def test_a_world_that_stands_still_ends_it(monkeypatch):
         def stop(self, _reason):
             self.stopped.set()
 
-    monkeypatch.setattr(demo, "_STUCK_S", 0.0)
-    monkeypatch.setattr(demo, "_WATCH_S", 0.01)
-    monkeypatch.setattr(demo, "close_shell", lambda *_: None)
+    monkeypatch.setattr(emulated, "_STUCK_S", 0.0)
+    monkeypatch.setattr(emulated, "_WATCH_S", 0.01)
     with pytest.raises(DeviceError, match="the emulated device stood still"):
-        demo._run(Waiting(), None, Frozen(), 100.0)
-    monkeypatch.setattr(demo, "_STUCK_S", 1e9)
+        emulated.run_watched(Waiting(), Frozen(), 100.0)
+    monkeypatch.setattr(emulated, "_STUCK_S", 1e9)
     with pytest.raises(DeviceError, match="no end after 11 s of device time"):
-        demo._run(Waiting(), None, Frozen(), 11.0)
+        emulated.run_watched(Waiting(), Frozen(), 11.0)
 
 
 def test_the_report_promises_of_a_seed_only_what_it_keeps(done):
@@ -172,7 +173,7 @@ def test_no_device_is_one_line(tmp_path, monkeypatch, run, capsys):
     def refuse(*_args, **_options):
         raise OSError(2, "out of pty devices")
 
-    monkeypatch.setattr(demo, "EmulatorProcess", refuse)
+    monkeypatch.setattr(emulated, "EmulatorProcess", refuse)
     assert run("demo", "--output", tmp_path / "d") == 75
     assert capsys.readouterr().err == ("ahrsd: no emulated device: [Errno 2] out of pty devices\n")
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings, corrected
+from ahrsd.counting import counted
 from ahrsd.samples import Array
 
 MINIMUM_SAMPLES = 20
@@ -42,7 +43,7 @@ def mag_noise(data: MethodData, settings: MethodSettings) -> float:
 def usable(data: MethodData) -> None:
     """MethodError naming the first thing that makes these samples unusable for every method."""
     if len(data) < MINIMUM_SAMPLES:
-        raise MethodError(f"{len(data)} samples: at least {MINIMUM_SAMPLES} are needed")
+        raise MethodError(f"{counted(len(data), 'sample')}: at least {MINIMUM_SAMPLES} are needed")
     for name in ("time_s", "raw_b_gauss", "gyro_b_rad_s"):
         good = np.isfinite(getattr(data, name)).reshape(len(data), -1).all(axis=1)
         if not good.all():

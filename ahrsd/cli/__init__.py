@@ -1,6 +1,7 @@
-"""The command line, one module per command, imported only when that command runs.
+"""The command line: a command's module is imported only when that command runs.
 
-Every module here has `command: click.Command`. A command that answers "no" ends with
+The module of a command has its name, and the command in it is called `command`; of modules with
+several (`_SHARED`) each command has its own name. A command that answers "no" ends with
 `raise SystemExit(EXIT_NO)`; whatever a person can put right is raised as an `AhrsdError`.
 """
 
@@ -33,6 +34,10 @@ COMMANDS: dict[str, str] = {
 }
 
 
+#: commands that are not in a module of their own
+_SHARED = dict.fromkeys(("status", "explain", "operator", "bundle"), "running_daemon")
+
+
 class LazyGroup(click.Group):
     """A group that imports `ahrsd.cli.NAME` when NAME is called, and not before."""
 
@@ -44,10 +49,11 @@ class LazyGroup(click.Group):
         """Import the command's module."""
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(f"ahrsd.cli.{cmd_name}")
-        command = module.command
+        shared = _SHARED.get(cmd_name)
+        module = importlib.import_module(f"ahrsd.cli.{shared or cmd_name}")
+        command = getattr(module, cmd_name if shared else "command")
         if not isinstance(command, click.Command):
-            raise TypeError(f"ahrsd.cli.{cmd_name}.command is not a click command")
+            raise TypeError(f"{module.__name__} has no click command {cmd_name}")
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.json_output import make_folder, refuse_unwritable, write_json
+from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
 from ahrsd.cli.progress import byte_progress
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.config.loading import Config, load_config
@@ -93,7 +93,7 @@ def command(
         write_json(json_path, result.json(method))
     if json_path != "-":
         click.echo(f"{result.name}: {counted(result.samples, 'sample')}, method {method}")
-        for line in estimate_lines(result.estimate):
+        for line in estimate_lines(result.estimate, result.wrong):
             click.echo(line)
         for text in result.all_warnings():
             click.echo(f"  warning: {text}")

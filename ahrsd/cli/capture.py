@@ -15,7 +15,8 @@ from pathlib import Path
 import click
 
 from ahrsd.cli.device_access import PORT, describe, driver_errors, open_port, read_all
-from ahrsd.cli.json_output import refuse_unwritable, write_json
+from ahrsd.cli.output_files import refuse_unwritable, write_json
+from ahrsd.counting import counted
 from ahrsd.daemon import host_clock
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
 from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
@@ -62,7 +63,7 @@ class _Session:
             heard = "no message of a VN-100" if self.received else "silence"
         else:
             most = ", ".join(kind for kind, _ in self.kinds.most_common(2))
-            heard = f"{self.messages:,} messages ({most})"
+            heard = f"{counted(self.messages, 'message', ',')} ({most})"
         return f"{took_s:7.1f} s {self.received:12,} bytes, {heard}"
 
 
@@ -203,7 +204,8 @@ def _report(path: Path, session: _Session, status: CaptureStatus, json_path: str
         click.echo(json.dumps(summary))
     else:
         click.echo(
-            f"{path}: {session.received} bytes, {session.messages} messages in {took_s:.1f} s, "
+            f"{path}: {session.received} bytes, "
+            f"{counted(session.messages, 'message')} in {took_s:.1f} s, "
             f"ended by {session.reason}"
         )
         if json_path:

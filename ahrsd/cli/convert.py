@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.json_output import refuse_unwritable
+from ahrsd.cli.output_files import refuse_unwritable
 from ahrsd.cli.progress import byte_progress
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.counting import counted

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.json_output import refuse_unwritable, write_json
+from ahrsd.cli.output_files import refuse_unwritable, write_json
 from ahrsd.cli.progress import byte_progress
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.config.loading import Config, load_config
+from ahrsd.errors import AhrsdError
 
 if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap
@@ -66,3 +67,5 @@ def command(
     if json_path != "-":
         for line in summary_lines(done.core, done.recording.name, done.warnings):
             click.echo(line)
+    if viewer is not None and (fault := viewer.counters.last_fault):
+        raise AhrsdError(f"{rerun_path}: is not whole: {fault}")

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import gzip
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from ahrsd.cli.json_output import refuse_unwritable, write_json
+from ahrsd.cli.output_files import refuse_unwritable, write_json
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, AhrsdError
 
 if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap
-    from ahrsd.samples import Array
     from ahrsd.simulation import Experiment
     from ahrsd.simulation.scenarios import Disturbances
 
-_STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
 _MG, _MRAD = 1e-3, 1e-3
 _RECORDED = "recorded"
 _MOST_SAMPLES = 1e7
@@ -101,15 +97,14 @@ class _Options:
 
 def _simulate_scenario(wanted: _Options) -> None:
     """Write a scenario's experiment, its effects in it, and its truth beside it."""
+    from ahrsd.offline.simulate import with_effects, write_experiment
     from ahrsd.simulation.tabular import truth_json
 
     experiment, made_from = _experiment(wanted)
     truth: dict[str, object] = {}
     if wanted.effects:
-        from ahrsd.cli.simulate_effects import with_effects
-
         experiment, truth["effects"] = with_effects(experiment, wanted.effects, wanted.seed)
-    _write_experiment(wanted.output, experiment)
+    write_experiment(wanted.output, experiment)
     write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
     count, name = len(experiment), experiment.name
     click.echo(f"{wanted.output}: {counted(count, 'sample')} of {name}; truth beside it")
@@ -174,10 +169,10 @@ def _recorded(path: Path, wanted: _Options, disturbances: Disturbances) -> Exper
 
 def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None:
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
-    from ahrsd.cli.simulate_effects import along
     from ahrsd.diagnosis.injection import terms_json
     from ahrsd.offline.diagnose import load_model
-    from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table
+    from ahrsd.offline.simulate import along, write_columns
+    from ahrsd.recording.table import TABLE_SUFFIXES, is_table
 
     output, seed = wanted.output, wanted.seed
     if not is_table(output):
@@ -186,7 +181,7 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     columns, notes = along(model, recording, seed, wanted.columns)
     for note in notes:
         click.echo(f"{recording}: {note}", err=True)
-    _write_columns(output, columns)
+    write_columns(output, columns)
     truth = {
         "schema": "ahrsd.truth/1",
         "name": f"{model_path.name} along {recording.name}, seed {seed}",
@@ -200,34 +195,3 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     click.echo(
         f"{output}: {counted(len(columns['time_s']), 'sample')} of {truth['name']}; truth beside it"
     )
-
-
-def _write_experiment(path: Path, experiment: Experiment) -> None:
-    from ahrsd.recording.table_writer import TABLE_SUFFIXES, is_table
-    from ahrsd.simulation.tabular import columns, sentences
-
-    further = experiment.samples.covariates
-    if is_table(path):
-        _write_columns(path, {**columns(experiment), **further})
-        return
-    if not path.name.endswith(_STREAM_SUFFIXES):
-        known = ", ".join((*TABLE_SUFFIXES, *_STREAM_SUFFIXES))
-        raise AhrsdError(f"{path}: unknown kind of file; the name must end in one of {known}")
-    if further:
-        raise AhrsdError(
-            f"{path}: a byte stream has no place for {', '.join(further)}; write a table"
-        )
-    content = b"".join(sentences(experiment))
-    try:
-        path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
-    except OSError as error:
-        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def _write_columns(path: Path, columns: Mapping[str, Array]) -> None:
-    from ahrsd.recording.table_writer import write_table
-
-    try:
-        write_table(path, columns)
-    except OSError as error:
-        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error

@@ -13,7 +13,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from ahrsd.cli.running import DaemonPlace, place_options
+from ahrsd.cli.running_daemon import DaemonPlace, place_options
 from ahrsd.counting import counted
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import line

@@ -16,7 +16,7 @@ from ahrsd.evidence.collector import EvidenceCollector
 from ahrsd.evidence.segments import Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
-from ahrsd.monitoring.online import Step, StepDetector
+from ahrsd.monitoring.step_detector import Step, StepDetector
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.world_field import WorldField
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.calibration import Estimate
+from ahrsd.counting import counted
 from ahrsd.inputs import EarlierRun, EarlierSamples, WallClock
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.clocks import Stamp, plausible, same_boot_s
@@ -131,7 +132,7 @@ class WarmStart:
         self._waits = ""
         age_s = (self._now(present.host_s).boot_s or 0.0) - (run.boot_s or 0.0)
         minutes = f"{age_s / 60:.1f}"
-        self._used = f"{self._rows} samples up to {minutes} min old, from {run.source}"
+        self._used = f"{counted(self._rows, 'sample')} up to {minutes} min old, from {run.source}"
         newest_s = float(self._blocks[-1].time_s[-1])
         shift_s = 0.0 if newest_s < first_s else first_s - age_s - newest_s - 1.0
         return [replace(b, time_s=b.time_s + shift_s) for b in self._blocks], (

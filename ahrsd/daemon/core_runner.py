@@ -77,7 +77,8 @@ class FoldedLog:
 
     def _end(self, key: tuple[int, str], value: tuple[float, int]) -> None:
         if value[1]:
-            self.write(key[0], f"{key[1]} ({value[1]} more times)")
+            again = "once more" if value[1] == 1 else f"{value[1]} more times"
+            self.write(key[0], f"{key[1]} ({again})")
 
 
 @dataclass(slots=True)

@@ -371,6 +371,8 @@ class Daemon:
 
     def _open(self) -> None:
         self._link.open(may_query=self._may_query)
+        if self._waiting:  # it is back: what it says now is news, however short ago it said it
+            self.shell.folded.finish()
         self._messages_before = self._messages
         self._watch.link_opened(time.monotonic())
         path, now = self._link.path, self.clock.now_ns()

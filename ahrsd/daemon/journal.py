@@ -35,6 +35,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from ahrsd.counting import counted
 from ahrsd.errors import JournalError
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_command
 from drivers.vn100.sentences import encode
@@ -294,7 +295,7 @@ def _check_receipt(path: Path, lines: list[bytes]) -> None:
             f"written to the device; look at {path.name}, then remove the receipt"
         ) from error
     if not known:
-        found = f"has {len(lines)} records" if lines else "is empty or gone"
+        found = f"has {counted(len(lines), 'record')}" if lines else "is empty or gone"
         raise JournalError(
             f"{path}: the journal {found}, but its record {seq} ({kind}) was acknowledged: records "
             "were lost, and what the device holds may be on trial; nothing will be written to it; "

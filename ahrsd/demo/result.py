@@ -1,22 +1,32 @@
-"""What the demo achieved, judged by the truth that was hidden from the daemon."""
+"""What the demo achieved, judged by the truth that was hidden from the daemon, and its report."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.report import KeyFigure
+from ahrsd.core.core import Core
+from ahrsd.demo.scene import DemoScene, live_samples
+from ahrsd.heading import tilt_compensated_heading, wrapped
+from ahrsd.report import EventCollector, HeadingError, KeyFigure, write_report
+from ahrsd.report.calibration_json import calibration_json
+from ahrsd.report.summary import heading_errors, serial_of
 from ahrsd.samples import Array
+from ahrsd.writeback.states import State
 from drivers.vn100.emulator.physics import EmulatedTruth
+from drivers.vn100.registers import same
 
 LIMIT_DEG: Final = 0.5
 LIMIT_BIAS_RAD_S: Final = 3e-4
 LIMIT_SIGMAS: Final = 3.0
 _BEFORE_DEG: Final = 10.0  # a smaller error before would not prove much
+MAG, GYRO = 23, 84  # registers
 _AXES = "xyz"
 
 
@@ -166,3 +176,88 @@ def _axes(name: str, unit: str, true: Array, found: Array, sigma: Array, limit: 
         (f"{name} {axis} [{unit}]", t * 1e3, f * 1e3, s * 1e3, limit)
         for axis, t, f, s in zip(_AXES, true, found, sigma, strict=True)
     ]
+
+
+def conclude(
+    truth: EmulatedTruth, registers: dict[int, tuple[float, ...]], scene: DemoScene, core: Core
+) -> DemoResult:
+    """Judge by the truth."""
+    sent = scene.proposed
+    exact = bool(sent) and all(same(n, sent[n], registers[n]) for n in sent)
+    present = Affine.identity()  # the emulated device comes from the factory
+    written = Affine.from_register(registers[MAG])
+    true = Affine(np.asarray(np.linalg.inv(truth.soft_iron), float), truth.hard_iron_gauss)
+    heading, before, after = _live_headings(scene, true, present, written)
+    return DemoResult(
+        truth=truth,
+        present=present,
+        written=written,
+        written_gyro=Affine.from_register(registers[GYRO]),
+        read_back_exact=exact,
+        estimate=scene.approved or scene.estimate,
+        state=scene.state,
+        goal=State.CONFIRMED.value,
+        decision_sha256=core.decisions.sha256,
+        live_heading_deg=heading,
+        live_before_deg=before,
+        live_after_deg=after,
+    )
+
+
+def _live_headings(
+    scene: DemoScene, true: Affine, old: Affine, new: Affine
+) -> tuple[Array, Array, Array]:
+    """Heading, error before and error after (deg) of the samples since the write.
+
+    All three corrections see the same samples, so sensor noise cancels in the differences.
+    """
+    raw, accel = live_samples(scene)
+    heading = tilt_compensated_heading(true.apply(raw), accel)
+    errors = [
+        np.degrees(wrapped(tilt_compensated_heading(c.apply(raw), accel) - heading))
+        for c in (old, new)
+    ]
+    return np.degrees(heading), errors[0], errors[1]
+
+
+def write_files(
+    directory: Path, seed: int, result: DemoResult, scene: DemoScene, core: Core
+) -> None:
+    """calibration.json and report.html; the other files are there already."""
+    body = calibration_json(
+        "capture.mcap",
+        result.estimate,
+        scene.in_force or core.registers,
+        heading=heading_errors(core),
+        warnings=list(core.stream.warnings),
+        serial=serial_of(core),
+    )
+    (directory / "calibration.json").write_text(json.dumps(body, indent=1) + "\n")
+    _report(directory / "report.html", seed, result, scene.collector)
+
+
+def _report(path: Path, seed: int, result: DemoResult, collector: EventCollector) -> None:
+    truth = result.truth
+    heading = HeadingError(
+        result.live_heading_deg,
+        result.live_before_deg,
+        result.live_after_deg,
+        "Live samples after the new registers were written: the approved estimate has not seen "
+        "them. The error is against the emulator's hidden truth.",
+        LIMIT_DEG,
+    )
+    report = collector.report(
+        "ahrsd demo",
+        {
+            "hard_iron_gauss": truth.hard_iron_gauss,
+            "soft_iron": truth.soft_iron,
+            "gyro_bias_rad_s": truth.gyro_bias_rad_s,
+        },
+        verdict=verdict(result),
+        good=result.good,
+        summary=figures(result),
+        seed=seed,
+        command=f"ahrsd demo --output {path.parent.name} --seed {seed}",
+        heading=heading if len(result.live_heading_deg) else None,
+    )
+    write_report(path, report)

@@ -7,13 +7,12 @@ back once the registers are saved. Neither knows the truth.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.daemon.daemon import Daemon
 from ahrsd.events import (
     Estimated,
     Event,
@@ -30,6 +29,7 @@ from ahrsd.report import EventCollector
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.report.run_time import RunTime
 from ahrsd.samples import Array, SampleBlock
+from ahrsd.writeback.composition import Proposal
 from ahrsd.writeback.states import State
 
 _SAY_EVERY_S = 60.0
@@ -42,15 +42,21 @@ _HOPELESS = frozenset({State.ROLLED_BACK, State.FAULT, State.LOCKED, State.FLASH
 
 @dataclass(slots=True)
 class DemoScene:
-    """Listens to the core's events; `daemon` and `power_cycle` are set before it begins.
+    """Listens to the core's events; what it does to the daemon and the device is set before.
 
     seconds: device time at most;  say: takes a line;  live: samples since the write
+    in_force: what the device held when the candidate was approved
+    stop, operate: of the daemon;  candidate: what waits for an operator;  registers: in force;
+    power_cycle: the device's
     """
 
     seconds: float
     say: Callable[[str], None]
+    stop: Callable[[str], None] = lambda reason: None
+    operate: Callable[[str, str], None] = lambda verb, text: None
+    candidate: Callable[[], Proposal | None] = lambda: None
+    registers: Callable[[], Mapping[int, tuple[float | int | str, ...]]] = dict
     power_cycle: Callable[[], None] = lambda: None
-    daemon: Daemon | None = None
     collector: EventCollector = field(default_factory=EventCollector)
     clock: RunTime = field(default_factory=RunTime)
     state: str = State.RECONCILING.value
@@ -58,6 +64,7 @@ class DemoScene:
     estimate: Estimate | None = None
     approved: Estimate | None = None
     proposed: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
+    in_force: dict[int, tuple[float | int | str, ...]] = field(default_factory=dict)
     live: list[tuple[Array, Array]] = field(default_factory=list)
     shown: set[int] = field(default_factory=set)
     written: bool = False
@@ -131,15 +138,15 @@ class DemoScene:
         self.written = self.written or state == State.TRIAL
 
     def _approve(self) -> None:
-        assert self.daemon is not None
-        proposal = self.daemon.shell.core.writeback.proposal
+        proposal = self.candidate()
         if proposal is None:
             return
         self.approved, self.proposed = self.estimate, dict(proposal.new)
+        self.in_force = dict(self.registers())
         self._line("", f"the operator approves candidate {proposal.id}, which is to send:")
         for line in proposal.lines:
             self.say(" " * 27 + line)
-        self.daemon.operate("approve", proposal.id)
+        self.operate("approve", proposal.id)
 
     def _progress(self) -> None:
         if self.passed_s - self.said_s < _SAY_EVERY_S or self.estimate is None:
@@ -160,8 +167,7 @@ class DemoScene:
         self.say(f"{at_s:8.1f} s  {state:15}{text}")
 
     def _end(self, reason: str) -> None:
-        assert self.daemon is not None
-        self.daemon.stop(reason)
+        self.stop(reason)
 
 
 def live_samples(scene: DemoScene, every: int = 5) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.counting import counted
 from ahrsd.diagnosis.coarse import noise_of
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact, spans_of
@@ -54,7 +55,7 @@ def clipping(track: Track) -> list[Fact]:
         sensor = "magnetometer" if unit == "gauss" else "gyro"
         words = (
             f"the {sensor} stands at its limit of {limit:.4g} {unit} in "
-            f"{int(np.count_nonzero(rows))} samples ({', '.join(axes)})"
+            f"{counted(int(np.count_nonzero(rows)), 'sample')} ({', '.join(axes)})"
         )
         out.append(
             Fact(

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.counting import counted
 from ahrsd.diagnosis.coarse import noise_of
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.effects.series import runs
@@ -66,7 +67,7 @@ def possible(track: Track) -> tuple[Track, tuple[str, ...]]:
     far = size > _FAR * usual
     if far.any():
         track = replace(track, mag_b_gauss=np.where(far[:, None], np.nan, track.mag_b_gauss))
-        notes.append(_left_out("readings of the magnetometer", far, track, f"{_FAR:g} fields"))
+        notes.append(_left_out("reading", "of the magnetometer ", far, track, f"{_FAR:g} fields"))
     rate = np.max(np.abs(track.gyro_b_rad_s), axis=1)
     limit = max(_FAR_RATE * float(np.quantile(rate, 0.999)), _QUICK)
     fast = rate > limit
@@ -74,16 +75,14 @@ def possible(track: Track) -> tuple[Track, tuple[str, ...]]:
         dt_s = np.where(fast, np.nan, track.dt_s)
         gyro = np.where(fast[:, None], 0.0, track.gyro_b_rad_s)
         track = replace(track, gyro_b_rad_s=gyro, dt_s=dt_s, runs=tuple(runs(dt_s)))
-        notes.append(_left_out("rates", fast, track, f"{limit:.3g} rad/s"))
+        notes.append(_left_out("rate", "", fast, track, f"{limit:.3g} rad/s"))
     return track, tuple(notes)
 
 
-def _left_out(what: str, rows: NDArray[np.bool], track: Track, beyond: str) -> str:
+def _left_out(what: str, of: str, rows: NDArray[np.bool], track: Track, beyond: str) -> str:
     first = float(track.time_s[int(np.argmax(rows))])
-    return (
-        f"{np.count_nonzero(rows)} {what} beyond {beyond}, first at {first:.1f} s: "
-        "no sensor gives them, they are left out"
-    )
+    number = counted(int(np.count_nonzero(rows)), what)
+    return f"{number} {of}beyond {beyond}, first at {first:.1f} s: no sensor gives that, left out"
 
 
 def dead_axes(track: Track) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from ahrsd.counting import counted
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.innovation import Filtered, run_filter
@@ -161,8 +162,8 @@ def _fact(track: Track, turns: Turns, setting: Mapping[str, float]) -> Fact:
     turned = np.asarray(1.0 + turns.lost + missed, np.float64)
     times = tuple((float(track.time_s[k - 1]), float(track.time_s[k])) for k in rows)
     words = (
-        f"at {len(rows)} samples the field is ahead by whole steps of the turn: samples are "
-        "missing that the time stamps do not show"
+        f"at {counted(len(rows), 'sample')} the field is ahead by whole steps of the "
+        "turn: samples are missing that the time stamps do not show"
     )
     if UNSEEN in setting:
         words += "; most are known by all jumps together, and not one by one"

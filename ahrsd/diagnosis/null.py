@@ -104,7 +104,7 @@ def unusable(track: Track) -> str | None:
         return "the magnetometer has no readings: nothing can be said about the field"
     steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
     if np.count_nonzero(steps) < _FEWEST:
-        return f"{np.count_nonzero(steps)} samples follow another one, {_FEWEST} are needed"
+        return f"samples that follow another one: {np.count_nonzero(steps)}, {_FEWEST} are needed"
     return None
 
 

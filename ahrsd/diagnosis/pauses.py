@@ -37,9 +37,9 @@ def without_jumps(track: Track) -> tuple[Track, tuple[str, ...]]:
     moved[starts[jumps]] = LEFT_S - breaks_s[jumps]
     first = int(np.argmax(jumps))
     others = f" (and {np.count_nonzero(jumps) - 1} more)" if np.count_nonzero(jumps) > 1 else ""
+    at_s = float(track.time_s[starts[first] - 1])
     words = (
-        f"the clock jumps by {breaks_s[first]:+.6g} s behind {track.time_s[starts[first] - 1]:.6g} "
-        f"s{others}: taken as a break of {LEFT_S:g} s; times behind it are told as if no more had "
-        "passed"
+        f"the clock jumps by {breaks_s[first]:+.6g} s behind {at_s:.13g} s{others}: "
+        f"taken as a break of {LEFT_S:g} s; times behind it are told as if no more had passed"
     )
     return replace(track, time_s=track.time_s + np.cumsum(moved)), (words,)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.counting import counted
 from ahrsd.diagnosis.clipping import step_of
 from ahrsd.diagnosis.coarse import noise_of
 from ahrsd.diagnosis.diagnosis import Value, Where
@@ -160,7 +161,7 @@ def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
     return [
         Fact(
             "dropped_samples",
-            f"{count} samples repeat the one before, gyro and magnetometer: they came twice",
+            f"{counted(count, 'sample')} as the one before, gyro and magnetometer: they came twice",
             Where(times, _AXES, "link"),
             0.95,
             (Value("part", share, float(np.sqrt(share / len(track))), "1"),),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.track import Track
@@ -38,7 +39,9 @@ def _backwards(track: Track) -> list[Fact]:
     if not len(wrong):
         return []
     times = tuple((float(track.time_s[k]), float(track.time_s[k + 1])) for k in wrong[:50])
-    words = f"time does not increase at {len(wrong)} samples, first at row {wrong[0] + 1}"
+    words = (
+        f"time does not increase at {counted(len(wrong), 'sample')}, first at row {wrong[0] + 1}"
+    )
     value = float(np.max(np.abs(steps[wrong])))
     parameters = (Value("jitter", value, 0.0, "s"),)
     return [Fact("timestamp_jitter", words, Where(times, (), "link"), 0.9, parameters, stops=True)]
@@ -65,7 +68,7 @@ def _missing(track: Track) -> list[Fact]:
         (),
         "link",
     )
-    words = f"{lost} samples are missing at {int(np.count_nonzero(long))} places"
+    words = f"missing: {counted(lost, 'sample')} at {counted(int(np.count_nonzero(long)), 'place')}"
     deviation = float(np.sqrt(share * (1 - share) / len(track)))
     parameters = (Value("part", share, deviation, "1"),)
     return [Fact("dropped_samples", words, where, 0.99, parameters)]

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
+from ahrsd.counting import counted
 from ahrsd.estimator import chain
 from ahrsd.estimator.chain import Noise
 from ahrsd.samples import Array
@@ -74,7 +75,7 @@ class Epoch:
         """
         count = len(dt_s)
         if count < _LEAST_ROWS:
-            raise ValueError(f"{count} readings: an epoch has at least {_LEAST_ROWS}")
+            raise ValueError(f"{counted(count, 'reading')}: an epoch has at least {_LEAST_ROWS}")
         for name, values, used in (
             ("field_b_gauss", field_b_gauss, 0),
             ("gyro_b_rad_s", gyro_b_rad_s, 1),

@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from ahrsd.baselines.data import field_spread
+from ahrsd.counting import counted
 from ahrsd.evaluation import dead_reckoning
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.heading import FOLDS, HeadingFigures, compare
@@ -201,8 +202,9 @@ def _reckoned(
     gaps = track.time_s[list(track.starts[1:])] - track.time_s[[k - 1 for k in track.starts[1:]]]
     if np.any(gaps > _LONG_GAP_S):
         said.append(
-            f"{np.count_nonzero(gaps > _LONG_GAP_S)} gaps of more than {_LONG_GAP_S:g} s are in "
-            "the dead reckoning, as straight lines"
+            f"in the dead reckoning, as straight lines: "
+            f"{counted(int(np.count_nonzero(gaps > _LONG_GAP_S)), 'gap')} of more than "
+            f"{_LONG_GAP_S:g} s"
         )
     figures = _both(
         fields, lambda b: dead_reckoning.reckon(track, b, up_b, velocity, inside, way_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
+from ahrsd.counting import counted
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.heading import HeadingFigures, rms_difference
 from ahrsd.evaluation.judging import Evaluation, FieldFigures, HeadingJudged, Reckoned
@@ -102,7 +103,7 @@ def evaluation_lines(found: Evaluation) -> list[str]:
     calibration, track = found.calibration, found.track
     duration_s = track.time_s[-1] - track.time_s[0]
     lines = [
-        f"{found.recording}: {len(track)} samples, {duration_s:.0f} s; calibration "
+        f"{found.recording}: {counted(len(track), 'sample')}, {duration_s:.0f} s; calibration "
         f"{calibration.method} of {calibration.recording or calibration.source}",
         f"{'':44}{'before':>10}{'after':>10}",
     ]
@@ -143,7 +144,7 @@ def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) ->
     """One row per calibration, least heading error first; without: method to why it has none."""
     first = found[0]
     duration_s = first.track.time_s[-1] - first.track.time_s[0]
-    lines = [f"{first.recording}: {len(first.track)} samples, {duration_s:.0f} s"]
+    lines = [f"{first.recording}: {counted(len(first.track), 'sample')}, {duration_s:.0f} s"]
     if first.headings:
         against = first.headings[0]
         lines.append(

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.calibration import Affine
+from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError
 from ahrsd.samples import Array, SampleBlock
 
@@ -72,7 +73,9 @@ def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
     kept = [(block, present) for block, present in pieces if len(block)]
     blocks = [block for block, _ in kept]
     if (count := sum(map(len, blocks))) < MINIMUM_SAMPLES:
-        raise EvaluationError(f"{count} samples, {MINIMUM_SAMPLES} are needed: record longer")
+        raise EvaluationError(
+            f"{counted(count, 'sample')}, {MINIMUM_SAMPLES} are needed: record longer"
+        )
     time_s = np.concatenate([block.time_s for block in blocks])
     if not np.all(np.diff(time_s) > 0):
         raise EvaluationError("the time of the recording goes backwards: split it at that place")

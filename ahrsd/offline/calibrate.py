@@ -17,16 +17,12 @@ from ahrsd.calibration import Estimate
 from ahrsd.config.loading import Config
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.core import Core
-from ahrsd.diagnosis.correction import without
-from ahrsd.diagnosis.facts import matters
-from ahrsd.diagnosis.hygiene import hygiene
 from ahrsd.diagnosis.model_file import RepairedModel
-from ahrsd.diagnosis.roles import prepared
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.model_checks import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
-from ahrsd.offline.diagnose import checked, track_of
 from ahrsd.offline.replay import Replayed, replay
+from ahrsd.offline.track import faults, without_terms
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS
 from ahrsd.report.calibration_json import calibration_json, why_not_converged
@@ -62,15 +58,20 @@ class BatchResult:
         """Warnings of recording and stream."""
         turned = self.misalignment
         return [
-            *(f"{words}: put this right and calibrate again" for words in self.wrong),
+            *(f"{words}: put this right and calibrate again" for words in self._wrong_besides),
             *warnings_of(self.core, self.warnings),
             *(self.estimate.warnings if self.estimate is not None else ()),
             *([] if turned is None or not turned.significant else [_misalignment_text(turned)]),
         ]
 
+    @property
+    def _wrong_besides(self) -> tuple[str, ...]:
+        """What is wrong and is not told already as the reason why it has not converged."""
+        return self.wrong if self.estimate is None or self.converged else ()
+
     def reasons(self) -> list[str]:
         """Why it has not converged; empty where it has."""
-        return why_not_converged(self.estimate)
+        return why_not_converged(self.estimate, self.wrong)
 
     def json(self, method: str) -> dict[str, object]:
         """The contract's calibration.json."""
@@ -83,6 +84,7 @@ class BatchResult:
             gyro_is_raw=not self.core.stream.compensated_gyro,
             warnings=self.all_warnings(),
             serial=serial_of(self.core),
+            wrong=self.wrong,
         )
 
     def write_report(self, path: Path) -> None:
@@ -132,53 +134,23 @@ def calibrate(
     )
     left: tuple[str, ...] = ()
     if model is not None:
-        seen, left = _without_terms(path, seen, model)
+        seen, left = without_terms(path, seen, model)
     calibrator = _of_everything(done, seen, again=model is not None)
     estimate = calibrator.finish()
     if estimate is not None:
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
     turned = calibrator.estimator.misalignment()
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
-    facts = hygiene(track_of(blocks)) if blocks else ()
-    wrong = tuple(fact.words for fact in facts if fact.stops)
+    wrong, odd = faults(blocks)
     warnings = (
         *done.warnings,
         *(f"{name} is in the model and cannot be taken out" for name in left),
-        *(fact.words for fact in facts if not fact.stops and matters(fact)),
+        *odd,
         *([] if calibrator.step is None else [calibrator.step.words]),
     )
     return BatchResult(
-        done.recording.name, done.core, estimate, tuple(seen), warnings, turned, wrong
+        done.recording.name, done.core, estimate, tuple(seen), warnings, turned, tuple(wrong)
     )
-
-
-def _without_terms(
-    path: Path, seen: list[Event], model: RepairedModel
-) -> tuple[list[Event], tuple[str, ...]]:
-    """The events, their samples without what the model's terms add; and what stays in them."""
-    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
-    if not blocks:
-        return seen, ()
-    track, refused = prepared(checked(track_of(blocks))[0])
-    try:
-        track, left = without(track, model.calibration, model.terms)
-    except ValueError as error:
-        raise AhrsdError("; ".join([f"{path}: {error}", *refused])) from None
-    rows = iter(np.cumsum([0, *map(len, blocks)]).tolist())
-    begin, events = next(rows), []
-    for event in seen:
-        if isinstance(event, SamplesSeen):
-            part, begin = slice(begin, end := next(rows)), end
-            event = replace(
-                event,
-                block=replace(
-                    event.block,
-                    raw_b_gauss=track.mag_b_gauss[part],
-                    gyro_b_rad_s=track.gyro_b_rad_s[part],
-                ),
-            )
-        events.append(event)
-    return events, left
 
 
 def _misalignment_text(turned: Misalignment) -> str:

@@ -15,19 +15,18 @@ import numpy as np
 
 from ahrsd import __version__
 from ahrsd.config.loading import Config
-from ahrsd.diagnosis.frames import windows
-from ahrsd.diagnosis.hygiene import as_recorded
+from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.offline.diagnose import track_of
 from ahrsd.offline.replay import replay
+from ahrsd.offline.track import disagreements, track_of
 from ahrsd.recording.bytestream import read_chunks
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, TIME
 from ahrsd.recording.foreign.formats import format_of, ready
 from ahrsd.recording.foreign.sensors import Choice
 from ahrsd.recording.limits import TABLE_ROWS
 from ahrsd.recording.opening import Recording, RecordingKind, open_recording
-from ahrsd.recording.table_writer import write_table
+from ahrsd.recording.table import write_table
 from ahrsd.samples import Array, SampleBlock
 
 _UNITS = "time_s s, mag gauss, gyro rad/s, accel m/s^2 (specific force); others by their names"
@@ -59,7 +58,7 @@ def listed(path: Path) -> list[str]:
     lines = [f"{recording.name} is a {recording.kind.value}"]
     if recording.table is not None:
         rows = recording.table.rows
-        lines.append(f"{len(rows)} rows over {rows.time_s[-1] - rows.time_s[0]:.1f} s")
+        lines.append(f"{counted(len(rows), 'row')} over {rows.time_s[-1] - rows.time_s[0]:.1f} s")
         lines += [f"column {name}" for name in (TIME, *MAG, *GYRO, *sorted(rows.covariates))]
     return lines
 
@@ -78,9 +77,9 @@ def converted(
         blocks, notes = _sent(recording, rate_hz, progress)
     if not blocks:
         raise RecordingError(path, "holds no samples", "record again")
-    track = track_of(blocks)
-    agreement = [fact.words for fact in as_recorded(track)]
-    agree = "field and gyro agree" if windows(track) else "not compared: it turns too little"
+    found = disagreements(track_of(blocks))
+    agree = "not compared: it turns too little" if found is None else "field and gyro agree"
+    agreement = found or []
     facts = {
         "format": f"{recording.kind.value} of ahrsd",
         "frame": "the sensor's own axes, as recorded",

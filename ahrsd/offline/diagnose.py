@@ -10,34 +10,27 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.diagnosis.aligned import align, differing
-from ahrsd.diagnosis.dead import dead_axes, possible
 from ahrsd.diagnosis.diagnosis import Diagnosis
-from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
 from ahrsd.diagnosis.logged import diagnose_logged
 from ahrsd.diagnosis.model_file import RepairedModel, from_text
-from ahrsd.diagnosis.pauses import without_jumps
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
+from ahrsd.offline.track import checked, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS
-from ahrsd.recording.opening import RecordingKind, open_recording
-from ahrsd.recording.table import read_table
-from ahrsd.samples import Array, SampleBlock
+from ahrsd.recording.opening import open_recording
+from ahrsd.samples import SampleBlock
 
 SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
 FEWEST_ROWS = 100
 RATE_AGREES = 0.05  # of a spec and the stamps' median step: clocks are closer, units are not
-_FEW_MISSING = 0.02  # of the rows, whose acceleration is filled from their neighbours
-_ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
 #: what a spec may say, the least and the most that is believable, and its unit
 _SPEC_KEYS = {
     "sigma_mag_gauss": (1e-7, 0.3, "gauss per sample"),
@@ -63,8 +56,7 @@ def load_track(
     """
     recording = open_recording(path, rate_hz, check_units=False, columns=columns)
     said_hz = None if spec is None else spec.rate_hz
-    if recording.kind is RecordingKind.TABLE:
-        table = recording.table or read_table(path, check_units=False, columns=columns)
+    if (table := recording.table) is not None:
         blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
     else:
         blocks, notes = _streamed(path, rate_hz or said_hz, progress)
@@ -72,42 +64,10 @@ def load_track(
     if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
         raise RecordingError(
             path,
-            f"is too short to diagnose: {len(track)} samples in {track.duration_s:.1f} s",
+            f"is too short to diagnose (samples: {len(track)}, {track.duration_s:.1f} s)",
             f"record at least {SHORTEST_S:.0f} s and {FEWEST_ROWS} samples, better some minutes",
         )
     return track, [*notes, *said, *_of_its_rate(track, said_hz)]
-
-
-def checked(track: Track) -> tuple[Track, list[str]]:
-    """The track without what no sensor gives, and one line for each such thing."""
-    track, jumped = without_jumps(track)
-    track, notes = possible(track)
-    accel, said = _acceleration(track)
-    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
-
-
-def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
-    """(N, 3) m/s^2, short holes filled; None where it cannot be used; one line on what was done."""
-    accel = track.accel_b_m_s2
-    if accel is None:
-        return None, []
-    known = np.isfinite(accel).all(axis=1)
-    missing = int(np.count_nonzero(~known))
-    if missing == len(track):
-        return None, []
-    if missing > _FEW_MISSING * len(track):
-        return None, [f"the acceleration was left out: {missing} of {len(track)} rows have none"]
-    notes = [f"no acceleration in {counted(missing, 'row')}: filled"] if missing else []
-    if missing:
-        time_s = track.time_s
-        accel = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])
-    size = float(np.median(np.linalg.norm(accel, axis=1)))
-    if size == 0.0:
-        return None, ["the acceleration was left out: it is 0 throughout, not even gravity"]
-    for unit, factor in _ACCEL_UNITS:
-        if 0.7 * GRAVITY_M_S2 < size * factor < 1.4 * GRAVITY_M_S2:
-            return accel * factor, [*notes, f"the acceleration was in {unit}: taken as m/s^2"]
-    return accel, notes
 
 
 def _of_its_rate(track: Track, said_hz: float | None) -> list[str]:
@@ -139,37 +99,6 @@ def _streamed(
     )
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     return blocks, [*done.warnings, *done.core.stream.warnings]
-
-
-def track_of(blocks: list[SampleBlock]) -> Track:
-    """Blocks in order as one track; only covariates that every block has are kept."""
-    names = set.intersection(*(set(block.covariates) for block in blocks)) if blocks else set()
-
-    def join(pick: Callable[[SampleBlock], Array]) -> Array:
-        return np.concatenate([pick(block) for block in blocks])
-
-    dt_s = join(lambda b: b.dt_s).copy()
-    row = 0
-    for block in blocks:
-        if block.gap_before:
-            dt_s[row] = np.nan
-        row += len(block)
-    dt_s[:1] = np.nan
-    starts = [*np.flatnonzero(np.isnan(dt_s)).tolist(), len(dt_s)]
-    accel = join(lambda b: b.accel_b_m_s2)
-    with_accel = bool(np.isfinite(accel).any())
-    return Track(
-        time_s=join(lambda b: b.time_s),
-        dt_s=dt_s,
-        mag_b_gauss=join(lambda b: b.raw_b_gauss),
-        gyro_b_rad_s=join(lambda b: b.gyro_b_rad_s),
-        accel_b_m_s2=accel if with_accel else None,
-        covariates={
-            name: np.concatenate([block.covariates[name] for block in blocks])
-            for name in sorted(names)
-        },
-        runs=tuple(slice(a, b) for a, b in pairwise(starts)),
-    )
 
 
 def load_spec(path: Path) -> tuple[Spec, list[str]]:

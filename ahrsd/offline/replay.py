@@ -20,12 +20,10 @@ from ahrsd.core.settings import BESIDE_KEY, CoreSettings
 from ahrsd.daemon.core_runner import Listener, Shell, Viewer
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
-from ahrsd.recording.bytestream import read_stream, unpacked_size
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
 from ahrsd.recording.opening import Recording, RecordingKind, open_recording
 from ahrsd.stream.assembler import NoSamplesError
-from ahrsd.stream.time_from_attitude import rate_of
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.deframer import Cause
@@ -78,7 +76,7 @@ def replay(
     shell = Shell(core, viewer=viewer, listeners=listeners or [])
     done = Replayed(core, recording, list(recording.notes))
     items = recording.inputs() if done.of_daemon else _registers_first(recording)
-    share = _share_of_file(recording)
+    share = recording.bytes_of_file()
     if (text := terms_text(config)) and not done.of_daemon:
         shell.feed(TermsKnown(0, text))
     for item in _paced(items, core, speed):
@@ -96,29 +94,6 @@ def replay(
     return done
 
 
-def _share_of_file(recording: Recording) -> Callable[[Input], int]:
-    """How many bytes of the file an input is: of what is packed as much as its part of the whole.
-
-    Of a capture the bytes that were received, as nobody knows what else is in the file.
-    """
-    scale = 1.0
-    on_disk = recording.path.stat().st_size
-    if recording.kind is RecordingKind.TABLE and recording.table is not None:
-        scale = on_disk / max(len(recording.table.rows), 1)
-    elif recording.kind is RecordingKind.BYTES:
-        scale = on_disk / max(unpacked_size(recording.path), 1)
-
-    def share(item: Input) -> int:
-        match item:
-            case Received(data=data):
-                return round(scale * len(data))
-            case Samples(block=block):
-                return round(scale * len(block))
-        return 0
-
-    return share
-
-
 def _settings(
     recording: Recording, config: Config, rate_hz: float | None, held_out: bool
 ) -> CoreSettings:
@@ -130,7 +105,7 @@ def _settings(
         return replace(core_settings(own), beside=BESIDE_KEY in recording.header)
     if recording.kind is not RecordingKind.BYTES:
         return core_settings(config, policy=_PASSIVE, held_out=held_out)
-    found = None if rate_hz is not None else rate_of(read_stream(recording.path))
+    found = None if rate_hz is not None else recording.told_rate()
     rate = rate_hz if found is None else found[0]
     settings = core_settings(config, stream_rate_hz=rate, policy=_PASSIVE, held_out=held_out)
     return settings if found is None else replace(settings, stream_rate_source=found[1])

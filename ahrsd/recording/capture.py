@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from ahrsd import __version__
+from ahrsd.counting import counted
 from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import Input, Received
 from ahrsd.recording import blocks, inputs_json
@@ -361,7 +362,7 @@ class CaptureReader:
                     continue
                 missing = 0 if expected is None else (entry.sequence - expected) % SEQUENCES
                 if missing:
-                    self.notes.append(f"{path.name}: {missing} records are missing")
+                    self.notes.append(f"{path.name}: missing: {counted(missing, 'record')}")
                 expected = (entry.sequence + 1) % SEQUENCES
                 yield entry
 

@@ -7,7 +7,7 @@ the core takes and ends in `Stop`, so that `replay` is `run` with another source
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -15,7 +15,14 @@ from pathlib import Path
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples, Stop
 from ahrsd.printable import printable
-from ahrsd.recording.bytestream import is_gzip, read_chunks, read_received, utf16_of
+from ahrsd.recording.bytestream import (
+    is_gzip,
+    read_chunks,
+    read_received,
+    read_stream,
+    unpacked_size,
+    utf16_of,
+)
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.foreign.formats import Format, format_of, ready
 from ahrsd.recording.foreign.recognised import recognised
@@ -75,6 +82,34 @@ class Recording:
         if self.kind is RecordingKind.CAPTURE:
             return self._capture_inputs()
         return _byte_inputs(self)
+
+    def bytes_of_file(self) -> Callable[[Input], int]:
+        """How many bytes of the file an input is: of what is packed its part of the whole.
+
+        Of a capture the bytes that were received, as nobody knows what else is in the file.
+        """
+        scale = 1.0
+        on_disk = self.path.stat().st_size
+        if self.kind is RecordingKind.TABLE and self.table is not None:
+            scale = on_disk / max(len(self.table.rows), 1)
+        elif self.kind is RecordingKind.BYTES:
+            scale = on_disk / max(unpacked_size(self.path), 1)
+
+        def share(item: Input) -> int:
+            match item:
+                case Received(data=data):
+                    return round(scale * len(data))
+                case Samples(block=block):
+                    return round(scale * len(block))
+            return 0
+
+        return share
+
+    def told_rate(self) -> tuple[float, str] | None:
+        """Rate in Hz that a byte stream itself tells, and by what; None: it tells none."""
+        from ahrsd.stream.time_from_attitude import rate_of
+
+        return rate_of(read_stream(self.path))
 
     def _capture_inputs(self) -> Iterator[Input]:
         from ahrsd.recording.capture import CaptureReader, Sent

@@ -1,4 +1,4 @@
-"""Tables of samples: CSV (plain or gzipped) and Parquet, checked before anything uses them.
+"""Tables of samples: CSV (plain or gzipped) and Parquet, written, and checked where they are read.
 
 Columns: time_s, mag_{x,y,z}_gauss, gyro_{x,y,z}_rad_s, optional accel_{x,y,z}_m_s2 (specific
 force); every other numeric column is a covariate and keeps its name, text columns are left out.
@@ -14,6 +14,7 @@ there is a gap.
 
 from __future__ import annotations
 
+import gzip
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ from typing import NoReturn
 
 import numpy as np
 import pyarrow
+import pyarrow.csv
+import pyarrow.parquet
 from numpy.typing import NDArray
 
 from ahrsd import so3
@@ -280,9 +283,10 @@ class _TableRows:
         if fitted is None:
             return time_s
         self.starts = fitted.starts
+        scatter_ms = float(f"{1e3 * fitted.scatter_s:.2g}")
         self.notes.append(
-            f"the time stamps are a host's, they scatter by {1e3 * fitted.scatter_s:.2g} ms about "
-            f"a regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
+            f"the time stamps are a host's, they scatter by {scatter_ms:g} ms about a "
+            f"regular clock of {1.0 / fitted.step_s:.4g} Hz: its times are used"
         )
         return fitted.time_s
 
@@ -462,7 +466,7 @@ def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_
         raise RecordingError(
             path,
             f"row {wrong[0] + first_row}, column {printable(source.column)}: empty, nan or "
-            f"infinite ({len(wrong)} rows in all)",
+            f"infinite ({counted(len(wrong), 'row')} in all)",
             "leave such rows out; a missing row is a gap, which is understood",
         )
     return values if factor == 1.0 else values * factor
@@ -574,7 +578,9 @@ def _covariates(table: pyarrow.Table, found: Resolved) -> tuple[dict[str, Array]
 
 def _check_length(path: Path, rows: int) -> None:
     if rows < MINIMUM_ROWS:
-        raise RecordingError(path, f"has {rows} rows, {MINIMUM_ROWS} are needed", "record longer")
+        raise RecordingError(
+            path, f"has {counted(rows, 'row')}, {MINIMUM_ROWS} are needed", "record longer"
+        )
 
 
 def _doubles(columns: list[Array]) -> NDArray[np.bool]:
@@ -602,7 +608,7 @@ def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
         raise RecordingError(
             path,
             f"row {numbers[row + 1]}, column time_s: time {word} "
-            f"({time_s[row]:g} to {time_s[row + 1]:g} s; {len(wrong)} such rows)",
+            f"({time_s[row]:g} to {time_s[row + 1]:g} s; {counted(len(wrong), 'such row')})",
             remedy,
         )
     median_s = float(np.median(step_s))
@@ -661,3 +667,32 @@ def _steps(time_s: Array, known: tuple[int, ...] = ()) -> tuple[Array, tuple[int
     gap[[row - 1 for row in known if row > 0]] = True
     dt_s = np.concatenate([[np.nan], np.where(gap, np.nan, step_s)])
     return dt_s, (0, *(np.flatnonzero(gap) + 1).tolist())
+
+
+TABLE_SUFFIXES = (".csv", ".csv.gz", ".parquet")
+
+
+def is_table(path: Path) -> bool:
+    """Whether the name asks for a table."""
+    return path.name.endswith(TABLE_SUFFIXES)
+
+
+def write_table(
+    path: Path, columns: Mapping[str, Array], facts: Mapping[str, str] | None = None
+) -> None:
+    """Write columns of equal length, every digit of them.  Raises OSError.
+
+    facts: for the metadata of a Parquet file. The gzip header carries no time, so the same columns
+    give the same bytes.
+    """
+    table = pyarrow.table(dict(columns))
+    if facts:
+        table = table.replace_schema_metadata(dict(facts))
+    if path.suffix == ".parquet":
+        pyarrow.parquet.write_table(table, path)
+        return
+    sink = pyarrow.BufferOutputStream()
+    sink.write((",".join(columns) + "\n").encode())  # the writer's own header would be quoted
+    pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(include_header=False))
+    content = sink.getvalue().to_pybytes()
+    path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)

@@ -191,7 +191,7 @@ def _drop_comments(text: _Text, notes: list[str]) -> None:
     body = bytes(text.data[text.at :]) if any(b"\n" + c in text.data for c in _COMMENTS) else b""
     if body and (count := len(_COMMENT_LINE.findall(body))):
         text.data, text.at = bytearray(_COMMENT_LINE.sub(b"", body)), 0
-        notes.append(f"{count} comment lines amid the rows were left out")
+        notes.append(f"left out amid the rows: {counted(count, 'comment line')}")
 
 
 def _drop_repeated_header(text: _Text, notes: list[str]) -> None:
@@ -205,7 +205,7 @@ def _drop_repeated_header(text: _Text, notes: list[str]) -> None:
     if len(kept) < len(lines):
         text.data, text.at = bytearray(b"\n".join(kept)), 0
         notes.append(
-            f"the line of names comes {len(lines) - len(kept)} times more amid the rows: left out"
+            f"left out amid the rows: {counted(len(lines) - len(kept), 'more line')} of names"
         )
 
 
@@ -256,7 +256,9 @@ def _parsed(path: Path, text: _Text, notes: list[str]) -> pyarrow.Table:
         row = (wrong[0].number or 1) + text.first_row - 1
         words = f"{wrong[0].actual_columns} cells where {wrong[0].expected_columns} are named"
         if count > max(_WRONG_FEW, _WRONG_SHARE * (table.num_rows + count)):
-            raise RecordingError(path, f"row {row} has {words} ({count} such rows)", "repair them")
+            raise RecordingError(
+                path, f"row {row} has {words} ({counted(count, 'such row')})", "repair them"
+            )
         notes.append(
             f"left out for another number of cells: {counted(count, 'row')}, first row {row}"
         )

@@ -1,17 +1,17 @@
 """A report for people: one HTML file with its pictures inside, readable on a phone and in print.
 
-`data` says what a report may contain, `collector` fills the part that follows from the core's
-events, `figures` draws (the only importer of matplotlib, loaded when a report is written), `page`
-puts it on a page.
+`contents` says what a report may contain and fills the part that follows from the core's events,
+`figures` draws (the only importer of matplotlib, loaded when a report is written), `page`
+puts it on a page, `template` renders the HTML in `templates/`.
 
     collector = EventCollector()
     for event in core_events: collector.add(event)
     write_report(path, collector.report("ahrsd demo", summary=..., heading=...))
 """
 
-from ahrsd.report.collector import EventCollector
-from ahrsd.report.data import (
+from ahrsd.report.contents import (
     EstimateHistory,
+    EventCollector,
     FieldClouds,
     FieldNorm,
     HeadingError,

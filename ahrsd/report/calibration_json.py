@@ -38,6 +38,7 @@ def calibration_json(
     heading: HeadingErrors | None = None,
     warnings: Sequence[str] = (),
     serial: int | None = None,
+    wrong: Sequence[str] = (),
 ) -> dict[str, object]:
     """The contract's `ahrsd.calibration/1`; `registers` are those in force, empty for unknown.
 
@@ -55,7 +56,7 @@ def calibration_json(
     if estimate is None:
         return base | _nothing(warnings)
     written, refusal = _registers(estimate, registers, gyro_is_raw)
-    said = [*warnings, *estimate.warnings, *refusal, *why_not_converged(estimate)]
+    said = [*warnings, *estimate.warnings, *refusal, *why_not_converged(estimate, wrong)]
     return (
         base
         | _found(estimate, heading or HeadingErrors())
@@ -108,16 +109,22 @@ def heading_words(sigma_deg: float) -> str:
     return f"known to {sigma_deg:.2f} deg (1 sigma, worst direction)"
 
 
-def why_not_converged(estimate: Estimate | None) -> list[str]:
-    """Reasons, one clause each; empty where it has converged."""
+def why_not_converged(estimate: Estimate | None, wrong: Sequence[str] = ()) -> list[str]:
+    """Reasons, one clause each; empty where it has converged.
+
+    wrong: what of the recording cannot be as it is; then that is why, whatever followed from it
+    """
     if estimate is None:
         return ["too few samples for an estimate"]
     if estimate.converged:
         return []
-    if wrong := estimate.gyro_misscaled:
+    if wrong:
+        return [f"not converged: {words}: put this right and calibrate again" for words in wrong]
+    if scale := estimate.gyro_misscaled:
         return [
-            f"not converged: the field turns {abs(wrong):.0%} {'more' if wrong > 0 else 'less'} "
-            "than the gyro says: the rate in Hz, the times of samples or the gyro's unit are wrong"
+            f"not converged: the field turns {abs(scale):.0%} {'more' if scale > 0 else 'less'} "
+            "than the gyro says: the rate in Hz, the times of samples, the gyro's unit or the axes "
+            "of one of the two sensors are wrong (`ahrsd diagnose` on the recording says which)"
         ]
     if (since_s := estimate.contradicted_s) is not None:
         return [

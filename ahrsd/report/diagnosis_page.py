@@ -1,15 +1,14 @@
-"""The report of a diagnosis: one HTML file, pictures inside, nothing loaded from elsewhere."""
+"""The report of a diagnosis: one HTML file with its pictures inside."""
 
 from __future__ import annotations
 
 from functools import partial
-from html import escape
 from pathlib import Path
 
 from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
 from ahrsd.diagnosis.shown import shown
 from ahrsd.diagnosis.spoken import headline, place, sensitivity, value_text, verdict
-from ahrsd.report.page import CSS, number, picture, section, table
+from ahrsd.report.template import Picture, number, picture, render
 
 _MG = 1e3
 #: what each picture is called, and what is said below it
@@ -69,36 +68,30 @@ _BY_FRAME = (
 
 def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
     """Write the page.  OSError where it cannot be written."""
-    title = f"Diagnosis of {found.recording}"
-    parts = [
-        f'<p class="verdict {"no" if found.mismatch else "yes"}">{escape(verdict(found))}</p>',
-        *(_finding(found, number_, one) for number_, one in enumerate(found.findings, start=1)),
-        _unexplained(found),
-        _pictures(found),
-        _sensitivity(found),
-        _checks(found),
-        _baseline(found),
-        _notes(found),
-        f'<p class="soft">Made by <code>{escape(command)}</code>.</p>',
-    ]
-    path.write_text(
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{CSS}</style></head>\n<body>\n"
-        f"<h1>{escape(title)}</h1>\n"
-        + "\n".join(part for part in parts if part)
-        + "\n</body></html>\n",
-        encoding="utf-8",
+    page = render(
+        "diagnosis.html",
+        title=f"Diagnosis of {found.recording}",
+        found=found,
+        verdict=verdict(found),
+        findings=[_finding(found, one) for one in found.findings],
+        unexplained=_unexplained(found),
+        how_real=_how_real(found),
+        pictures=_pictures(found),
+        sensitivity=sensitivity(found.sensitivity),
+        limits=_limits(found),
+        checks=[
+            (_STATISTICS.get(name, name.replace("_", " ")), check)
+            for name, check in found.posterior_predictive.items()
+        ],
+        baseline=_baseline(found),
+        command=command,
     )
+    path.write_text(page, encoding="utf-8")
 
 
-def _finding(found: Diagnosis, number_: int, one: Finding) -> str:
+def _finding(found: Diagnosis, one: Finding) -> dict[str, object]:
     held, cost = one.heldout, one.cost_if_left_out
-    rows = [
-        ("where", escape(place(one.where))),
-        ("size", "<br>".join(escape(value_text(value)) for value in one.parameters)),
-        ("left out", f"<code>{escape(one.equation)}</code>"),
-    ]
+    rows = []
     if cost is not None:
         off = (
             f"hard iron off by {number(cost.hard_iron_shift_gauss * _MG, 'mG')}, heading by "
@@ -113,46 +106,46 @@ def _finding(found: Diagnosis, number_: int, one: Finding) -> str:
         rows.append(("on data not fitted", gain))
     if one.alternatives:
         rest = ", ".join(f"{a.effect} ({a.confidence:.1%})" for a in one.alternatives)
-        rows.append(("or else", escape(rest)))
+        rows.append(("or else", rest))
     if one.separate_from:
-        rows.append(("to be sure", escape(one.separate_from)))
-    parts = [table(("", ""), [[escape(name), text] for name, text in rows])]
-    if found.drawn is not None and one.term is not None:
-        from ahrsd.report import diagnosis_figures as figures
-
-        added = found.drawn.contributions[one.term]
-        parts.append(
-            picture(
-                partial(figures.contribution, added),
-                f"{one.effect} over time",
-                "What it adds to the readings.",
-            )
-        )
-    return section(f"{number_}. {headline(one)}", *parts)
+        rows.append(("to be sure", one.separate_from))
+    return {
+        "headline": headline(one),
+        "where": place(one.where),
+        "sizes": [value_text(value) for value in one.parameters],
+        "equation": one.equation,
+        "rows": rows,
+        "picture": _contribution(found, one),
+    }
 
 
-def _unexplained(found: Diagnosis) -> str:
+def _contribution(found: Diagnosis, one: Finding) -> Picture | None:
+    if found.drawn is None or one.term is None:
+        return None
+    from ahrsd.report import diagnosis_figures as figures
+
+    added = found.drawn.contributions[one.term]
+    draw = partial(figures.contribution, added)
+    return picture(draw, f"{one.effect} over time", "What it adds to the readings.")
+
+
+def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     left = found.unexplained
     if not left.detected or left.where is None:
-        return ""
-    rows = [("where", escape(place(left.where)))]
+        return []
+    rows = [("where", place(left.where))]
     if left.size is not None:
-        rows.append(("size", escape(number(left.size, left.unit))))
+        rows.append(("size", number(left.size, left.unit)))
     if left.single_source_share is not None:
         rows.append(("one source", f"{left.single_source_share:.0%} of it has one direction"))
     rows += [
         (
             "moves with",
-            escape(f"{shown(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}"),
+            f"{shown(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}",
         )
         for s in left.follows
     ]
-    words = (
-        f"<p>Nothing in the library explains this. {_how_real(found)} A name would be a guess.</p>"
-    )
-    return section(
-        "Unknown, here", words, table(("", ""), [[escape(name), text] for name, text in rows])
-    )
+    return rows
 
 
 def _how_real(found: Diagnosis) -> str:
@@ -167,39 +160,26 @@ def _how_real(found: Diagnosis) -> str:
     return "It is real: it has a place and a size."
 
 
-def _sensitivity(found: Diagnosis) -> str:
-    """One row an effect: the range of its parameters' limits; those that are invisible last."""
-    if not found.sensitivity:
-        return ""
+def _limits(found: Diagnosis) -> list[dict[str, object]]:
+    """One row an effect: the limits of its parameters; those that are invisible last."""
     seen: dict[str, list[str]] = {}
     hidden: dict[str, list[str]] = {}
     for limit in found.sensitivity:
         if limit.smallest is None:
             hidden.setdefault(limit.effect, []).append(limit.parameter)
         else:
-            shown = f"{limit.parameter} {number(limit.smallest, limit.unit)}"
-            seen.setdefault(limit.effect, []).append(shown)
-    rows = [[escape(effect), escape(", ".join(texts))] for effect, texts in seen.items()]
-    rows += [
-        [
-            escape(effect),
-            f'<span class="soft">cannot be seen here: {escape(", ".join(names))}</span>',
-        ]
-        for effect, names in hidden.items()
+            smallest = f"{limit.parameter} {number(limit.smallest, limit.unit)}"
+            seen.setdefault(limit.effect, []).append(smallest)
+    rows: list[dict[str, object]] = [{"effect": e, "smallest": texts} for e, texts in seen.items()]
+    return rows + [
+        {"effect": effect, "smallest": [], "hidden": names} for effect, names in hidden.items()
     ]
-    text = f"<p>This recording would have shown {escape(sensitivity(found.sensitivity))}.</p>"
-    inner = table(("effect", "would have been seen from"), rows)
-    count = len(seen | hidden)
-    folded = (
-        f"<details><summary>all {count} effects that were looked for</summary>{inner}</details>"
-    )
-    return section("What would have been seen", text, folded)
 
 
-def _pictures(found: Diagnosis) -> str:
+def _pictures(found: Diagnosis) -> list[Picture]:
     drawn = found.drawn
     if drawn is None:
-        return ""
+        return []
     from ahrsd.report import diagnosis_figures as figures
 
     worse = figures.spectrum_is_worse(drawn)
@@ -216,7 +196,7 @@ def _pictures(found: Diagnosis) -> str:
         shots.append((partial(figures.validation, found.validation), *_NOT_FITTED))
     if drawn.courses:
         shots.append((partial(figures.courses, drawn), *_BY_FRAME))
-    return section("Before and after", *(picture(*shot) for shot in shots))
+    return [picture(*shot) for shot in shots]
 
 
 def _longer(texts: tuple[str, str], wanted: bool, more: str) -> tuple[str, str]:
@@ -224,47 +204,15 @@ def _longer(texts: tuple[str, str], wanted: bool, more: str) -> tuple[str, str]:
     return (texts[0], f"{texts[1]} {more}") if wanted else texts
 
 
-def _checks(found: Diagnosis) -> str:
-    if not found.posterior_predictive:
-        return ""
-
-    def mark(inside: bool) -> str:
-        return '<span class="good">in</span>' if inside else '<span class="bad">out</span>'
-
-    rows = [
-        [
-            escape(_STATISTICS.get(name, name.replace("_", " "))),
-            f"{number(check.value)} ({number(check.band[0])} to {number(check.band[1])})",
-            mark(check.inside_before),
-            mark(check.inside_after),
-        ]
-        for name, check in found.posterior_predictive.items()
-    ]
-    text = (
-        "<p>The recording's own statistics against simulations along its motion: by the "
-        "calibration alone (before), and with the effects above (after), whose range is shown.</p>"
-    )
-    head = ("statistic", "recording (simulated)", "before", "after")
-    return section("Does the repaired simulation look like the recording?", text, table(head, rows))
-
-
-def _baseline(found: Diagnosis) -> str:
+def _baseline(found: Diagnosis) -> list[tuple[str, str]]:
     base = found.baseline
     if base is None:
-        return ""
+        return []
     rows = [
-        ["rms of the innovations", number(base.heldout_rms_gauss * _MG, "mG")],
-        ["normalised innovation (1: as expected)", number(base.normalised_innovation)],
+        ("rms of the innovations", number(base.heldout_rms_gauss * _MG, "mG")),
+        ("normalised innovation (1: as expected)", number(base.normalised_innovation)),
     ]
     if found.model is not None:
         iron = ", ".join(f"{value * _MG:+.2f}" for value in found.model.hard_iron_gauss)
-        rows.append(["hard iron with the effects in the model", f"{iron} mG"])
-    return section("The calibration alone", table(("", ""), rows))
-
-
-def _notes(found: Diagnosis) -> str:
-    if not found.notes:
-        return ""
-    return section(
-        "Notes", "<ul>" + "".join(f"<li>{escape(n)}</li>" for n in found.notes) + "</ul>"
-    )
+        rows.append(("hard iron with the effects in the model", f"{iron} mG"))
+    return rows

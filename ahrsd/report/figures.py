@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from ahrsd.report.data import EstimateHistory, FieldClouds, FieldNorm, HeadingError
+from ahrsd.report.contents import EstimateHistory, FieldClouds, FieldNorm, HeadingError
 from ahrsd.samples import Array
 
 BEFORE, AFTER, TRUTH = "#e67d28", "#2f86e8", "#888888"

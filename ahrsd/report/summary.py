@@ -147,8 +147,8 @@ def _shut_lines(gates: Sequence[GateResult], what: str) -> list[str]:
     return [head, *(f"    {', '.join(names)}: {advice}" for advice, names in shut.items())]
 
 
-def estimate_lines(estimate: Estimate | None) -> list[str]:
-    """An estimate in the units of a field engineer."""
+def estimate_lines(estimate: Estimate | None, wrong: Sequence[str] = ()) -> list[str]:
+    """An estimate in the units of a field engineer. wrong: see `why_not_converged`."""
     if estimate is None:
         return ["  no estimate: too few samples"]
     numbers = np.concatenate([estimate.hard_iron_gauss, estimate.gyro_bias_rad_s]) * 1e3
@@ -164,7 +164,7 @@ def estimate_lines(estimate: Estimate | None) -> list[str]:
         f"  gyro bias  {', '.join(values[3:])} mrad/s",
         f"  heading    {heading_words(estimate.heading_sigma_deg)}",
         *([f"  lag        the field is {late_ms:.1f} ms late against the gyro"] if late_ms else []),
-        *(f"  {text}" for text in why_not_converged(estimate)),
+        *(f"  {text}" for text in why_not_converged(estimate, wrong)),
     ]
 
 

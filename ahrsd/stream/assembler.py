@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.evidence.values import HealthFacts
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.decompensation import (
@@ -375,7 +376,8 @@ class Stream:
         self.warnings.pop(self._rate_warned, None)
         self._rate_warned = (
             f"{self.facts.layout} carries no time: {rate_hz:.4g} Hz ({source}); "
-            "a wrong rate makes the gyro bias and the weights wrong, --rate sets it"
+            "a wrong rate makes the gyro bias and the weights wrong; --rate sets that of a "
+            "recording, device.configure_stream asks a device for packets with their time"
         )
         self.warnings[self._rate_warned] = None
         self._steps = StepClock(rate_hz)
@@ -445,9 +447,10 @@ class Stream:
         self.warnings.pop(self._turns_said, None)
         share = 100.0 * turns.missing / (turns.missing + self.by_layout[self.facts.layout])
         self._turns_said = (
-            f"messages are missing without a trace in the bytes: at {turns.places} places the "
-            f"device turned further than its rate explains (about {share:.0f} % of all are "
-            "missing); the steps there are left out; was the recording computer too slow?"
+            f"messages are missing without a trace in the bytes: at "
+            f"{counted(turns.places, 'place')} the device turned further than its rate explains "
+            f"(about {share:.0f} % of all are missing); the steps there are left out; was the "
+            "recording computer too slow?"
         )
         self.warnings[self._turns_said] = None
 

@@ -73,7 +73,7 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "mismatch": _mismatch(status),
         "gates": shut,
         "others": others,
-        "next": _next(status, state, shut),
+        "next": _next(status, state, shut, others),
     }
 
 
@@ -126,7 +126,12 @@ def _mismatch(status: Mapping[str, Any]) -> str:
     return str(found["step"]["text"]) if found["open"] else ""
 
 
-def _next(status: Mapping[str, Any], state: str, shut: Sequence[Mapping[str, Any]]) -> str:
+def _next(
+    status: Mapping[str, Any],
+    state: str,
+    shut: Sequence[Mapping[str, Any]],
+    others: Sequence[str],
+) -> str:
     """One thing to do: what is nearest to the cause comes first."""
     if status["sensors"] and status["link"]["open"]:
         return str(status["sensors"][0])
@@ -145,7 +150,7 @@ def _next(status: Mapping[str, Any], state: str, shut: Sequence[Mapping[str, Any
     asks = [text for text in holds if "operator must approve" in text]
     if proposal is not None and asks == list(holds):
         return f"look at it (`ahrsd status`), then: ahrsd operator approve {proposal['id']}"
-    return str(holds[0])
+    return others[0]
 
 
 def explain_lines(explained: Mapping[str, Any]) -> list[str]:

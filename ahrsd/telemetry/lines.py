@@ -140,7 +140,8 @@ def write_back_line(status: Status) -> str:
     """State and mode."""
     back = status["write_back"]
     count = len(back["holds"])
-    wait = f"; {count} things hold a write (ahrsd explain)" if count else ""
+    holds = f"{counted(count, 'thing')} {'holds' if count == 1 else 'hold'}"
+    wait = f"; {holds} a write (ahrsd explain)" if count else ""
     return f"write-back: {back['state']}, mode {status['mode']}: {STATES[back['state']]}{wait}"
 
 

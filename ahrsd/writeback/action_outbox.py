@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from ahrsd.counting import counted
 from ahrsd.events import Noted, RegisterWritten, StateChanged
 from ahrsd.writeback.actions import (
     Action,
@@ -97,7 +98,9 @@ class ActionOutbox:
         and what the disk has not taken yet comes behind what it has.
         """
         if serial != self._serial and self._unjournaled:
-            self.note("error", f"{len(self._unjournaled)} records of {self._serial} are lost")
+            self.note(
+                "error", f"lost of {self._serial}: {counted(len(self._unjournaled), 'record')}"
+            )
             self._unjournaled.clear()
         self._serial, self._bound_s, self.device_s = serial, self.host_s, None
         remembered = self.history.open

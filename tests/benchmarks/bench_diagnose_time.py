@@ -27,7 +27,7 @@ from mismatch_trials import Trial, made
 from ahrsd.diagnosis import engine
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import diagnose_recording
-from ahrsd.recording.table_writer import write_table
+from ahrsd.recording.table import write_table
 
 ROWS, RATE_HZ = 16_000, 40.0
 KINDS = {

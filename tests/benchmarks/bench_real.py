@@ -30,7 +30,6 @@ from scipy.spatial.transform import Rotation
 from ahrsd.baselines import METHODS
 from ahrsd.baselines.comparison import ComparisonRow
 from ahrsd.calibration import Affine
-from ahrsd.cli.evaluate_sources import gps_beside, read_fixes, read_track
 from ahrsd.config.loading import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
@@ -38,6 +37,7 @@ from ahrsd.evaluation.references import QUATERNION, course, optical
 from ahrsd.heading import wrapped
 from ahrsd.offline.calibrate import BatchResult, calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published
+from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
 from ahrsd.samples import Array
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "recordings"

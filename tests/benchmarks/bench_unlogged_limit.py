@@ -7,8 +7,8 @@ withheld: the generator draws the same kind of cause `DRAWS` times more, with ot
 directions and places, along the very motion of the case. Their covariance, at the case's
 strength, is all that anyone can know of a course that was not logged. The observer knows it,
 besides the noise, the attitude and the field; calibration, gyro bias and the outside field are
-projected out, as of all that `blindworld.ideal` sees. Of a gyro's bias the noise is also a walk
-of an ordinary gyro (5e-6 rad/s per root second).
+projected out, as of all that `world.ideal` sees. Of a gyro's bias the noise is also a walk of an
+ordinary gyro (5e-6 rad/s per root second).
 
 Of tests that know no more of a signal than its covariance the best is the likelihood ratio
 
@@ -24,25 +24,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import defaultdict
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
-
-from blindworld import cases
-from blindworld.__main__ import case_ids
-from blindworld.chain import Stages, readings
-from blindworld.curves import wave
-from blindworld.limits import EFFECTS
-from blindworld.motion import MOTIONS, _box, _course
-from blindworld.rings import orders
-from blindworld.rotations import to_body
-from blindworld.world import _joint, _throttle
+from blind_trials.world import cases
+from blind_trials.world.__main__ import case_ids
+from blind_trials.world.chain import Stages, readings
+from blind_trials.world.curves import wave
+from blind_trials.world.limits import EFFECTS
+from blind_trials.world.motion import MOTIONS, _box, _course
+from blind_trials.world.rings import orders
+from blind_trials.world.rotations import to_body
+from blind_trials.world.world import _joint, _throttle
 
 DRAWS, NOISES = 240, 4000
 WALKS, WALK_RAD_S_SQRT_S = 100, 5e-6

@@ -205,6 +205,28 @@ def test_json_to_a_forbidden_path_is_one_line(run, tmp_path, capsys, command):
         assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", [("replay", "--rerun"), ("montecarlo", "wam", "--json")])
+def test_a_folder_that_takes_no_file_is_told_before_any_work(run, capsys, command):
+    """Root may write everywhere, says the system; /proc takes no file all the same."""
+    first, *options = command
+    path = [FOLDER / "tumble_binary_restart.vnbin.gz"] if first == "replay" else []
+    assert run(first, *path, *options, "/proc/of_nobody.out") == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("ahrsd: /proc/of_nobody.out: cannot be written: ")
+    assert said.out == "" and said.err.count("\n") == 1
+
+
+def test_a_viewer_file_that_could_not_be_written_is_told(run, tmp_path, capsys, monkeypatch):
+    path = FOLDER / "tumble_binary_restart.vnbin.gz"
+    monkeypatch.setattr("ahrsd.cli.replay.refuse_unwritable", lambda target: None)
+    assert run("replay", path, "--rerun", tmp_path / "none" / "run.rrd") == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .startswith(f"ahrsd: {tmp_path / 'none' / 'run.rrd'}: is not whole: ")
+    )
+
+
 def test_position_and_date_give_the_field_of_the_world_model(run, tmp_path):
     """On the Black Sea at the beginning of 2026: 0.490 G (WMM2025), which is then no unknown."""
     path = FOLDER / "tumble_binary_restart.vnbin.gz"

@@ -47,6 +47,22 @@ def test_help_lists_every_command_and_imports_nothing_heavy():
         assert f"\n  {name} " in done.stdout
 
 
+@pytest.mark.parametrize("words", [[], ["make", "--cases", "3", "-o", "new"], ["score", "x"]])
+def test_without_the_source_tree_the_blind_trials_say_in_one_line_what_to_install(words):
+    code = (
+        "import sys\n"
+        "sys.path = [path for path in sys.path if not path.endswith('tests/tools')]\n"
+        "from ahrsd.__main__ import main\n"
+        f"main(['challenge', *{words}])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "ahrsd: the blind trials are not in this installation: they are a tool of the source tree; "
+        "clone it and install the clone with: pip install -e '.[trials]'\n"
+    )
+
+
 @pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
 def test_matrices_take_one_thread_unless_told_otherwise(given, used):
     code = (

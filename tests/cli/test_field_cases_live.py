@@ -7,6 +7,7 @@ The inputs are not part of the project; the same kinds are made by our own gener
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import re
@@ -14,7 +15,9 @@ import signal
 import subprocess
 import sys
 import time
+import tty
 from collections.abc import Callable, Iterator
+from operator import xor
 from pathlib import Path
 
 import pytest
@@ -27,7 +30,7 @@ COMMAND = [sys.executable, "-m", "ahrsd"]
 
 pytestmark = [
     pytest.mark.timeout(400),
-    pytest.mark.skipif(not CASES.is_dir(), reason="the field cases (../shared) are not here"),
+    pytest.mark.field_cases,
 ]
 
 
@@ -231,6 +234,47 @@ def test_another_model_is_named_observed_and_never_written(tmp_path: Path) -> No
     (line,) = [line for line in said.splitlines() if "observed only" in line]
     assert "the model is VN-110-A" in line
     assert rate_of(said).startswith("40 Hz")
+
+
+@contextlib.contextmanager
+def emulated(firmware: int) -> Iterator[Callable[[str], str]]:
+    """Asks `ahrsd emulate` as a terminal program does: a command in, the first reply out."""
+    command = [*COMMAND, "emulate", "--firmware", str(firmware)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        fd = os.open(process.stdout.readline().strip(), os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(fd)
+
+        def ask(body: str) -> str:
+            os.write(fd, f"${body}*{functools.reduce(xor, body.encode()):02X}\r\n".encode())
+            heard, end_s = b"", time.monotonic() + 20.0
+            reply = re.compile(rb"\$(VN(?:ERR|" + body[2:5].encode() + rb")[^*\r]*)\*[0-9A-F]+\r")
+            while not (found := reply.search(heard)):
+                assert time.monotonic() < end_s, heard[-200:]
+                heard += os.read(fd, 4096)
+            return found[1].decode()
+
+        try:
+            yield ask
+        finally:
+            os.close(fd)
+            process.terminate()
+
+
+def test_the_emulator_answers_as_devices_did_in_public_reports() -> None:
+    """f38; in more ways in `vn100/test_emulator.py`."""
+    ros2 = "VNWRG,75,3,40,29,7FFF,0210,000C"
+    with emulated(2) as ask:
+        assert ask("VNRRG,04").startswith("VNRRG,04,2.")
+        assert ask(ros2) == ros2
+        assert ask("VNBOM,1") == "VNBOM,1"
+        assert ask("VNSFB") == "VNERR,04"
+    with emulated(3) as ask:
+        assert ask(ros2) == ros2
+        assert ask("VNSIH,+090.000") == "VNSIH,+090.000"
+        assert ask("VNSFB") == "VNSFB"
+        assert ask("VNRRG,206") == "VNRRG,206,0,0,0,0"
+        assert ask("VNRRG,116") == "VNRRG,116,0,0,0,0,0,0,0"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open every port")

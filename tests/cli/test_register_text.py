@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.cli.register_text import described
+from ahrsd.cli.registers import described
 from drivers.vn100.registers import REGISTERS
 
 

@@ -32,7 +32,7 @@ def test_it_holds_every_module_and_nothing_else(wheel):
         str(path.relative_to(PROJECT))
         for package in ("ahrsd", "drivers")
         for path in (PROJECT / package).rglob("*")
-        if path.suffix == ".py" or path.name == "py.typed"
+        if path.suffix in (".py", ".html", ".css") or path.name == "py.typed"
     }
     found = {name for name in wheel.namelist() if not name.startswith("ahrsd-0.1.0.")}
     assert found - expected == set()

@@ -66,7 +66,7 @@ def test_it_finds_what_is_hidden_in_the_device(blocks):
 
 
 def test_what_is_held_out_is_never_seen_by_the_estimator(blocks):
-    """Whatever is in the held-out parts changes nothing (a step would: `monitoring.online`)."""
+    """Whatever is in the held-out parts changes nothing (a step would: `monitoring`)."""
     plain, other = (Calibrator(settings(), Affine.identity(), np.zeros(3)) for _ in range(2))
     held, rng = 0, np.random.default_rng(1)
     for block in later(blocks, 3):

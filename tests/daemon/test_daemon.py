@@ -119,6 +119,17 @@ def test_stopped_while_unplugged(live, caplog):
         assert daemon.noted("not everything was put back")
 
 
+def test_a_device_that_is_back_is_told_however_soon(live, caplog):
+    caplog.set_level(logging.INFO, "ahrsd")
+    with live({"output": "imu"}) as daemon:
+        daemon.flowing()
+        daemon.emulator.plugged = False
+        daemon.until(lambda: "waiting for the device: " in caplog.text)
+        daemon.emulator.plugged = True
+        daemon.until(lambda: caplog.text.count(" open at ") == 2)
+        assert daemon.stop() < LIMIT_S
+
+
 def test_a_reset_is_noticed_and_the_session_is_set_up_again(live):
     setup = {"output": "ascii", "faults": ("reset@4",)}
     with live(setup, device=OWN_STREAM) as daemon:
@@ -270,11 +281,14 @@ def test_the_log_counts_what_comes_again():
     assert lines[1:] == [(20, "another")]
     folded.settle(61.0)
     assert lines[2:] == [(30, "VNERR 0B (49 more times)")]
+    folded.say(20, "another", 61.0)
+    folded.settle(111.0)
+    assert lines[3:] == [(20, "another (once more)")]
     for number in range(200):
         folded.say(20, f"text {number}", 62.0)
     assert len(folded._open) == 64
     folded.finish()
-    assert len(lines) == 203
+    assert len(lines) == 204
 
 
 def test_a_host_that_was_suspended_begins_the_link_anew(live, monkeypatch):

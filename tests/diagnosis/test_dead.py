@@ -106,7 +106,7 @@ def test_readings_that_no_sensor_gives_are_left_out(track: Track) -> None:
     mag[50, 0], gyro[70:72, 1] = 1e300, 1e9
     clean, notes = possible(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
     assert [note.split(" beyond")[0] for note in notes] == [
-        "1 readings of the magnetometer",
+        "1 reading of the magnetometer",
         "2 rates",
     ]
     assert np.flatnonzero(np.isnan(clean.mag_b_gauss).any(axis=1)).tolist() == [50]

@@ -11,7 +11,7 @@ from ahrsd.diagnosis.aligned import align
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.diagnose import load_spec, load_track
-from ahrsd.recording.table_writer import write_table
+from ahrsd.recording.table import write_table
 from ahrsd.simulation import ScenarioSettings, simulate
 
 
@@ -99,7 +99,7 @@ def test_nothing_wrong_says_what_would_have_been_seen(run, saved, clean, capsys)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda c: {k: v[:200] for k, v in c.items()}, "is too short to diagnose: 200 samples"),
+        (lambda c: {k: v[:200] for k, v in c.items()}, "is too short to diagnose (samples: 200,"),
         (lambda c: {k: v for k, v in c.items() if k != "mag_z_gauss"}, "has no column mag_z_gauss"),
         (lambda c: {**c, "time_s": c["time_s"][::-1]}, "time goes back"),
         (lambda c: {**c, "mag_x_gauss": np.full(len(c["time_s"]), math.nan)}, "mag_x_gauss"),

@@ -17,8 +17,15 @@ from ahrsd.core.core import Core
 from ahrsd.events import Judged, Noted
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.inputs import Samples
-from ahrsd.monitoring.block_score import ReferenceCalibration, Scorer, Thinned, carried
-from ahrsd.monitoring.online import KEPT, Step, StepDetector
+from ahrsd.monitoring.step_detector import (
+    KEPT,
+    ReferenceCalibration,
+    Scorer,
+    Step,
+    StepDetector,
+    Thinned,
+    carried,
+)
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.simulation import Experiment

@@ -7,13 +7,17 @@ common with many others is tested in `test_foreign_tables.py` by a generator of 
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+pytestmark = pytest.mark.field_cases
 
 FOLDER = Path(__file__).parents[3] / "shared" / "field-cases"
 HARD_IRON_MG = np.array([120.0, -80.0, 60.0])
@@ -26,6 +30,8 @@ class Case:
 
     iron_mg, bias_mrad_s: how near the answer must be to the truth, None: not asked
     sigma_mg: what must be announced of the hard iron at most
+    named, beside: what `diagnose` must name, and what it may name besides
+    size: of what it names first, in SI and gauss, to 1 %
     has, has_not: words of the output
     """
 
@@ -36,12 +42,17 @@ class Case:
     iron_mg: float | None = None
     bias_mrad_s: float | None = None
     sigma_mg: float | None = None
+    named: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    size: Mapping[str, float] = field(default_factory=dict)
     has: tuple[str, ...] = ()
     has_not: tuple[str, ...] = ()
 
 
 CASES = (
-    Case("f19_mag_y_mirrored.csv.gz", "calibrate", 1, has=("the magnetometer is left-handed",)),
+    Case("f19_mag_y_mirrored.csv.gz", "calibrate", 1,
+         has=("not converged: the magnetometer is left-handed: negate its y",),
+         has_not=("the rate in Hz",)),
     Case("f19_mag_y_mirrored.csv.gz", "diagnose", 0, has=("the magnetometer is left-handed",)),
     Case("f11_sdk_export_FA_06_0001_003E.csv.gz", "calibrate", 0, 1600, 1.0,
          has=("VectorNav's SDK",)),
@@ -65,12 +76,35 @@ CASES = (
     Case("f32_nan_accel.csv.gz", "replay", 0, None, 1.0, 0.3,
          has=("no acceleration in 20 rows",),
          has_not=("add acceleration", "do not form an ellipsoid")),
+    Case("f34_motor_current.csv.gz", "diagnose", 0,
+         named=("motor_current_field",), beside=("gyro_integration", "mag_time_lag"),
+         size={"field_per_ampere_x": 7.5e-3, "field_per_ampere_y": -3.75e-3,
+               "field_per_ampere_z": 7.5e-3}),
     Case("f36_held_10hz_in_100hz.csv.gz", "calibrate", 0, 12000, 0.7, 0.3,
          has=("a new reading only every 10 samples",), has_not=("a magnet came near",)),
     Case("f37_circles_then_roll.csv.gz", "calibrate", 0, 3200, 0.5, 0.2, sigma_mg=1.0),
     Case("f37_circles_then_roll.csv.gz", "replay", 0, None, 0.5, 0.2, sigma_mg=1.0,
          has_not=("observability.",)),
 )  # fmt: skip
+
+
+#: cases that are tried in other files
+ELSEWHERE = {
+    "cli/test_field_cases_live.py": ["f01", "f02", "f03", "f04", "f06", "f07", "f09", "f25", "f38"],
+    "recording/test_ros_recordings.py": ["f14", "f15"],
+}
+
+
+def test_every_case_of_the_folder_is_tried():
+    table = (FOLDER / "README.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| (f\d+) ", table, re.MULTILINE))
+    assert len(listed) >= 24
+    tests = Path(__file__).parents[1]
+    for file, names in ELSEWHERE.items():
+        text = (tests / file).read_text(encoding="utf-8")
+        assert [name for name in names if name not in text] == []
+    here = {case.file.partition("_")[0] for case in CASES}
+    assert listed - here - {name for names in ELSEWHERE.values() for name in names} == set()
 
 
 def ahrsd(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -82,8 +116,6 @@ def ahrsd(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     "case", CASES, ids=lambda case: f"{case.file.split('_')[0]}-{case.command}"
 )
 def test_the_command_line_says_what_is_right(tmp_path, case):
-    if not FOLDER.is_dir():
-        pytest.skip("the field cases (../shared/field-cases) are not here")
     written = tmp_path / "answer.json"
     done = ahrsd(case.command, FOLDER / case.file, "--json", written)
     shown = done.stdout + done.stderr
@@ -97,6 +129,11 @@ def test_the_command_line_says_what_is_right(tmp_path, case):
         assert len(shown.splitlines()) == 1
         return
     body = json.loads(written.read_text())
+    if case.named:
+        names = [one["effect"] for one in body["findings"]]
+        assert set(case.named) <= set(names) <= set(case.named) | set(case.beside)
+        sizes = {one["name"]: one["value"] for one in body["findings"][0]["parameters"]}
+        assert {name: sizes[name] for name in case.size} == pytest.approx(case.size, rel=0.01)
     found = body.get("calibration", body)
     if case.samples is not None:
         assert found["samples"] == case.samples

@@ -16,7 +16,9 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.__main__ import main
+from ahrsd.config.loading import Config
 from ahrsd.errors import AhrsdError, RecordingError
+from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, REQUIRED, TIME, parse_columns
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
@@ -44,6 +46,30 @@ def sensor(count: int = COUNT, rate_hz: float = RATE_HZ, seed: int = 1) -> dict[
         **dict(zip(GYRO, gyro.T, strict=True)),
         **dict(zip(ACCEL, force.T, strict=True)),
     }
+
+
+@pytest.mark.parametrize(
+    ("axes", "signs", "words"),
+    [
+        ((0, 1, 2), (1, -1, 1), "the magnetometer is left-handed: negate its y"),
+        ((1, 0, 2), (1, 1, 1), "the magnetometer is left-handed: its right x y z are its y x z"),
+        ((0, 1, 2), (1, -1, -1), "the magnetometer is turned against the gyro: negate its y and z"),
+    ],
+)
+def test_wrong_axes_are_why_it_has_not_converged(tmp_path, axes, signs, words):
+    """And not what follows from them: a rate or a unit that looks wrong."""
+    made = sensor(4000)
+    turned = dict(zip(MAG, [sign * made[MAG[k]] for k, sign in zip(axes, signs, strict=True)],
+                      strict=True))  # fmt: skip
+    result = calibrate(save(tmp_path / "t.csv", texts(made | turned)), Config())
+    assert not result.converged
+    (reason,) = result.reasons()
+    assert reason.startswith(f"not converged: {words}")
+    assert reason.endswith(": put this right and calibrate again")
+    assert [text for text in result.json("magyc")["warnings"] if words in text] == [reason]
+    right = calibrate(save(tmp_path / "right.csv", texts(made)), Config())
+    assert right.converged
+    assert not [text for text in right.all_warnings() if "put this right" in text]
 
 
 def texts(columns: dict[str, np.ndarray]) -> dict[str, list[str]]:
@@ -134,7 +160,7 @@ def test_a_logger_that_was_started_again_writes_its_names_again(tmp_path):
     table = read_table(path)
     assert len(table.rows) == 380
     assert table.starts == (0, 200)
-    assert "the line of names comes 1 times more" in table.notes[0]
+    assert "left out amid the rows: 1 more line of names" in table.notes[0]
 
 
 def test_few_rows_with_another_number_of_cells_are_left_out_and_many_are_not(tmp_path):

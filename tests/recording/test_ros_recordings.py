@@ -20,8 +20,8 @@ from ahrsd.errors import RecordingError
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import parse_columns
 from ahrsd.recording.foreign import formats
+from ahrsd.recording.foreign.ros import DEFINITIONS
 from ahrsd.recording.foreign.sensors import Choice
-from ahrsd.recording.foreign.vectornav_messages import DEFINITIONS
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 
@@ -392,9 +392,8 @@ def test_list_says_what_is_inside(tmp_path, container):
     assert "/imu/mag  sensor_msgs/msg/MagneticField  600 messages, 20 Hz" in result.output
 
 
+@pytest.mark.field_cases
 @pytest.mark.parametrize("name", ["f14_imu_mag.bag", "f15_ros2_imu_mag.mcap"])
 def test_recordings_from_the_field_are_read(name, tmp_path):
-    if not (CASES / name).is_file():
-        pytest.skip(f"{name} is not here")
     path = shutil.copy(CASES / name, tmp_path / name)
     assert len(open_recording(Path(path)).table.rows) == 80

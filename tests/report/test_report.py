@@ -39,9 +39,9 @@ from ahrsd.report import (
     figures,
     write_report,
 )
-from ahrsd.report.collector import KEPT
+from ahrsd.report.contents import KEPT
 from ahrsd.report.figures import _binned, _settled_range, clouds
-from ahrsd.report.page import number
+from ahrsd.report.template import number
 from ahrsd.samples import SampleBlock
 
 SOFT = np.array([[1.1, 0.05, 0.0], [0.05, 0.95, -0.02], [0.0, -0.02, 0.97]])

@@ -15,8 +15,8 @@ from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES, Level, guards_a_write
-from ahrsd.report.data import ReportData
-from ahrsd.report.page import _gates
+from ahrsd.report.contents import ReportData
+from ahrsd.report.page import write_report
 from ahrsd.report.summary import (
     _gate_lines,
     estimate_lines,
@@ -125,7 +125,7 @@ def test_gates_of_a_write_without_a_person_are_counted_apart_and_only_where_that
     ]
 
 
-def test_the_number_of_gates_is_one_number_everywhere():
+def test_the_number_of_gates_is_one_number_everywhere(tmp_path):
     """Summary, page, live view of the terminal and the viewer's table count the same gates."""
     results = [
         GateResult(gate.gate, 2.0, 1.0, k % 3 > 0, 0.0, "", "do something")
@@ -138,7 +138,8 @@ def test_the_number_of_gates_is_one_number_everywhere():
         _gate_lines(results, Level.RAM)[0] == f"  {shut} of {len(counted)} gates hold a write back:"
     )
     assert gate_table(results).startswith(f"**Held back by {shut} of {len(counted)} gates**")
-    page = _gates(ReportData(title="t", gates=tuple(results)))
+    write_report(tmp_path / "report.html", ReportData(title="t", gates=tuple(results)))
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"{len(counted) - shut} of {len(counted)} gates are ok" in page
     console = Console(width=200, record=True)
     rows = [{"gate": r.gate, "ok": r.ok, "value": 2.0, "unit": "", "limit": 1.0} for r in results]

@@ -382,5 +382,6 @@ def test_a_rate_that_is_found_again_is_warned_of_once():
         stream.forget()
     assert [text for text in stream.warnings if "carries no time" in text] == [
         "VNYMR carries no time: 20 Hz (register 7); a wrong rate makes the gyro bias and the "
-        "weights wrong, --rate sets it"
+        "weights wrong; --rate sets that of a recording, device.configure_stream asks a device "
+        "for packets with their time"
     ]

@@ -109,6 +109,7 @@ class ClientHistory:
 
     def _end(self) -> None:
         run = self.run
+        run.safe = False  # no write or save begins any more
         run.run(8.0)
         for name in self._open:
             run.feed(inputs.ClientLeft(run.now_ns, name))

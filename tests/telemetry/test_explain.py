@@ -2,8 +2,8 @@
 
 import pytest
 
-from ahrsd.telemetry.explain import STATES, explain_json, explain_lines
-from ahrsd.telemetry.lines import candidate_lines, estimator_line
+from ahrsd.telemetry.explain import NO_INTERLOCK, STATES, explain_json, explain_lines
+from ahrsd.telemetry.lines import candidate_lines, estimator_line, write_back_line
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
@@ -158,6 +158,25 @@ def test_without_an_interlock_the_key_is_named():
     assert text.startswith("no interlock is configured, so nothing is ever written: set interlock.")
     (text,) = explain_json(status(interlock="not safe", write_back=held))["others"]
     assert text == unheard
+
+
+def test_without_an_interlock_that_is_the_thing_to_do_and_not_to_wait_for_a_word():
+    unheard = WriteBack(WriteBackPolicy()).holds()[-2]
+    held = {
+        "state": "QUALIFIED",
+        "holds": [unheard, "an operator must approve 12ab34cd"],
+        "proposal": {"id": "12ab34cd"},
+    }
+    passed = {"gates": [GATE | {"ok": True}], "write_back": held}
+    assert explain_json(status(interlock="none", **passed))["next"] == NO_INTERLOCK
+    assert explain_json(status(interlock="not safe", **passed))["next"] == unheard
+
+
+def test_one_thing_holds_and_two_hold():
+    back = {"state": "QUALIFIED", "holds": ["a"]}
+    assert "; 1 thing holds a write (" in write_back_line(status(write_back=back))
+    back["holds"] = ["a", "b"]
+    assert "; 2 things hold a write (" in write_back_line(status(write_back=back))
 
 
 def test_the_status_shows_the_candidate_that_is_to_be_looked_at():

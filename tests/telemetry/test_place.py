@@ -13,8 +13,8 @@ import click
 import pytest
 
 import ahrsd
-from ahrsd.cli import COMMANDS, bundle
-from ahrsd.cli.running import _HINT, DaemonPlace
+from ahrsd.cli import COMMANDS, running_daemon
+from ahrsd.cli.running_daemon import _HINT, DaemonPlace
 from ahrsd.config.loading import Config
 
 TALK = ("status", "explain", "watch", "bundle", "operator")
@@ -101,4 +101,4 @@ def test_a_bundle_of_an_unknown_format_is_refused(run, tmp_path, capsys):
 
 
 def test_the_help_of_bundle_names_its_formats():
-    assert ".zip" in inspect.getsource(bundle)
+    assert ".zip" in inspect.getsource(running_daemon)

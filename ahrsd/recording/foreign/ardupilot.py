@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.foreign.dataflash import Log, read_log, refuse_empty
@@ -47,7 +48,7 @@ def listed(path: Path) -> list[str]:
     """One line per message: name, how many, fields."""
     log = read_log(path, _WANTED)
     return [
-        f"{printable(name)}  {count} messages"
+        f"{printable(name)}  {counted(count, 'message')}"
         + (f"  {', '.join(log.codes[name])}" * (name in log.codes))
         for name, count in sorted(log.counts.items())
     ]

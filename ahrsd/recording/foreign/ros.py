@@ -3,7 +3,8 @@
 Messages are searched for what they hold, not for their type alone: many drivers publish one of
 their own with an Imu, a MagneticField or the device's raw line inside. A MagneticField is in tesla
 and an Imu in rad/s and m/s^2 by definition; vectornav_msgs are in gauss. Axes stay as the driver
-published them.
+published them. Definitions of vectornav_msgs, which recordings in SQLite do not bring
+along, are here.
 """
 
 from __future__ import annotations
@@ -22,14 +23,73 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
 from ahrsd.printable import printable
 from ahrsd.recording.foreign.sensors import Choice, RawBytes, Sensors, SensorSeries, positions
-from ahrsd.recording.foreign.vectornav_messages import DEFINITIONS
 from ahrsd.recording.limits import TABLE_BYTES, TABLE_CELLS, refuse_beyond
 from ahrsd.samples import Array
 from drivers.vn100.deframer import Deframer
+
+_INS_STATUS = """\
+uint8 mode
+bool gps_fix
+bool time_error
+bool imu_error
+bool mag_pres_error
+bool gps_error
+bool gps_heading_ins
+bool gps_compass
+"""
+_COMMON_GROUP = """\
+std_msgs/Header header
+uint16 group_fields
+uint64 timestartup
+uint64 timegps
+uint64 timesyncin
+geometry_msgs/Vector3 yawpitchroll
+geometry_msgs/Quaternion quaternion
+geometry_msgs/Vector3 angularrate
+geometry_msgs/Point position
+geometry_msgs/Vector3 velocity
+geometry_msgs/Vector3 accel
+geometry_msgs/Vector3 imu_accel
+geometry_msgs/Vector3 imu_rate
+geometry_msgs/Vector3 magpres_mag
+float32 magpres_temp
+float32 magpres_pres
+float32 deltatheta_dtime
+geometry_msgs/Vector3 deltatheta_dtheta
+geometry_msgs/Vector3 deltatheta_dvel
+vectornav_msgs/InsStatus insstatus
+uint32 syncincnt
+uint16 timegpspps
+"""
+_IMU_GROUP = """\
+std_msgs/Header header
+uint16 group_fields
+uint16 imustatus
+geometry_msgs/Vector3 uncompmag
+geometry_msgs/Vector3 uncompaccel
+geometry_msgs/Vector3 uncompgyro
+float32 temp
+float32 pres
+float32 deltatheta_time
+geometry_msgs/Vector3 deltatheta_dtheta
+geometry_msgs/Vector3 deltavel
+geometry_msgs/Vector3 mag
+geometry_msgs/Vector3 accel
+geometry_msgs/Vector3 angularrate
+uint16 sensat
+"""
+#: message name -> its definition
+DEFINITIONS = {
+    "InsStatus": _INS_STATUS,
+    "CommonGroup": _COMMON_GROUP,
+    "ImuGroup": _IMU_GROUP,
+}
+
 
 _DEPTH = 3  # of messages within messages
 _LOOKED_AT = 20  # messages of a type by which it is told whether they hold the device's bytes
@@ -240,7 +300,7 @@ def listed(path: Path, suffix: str) -> list[str]:
     except damages() as error:
         raise _refused(path, suffix, error) from error
     return [
-        f"{printable(topic)}  {printable(kind)}  {count} messages"
+        f"{printable(topic)}  {printable(kind)}  {counted(count, 'message')}"
         + (f", {count / seconds:.3g} Hz" if seconds > 0 else "")
         for topic, kind, count in sorted(rows)
     ]
@@ -383,8 +443,8 @@ def _raw(path: Path, found: _Found, topics: list[str]) -> RawBytes:
         )  # fmt: skip
     received = found.raw[topics[0]].received
     note = (
-        f"{len(received)} messages of {printable(topics[0])} are what the device sent: used with "
-        "the recorder's times"
+        f"what the device sent is in {counted(len(received), 'message')} of "
+        f"{printable(topics[0])}: used with the recorder's times"
     )
     facts = {"source": topics[0], "clock": "the recorder's, of each message"}
     return RawBytes(received, [note], facts)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, NO_MAP, TIME, UNITS, ColumnMap, Source
@@ -162,7 +163,7 @@ def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> Se
     known = np.isfinite(stream.time_s) & (np.abs(stream.values) < _LARGEST).all(axis=1)
     if count := int(np.count_nonzero(~known)):
         notes.append(
-            f"{count} readings of {name} are no readings (nan, or beyond any sensor): left out"
+            f"left out of {name}: {counted(count, 'reading')} that no sensor gives (nan, or beyond)"
         )
     time_s, values = stream.time_s[known], stream.values[known]
     if np.any(np.diff(time_s) < 0.0):
@@ -176,11 +177,15 @@ def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> Se
                 path, f"{name} has no time: {count} of {len(new)} readings share one with another",
                 "record again with a clock",
             )  # fmt: skip
-        notes.append(f"{count} readings of {name} have the time of the one before: left out")
+        notes.append(
+            f"left out of {name}: {counted(count, 'reading')} with the time of the one before"
+        )
     time_s, values = time_s[new], values[new]
     if len(time_s) < FEWEST:
         raise RecordingError(
-            path, f"{name} has {len(time_s)} readings, {FEWEST} are needed", "record longer"
+            path,
+            f"{name} has {counted(len(time_s), 'reading')}, {FEWEST} are needed",
+            "record longer",
         )
     return SensorSeries(time_s, values)
 

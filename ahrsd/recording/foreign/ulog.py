@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.foreign.sensors import Choice, Sensors, SensorSeries, positions
@@ -57,7 +58,7 @@ def listed(path: Path) -> list[str]:
     """One line per topic: name, instance, messages, fields."""
     log = _loaded(path, None)
     return [
-        f"{printable(one.name)}[{one.multi_id}]  {len(one.data['timestamp'])} messages  "
+        f"{printable(one.name)}[{one.multi_id}]  {counted(len(one.data['timestamp']), 'message')}  "
         + ", ".join(printable(name) for name in sorted(one.data) if name != "timestamp")
         for one in sorted(log.data_list, key=lambda one: (one.name, one.multi_id))
     ]
@@ -79,7 +80,9 @@ def read(path: Path, choice: Choice) -> Sensors:
     if log.file_corruption:
         out.notes.append("parts of the log are damaged: left out")
     if lost := sum(one.duration for one in log.dropouts):
-        out.notes.append(f"the logger dropped data {len(log.dropouts)} times, {lost / 1e3:.1f} s")
+        out.notes.append(
+            f"the logger lost data: {counted(len(log.dropouts), 'gap')}, {lost / 1e3:.1f} s"
+        )
     parameters = {str(k): float(v) for k, v in log.initial_parameters.items()}
     combined = sets["sensor_combined"][0].data
     time_s = combined["timestamp"] * 1e-6

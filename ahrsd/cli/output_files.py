@@ -1,0 +1,81 @@
+"""Files that a command writes: refused before any work, told where one is replaced, whole or not.
+
+A file that can be made again is replaced, and a line says so. What cannot (a recording of a device)
+is never replaced: `capture` asks for another name.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import click
+
+from ahrsd.errors import AhrsdError
+
+
+def refuse_unwritable(target: str | Path | None) -> None:
+    """Raise AhrsdError before any work is done for a file that cannot be written.
+
+    One that exists and is going to be replaced is told on stderr.
+    """
+    if target is None or str(target) == "-":
+        return
+    path = Path(target)
+    if path.is_dir():
+        raise AhrsdError(f"{path}: is a folder; name a file")
+    if not path.parent.is_dir():
+        raise AhrsdError(f"{path}: {path.parent} is no folder; make it first")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise AhrsdError(f"{path}: cannot be written: permission denied; name another file")
+    if not path.exists():  # a folder may say that it is writable and take no file
+        try:
+            descriptor, made = tempfile.mkstemp(prefix=f".{path.name}", dir=path.parent)
+            os.close(descriptor)
+            Path(made).unlink()
+        except OSError as error:
+            raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+    if path.is_file():
+        click.echo(f"{path}: exists and will be replaced", err=True)
+
+
+def make_folder(folder: Path, names: Iterable[str]) -> None:
+    """The folder of a `--report`, and every file in it as `refuse_unwritable` looks at it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AhrsdError(f"{folder}: cannot be made: {error.strerror}") from error
+    for name in names:
+        refuse_unwritable(folder / name)
+
+
+def write_text(target: Path, text: str) -> None:
+    """A file of text.  AhrsdError where it cannot be written."""
+    try:
+        target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise AhrsdError(f"{target}: cannot be written: {error.strerror}") from error
+
+
+def write_json(target: str, value: object) -> None:
+    """Write `value` to a file or to stdout.  AhrsdError where the file cannot be written."""
+    text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+    if target == "-":
+        click.echo(text, nl=False)
+        return
+    path = Path(target)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        if path.exists() and not path.is_file():  # a pipe or a device is written, not replaced
+            path.write_text(text, encoding="utf-8")
+            return
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink()
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,475 @@
+"""Beside the running estimator: did hard iron or gyro bias step since the calibration was made?
+
+Every ten seconds of the stream give one small Gram, scored against the newest converged estimate of
+that moment. The newest blocks that show motion are tested together against the estimate as it stood
+before the first of them, its covariance taken into account:
+
+    T = 2 max over D of the gain in log likelihood by a step D of the hard iron (or the gyro bias)
+
+T is measured by what such blocks usually give in this stream (lag, gradients, coloured noise), and
+a step is told only if one D explains two blocks or more, each of them by itself, and better than
+the other sensor and than a field that changes in the world. Then the time is looked for.
+
+A step is told once; `restart` begins anew, with data from after it.
+
+What one block of ten seconds says against a calibration costs a few small matrices. A recording's
+filter (`innovation`) takes a loop over samples; beside a running estimator that is too dear. Within
+a block the same whitened innovations come without one: the gyro carries every reading into the
+frame of the block's first one, where the field stands still,
+
+    y_k = R_k C (m_k - b) = h + noise,   R_k = R_k-1 Exp((w_k - w_b) dt)
+
+and the noise is white (magnetometer) plus, across the field, a random walk (gyro). The inverse of
+the Cholesky factor of its covariance gives the innovations of the filter that starts knowing
+nothing of h; it is the same for every block. The field h of the block is projected out, so a block
+says nothing while the vehicle stands, whatever is the matter with the field around it; so is a lag
+between the two sensors, which nearly every stream has and no calibration knows of.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd import so3
+from ahrsd.calibration import Estimate
+from ahrsd.samples import Array, SampleBlock
+
+ROWS = 128  # thinned samples in a block
+LAG_S = 0.05  # 1-sigma of a lag between magnetometer and gyro
+LEAST_ROWS = 64  # in a piece before a gap that is worth scoring
+#: columns of a block: those of `Estimate.covariance`, then a drift of the field in the world
+SOFT, IRON, GYRO, DRIFT = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+_ENTRIES = np.triu_indices(3)
+# 1-sigma that no calibration is believed to fall below: what moves by itself from minute to minute
+_FLOOR = np.r_[np.full(6, 1e-3), np.full(3, 5e-4), np.full(3, 2e-4)]
+_KEEP_ROOT = 1.2  # the whitening is kept while the ratio of the noises is within this factor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceCalibration:
+    """A calibration to test: theta (12,) and a root (12, 12) of its covariance, and the noises."""
+
+    theta: Array
+    root: Array
+    correction: Array
+    offset: Array
+    gyro_bias_rad_s: Array
+    noise_mag_gauss: float
+    noise_gyro_rad_s: float
+
+    @staticmethod
+    def of(estimate: Estimate) -> ReferenceCalibration:
+        """The estimate, in the order of its covariance."""
+        A = estimate.soft_iron
+        values, vectors = np.linalg.eigh(estimate.covariance + np.diag(_FLOOR**2))
+        return ReferenceCalibration(
+            np.r_[A[_ENTRIES], estimate.hard_iron_gauss, estimate.gyro_bias_rad_s],
+            vectors * np.sqrt(np.maximum(values, 0.0)),
+            np.asarray(np.linalg.inv(A), float),
+            estimate.hard_iron_gauss,
+            estimate.gyro_bias_rad_s,
+            max(estimate.noise_mag_gauss, 1e-5),
+            max(estimate.noise_gyro_rad_s, 1e-6),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinned:
+    """Rows of a block: means of `averaged` samples; angle_b_rad is the gyro's integral."""
+
+    time_s: Array
+    raw_b_gauss: Array
+    angle_b_rad: Array
+    averaged: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredBlock:
+    """A scored block.
+
+    information (15, 15), score (15,): of the columns, the block's own field and lag projected out
+    residual (n, 3), lever (n, 3, 3): y - h and how it moves with the hard iron, carried frame
+    """
+
+    reference: ReferenceCalibration
+    time_s: Array
+    information: Array
+    score: Array
+    residual: Array
+    lever: Array
+
+
+class Scorer:
+    """Scores blocks; keeps the whitening, which changes with the noise only."""
+
+    def __init__(self) -> None:
+        self._ratio = 0.0
+        self._root: Array = np.eye(ROWS)
+
+    def score(self, rows: Thinned, reference: ReferenceCalibration) -> ScoredBlock:
+        """One block of at most ROWS rows against `reference`."""
+        n = len(rows.time_s)
+        dt_s = np.diff(rows.time_s, prepend=rows.time_s[:1])
+        turn = np.diff(rows.angle_b_rad, axis=0, prepend=rows.angle_b_rad[:1])
+        turn -= dt_s[:, None] * reference.gyro_bias_rad_s
+        R = carried(so3.exp(turn))
+        lever = R @ reference.correction
+        y = (lever @ (rows.raw_b_gauss - reference.offset)[:, :, None])[:, :, 0]
+        h = y.mean(axis=0)
+        Z = np.zeros((n, 3, 20))
+        Z[:, :, SOFT] = lever @ _soft(h @ R)
+        Z[:, :, IRON] = lever
+        Z[:, :, GYRO] = -so3.skew(h) @ np.cumsum(R * dt_s[:, None, None], axis=0)
+        Z[:, [0, 1, 2], [12, 13, 14]] = np.linspace(-1.0, 1.0, n)[:, None]
+        Z[:, [0, 1, 2], [15, 16, 17]] = 1.0
+        Z[:, :, 18] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])
+        Z[:, :, 19] = y - h
+        G = self._gram(Z, h, reference, float(dt_s[1:].mean()), rows.averaged)
+        own = G[15:19, 15:19] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
+        G = G - G[:, 15:19] @ np.linalg.solve(own, G[15:19])
+        return ScoredBlock(reference, rows.time_s, G[:15, :15], G[:15, 19], y - h, lever)
+
+    def _gram(
+        self, Z: Array, h: Array, reference: ReferenceCalibration, dt_s: float, averaged: int
+    ) -> Array:
+        """Along the field nothing but the magnetometer's noise, across it the gyro's walk too."""
+        size = float(np.linalg.norm(h))
+        sigma = reference.noise_mag_gauss / np.sqrt(averaged)
+        walk = size * reference.noise_gyro_rad_s * dt_s / np.sqrt(averaged)
+        u = h / max(size, 1e-12)
+        frame = np.column_stack([u, so3.tangent_basis(u[None])[0]])
+        turned = frame.T @ Z
+        across = self._whitening(walk / sigma)[: len(Z), : len(Z)] @ turned[:, 1:].reshape(
+            len(Z), -1
+        )
+        rows = np.concatenate([turned[:, 0], across.reshape(-1, Z.shape[2])]) / sigma
+        return np.asarray(rows.T @ rows)
+
+    def _whitening(self, ratio: float) -> Array:
+        """L^-1 of I + ratio^2 min(i, j) = L L^T; that of fewer rows is its upper left corner."""
+        if not self._ratio / _KEEP_ROOT <= ratio <= self._ratio * _KEEP_ROOT:
+            steps = np.arange(ROWS, dtype=np.float64)
+            noise = np.eye(ROWS) + ratio**2 * np.minimum(steps[:, None], steps)
+            self._root, self._ratio = np.linalg.inv(np.linalg.cholesky(noise)), ratio
+        return self._root
+
+
+def carried(turns: Array) -> Array:
+    """R_k = turns_0 ... turns_k, (n, 3, 3), in log2(n) passes."""
+    out, step = turns, 1
+    while step < len(out):
+        out = np.concatenate([out[:step], out[:-step] @ out[step:]])
+        step *= 2
+    return out
+
+
+def _rate(turn: Array, dt_s: Array) -> Array:
+    """Rate (n, 3) at the rows' instants, of the turns between them."""
+    rate = turn[1:] / dt_s[1:, None]
+    out = np.concatenate([rate[:1], rate])
+    out[1:-1] = (rate[:-1] + rate[1:]) / 2
+    return out
+
+
+def _soft(field_b: Array) -> Array:
+    """d(A h)/d entries of the symmetric A, (n, 3, 6)."""
+    out = np.zeros((len(field_b), 3, 6))
+    for column, (i, j) in enumerate(zip(*_ENTRIES, strict=True)):
+        out[:, i, column] = field_b[:, j]
+        out[:, j, column] = field_b[:, i]
+    return out
+
+
+RATE_HZ = 12.5  # of the thinned samples: larger follows faster motion and costs more
+KEPT = 16  # blocks
+_MOST = 100.0  # gauss or rad/s: more than any of these sensors reads
+_RATE_ROWS = 9  # from which a piece's rate is measured, whatever blocks they came in
+_WINDOWS = (1, 2, 4, 8)  # informative blocks that are tested together; 1: for the usual size only
+_LEAST_USUAL, _MOST_USUAL = 4, 24  # blocks that say what is usual
+_LIMIT = 40.0  # T over what is usual; in a simulated week 17, with coloured noise 27
+_SHARE = 0.7  # of what each block could gain by a D of its own
+_CLEAR = 4.0  # sigmas from which a component counts
+_INFORMATIVE = 0.005  # gauss (rad/s): a block whose best-known direction is worse says nothing
+_BELIEF = {"hard iron": 0.5, "gyro bias": 0.1}  # 1-sigma of a step before anything is known
+_LEAST = {"hard iron": 0.005, "gyro bias": 0.002}  # smaller ones are nobody's business
+_COLUMNS = {"hard iron": IRON, "gyro bias": GYRO}
+_SHOWN = {"hard iron": (1e3, "mG"), "gyro bias": (1e3, "mrad/s")}
+_WHY = {
+    "hard iron": "something magnetic was mounted, moved or removed",
+    "gyro bias": "the gyro got a shock, or its temperature jumped",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What stepped ("hard iron" or "gyro bias"): by `size` +- `sigma`, (3,), gauss or rad/s.
+
+    at_s: when, device time; told_s: end of the block that decided it; blocks: how many agree.
+    """
+
+    what: str
+    at_s: float
+    told_s: float
+    size: Array
+    sigma: Array
+    blocks: int
+
+    @property
+    def frame(self) -> str:
+        """Where it sits."""
+        return "sensor" if self.what == "hard iron" else "gyro"
+
+    @property
+    def unit(self) -> str:
+        """Of size and sigma."""
+        return "gauss" if self.what == "hard iron" else "rad/s"
+
+    @property
+    def words(self) -> str:
+        """For the log: size, time, what it means."""
+        factor, unit = _SHOWN[self.what]
+        size = ", ".join(f"{value:+.1f}" for value in self.size * factor)
+        sigma = ", ".join(f"{value:.1f}" for value in self.sigma * factor)
+        return (
+            f"the {self.what} changed by ({size}) +- ({sigma}) {unit} at {self.at_s:.0f} s: the "
+            f"calibration in force is void; {_WHY[self.what]}"
+        )
+
+
+class StepDetector:
+    """Samples and the newest estimate in, a `Step` out, once. Bounded memory, deterministic."""
+
+    def __init__(self) -> None:
+        self.found: Step | None = None
+        self._scorer = Scorer()
+        self._estimate: Estimate | None = None
+        self._reference: ReferenceCalibration | None = None
+        self.scored = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything: what follows has another iron, or another calibration."""
+        self._estimate = self._reference = self.found = None
+        self._blocks: deque[ScoredBlock] = deque(maxlen=KEPT)
+        self._single: deque[float] = deque(maxlen=_MOST_USUAL + max(_WINDOWS))
+        self._intake = _Intake()
+
+    @property
+    def armed(self) -> bool:
+        """Whether a step would be told."""
+        return self.found is None and self._usual() is not None
+
+    def add(self, block: SampleBlock, estimate: Estimate | None) -> Step | None:
+        """Take samples; the step, where they show one."""
+        if self.found is not None:
+            return None
+        if estimate is not None and estimate is not self._estimate and estimate.converged:
+            self._estimate = estimate
+            if np.isfinite(estimate.covariance).all():
+                self._reference = ReferenceCalibration.of(estimate)
+        for rows in self._intake.add(block):
+            step = None if self._reference is None else self._judge(rows, self._reference)
+            if step is not None:
+                self.found = step
+                return step
+        return None
+
+    def _judge(self, rows: Thinned, reference: ReferenceCalibration) -> Step | None:
+        block = self._scorer.score(rows, reference)
+        self._blocks.append(block)
+        self.scored += 1
+        if not _informative(block):
+            return None
+        told = [b for b in self._blocks if _informative(b)]
+        usual = self._usual()
+        step = None
+        for count in _WINDOWS:
+            if count > len(told):
+                break
+            newest = told[-count:]
+            gains = _gains(newest)
+            if count == 1:
+                self._single.append(max(gain for gain, _, _ in gains.values()) / 3.0)
+            elif step is None and usual is not None:
+                step = self._decide(newest, gains, usual)
+        return step
+
+    def _usual(self) -> float | None:
+        """What a block without a step gains, 1 if all is as modelled; the newest do not count."""
+        known = list(self._single)
+        older = known[: -min(max(_WINDOWS), max(2, len(known) - _LEAST_USUAL))]
+        return None if len(older) < _LEAST_USUAL else max(1.0, float(np.mean(older)))
+
+    def _decide(
+        self, newest: list[ScoredBlock], gains: dict[str, tuple[float, Array, Array]], usual: float
+    ) -> Step | None:
+        what = max(gains, key=lambda name: gains[name][0])
+        gain, size, information = gains[what]
+        if gain < _LIMIT * usual or _clear_size(size, information) < _LEAST[what]:
+            return None
+        if gain < sum(_drift_gain(block, newest[0].reference) for block in newest):
+            return None
+        if any(_share(block, newest[0].reference, what, size) < _SHARE for block in newest):
+            return None
+        at_s = float(newest[0].time_s[0])
+        if what == "hard iron":
+            # it may have come within the first block: then only the others have all of it
+            _, late, of_late = _gains(newest[1:], newest[0].reference)[what]
+            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, late)]
+            at_s = self._when(newest[0], late if explained[1] > explained[0] else size)
+            if at_s > newest[0].time_s[0]:
+                size, information = late, of_late
+        sigma = np.sqrt(usual * np.diag(np.linalg.inv(information)))
+        return Step(what, at_s, float(newest[-1].time_s[-1]), size, sigma, len(newest))
+
+    def _when(self, first: ScoredBlock, size: Array) -> float:
+        """The time from which on the step explains most, from the first block backwards.
+
+        While the vehicle stands only the jump itself shows.
+        """
+        blocks = list(self._blocks)
+        best, at_s, after = 0.0, float(first.time_s[0]), 0.0
+        last = next(k for k, block in enumerate(blocks) if block is first)
+        for block in reversed(blocks[: last + 1]):
+            gains = after + _onset_gains(block, size)
+            row = int(np.argmax(gains))
+            if gains[row] > best:
+                best, at_s = float(gains[row]), float(block.time_s[row])
+            after = float(gains[0])
+        return at_s
+
+
+class _Intake:
+    """Samples to thinned blocks; a gap, a clock that falls or a change of registers ends one."""
+
+    def __init__(self) -> None:
+        self._waiting: list[SampleBlock] = []
+        self._count = 0
+        self._averaged = 0
+
+    def add(self, block: SampleBlock) -> list[Thinned]:
+        if len(block) == 0:
+            return []
+        out = self._close() if self._breaks(block) else []
+        self._waiting.append(block)
+        self._count += len(block)
+        if not self._averaged and self._count >= _RATE_ROWS:
+            first = np.concatenate([b.time_s for b in self._waiting])[:_RATE_ROWS]
+            usual_s = max(1e-4, float(np.median(np.diff(first))))
+            self._averaged = max(1, round(1.0 / (usual_s * RATE_HZ)))
+        while self._averaged and self._count >= ROWS * self._averaged:
+            out += self._cut(ROWS)
+        return out
+
+    def _breaks(self, block: SampleBlock) -> bool:
+        if not self._waiting:
+            return False
+        last = self._waiting[-1]
+        return block.gap_before or block.epoch != last.epoch or block.time_s[0] <= last.time_s[-1]
+
+    def _close(self) -> list[Thinned]:
+        rows = self._count // self._averaged if self._averaged else 0
+        out = self._cut(rows) if rows >= LEAST_ROWS else []
+        self._waiting, self._count, self._averaged = [], 0, 0
+        return out
+
+    def _cut(self, rows: int) -> list[Thinned]:
+        """The first `rows` thinned rows; none where a number is not one that a sensor reads."""
+        m, used = self._averaged, rows * self._averaged
+        time_s = np.concatenate([b.time_s for b in self._waiting])
+        table = np.concatenate(
+            [np.column_stack([b.raw_b_gauss, b.gyro_b_rad_s]) for b in self._waiting]
+        )
+        last = self._waiting[-1]
+        left = len(time_s) - used
+        self._waiting = [_tail(last, left)] if left else []
+        self._count = left
+        dt_s = np.diff(time_s[:used], prepend=time_s[:1])
+        if not ((np.abs(table) < _MOST).all() and (dt_s[1:] > 0).all()):
+            return []
+        table = table[:used]
+        angle = np.cumsum(table[:, 3:] * dt_s[:, None], axis=0)
+        mean = np.column_stack([time_s[:used], table[:, :3], angle])
+        mean = mean.reshape(rows, m, 7).mean(axis=1)
+        return [Thinned(mean[:, 0], mean[:, 1:4], mean[:, 4:], m)]
+
+
+def _tail(block: SampleBlock, rows: int) -> SampleBlock:
+    return replace(
+        block,
+        time_s=block.time_s[-rows:],
+        dt_s=block.dt_s[-rows:],
+        raw_b_gauss=block.raw_b_gauss[-rows:],
+        gyro_b_rad_s=block.gyro_b_rad_s[-rows:],
+        covariates={},
+    )
+
+
+def _informative(block: ScoredBlock) -> bool:
+    """Whether the block alone knows the hard iron in some direction."""
+    return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE**-2)
+
+
+def _believed(blocks: list[ScoredBlock], reference: ReferenceCalibration) -> tuple[Array, Array]:
+    """Information (12, 12) and score (12,) of what departs from it, less its own error."""
+    total = sum((b.information[:12, :12] for b in blocks), np.zeros((12, 12)))
+    score = np.zeros(12)
+    for b in blocks:
+        score += b.score[:12] + b.information[:12, :12] @ (b.reference.theta - reference.theta)
+    K = total @ reference.root
+    inner = np.eye(12) + reference.root.T @ K
+    solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score]))
+    return total - K @ solved[:, :12], score - K @ solved[:, 12]
+
+
+def _gains(
+    blocks: list[ScoredBlock], reference: ReferenceCalibration | None = None
+) -> dict[str, tuple[float, Array, Array]]:
+    """By what steps: T, the step (3,), its information (3, 3), against the first's reference."""
+    information, score = _believed(blocks, reference or blocks[0].reference)
+    return {what: _gain(information, score, what) for what in _COLUMNS}
+
+
+def _gain(information: Array, score: Array, what: str) -> tuple[float, Array, Array]:
+    columns = _COLUMNS[what]
+    J = information[columns, columns] + np.eye(3) / _BELIEF[what] ** 2
+    size = np.asarray(np.linalg.solve(J, score[columns]), float)
+    return float(score[columns] @ size), size, J
+
+
+def _share(block: ScoredBlock, reference: ReferenceCalibration, what: str, size: Array) -> float:
+    """Of the gain that a step of its own gives the block, what this step gives."""
+    information, score = _believed([block], reference)
+    most, _, J = _gain(information, score, what)
+    return float(2 * size @ score[_COLUMNS[what]] - size @ J @ size) / max(most, 1e-12)
+
+
+def _drift_gain(block: ScoredBlock, reference: ReferenceCalibration) -> float:
+    """T of a field that changes in the world during the block."""
+    score = block.score + block.information[:, :12] @ (block.reference.theta - reference.theta)
+    G, K = block.information, block.information[:, :12] @ reference.root
+    inner = np.eye(12) + reference.root.T @ K[:12]
+    solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score[:12]]))
+    J = (G - K @ solved[:, :15])[DRIFT, DRIFT] + np.eye(3) * 1e-6
+    s = (score - K @ solved[:, 15])[DRIFT]
+    return float(s @ np.linalg.solve(J, s))
+
+
+def _clear_size(size: Array, information: Array) -> float:
+    """Length of the step along the directions in which it is clear."""
+    values, vectors = np.linalg.eigh(information)
+    along = vectors.T @ size
+    return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _CLEAR]))
+
+
+def _onset_gains(block: ScoredBlock, size: Array) -> Array:
+    """(n,) what a step that begins in row k gains in this block, its own field fitted."""
+    moved = block.lever @ size
+    residual = block.residual
+    cross = np.cumsum(np.sum(moved * residual, axis=1)[::-1])[::-1]
+    square = np.cumsum(np.sum(moved**2, axis=1)[::-1])[::-1]
+    mean = np.cumsum(moved[::-1], axis=0)[::-1]
+    return np.asarray(2 * cross - square + np.sum(mean**2, axis=1) / len(moved))

@@ -1,0 +1,90 @@
+"""Recordings that are simulated: effects in an experiment, a repaired model along a measured
+motion, and the files that hold them."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ahrsd.diagnosis import forward, roles
+from ahrsd.diagnosis.effects import profiles, request
+from ahrsd.diagnosis.injection import injected, readings_of, terms_json
+from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.errors import AhrsdError
+from ahrsd.offline.diagnose import load_track
+from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.table import TABLE_SUFFIXES, is_table, write_table
+from ahrsd.samples import Array
+from ahrsd.simulation import Experiment, tabular
+
+STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
+
+
+def with_effects(
+    experiment: Experiment, wanted: Sequence[str], seed: int
+) -> tuple[Experiment, list[dict[str, object]]]:
+    """The experiment with the wanted effects and the covariates they need, and the terms for the
+    truth.  AhrsdError in one line for a request that cannot be."""
+    try:
+        requests = [request.parse(text) for text in wanted]
+        effects = [one.effect for one in requests]
+        columns = profiles.columns_for(effects, experiment.samples.time_s, seed)
+        readings = readings_of(experiment, columns)
+        terms = [one.term(readings) for one in requests]
+    except ValueError as error:
+        raise AhrsdError(f"--effect: {error}") from None
+    return injected(experiment, readings, terms), terms_json(terms)
+
+
+def along(
+    model: RepairedModel, recording: Path, seed: int, columns: ColumnMap = NO_MAP
+) -> tuple[dict[str, Array], list[str]]:
+    """A table's columns: what the repaired model reads along the motion of a recording.
+
+    RecordingError as `diagnose`; AhrsdError where a term needs a column that there is not.
+    """
+    read, notes = load_track(recording, columns=columns)
+    track, refused = roles.prepared(read)
+    try:
+        context = forward.context_along(track, model.calibration, model.terms)
+        truth = forward.truth_along(context)
+        made = forward.simulated(truth, model.terms, model.noise, seed)
+    except ValueError as error:
+        raise AhrsdError(f"{recording}: {error}") from None
+    done = forward.track_of(made, track)
+    written = {"time_s": done.time_s}
+    sensors = [("mag", "gauss", done.mag_b_gauss), ("gyro", "rad_s", done.gyro_b_rad_s)]
+    if done.accel_b_m_s2 is not None:
+        sensors.append(("accel", "m_s2", done.accel_b_m_s2))
+    for name, unit, values in sensors:
+        written |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
+    return written | done.covariates, [*notes, *refused]
+
+
+def write_experiment(path: Path, experiment: Experiment) -> None:
+    """A table, or a byte stream of VNYMR sentences, as the name says.  AhrsdError otherwise."""
+    further = experiment.samples.covariates
+    if is_table(path):
+        write_columns(path, {**tabular.columns(experiment), **further})
+        return
+    if not path.name.endswith(STREAM_SUFFIXES):
+        known = ", ".join((*TABLE_SUFFIXES, *STREAM_SUFFIXES))
+        raise AhrsdError(f"{path}: unknown kind of file; the name must end in one of {known}")
+    if further:
+        raise AhrsdError(
+            f"{path}: a byte stream has no place for {', '.join(further)}; write a table"
+        )
+    content = b"".join(tabular.sentences(experiment))
+    try:
+        path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
+    """A table.  AhrsdError where it cannot be written."""
+    try:
+        write_table(path, columns)
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,141 @@
+"""Samples of a recording as the diagnosis sees them: a track, and what is wrong with it.
+
+What no sensor gives is left out, what cannot be as recorded is said, and what the terms of a
+repaired model add is taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from ahrsd.counting import counted
+from ahrsd.diagnosis.correction import without
+from ahrsd.diagnosis.dead import dead_axes, possible
+from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
+from ahrsd.diagnosis.facts import matters
+from ahrsd.diagnosis.frames import windows
+from ahrsd.diagnosis.hygiene import as_recorded, hygiene
+from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.diagnosis.pauses import without_jumps
+from ahrsd.diagnosis.roles import prepared
+from ahrsd.diagnosis.track import Track
+from ahrsd.errors import AhrsdError
+from ahrsd.events import Event, SamplesSeen
+from ahrsd.samples import Array, SampleBlock
+
+_FEW_MISSING = 0.02  # of the rows, whose acceleration is filled from their neighbours
+_ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
+
+
+def track_of(blocks: list[SampleBlock]) -> Track:
+    """Blocks in order as one track; only covariates that every block has are kept."""
+    names = set.intersection(*(set(block.covariates) for block in blocks)) if blocks else set()
+
+    def join(pick: Callable[[SampleBlock], Array]) -> Array:
+        return np.concatenate([pick(block) for block in blocks])
+
+    dt_s = join(lambda b: b.dt_s).copy()
+    row = 0
+    for block in blocks:
+        if block.gap_before:
+            dt_s[row] = np.nan
+        row += len(block)
+    dt_s[:1] = np.nan
+    starts = [*np.flatnonzero(np.isnan(dt_s)).tolist(), len(dt_s)]
+    accel = join(lambda b: b.accel_b_m_s2)
+    with_accel = bool(np.isfinite(accel).any())
+    return Track(
+        time_s=join(lambda b: b.time_s),
+        dt_s=dt_s,
+        mag_b_gauss=join(lambda b: b.raw_b_gauss),
+        gyro_b_rad_s=join(lambda b: b.gyro_b_rad_s),
+        accel_b_m_s2=accel if with_accel else None,
+        covariates={
+            name: np.concatenate([block.covariates[name] for block in blocks])
+            for name in sorted(names)
+        },
+        runs=tuple(slice(a, b) for a, b in pairwise(starts)),
+    )
+
+
+def checked(track: Track) -> tuple[Track, list[str]]:
+    """The track without what no sensor gives, and one line for each such thing."""
+    track, jumped = without_jumps(track)
+    track, notes = possible(track)
+    accel, said = _acceleration(track)
+    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
+
+
+def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
+    """(N, 3) m/s^2, short holes filled; None where it cannot be used; one line on what was done."""
+    accel = track.accel_b_m_s2
+    if accel is None:
+        return None, []
+    known = np.isfinite(accel).all(axis=1)
+    missing = int(np.count_nonzero(~known))
+    if missing == len(track):
+        return None, []
+    if missing > _FEW_MISSING * len(track):
+        return None, [f"the acceleration was left out: {missing} of {len(track)} rows have none"]
+    notes = [f"no acceleration in {counted(missing, 'row')}: filled"] if missing else []
+    if missing:
+        time_s = track.time_s
+        accel = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])
+    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    if size == 0.0:
+        return None, ["the acceleration was left out: it is 0 throughout, not even gravity"]
+    for unit, factor in _ACCEL_UNITS:
+        if 0.7 * GRAVITY_M_S2 < size * factor < 1.4 * GRAVITY_M_S2:
+            return accel * factor, [*notes, f"the acceleration was in {unit}: taken as m/s^2"]
+    return accel, notes
+
+
+def faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
+    """Units, axes, signs and times that cannot be as recorded, and what is odd, in words."""
+    facts = hygiene(track_of(blocks)) if blocks else ()
+    wrong = [fact.words for fact in facts if fact.stops]
+    return wrong, [fact.words for fact in facts if not fact.stops and matters(fact)]
+
+
+def disagreements(track: Track) -> list[str] | None:
+    """Where field, gyro and gravity do not mean the same axes; None: it turns too little to tell
+    anything, and nothing else is wrong."""
+    found = [fact.words for fact in as_recorded(track)]
+    return found if found or windows(track) else None
+
+
+def without_terms(
+    path: Path, seen: list[Event], model: RepairedModel
+) -> tuple[list[Event], tuple[str, ...]]:
+    """The events, their samples without what the model's terms add; and what stays in them.
+
+    AhrsdError where a term needs a column that the recording has not.
+    """
+    blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
+    if not blocks:
+        return seen, ()
+    track, refused = prepared(checked(track_of(blocks))[0])
+    try:
+        track, left = without(track, model.calibration, model.terms)
+    except ValueError as error:
+        raise AhrsdError("; ".join([f"{path}: {error}", *refused])) from None
+    rows = iter(np.cumsum([0, *map(len, blocks)]).tolist())
+    begin, events = next(rows), []
+    for event in seen:
+        if isinstance(event, SamplesSeen):
+            part, begin = slice(begin, end := next(rows)), end
+            event = replace(
+                event,
+                block=replace(
+                    event.block,
+                    raw_b_gauss=track.mag_b_gauss[part],
+                    gyro_b_rad_s=track.gyro_b_rad_s[part],
+                ),
+            )
+        events.append(event)
+    return events, left
