@@ -28,6 +28,7 @@ from ahrsd.estimator.graph import (
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
+from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -49,7 +50,7 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron and instrument (see `instrument`): H (17, 17), g (17,) at c."""
+    """Quadratic of an epoch in iron and instrument (see `instrument`): H (22, 22), g (22,) at c."""
 
     H: Array
     g: Array
@@ -290,15 +291,21 @@ def _squares(
 # wrong: a host's clock, messages lost without a trace. Whoever turns a full circle sees it; what is
 # estimated with it means nothing. dq/ds = -(dq/dw_b / dt) phi.
 #
+# Shape: the gyro's axes have scales of their own and are not at right angles: its angles are (1 +
+# E) times too small, E symmetric and traceless (5). It is not asked for, only considered: what it
+# may do to the answer widens the answer.
+#
 # One Gauss-Newton step from the answer gives them beside M, b and the bias. On fast motion one
 # looks like another, so they are asked for together. Every epoch stands alone here, its borders
 # free.
 
 TURN, LAG, SCALE = slice(12, 15), 15, 16
-_SIZE = 17
-_OF_ANGLE = np.r_[12:15, 16]
+_ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
+_SIZE = 22
+_X, _REST = slice(0, 12), slice(12, _SIZE)
+_OF_ANGLE = np.r_[12:15, 16:22]
 _FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
-_MOTION = np.ix_(np.r_[9:15, SCALE, _SIZE], np.r_[9:15, SCALE, _SIZE])
+_MOTION = np.ix_(np.r_[9:15, SCALE:23], np.r_[9:15, SCALE:23])
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
 _LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
@@ -343,6 +350,11 @@ class InstrumentInformations:
 
     def of(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
         """LinAlgError where none has motion, or its directions are not determined."""
+        H, g = self.whole(epochs, graph)
+        return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
+
+    def whole(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+        """The same with the gyro's shape: H (N, 22, 22) and gradient (N, 22)."""
         at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
         kept = self._kept
         if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
@@ -402,7 +414,7 @@ class FoldedInformation:
         self._eta = self._eta + H @ _place(c, lag_s) - g
 
     def at(self, c: Array, lag_s: float) -> tuple[Array, Array]:
-        """H (17, 17) and gradient (17,) there."""
+        """H (22, 22) and gradient (22,) there."""
         return self._H, self._H @ _place(c, lag_s) - self._eta
 
 
@@ -428,8 +440,9 @@ def lag_known(
     the lag, so what both make adds up.
     """
     linearise_instrument(epochs, graph)
-    H = believed(graph, sigma_bias)[0] + past.at(graph.c, 0.0)[0]
+    H = past.at(graph.c, 0.0)[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
+    H = believed(graph, sigma_bias)[0] + H[:_ASKED, :_ASKED]
     sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
     return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
 
@@ -459,7 +472,7 @@ def instrument(
     """
     H, g = believed(graph, sigma_bias)
     if before is not None:
-        H, g = H + before[0], g + before[1]
+        H, g = H + before[0][:_ASKED, :_ASKED], g + before[1][:_ASKED]
     H, g = H + epochs[0].sum(axis=0), g + epochs[1].sum(axis=0)
     covariance = _inverse(H)
     step = -covariance @ g
@@ -467,9 +480,38 @@ def instrument(
     return Instrument(step, misfit * covariance, misfit)
 
 
+def considered(
+    epochs: InformationStack,
+    graph: Graph,
+    parameters: EstimatorParameters,
+    before: tuple[Array, Array],
+) -> Array:
+    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12).
+
+    The answer takes the instrument to be perfect; it is not, by as much as `Imperfections` say and
+    as the data leave open. epochs, before: all that is known, imperfections included. What the data
+    say that they are, beyond chance, is an error of the answer and counts as one.
+    LinAlgError where the motion does not tell.
+    """
+    H, g = before[0] + epochs[0].sum(axis=0), before[1] + epochs[1].sum(axis=0)
+    own_H, own_g = believed(graph, parameters.prior_gyro_bias_rad_s)
+    known = np.diag(graph.temper / np.square(parameters.imperfections.sigmas))
+    H[_X, _X] += own_H[_X, _X]
+    H[_REST, _REST] += known
+    g[_X] += own_g[_X]
+    alone = _inverse(H[_X, _X])
+    by_rest = -alone @ H[_X, _REST]
+    left = H[_REST, _REST] + H[_REST, _X] @ by_rest
+    spread = _inverse(left)
+    found = -spread @ (g[_REST] + by_rest.T @ g[_X])
+    chi2 = float(found @ left @ found) / graph.temper
+    wrong = by_rest @ found * np.sqrt(max(0.0, 1.0 - len(found) / max(chi2, 1e-9)))
+    return np.asarray(graph.temper * by_rest @ spread @ by_rest.T + np.outer(wrong, wrong))
+
+
 def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
     """H (17, 17) and gradient (17,) of what is known without the epochs."""
-    H, g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
+    H, g = np.zeros((_ASKED, _ASKED)), np.zeros(_ASKED)
     pull = graph.temper * graph.anchor[1] + graph.hold
     H[:9, :9], g[:9] = pull, pull @ (graph.c - graph.anchor[0])
     prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
@@ -522,10 +564,15 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
 
 
 def _of_angle(by_angle: Array, angle: Array) -> Array:
-    """dq/dtheta and dq/ds, (2, 4, N), of dq/dphi (2, 3, N) and phi (3, N)."""
+    """dq/dtheta, dq/ds and dq/dE, (2, 9, N), of dq/dphi (2, 3, N) and phi (3, N).
+
+    E: x and y apart, z against both, then the three shears.
+    """
     (x, y, z), (p, q, r) = by_angle.transpose(1, 0, 2), angle
     turn = [y * r - z * q, z * p - x * r, x * q - y * p]  # by_angle [phi]x
-    return np.array([*turn, -(x * p + y * q + z * r)]).transpose(1, 0, 2)
+    shape = [y * q - x * p, (2 * z * r - x * p - y * q) / np.sqrt(3.0)]
+    shape += [-(y * r + z * q), -(x * r + z * p), -(x * q + y * p)]
+    return np.array([*turn, -(x * p + y * q + z * r), *shape]).transpose(1, 0, 2)
 
 
 # -- A contradiction -------------------------------------------------------------------------------

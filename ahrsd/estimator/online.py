@@ -14,7 +14,12 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, noise, summary
-from ahrsd.estimator.epoch import Instrument, InstrumentInformations, instrument
+from ahrsd.estimator.epoch import (
+    Instrument,
+    InstrumentInformations,
+    considered,
+    instrument,
+)
 from ahrsd.estimator.epoch_builder import EpochBuilder, check_samples, with_border
 from ahrsd.estimator.graph import Node, SingularError, curvature, whitening
 from ahrsd.estimator.model_checks import (
@@ -299,6 +304,17 @@ class Estimator:
         known = window.lag_known() if window.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
+    def _by_imperfections(self, window: Window) -> Array:
+        """What an instrument that is not perfect adds to the covariance (12, 12)."""
+        if not any(self.parameters.imperfections.sigmas):
+            return np.zeros((12, 12))
+        before = window.folded_information.at(window.graph.c, window.lag_s)
+        try:
+            said = self._informations.whole(window.epochs, window.graph)
+            return considered(said, window.graph, self.parameters, before)
+        except np.linalg.LinAlgError:
+            return np.zeros((12, 12))
+
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
         window = self._window
@@ -331,7 +347,7 @@ class Estimator:
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         covariance = covariance * (1.0 + doubt**2) * self._parted
-        covariance = covariance + self._by_lag(window)
+        covariance = covariance + self._by_lag(window) + self._by_imperfections(window)
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)

@@ -9,6 +9,32 @@ MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
 
 @dataclass(frozen=True, slots=True)
+class Imperfections:
+    """What an instrument that nobody calibrated may have besides iron and bias, 1 sigma each.
+
+    turn_rad: the magnetometer's axes against the gyro's, per axis [1.1 deg: two boards in one
+              housing; a VN-100's own is .05 deg by its data sheet]
+    lag_s:    the field's reading against the gyro's [15 ms: filters, buses, drivers]
+    scale:    the gyro's angles, all axes alike [1 %: data sheets of MEMS gyros uncalibrated]
+    shape:    each of the five ways in which its scales differ and its axes are not at right angles
+              [1 %, the same]
+    """
+
+    turn_rad: float = 0.02
+    lag_s: float = 0.015
+    scale: float = 0.01
+    shape: float = 0.01
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """Turn (3), lag, scale, shape (5)."""
+        return (*[self.turn_rad] * 3, self.lag_s, self.scale, *[self.shape] * 5)
+
+
+PERFECT = Imperfections(0.0, 0.0, 0.0, 0.0)  # as in a simulation that has none
+
+
+@dataclass(frozen=True, slots=True)
 class EstimatorParameters:
     """Settings of the estimator (VQF's discipline: what it does, which way it pushes, unit).
 
@@ -27,6 +53,8 @@ class EstimatorParameters:
     outlier_sigma:     field residuals beyond this many sigmas lose weight quadratically [4.6, which
                        Gaussian noise exceeds once in 10^4 samples]
     mag_noise_floor_gauss, gyro_noise_floor_rad_s: never believe less noise than this
+    imperfections:     of the instrument, that the answer is widened for as far as the data leave
+                       them open
     """
 
     step_rate_hz: float = 33.0
@@ -39,11 +67,14 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
+    imperfections: Imperfections = Imperfections()
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that is out of range."""
         for name in self.__slots__:
             value = getattr(self, name)
+            if isinstance(value, Imperfections):
+                continue
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be a positive number")
         if self.epoch_steps < MIN_EPOCH_STEPS:

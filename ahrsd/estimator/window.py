@@ -101,6 +101,7 @@ class Window:
         self.folded = False
         self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
         self.past = FoldedInformation()  # of what was folded since there is a lag
+        self.folded_information = FoldedInformation()  # of all that was folded
         self._folded_cells = DirectionCells()
         self._rest: Array | None = None
         self._work = 0
@@ -184,20 +185,23 @@ class Window:
             self.folded |= old.turned
             if old.turned:
                 self._folded_cells += old.cells
-            self._remember_lag(old)
+            self._remember_instrument(old)
             self.misfit.remember(old.factor, scores_of([old])[0], self.graph)
             while self.graph.first < self.epochs[0].a:
                 self.graph.fold_oldest()
 
-    def _remember_lag(self, old: WindowEpoch) -> None:
-        """Keep what an epoch that leaves the window knows of the lag, where one is taken out."""
-        if not old.turned or self.lag_s == 0.0:
+    def _remember_instrument(self, old: WindowEpoch) -> None:
+        """Keep what an epoch that leaves the window knows of the instrument."""
+        if not old.turned:
             return
         if old.instrument is None:  # the others will be asked soon; together it is cheaper
             linearise_instrument([old, *self.epochs], self.graph)
         if old.instrument is not None:
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            self.past = self.past.with_epoch(old.instrument, self.lag_s, sigma_bias)
+            told = old.instrument, self.lag_s, sigma_bias
+            self.folded_information = self.folded_information.with_epoch(*told)
+            if self.lag_s != 0.0:
+                self.past = self.past.with_epoch(*told)
 
     # -- linearisation ---------------------------------------------------------------------------
 

@@ -16,9 +16,11 @@ from scipy.stats import chi2
 from ahrsd.calibration import Affine
 from ahrsd.estimator import summary
 from ahrsd.estimator.online import WHOLE, Estimator
-from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.parameters import PERFECT, EstimatorParameters
 from ahrsd.recording.table import read_table
 
+#: the simulated instrument has no imperfections, and the bound knows of none
+IDEAL = EstimatorParameters(imperfections=PERFECT)
 SMALL = EstimatorParameters(epoch_steps=128)
 
 
@@ -35,7 +37,7 @@ bench = _benchmark()
 
 
 def calibrated(run, estimator=None, size=50):
-    estimator = estimator or Estimator()
+    estimator = estimator or Estimator(IDEAL)
     history = bench.feed(estimator, run.block, size)
     return estimator.finish(), history
 
@@ -240,8 +242,8 @@ def test_blocks_of_any_size_give_bit_identical_estimates():
 def test_many_epochs_at_once_give_the_answer_of_a_stream(kind, motion):
     """Whether all fit into the window or not, and whatever the size of the blocks."""
     run = bench.simulate(kind, motion, 1)
-    small = EstimatorParameters(window_steps=4096)
-    for parameters, far in ((EstimatorParameters(), 0.2), (small, 0.3)):
+    small = EstimatorParameters(window_steps=4096, imperfections=PERFECT)
+    for parameters, far in ((IDEAL, 0.2), (small, 0.3)):
         one = unasked(Estimator(parameters), run.block)
         whole, other = (
             unasked(Estimator(parameters, at_once=8), run.block, size) for size in (1000, 333)
@@ -458,7 +460,7 @@ def test_circles_calibrate_the_drive_that_follows(replayed, request):
 def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():
     """It is as often below 1, where it counts as 1: else sigmas were always too large."""
     run = bench.simulate("mam", "rov", 5, samples=4000)
-    estimator = Estimator(at_once=WHOLE)
+    estimator = Estimator(IDEAL, at_once=WHOLE)
     estimator.add(run.block)
     estimate = estimator.finish()
     assert 1.15 < estimate.misfit < 1.4

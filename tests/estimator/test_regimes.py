@@ -78,7 +78,7 @@ def test_motions_put_together_from_pieces(monkeypatch):
 def test_what_a_lag_costs_follows_the_data(seed):
     """Found in level circles, where it leaves the vertical hard iron open; the roll closes that."""
     made = pieces.drive((("circles", 100.0), ("roll", 60.0)), seed, rate_hz=20.0, lag_s=LAG_S)
-    estimator = Estimator()
+    estimator = Estimator(pieces.IDEAL)
     estimator.add(part(made.block, 0, 2000))
     level = estimator.estimate()
     estimator.add(part(made.block, 2000, len(made.block)))
@@ -103,7 +103,7 @@ def test_taking_a_lag_out_leaves_no_noise_behind(motion):
 def test_what_left_the_window_still_tells_the_lag():
     """A roll that is forgotten as rows and remembered as a Gaussian, then circles for long."""
     made = pieces.drive((("roll", 80.0), ("circles", 1100.0)), 4, rate_hz=20.0, lag_s=LAG_S)
-    estimator = Estimator()
+    estimator = Estimator(pieces.IDEAL)
     for a in range(0, len(made.block), 400):
         estimator.add(part(made.block, a, min(a + 400, len(made.block))))
     found = estimator.estimate()

@@ -10,7 +10,7 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.calibration import Estimate
 from ahrsd.estimator.online import Estimator
-from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.parameters import PERFECT, EstimatorParameters
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.samples import Array, SampleBlock
@@ -124,9 +124,13 @@ def drive(
     return Drive(block, field, rate, shift / (rate_hz * _SUBSTEPS))
 
 
+#: the pieces' instrument has no imperfections, and the bound knows of none
+IDEAL = EstimatorParameters(imperfections=PERFECT)
+
+
 def answer(made: Drive, *, at_once: int = 1) -> Estimate | None:
     """Of the estimator over the whole recording."""
-    estimator = Estimator(at_once=at_once)
+    estimator = Estimator(IDEAL, at_once=at_once)
     estimator.add(made.block)
     return estimator.finish()
 
