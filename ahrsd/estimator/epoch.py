@@ -488,25 +488,41 @@ def considered(
 ) -> Array:
     """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12).
 
-    The answer takes the instrument to be perfect; it is not, by as much as `Imperfections` say and
-    as the data leave open. epochs, before: all that is known, imperfections included. What the data
-    say that they are, beyond chance, is an error of the answer and counts as one.
+    The answer takes the instrument to be perfect. It is of one of the kinds of
+    `parameters.imperfections`, each as likely as the data make it. Of each kind, what the data
+    leave open of the imperfections spreads the answer, and what they say that they are is an error
+    of it. epochs, before: all that is known, imperfections included.
     LinAlgError where the motion does not tell.
     """
     H, g = before[0] + epochs[0].sum(axis=0), before[1] + epochs[1].sum(axis=0)
     own_H, own_g = believed(graph, parameters.prior_gyro_bias_rad_s)
-    known = np.diag(graph.temper / np.square(parameters.imperfections.sigmas))
-    H[_X, _X] += own_H[_X, _X]
-    H[_REST, _REST] += known
-    g[_X] += own_g[_X]
-    alone = _inverse(H[_X, _X])
+    alone = _inverse(H[_X, _X] + own_H[_X, _X])
     by_rest = -alone @ H[_X, _REST]
-    left = H[_REST, _REST] + H[_REST, _X] @ by_rest
-    spread = _inverse(left)
-    found = -spread @ (g[_REST] + by_rest.T @ g[_X])
-    chi2 = float(found @ left @ found) / graph.temper
-    wrong = by_rest @ found * np.sqrt(max(0.0, 1.0 - len(found) / max(chi2, 1e-9)))
-    return np.asarray(graph.temper * by_rest @ spread @ by_rest.T + np.outer(wrong, wrong))
+    known = H[_REST, _REST] + H[_REST, _X] @ by_rest
+    asked = g[_REST] + by_rest.T @ (g[_X] + own_g[_X])
+    kinds = [np.array(kind.sigmas) for kind in parameters.imperfections]
+
+    def found(sigmas: Array, temper: float) -> tuple[Array, Array]:
+        spread = _inverse(known + np.diag(temper / sigmas**2))
+        return spread, -spread @ asked
+
+    def left(sigmas: Array) -> float:
+        rest = found(sigmas, graph.temper)[1]
+        step = np.r_[-alone @ (g[_X] + own_g[_X]) + by_rest @ rest, rest]
+        return max(1.0, disagreement(*epochs, step))
+
+    # what an imperfection makes the epochs disagree is no noise
+    temper = min(graph.temper, *map(left, kinds))
+    evidence, spreads = [], []
+    for sigmas in kinds:
+        spread, rest = found(sigmas, temper)
+        told = np.linalg.slogdet(np.eye(len(rest)) + known / temper * np.outer(sigmas, sigmas))[1]
+        evidence.append(0.5 * (float(-asked @ rest) / temper - float(told)))
+        wrong = by_rest @ rest
+        spreads.append(temper * by_rest @ spread @ by_rest.T + np.outer(wrong, wrong))
+    likely = np.exp(np.array(evidence) - max(evidence))
+    added = np.einsum("k,kij->ij", likely / likely.sum(), np.array(spreads))
+    return np.asarray((added + added.T) / 2)
 
 
 def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:

@@ -306,7 +306,7 @@ class Estimator:
 
     def _by_imperfections(self, window: Window) -> Array:
         """What an instrument that is not perfect adds to the covariance (12, 12)."""
-        if not any(self.parameters.imperfections.sigmas):
+        if not self.parameters.imperfections:
             return np.zeros((12, 12))
         before = window.folded_information.at(window.graph.c, window.lag_s)
         try:

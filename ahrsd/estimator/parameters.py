@@ -10,20 +10,19 @@ MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """What an instrument that nobody calibrated may have besides iron and bias, 1 sigma each.
+    """What a kind of instrument has besides iron and bias, 1 sigma each.
 
-    turn_rad: the magnetometer's axes against the gyro's, per axis [1.1 deg: two boards in one
-              housing; a VN-100's own is .05 deg by its data sheet]
-    lag_s:    the field's reading against the gyro's [15 ms: filters, buses, drivers]
-    scale:    the gyro's angles, all axes alike [1 %: data sheets of MEMS gyros uncalibrated]
-    shape:    each of the five ways in which its scales differ and its axes are not at right angles
-              [1 %, the same]
+    turn_rad: the magnetometer's axes against the gyro's, about each axis [rad]
+    lag_s:    the field's reading against the gyro's [s]
+    scale:    the gyro's angles, all axes alike, over themselves [1]
+    shape:    each of the five ways in which the gyro's scales differ and its axes are not at right
+              angles [1]
     """
 
-    turn_rad: float = 0.02
-    lag_s: float = 0.015
-    scale: float = 0.01
-    shape: float = 0.01
+    turn_rad: float
+    lag_s: float
+    scale: float
+    shape: float
 
     @property
     def sigmas(self) -> tuple[float, ...]:
@@ -31,7 +30,11 @@ class Imperfections:
         return (*[self.turn_rad] * 3, self.lag_s, self.scale, *[self.shape] * 5)
 
 
-PERFECT = Imperfections(0.0, 0.0, 0.0, 0.0)  # as in a simulation that has none
+#: as its maker calibrated it: a VN-100's data sheet says axes within .05 deg; both are sampled at
+#: 800 Hz; what is left of a scale is chosen (the data sheet's .1 % is of the full range)
+AS_SPECIFIED = Imperfections(turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4)
+#: put together from parts: some degree between two boards, filters and buses, a MEMS gyro as it is
+ASSEMBLED = Imperfections(turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +56,8 @@ class EstimatorParameters:
     outlier_sigma:     field residuals beyond this many sigmas lose weight quadratically [4.6, which
                        Gaussian noise exceeds once in 10^4 samples]
     mag_noise_floor_gauss, gyro_noise_floor_rad_s: never believe less noise than this
-    imperfections:     of the instrument, that the answer is widened for as far as the data leave
-                       them open
+    imperfections:     kinds of instruments that it may be; the answer is widened for what each
+                       has and the data leave open. None: it is perfect, as a simulated one
     """
 
     step_rate_hz: float = 33.0
@@ -67,13 +70,13 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
-    imperfections: Imperfections = Imperfections()
+    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, ASSEMBLED)
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that is out of range."""
         for name in self.__slots__:
             value = getattr(self, name)
-            if isinstance(value, Imperfections):
+            if name == "imperfections":
                 continue
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be a positive number")

@@ -25,7 +25,7 @@ import numpy as np
 from ahrsd.baselines import METHODS, MethodError, MethodSettings, calibrate_with
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.online import WHOLE, Estimator
-from ahrsd.estimator.parameters import PERFECT, EstimatorParameters
+from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.montecarlo.accuracy import (
     HEADINGS,
     MethodAnswer,
@@ -57,7 +57,7 @@ _BLOCK = 1000
 
 
 #: a simulated instrument has no imperfections but iron and bias; the published methods know of none
-IDEAL = EstimatorParameters(imperfections=PERFECT)
+IDEAL = EstimatorParameters(imperfections=())
 
 
 def known_methods() -> tuple[str, ...]:

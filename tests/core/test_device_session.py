@@ -131,6 +131,9 @@ def test_closed_in_any_phase_the_device_is_as_it_was(phase):
     elif phase is Phase.CLOSED:
         talk.in_phase(Phase.READY)
         talk.device_session.lost(talk.now_s)
+    elif phase is Phase.SERVING:
+        talk.in_phase(Phase.READY).device_session.serve(Read(23), talk.now_s)
+        assert talk.device_session.phase is phase
     else:
         talk.in_phase(phase)
     closed = talk.until(lambda: talk.device_session.may_close).close()

@@ -16,11 +16,11 @@ from scipy.stats import chi2
 from ahrsd.calibration import Affine
 from ahrsd.estimator import summary
 from ahrsd.estimator.online import WHOLE, Estimator
-from ahrsd.estimator.parameters import PERFECT, EstimatorParameters
+from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.recording.table import read_table
 
 #: the simulated instrument has no imperfections, and the bound knows of none
-IDEAL = EstimatorParameters(imperfections=PERFECT)
+IDEAL = EstimatorParameters(imperfections=())
 SMALL = EstimatorParameters(epoch_steps=128)
 
 
@@ -242,7 +242,7 @@ def test_blocks_of_any_size_give_bit_identical_estimates():
 def test_many_epochs_at_once_give_the_answer_of_a_stream(kind, motion):
     """Whether all fit into the window or not, and whatever the size of the blocks."""
     run = bench.simulate(kind, motion, 1)
-    small = EstimatorParameters(window_steps=4096, imperfections=PERFECT)
+    small = EstimatorParameters(window_steps=4096, imperfections=())
     for parameters, far in ((IDEAL, 0.2), (small, 0.3)):
         one = unasked(Estimator(parameters), run.block)
         whole, other = (

@@ -10,7 +10,7 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.calibration import Estimate
 from ahrsd.estimator.online import Estimator
-from ahrsd.estimator.parameters import PERFECT, EstimatorParameters
+from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.samples import Array, SampleBlock
@@ -125,7 +125,7 @@ def drive(
 
 
 #: the pieces' instrument has no imperfections, and the bound knows of none
-IDEAL = EstimatorParameters(imperfections=PERFECT)
+IDEAL = EstimatorParameters(imperfections=())
 
 
 def answer(made: Drive, *, at_once: int = 1) -> Estimate | None:
