@@ -163,7 +163,9 @@ def test_every_key_says_what_it_does():
 def test_the_estimators_defaults_have_one_source():
     assert Config().estimator.parameters() == EstimatorParameters()
     names = {field.name for field in dataclasses.fields(EstimatorParameters)}
-    assert set(type(Config().estimator).model_fields) - {"warm_start_s"} == names
+    assert set(type(Config().estimator).model_fields) - {"warm_start_s"} == names - {
+        "imperfections"
+    }
 
 
 def test_the_gates_defaults_have_one_source():

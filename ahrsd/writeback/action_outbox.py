@@ -99,7 +99,7 @@ class ActionOutbox:
         """
         if serial != self._serial and self._unjournaled:
             self.note(
-                "error", f"lost of {self._serial}: {counted(len(self._unjournaled), 'record')}"
+                "error", f"lost: {counted(len(self._unjournaled), 'record')} of {self._serial}"
             )
             self._unjournaled.clear()
         self._serial, self._bound_s, self.device_s = serial, self.host_s, None

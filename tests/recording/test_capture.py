@@ -22,6 +22,8 @@ from mcap.reader import make_reader
 
 from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import (
+    ClientLeft,
+    ClientSent,
     Columns,
     EarlierRun,
     EarlierSamples,
@@ -62,6 +64,8 @@ EVERY_INPUT: list[Input] = [
     TermsKnown(13, '{"schema": "ahrsd.model/1"}'),
     Columns(13, {"motor_current_a": 3.25}),
     Operator(14, "approve", "ab12"),
+    ClientSent(5, "/run/ahrsd/vn100", "$VNRRG,01*72\r\n\xff"),
+    ClientLeft(6, "/run/ahrsd/vn100"),
     LinkLost(15, "unplugged"),
     JournalOpened(15, 100012345, [{"seq": 1, "old": {"23": [1.0, 1e-7]}}], "line 2 is damaged"),
     Journalled(15, "PREPARED"),

@@ -160,7 +160,7 @@ def test_a_row_after_doubled_ones_is_named_by_its_number_in_the_file(tmp_path):
 
 def test_one_row_written_many_times_is_too_short(tmp_path):
     values = {name: [cells[0]] * ROWS for name, cells in columns().items()}
-    with pytest.raises(RecordingError, match="has 1 rows"):
+    with pytest.raises(RecordingError, match="has 1 row"):
         read_table(save(tmp_path / "t.csv", values))
 
 
@@ -178,7 +178,7 @@ MAG, GYRO = NAMES[1:4], NAMES[4:7]
     ("change", "words"),
     [
         (cell("time_s", 9, "0.100"), "row 11, column time_s: time goes back (0.16 to 0.1 s"),
-        (cell("mag_y_gauss", 3, ""), "row 5, column mag_y_gauss: empty, nan or infinite (1 rows"),
+        (cell("mag_y_gauss", 3, ""), "row 5, column mag_y_gauss: empty, nan or infinite (1 row"),
         (cell("gyro_x_rad_s", 3, "nan"), "row 5, column gyro_x_rad_s: empty, nan"),
         (cell("gyro_z_rad_s", 48, "inf"), "row 50, column gyro_z_rad_s: empty, nan or infinite"),
         (cell("mag_z_gauss", 3, "0.1x"), "row 5, column mag_z_gauss: '0.1x' is no number"),

@@ -20,7 +20,8 @@ READS = [Read(number) for number in REGISTERS]
 COMMANDS: list[Command] = [*WRITES, *SPOKEN, *READS]
 
 modes = st.sampled_from(Mode)
-purposes = st.sampled_from(Purpose)
+OURS = [purpose for purpose in Purpose if purpose is not Purpose.CLIENT]
+purposes = st.sampled_from(OURS)
 commands = st.sampled_from(COMMANDS)
 
 
@@ -52,13 +53,37 @@ TABLE = {
 
 @pytest.mark.parametrize("mode", Mode)
 @pytest.mark.parametrize("configure_stream", [False, True])
-@pytest.mark.parametrize("purpose", Purpose)
+@pytest.mark.parametrize("purpose", OURS)
 def test_every_mode_and_purpose(mode: Mode, configure_stream: bool, purpose: Purpose) -> None:
     """Where the table above has no row for it, or its row without the stream, nothing passes."""
     row = TABLE.get((mode, configure_stream, purpose), TABLE.get((mode, False, purpose), set()))
     assert allowed(mode, configure_stream, purpose) == row
     reads = [permitted(c, mode, configure_stream, purpose) for c in READS]
     assert set(reads) == {mode is not Mode.PASSIVE}
+
+
+@pytest.mark.parametrize("mode", Mode)
+@pytest.mark.parametrize("configure_stream", [False, True])
+def test_what_clients_ask_for_passes_in_every_mode_but_nothing_that_calibrates(
+    mode: Mode, configure_stream: bool
+) -> None:
+    """Who may ask what is decided before (`sharing.client_commands`)."""
+    passed = allowed(mode, configure_stream, Purpose.CLIENT)
+    registers = {str(c.register) for c in WRITES} - {
+        str(n) for n in (5, 23, 25, 26, 43, 44, 74, 84)
+    }
+    assert passed == registers | {"VNWNV", "VNRST", "VNKMD", "VNKAD"}
+    assert all(permitted(c, mode, configure_stream, Purpose.CLIENT) for c in READS)
+
+
+@given(st.sampled_from(WRITES), modes, st.booleans(), st.sets(st.sampled_from(sorted(REGISTERS))))
+def test_a_save_puts_settings_of_clients_back_and_nothing_that_calibrates(
+    command: Write, mode: Mode, stream: bool, clients: set[int]
+) -> None:
+    may = permitted(command, mode, stream, Purpose.SAVE, clients)
+    theirs = command.register in clients - {5, 23, 25, 26, 43, 44, 74, 84}
+    ours = stream and command.register in SESSION_SETTINGS
+    assert may == (mode is Mode.COMMIT and (theirs or ours))
 
 
 @given(commands, st.booleans(), purposes)

@@ -294,7 +294,7 @@ def test_records_of_another_unit_are_not_journaled_for_this_one(make_rig):
     rig.connect()
     rig.pass_time(31.0)
     assert rig.kinds == []
-    assert any("2 records of" in text for text in rig.notes("error"))
+    assert any("lost: 2 records of" in text for text in rig.notes("error"))
 
 
 # -- the rollback itself ---------------------------------------------------------------------------
