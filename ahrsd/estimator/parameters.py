@@ -30,10 +30,10 @@ class Imperfections:
         return (*[self.turn_rad] * 3, self.lag_s, self.scale, *[self.shape] * 5)
 
 
-#: as its maker calibrated it: a VN-100's data sheet says axes within .05 deg; both are sampled at
-#: 800 Hz; what is left of a scale is chosen (the data sheet's .1 % is of the full range)
+#: as its maker calibrated it. Chosen, and not checked against a data sheet: axes within some .05
+#: deg, half a sample at 800 Hz, and what is left of a scale
 AS_SPECIFIED = Imperfections(turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4)
-#: put together from parts: some degree between two boards, filters and buses, a MEMS gyro as it is
+#: put together from parts. Chosen: a degree between two boards, filters and buses, a gyro's 1 %
 ASSEMBLED = Imperfections(turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01)
 
 

@@ -1,7 +1,7 @@
-"""What real drivers send to a VN-100 at their start, line by line, as they were heard.
+"""What real drivers send to a VN-100 at their start, line by line, between $ and *.
 
-Between $ and *; what a driver waits for and how often it asks again is with each. The drivers are
-dawonn/vectornav (ROS 2), ntnu-arl/vectornav, VectorNav's SDK 0.99 and ArduPilot.
+dawonn/vectornav (ROS 2), ntnu-arl/vectornav and VectorNav's SDK 0.99 as they were traced; ArduPilot
+only as it is described: text off, binary output without a time at 50 Hz.
 """
 
 from __future__ import annotations
@@ -17,4 +17,4 @@ NTNU_BEHIND_THE_RESET = (
     "VNWRG,85,0,4,4,4,4,0,3,3,3,0", "VNWRG,75,1,4,6,1,3E", "VNWRG,76,0,1,0", "VNWRG,77,0,1,0",
 )  # fmt: skip
 SDK = ("VNRRG,01", "VNWRG,06,0,1", "VNWRG,75,1,20,01,0721")
-ARDUPILOT = ("VNWRG,06,0", "VNWRG,75,3,16,01,0721", "VNRRG,01")
+ARDUPILOT = ("VNWRG,06,0", "VNWRG,75,3,16,01,0720", "VNRRG,01")
