@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from ahrsd import events, inputs
+from ahrsd import inputs
 from ahrsd.core.device_session import DeviceSession
+from ahrsd.events import SendToClient
 from ahrsd.sharing.arbiter import COUNTED, Arbiter, Waiting
 from ahrsd.sharing.client_commands import UNAUTHORIZED, Kind, Refusal, SharePolicy
 from ahrsd.writeback.actions import Action
@@ -59,12 +60,9 @@ class Clients:
         """The device reports an error of its own: each driver would have heard it."""
         self.arbiter.tell_all(f"VNERR,{code:02X}")
 
-    def take_answers(self) -> list[events.Event]:
+    def take_answers(self) -> list[SendToClient]:
         """Bytes for clients."""
-        return [
-            events.SendToClient(one.client, one.data, one.stream)
-            for one in self.arbiter.take_answers()
-        ]
+        return self.arbiter.take_answers()
 
     def take_notes(self) -> list[str]:
         """What a person should know of."""

@@ -15,6 +15,7 @@ from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
+from ahrsd.events import SendToClient
 from ahrsd.sharing.client_commands import (
     BAD_CHECKSUM,
     IDENTITY,
@@ -35,15 +36,6 @@ from drivers.vn100.sentences import encode
 PATIENCE_S = 2.5  # the longest that a known driver waits for an answer
 MOST_WAITING = 16  # commands of one client
 COUNTED = ("commands", "answered", "refused", "absorbed", "dropped", "unanswered")
-
-
-@dataclass(frozen=True, slots=True)
-class ToClient:
-    """Bytes for a client; `stream`: whether it wants measurements from now on, None: as before."""
-
-    client: str
-    data: bytes
-    stream: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +63,7 @@ class Arbiter:
         self._clients = {policy.name: _Client(policy) for policy in policies}
         self._queue: deque[Waiting] = deque()
         self._under_way: Waiting | None = None
-        self._answers: list[ToClient] = []
+        self._answers: list[SendToClient] = []
         self._notes: list[str] = []
 
     @property
@@ -84,7 +76,7 @@ class Arbiter:
         """The command that is on the wire."""
         return self._under_way
 
-    def take_answers(self) -> list[ToClient]:
+    def take_answers(self) -> list[SendToClient]:
         """What is due to clients since the last call."""
         answers, self._answers = self._answers, []
         return answers
@@ -211,4 +203,4 @@ class Arbiter:
 
     def _say(self, name: str, data: bytes, stream: bool | None = None) -> None:
         if name in self._clients:
-            self._answers.append(ToClient(name, data, stream))
+            self._answers.append(SendToClient(name, data, stream))

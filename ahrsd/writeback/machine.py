@@ -127,7 +127,9 @@ class WriteBack:
 
         Never while nobody knows what the device holds.
         """
-        if self.state in (State.FAULT, State.FLASH_TORN):
+        history = self.history
+        foreign = history.locked is not None and history.last is RecordKind.FOREIGN
+        if foreign or self.state in (State.FAULT, State.FLASH_TORN):
             return False
         if self.state in _BETWEEN or self._outbox.running:
             return None

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from cabled_units import sentence
 
-from ahrsd.sharing.arbiter import MOST_WAITING, PATIENCE_S, Arbiter, ToClient
+from ahrsd.events import SendToClient
+from ahrsd.sharing.arbiter import MOST_WAITING, PATIENCE_S, Arbiter
 from ahrsd.sharing.client_commands import SharePolicy
 from drivers.vn100.commands import NoReply, Read, Write
 from drivers.vn100.decode import Reply
@@ -103,8 +104,8 @@ def test_the_rate_of_the_line_is_pretended(arbiter):
 def test_pausing_the_output_is_a_clients_own_matter(arbiter):
     ask(arbiter, "b", "VNASY,0", "VNASY,1")
     off, on = arbiter.take_answers()
-    assert off == ToClient("b", sentence("VNASY,0"), stream=False)
-    assert on == ToClient("b", sentence("VNASY,1"), stream=True)
+    assert off == SendToClient("b", sentence("VNASY,0"), stream=False)
+    assert on == SendToClient("b", sentence("VNASY,1"), stream=True)
     assert arbiter.first(0.0) is None
 
 

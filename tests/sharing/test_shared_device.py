@@ -135,6 +135,19 @@ def test_a_save_of_the_owner_saves_nothing_unproven(state):
     assert run.kinds()[-3:] == ["ROLLBACK", "ROLLED_BACK", "CLIENT_SAVED"]
 
 
+def test_nothing_is_saved_for_the_owner_while_the_device_holds_what_nobody_knows():
+    """Somebody wrote one register in a trial: the other still holds a value that is not proven."""
+    run = shared()
+    unit = run.cable.unit
+    run.approve()
+    assert run.until("TRIAL", 30.0)
+    unit.ram[23] = "1.02,0,0,0,1.01,0,0,0,1,0.11,0.01,0.02"
+    assert run.until("LOCKED", 40.0), run.notes
+    assert start(run, ("VNWNV",)) == ["VNERR,09"]
+    assert unit.saves == []
+    assert run.told("nothing is saved for a client")
+
+
 def test_a_driver_that_saves_and_resets_a_hundred_times_leaves_the_registers_as_they_were():
     run = shared(planted=False, mode=Mode.OBSERVE)
     unit = run.cable.unit
