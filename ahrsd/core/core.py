@@ -469,7 +469,8 @@ class Core:
             self.stream.facts.rate_source == "device time"
             and self.stream.restarts == self._restarts
         ):
-            self._action_queue.add(self.writeback.on_uptime(self.at_s, self._host_s))
+            heard_s = min(float(block.host_s[-1]), self._host_s)
+            self._action_queue.add(self.writeback.on_uptime(self.at_s, self._host_s, heard_s))
         if self.stream.take_replaced():
             self.unconfirmed.drop()
             self.calibrator = self.calibrator.anew()

@@ -65,11 +65,15 @@ class ActionOutbox:
     @property
     def stamp(self) -> Stamp:
         """The present by every clock, for a record."""
-        boot_id, offset_s = self._boot
+        return self.stamp_at(self.host_s)
+
+    def stamp_at(self, host_s: float) -> Stamp:
+        """That moment by every clock of the host, and the device's time as last heard."""
+        (boot_id, boot_s), wall_s = self._boot, self._wall_offset_s
         return Stamp(
-            wall_s=None if self._wall_offset_s is None else self.wall_s,
+            wall_s=None if wall_s is None else host_s + wall_s,
             boot_id=boot_id,
-            boot_s=None if offset_s is None else self.host_s + offset_s,
+            boot_s=None if boot_s is None else host_s + boot_s,
             device_s=self.device_s,
         )
 

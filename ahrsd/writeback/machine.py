@@ -228,26 +228,32 @@ class WriteBack:
         self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
-    def on_uptime(self, uptime_s: float, host_s: float) -> list[Action]:
+    def on_uptime(
+        self, uptime_s: float, host_s: float, heard_s: float | None = None
+    ) -> list[Action]:
         """The device's time since its start-up, as its stream tells: a restart that nobody saw.
 
         One since the registers were read makes that reading void. And only a restart shows what a
         save left in flash, so it is asked again then.
+
+        heard_s: when the message came that told it, where that was before now
         """
         outbox, record = self._outbox, self.history.last_at
-        outbox.host_s = host_s
-        reason = self._restarts.heard(uptime_s, host_s)
+        outbox.host_s, heard_s = host_s, host_s if heard_s is None else heard_s
+        if outbox.running:
+            self._restarts.doubt()
+        reason, stamp = self._restarts.heard(uptime_s, heard_s), outbox.stamp_at(heard_s)
         if reason:
-            self._restarts.seen(record, outbox.stamp, host_s, uptime_s)
+            self._restarts.seen(record, stamp, heard_s, uptime_s)
         elif (
             self.history.open is not None
             and self.state in RESTS
-            and self._restarts.proven(record, outbox.stamp, host_s)
+            and self._restarts.proven(record, stamp, heard_s)
         ):
             self._restarts.concluded()
             reason = "the device restarted since the journal's newest record"
-        else:
-            outbox.device_s = uptime_s
+        elif not self._restarts.doubtful(heard_s):
+            outbox.device_s = uptime_s + host_s - heard_s
         if reason:
             self._flow.signal(Signal.DEVICE_RESET, reason)
             outbox.ask(IdentifyAgain())
@@ -275,6 +281,7 @@ class WriteBack:
             flow.changed(tuple(changed))
         else:
             self.confirmed_s = self._recheck.asked_s
+            self._restarts.answered(self._recheck.asked_s, host_s)
             took_s = host_s - self._recheck.asked_s
             self._safe.asking_took_s = min(took_s, self.policy.recheck_s)
             flow.proven_to_s = self._sampled_to_s if flow.passed else None
@@ -298,6 +305,7 @@ class WriteBack:
         self._outbox.host_s = host_s
         self._outbox.note("debug", f"{reason}: the device is asked again who it is")
         self._safe.doubt(host_s)
+        self._restarts.doubt(host_s)
         self._flow.proven_to_s = None
         if jumped:
             self._flow.prove_again(reason)
@@ -478,11 +486,11 @@ class WriteBack:
         self._outbox.host_s = host_s
         if name == self._outbox.running and isinstance(result, ProcedureOutcome):
             self._outbox.running = ""
+            self._restarts.doubt()  # nobody watched the stream
             if result.other is not None:
                 self._restarts.another()
             self._flow.on_outcome(result)
-            if not result.as_expected:
-                self._recheck.now(host_s)
+            self._recheck.now(host_s)
         return self._answer()
 
     def on_procedure_failed(self, name: str, error: Exception, host_s: float) -> list[Action]:
@@ -490,6 +498,7 @@ class WriteBack:
         self._outbox.host_s = host_s
         if name == self._outbox.running:
             self._outbox.running = ""
+            self._restarts.doubt()
             self._flow.on_failure(error)
             self._recheck.now(host_s)  # nobody knows who was silent, or refused
         return self._answer()

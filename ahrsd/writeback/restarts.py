@@ -4,6 +4,9 @@ A suspicion has the device read again at once. Only a proof confirms what is in 
 since start-up against the journal's newest record (`clocks.restarted_since`); its time that fell in
 this run, for a record of before this run; or a restart that it reported, where it tells no time.
 
+While it is doubtful whose the stream is, nothing that it shows is a proof: in a procedure, when
+nobody watches it, while the device is asked who it is, and from a doubt on until it said so.
+
 A message may have lain in a buffer, as old as its time says, so a proof by its time takes the
 earliest start-up that a second of messages shows.
 """
@@ -27,7 +30,8 @@ class RestartWatch:
         self._seen: int | None = None
         self._in_run = False  # its time fell since this run knows it
         self._read_from_s = math.inf
-        self._another = False  # nobody knows whose the messages are
+        self._doubt_s: float | None = None  # since when nobody knows whose the messages are
+        self._asked_s = self._answered_s = -math.inf  # who it is, the newest time
         self._first_s: float | None = None  # when its time was heard first since it was bound
         self._newest_s = self._newest_at_s = math.nan  # its time, as last heard, and when
         self._started_s = math.inf  # when it started up, at the latest
@@ -37,7 +41,8 @@ class RestartWatch:
 
         So what the device only reports (VNERR) counts where its stream has no time.
         """
-        if self._another:
+        if self.doubtful(host_s):
+            self._bound = False
             return
         if uptime_s is not None:
             self._in_run |= self._fell(uptime_s) and self._may_have_restarted(uptime_s, host_s)
@@ -54,9 +59,20 @@ class RestartWatch:
         """The link went away, or nobody is there to ask."""
         self._bound = False
 
+    def doubt(self, host_s: float = -math.inf) -> None:
+        """From then on the messages may be another device's, until one says who it is."""
+        self._doubt_s = host_s if self._doubt_s is None else min(self._doubt_s, host_s)
+
+    def answered(self, asked_s: float, answered_s: float) -> None:
+        """It was this device that was asked; what came in between may still be another's."""
+        self._asked_s, self._answered_s = asked_s, answered_s
+        if self._doubt_s is not None and self._doubt_s <= asked_s:
+            self._doubt_s = None
+
     def another(self) -> None:
         """Another device has the cable: what was seen may be of that one, until one is read."""
-        self._another, self._bound = True, False
+        self.doubt()
+        self._bound = False
         self._seen, self._in_run, self._newest_s = None, False, math.nan
 
     def bind(self, serial: int, read_from_s: float) -> bool:
@@ -64,7 +80,7 @@ class RestartWatch:
         restarted = self._seen == serial
         if serial != self._serial:
             self._in_run, self._newest_s = False, math.nan
-        self._serial, self._seen, self._bound, self._another = serial, None, True, False
+        self._serial, self._seen, self._bound, self._doubt_s = serial, None, True, None
         self._read_from_s = math.inf if restarted else read_from_s
         self._first_s, self._started_s = None, math.inf
         return restarted
@@ -78,7 +94,8 @@ class RestartWatch:
         fell = self._fell(uptime_s)
         if fell and not first:
             return "the device restarted: its time fell"
-        self._in_run |= fell and self._may_have_restarted(uptime_s, host_s)
+        if not self.doubtful(host_s):
+            self._in_run |= fell and self._may_have_restarted(uptime_s, host_s)
         self._newest_s, self._newest_at_s = uptime_s, host_s
         self._started_s = min(self._started_s, host_s - uptime_s)
         stale = first and uptime_s < host_s - self._read_from_s - LATENCY_S
@@ -86,7 +103,8 @@ class RestartWatch:
 
     def proven(self, record: Stamp, now: Stamp, host_s: float) -> bool:
         """Whether the device's time proves a restart since this record."""
-        if not self._bound or self._first_s is None or host_s - self._first_s < SETTLE_S:
+        settled = self._first_s is not None and host_s - self._first_s >= SETTLE_S
+        if not (self._bound and settled) or self.doubtful(host_s):
             return False
         return self._proves(record, now, host_s - self._started_s)
 
@@ -94,6 +112,11 @@ class RestartWatch:
         """A record of another boot of the host is older than this run."""
         of_before = bool(now.boot_id) and record.boot_id != now.boot_id
         return (self._in_run and of_before) or restarted_since(record, now, uptime_s)
+
+    def doubtful(self, host_s: float) -> bool:
+        """Whether it is, and was before now: a restart itself makes readings jump."""
+        asking = self._asked_s < host_s < self._answered_s
+        return asking or (self._doubt_s is not None and self._doubt_s < host_s)
 
     def _fell(self, uptime_s: float) -> bool:
         return uptime_s < self._newest_s - LATENCY_S

@@ -31,7 +31,8 @@ from ahrsd.config.sections import LocationSection
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy
 
 MOTION = Motion(rest_s=2.5, turn_s=3.5)
-LENGTH_S, LONG_S, END_S = 15.0, 28.0, 2.5
+LENGTH_S, LONG_S = 15.0, 28.0
+RESTART_S, END_S = 2.0, 5.0  # behind it: the last restart, later than any save's window; the end
 REAL_MOTION, REAL_BEGIN_S, REAL_S = Motion(6.0, 20.0, 0.6), 60.0, 370.0
 REAL_SOFT_IRON = np.array([[1.06, 0.02, 0.0], [0.02, 0.97, 0.01], [0.0, 0.01, 0.98]])
 MOST_STEPS = 20_000
@@ -149,7 +150,7 @@ def carry_out(world: World, length_s: float = LENGTH_S) -> None:
     if world.core is None:
         world.start()
     world.safe, world.disk_full = True, False
-    world.run(length_s + 0.5, spins)
+    world.run(length_s + RESTART_S, spins)
     world.unit.restart(world.now_s)
     world.run(length_s + END_S, spins)
 

@@ -139,3 +139,29 @@ def test_a_rollback_writes_nothing_into_another_unit(binary, at):
     assert len(heard) >= at
     untouched(run)
     assert np.allclose(float(spare.held()[0].split(",")[9]), 0.2)
+
+
+@pytest.mark.parametrize("steps", range(16, 30))
+def test_a_unit_that_has_the_cable_while_a_save_ends_confirms_nothing(steps):
+    """It starts up there, so a time falls; the first one did not restart and is back.
+
+    Up to the end of the window behind VNWNV, in which nobody asks who has the cable.
+    """
+    run, saved = CabledRun(two_units(binary=True)), []
+    first, spare = run.cable.units[FIRST], run.cable.units[SPARE]
+    first.before = lambda line: saved.append(line) if line.startswith("VNWNV") else None
+    run.proven()
+    run.cable.moving, run.safe = False, True
+    assert run.until(lambda: saved, 60.0), run.notes
+    run.run(0.2)
+    run.cable.unit = spare
+    for _ in range(steps):
+        run.step()
+    spare.uptime_s = 0.1
+    run.step()
+    run.cable.unit = first
+    run.run(40.0)
+    assert run.state in ("COMMITTED", "FAULT")  # FAULT: that one answered in the middle of it
+    assert spare.writes == spare.saves == []
+    first.restart()  # and now it did
+    assert run.until("CONFIRMED", 40.0), run.notes

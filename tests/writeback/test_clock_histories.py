@@ -113,6 +113,7 @@ def wait_s(draw) -> float:
 def act(rig: Observed) -> str:
     """One thing that the world does."""
     draw = rig.draw
+    rig.do(rig.wb.tick(rig.now_s))  # as the core does with every input
     what = str(draw.choice(["set", "device", "program", "computer", "link", "time"]))
     if what == "set":
         rig.set_wall()
