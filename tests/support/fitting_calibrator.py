@@ -20,6 +20,7 @@ from ahrsd.samples import Array, SampleBlock
 EVERY_S = 1.0
 LEAST_SAMPLES, LEAST_AXIS_GAUSS = 24, 0.12
 STEP_GAUSS, MISFIT_GAUSS, STILL_GAUSS, STILL_RAD_S = 0.008, 0.0015, 0.005, 0.003
+APART_GAUSS = 0.006  # at most, with and without the first second: iron that moved early on
 
 
 class FittingCalibrator(Calibrator):
@@ -33,6 +34,7 @@ class FittingCalibrator(Calibrator):
     def _reset(self) -> None:
         self._normal, self._right, self._square = np.zeros((4, 4)), np.zeros(4), 0.0
         self._count = self._resting = 0
+        self._since: list[tuple[float, Array, Array, int]] = []  # the sums before each second
         self._rest_sum = np.zeros(3)
         self._last_s = float("-inf")
         self.estimate = None
@@ -80,7 +82,9 @@ class FittingCalibrator(Calibrator):
         return True
 
     def _add(self, block: SampleBlock) -> None:
-        raw = block.raw_b_gauss
+        raw, at_s = block.raw_b_gauss, float(block.time_s[0])
+        if not self._since or not 0.0 <= at_s - self._since[-1][0] < EVERY_S:
+            self._since.append((at_s, self._normal.copy(), self._right.copy(), self._count))
         row = np.column_stack([2.0 * raw, np.ones(len(raw))])
         length = np.sum(raw * raw, axis=1)
         self._normal += row.T @ row
@@ -96,11 +100,9 @@ class FittingCalibrator(Calibrator):
     def _fit(self, at_s: float) -> Estimate | None:
         if self._count < LEAST_SAMPLES or self._resting < 6:
             return None
-        mean = self._normal[:3, 3] / (2.0 * self._count)
-        spread = self._normal[:3, :3] / (4.0 * self._count) - np.outer(mean, mean)
-        if np.linalg.eigvalsh(spread)[0] < LEAST_AXIS_GAUSS**2:
+        solution = _solved(self._normal, self._right, self._count)
+        if solution is None:
             return None
-        solution = np.linalg.solve(self._normal, self._right)
         hard = solution[:3]
         field_gauss = float(np.sqrt(max(solution[3] + hard @ hard, 1e-9)))
         left = max(self._square - float(solution @ self._right), 0.0) / self._count
@@ -109,6 +111,10 @@ class FittingCalibrator(Calibrator):
             self._void = "the samples fit no sphere: begun anew"
             self._notes.append((at_s, self._void))
             return None
+        for _, normal, right, count in self._since[1:2]:
+            newer = _solved(self._normal - normal, self._right - right, self._count - count)
+            if newer is None or np.linalg.norm(newer[:3] - hard) > APART_GAUSS:
+                return None
         return Estimate(
             soft_iron=np.eye(3),
             hard_iron_gauss=hard,
@@ -132,3 +138,12 @@ class FittingCalibrator(Calibrator):
             GateResult(g.gate, 1.0, 1.0, ok, at_s, "", "the iron stepped") for g in GATES
         )
         return self.gates
+
+
+def _solved(normal: Array, right: Array, count: int) -> Array | None:
+    """The sphere, None where the samples do not reach far enough to tell one."""
+    mean = normal[:3, 3] / (2.0 * count)
+    spread = normal[:3, :3] / (4.0 * count) - np.outer(mean, mean)
+    if np.linalg.eigvalsh(spread)[0] < LEAST_AXIS_GAUSS**2:
+        return None
+    return np.linalg.solve(normal, right)
