@@ -7,7 +7,8 @@ not_judged_here    a value in a unit that was not judged on that unit: neither i
                    or somebody else put there) nor a candidate announced while it was on the cable
                    and right for the iron that it felt
 other_journal      a value of a candidate, journaled under another unit's number
-void_save          a save of values that the iron, as it had been for `GRACE_S`, made wrong
+void_save          a save of values that the iron had made wrong, as `GRACE_S` of readings showed:
+                   iron that leaves a field's length as it was shows in no reading at rest
 foreign_save       a save of what another program wrote while this one listened, and did not save
 half_save          a save while the device does not hold all of the transaction's new values; one
                    that shows them in every reading and does not apply them is for the trial on
@@ -29,6 +30,7 @@ from scripted_vn100 import Cable, Change, Unit
 from scripted_vn100.memory import stored
 
 GRACE_S = 3.0  # in which nobody can know yet that the iron changed
+VISIBLE_GAUSS, READINGS_S, LONGEST_S = 0.008, 0.2, 60.0
 RACE_S = 1.5  # in which another program's write may slip between a look and an act
 HARD_GAUSS, SOFT, BIAS_RAD_S = 0.012, 0.03, 0.004
 KINDS = (
@@ -190,10 +192,28 @@ class Observer:
             half = number in new and new[number] not in (text, unit.shown(number))
             if half and at_s - self._since_s(seen) > RACE_S:
                 self._wrong("half_save", at_s, f"unit {unit.serial} register {number}: {text}")
-            if who == "host" and text not in seen.own[number]:
-                times = np.linspace(at_s - GRACE_S, at_s, 7)
-                if not any(self._right(unit, number, text, float(t)) for t in times):
-                    self._wrong("void_save", at_s, f"unit {unit.serial} register {number}: {text}")
+            ours = who == "host" and text not in seen.own[number]
+            if ours and self._shown_s(unit, number, text, at_s) >= GRACE_S:
+                self._wrong("void_save", at_s, f"unit {unit.serial} register {number}: {text}")
+
+    def _shown_s(self, unit: Unit, number: int, text: str, until_s: float) -> float:
+        """For how long readings have shown that this value is wrong, since it was right last."""
+        shown_s = 0.0
+        for at_s in np.arange(until_s, max(until_s - LONGEST_S, 0.0), -READINGS_S):
+            if self._right(unit, number, text, float(at_s)):
+                break
+            shown_s += READINGS_S * self._visible(unit, number, text, float(at_s))
+        return shown_s
+
+    def _visible(self, unit: Unit, number: int, text: str, at_s: float) -> bool:
+        """Whether a reading that this value corrects is not as long as the field is."""
+        if number == 84:
+            return True
+        values, iron = np.array([float(token) for token in text.split(",")]), unit.iron
+        field = unit.vehicle.field_b(at_s, READINGS_S)
+        raw = iron.soft @ field + iron.hard_gauss + unit.vehicle.hard_at(at_s)
+        away = np.linalg.norm(values[:9].reshape(3, 3) @ (raw - values[9:]))
+        return bool(abs(away - np.linalg.norm(field)) > VISIBLE_GAUSS)
 
     def _first_read_s(self, unit: Unit, number: int) -> float:
         """When this run of the program read a register of this unit first."""

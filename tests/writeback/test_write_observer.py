@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import write_histories
-from scripted_vn100 import Cable, Iron, Unit, Vehicle
+from scripted_vn100 import Cable, Iron, Motion, Unit, Vehicle
 from scripted_vn100.memory import printed
 from scripted_vn100.wire import sentence
 from scripted_world import fitted
@@ -134,6 +134,25 @@ def test_a_save_just_after_the_iron_changed_is_nobodys_fault():
     story.unit.vehicle.move_iron(np.array([0.05, 0.0, 0.0]), story.now_s - 0.1)
     story.say("VNWNV")
     assert story.kinds == []
+
+
+def test_iron_that_leaves_the_fields_length_as_it_is_shows_in_no_reading_at_rest():
+    story = Story()
+    story.unit.vehicle.motion = Motion(rest_s=100.0)
+    story.announce()
+    story.prepare()
+    story.write()
+    field = story.unit.vehicle.field_b(0.0, 0.2)
+    across = np.cross(field, [0.0, 0.0, 1.0])
+    across *= np.linalg.norm(field) / np.linalg.norm(across)
+    turned = np.cos(0.1) * field + np.sin(0.1) * across
+    story.unit.vehicle.move_iron(turned - field, story.now_s)
+    story.now_s += 10.0
+    story.say("VNWNV")
+    assert story.kinds == []
+    story.unit.vehicle.motion = Motion()  # had it turned, it would have shown
+    story.say("VNWNV")
+    assert story.kinds == ["void_save"]
 
 
 def test_a_save_of_half_and_of_somebodys_values():

@@ -138,6 +138,11 @@ class Vehicle:
         gyro = w[k] + iron.gyro_bias_rad_s + GYRO_NOISE_RAD_S * n[3:6]
         return mag, gyro, f[k] + ACCEL_NOISE_M_S2 * n[6:]
 
+    def field_b(self, at_s: float, period_s: float) -> np.ndarray:
+        """The field without iron in the sensor frame, gauss, of the step at a time."""
+        steps = round(self.LENGTH_S / period_s)
+        return table(self.motion, period_s, steps)[0][round(at_s / period_s) % steps]
+
     def resting(self, at_s: float) -> bool:
         """Whether the vehicle stands still."""
         return not self.motion.rate_b(at_s).any()
