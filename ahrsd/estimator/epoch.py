@@ -302,7 +302,7 @@ def _squares(
 TURN, LAG, SCALE = slice(12, 15), 15, 16
 _ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
 _SIZE = 22
-_X, _REST = slice(0, 12), slice(12, _SIZE)
+_X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
 _OF_ANGLE = np.r_[12:15, 16:22]
 _FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
 _MOTION = np.ix_(np.r_[9:15, SCALE:23], np.r_[9:15, SCALE:23])
@@ -482,6 +482,7 @@ def instrument(
 
 def considered(
     epochs: InformationStack,
+    times_s: Array,
     graph: Graph,
     parameters: EstimatorParameters,
     before: tuple[Array, Array],
@@ -491,10 +492,13 @@ def considered(
     The answer takes the instrument to be perfect. It is of one of the kinds of
     `parameters.imperfections`, each as likely as the data make it. Of each kind, what the data
     leave open of the imperfections spreads the answer, and what they say that they are is an error
-    of it. epochs, before: all that is known, imperfections included.
+    of it. epochs (of these times, (N,)), before: all that is known, imperfections included.
     LinAlgError where the motion does not tell.
     """
-    H, g = before[0] + epochs[0].sum(axis=0), before[1] + epochs[1].sum(axis=0)
+    epochs = with_drift(epochs, times_s)
+    H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
+    H[:_SIZE, :_SIZE] += before[0]
+    g[:_SIZE] += before[1]
     own_H, own_g = believed(graph, parameters.prior_gyro_bias_rad_s)
     alone = _inverse(H[_X, _X] + own_H[_X, _X])
     by_rest = -alone @ H[_X, _REST]
@@ -523,6 +527,19 @@ def considered(
     likely = np.exp(np.array(evidence) - max(evidence))
     added = np.einsum("k,kij->ij", likely / likely.sum(), np.array(spreads))
     return np.asarray((added + added.T) / 2)
+
+
+def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
+    """H (N, 25, 25) and g (N, 25): and by how much the gyro's bias came to be in all the epochs.
+
+    It moved at one rate; w_b is that of the newest epoch.
+    """
+    H, g = epochs
+    span_s = max(float(np.ptp(times_s)), 1e-9)
+    until = (times_s - float(np.max(times_s)))[:, None] / span_s
+    with_bias = np.concatenate([H, until[:, None] * H[:, _BIAS]], axis=1)
+    both = np.concatenate([with_bias, until[:, None] * with_bias[:, :, _BIAS]], axis=2)
+    return both, np.concatenate([g, until * g[:, _BIAS]], axis=1)
 
 
 def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:

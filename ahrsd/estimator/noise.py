@@ -166,7 +166,7 @@ def _floored(mag: float, gyro: float, parameters: EstimatorParameters) -> chain.
 # directions that was visited, so the information of n samples with noise s, of which s_r repeats,
 # shrinks by n s_r^2 / (cells s^2).
 
-_BANDS, _SECTORS = 8, 12  # cells of equal area, about 22 deg across
+_BANDS, _SECTORS = 4, 6  # cells of equal area, about 22 deg across
 _WHITE = 1.5  # residual variance over that of the differences up to which there is nothing else
 _LEAST = 0.005  # of a band's cell: share of the samples that makes a cell count
 

@@ -311,7 +311,9 @@ class Estimator:
         before = window.folded_information.at(window.graph.c, window.lag_s)
         try:
             said = self._informations.whole(window.epochs, window.graph)
-            return considered(said, window.graph, self.parameters, before)
+            moving = [e.data.time_s for e in window.epochs if e.turned]
+            times_s = np.array([(float(t[0]) + float(t[-1])) / 2 for t in moving])
+            return considered(said, times_s, window.graph, self.parameters, before)
         except np.linalg.LinAlgError:
             return np.zeros((12, 12))
 

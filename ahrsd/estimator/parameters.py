@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+#: chosen: less than the walk that every gyro has; a tenth of a degree per second
+STEADY_RAD_S, WARMING_RAD_S = 1e-5, 2e-3
 MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
 
@@ -17,24 +19,37 @@ class Imperfections:
     scale:    the gyro's angles, all axes alike, over themselves [1]
     shape:    each of the five ways in which the gyro's scales differ and its axes are not at right
               angles [1]
+    bias_rad_s: by how much the gyro's bias moves while the window was measured, each axis [rad/s]
     """
 
     turn_rad: float
     lag_s: float
     scale: float
     shape: float
+    bias_rad_s: float
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Turn (3), lag, scale, shape (5)."""
-        return (*[self.turn_rad] * 3, self.lag_s, self.scale, *[self.shape] * 5)
+        """Turn (3), lag, scale, shape (5), bias (3)."""
+        fixed = (*[self.turn_rad] * 3, self.lag_s, self.scale, *[self.shape] * 5)
+        return (*fixed, *[self.bias_rad_s] * 3)
+
+    @property
+    def warming(self) -> Imperfections:
+        """The same in the minutes behind switching on, when its bias follows its temperature."""
+        return replace(self, bias_rad_s=WARMING_RAD_S)
 
 
 #: as its maker calibrated it. Chosen, and not checked against a data sheet: axes within some .05
 #: deg, half a sample at 800 Hz, and what is left of a scale
-AS_SPECIFIED = Imperfections(turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4)
+AS_SPECIFIED = Imperfections(
+    turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4, bias_rad_s=STEADY_RAD_S
+)
 #: put together from parts. Chosen: a degree between two boards, filters and buses, a gyro's 1 %
-ASSEMBLED = Imperfections(turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01)
+ASSEMBLED = Imperfections(
+    turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01, bias_rad_s=STEADY_RAD_S
+)
+KINDS = (AS_SPECIFIED, ASSEMBLED, AS_SPECIFIED.warming, ASSEMBLED.warming)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +85,7 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
-    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, ASSEMBLED)
+    imperfections: tuple[Imperfections, ...] = KINDS
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that is out of range."""
