@@ -28,7 +28,7 @@ from ahrsd.estimator.graph import (
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
-from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.parameters import EstimatorParameters, instruments
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -489,10 +489,10 @@ def considered(
 ) -> Array:
     """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12).
 
-    The answer takes the instrument to be perfect. It is of one of the kinds of
-    `parameters.imperfections`, each as likely as the data make it. Of each kind, what the data
-    leave open of the imperfections spreads the answer, and what they say that they are is an error
-    of it. epochs (of these times, (N,)), before: all that is known, imperfections included.
+    The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
+    the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
+    what they say that they are is an error of it. epochs (of these times, (N,)), before: all that
+    is known, imperfections included.
     LinAlgError where the motion does not tell.
     """
     epochs = with_drift(epochs, times_s)
@@ -504,19 +504,16 @@ def considered(
     by_rest = -alone @ H[_X, _REST]
     known = H[_REST, _REST] + H[_REST, _X] @ by_rest
     asked = g[_REST] + by_rest.T @ (g[_X] + own_g[_X])
-    kinds = [np.array(kind.sigmas) for kind in parameters.imperfections]
+    kinds = np.array(instruments(parameters.imperfections))
 
     def found(sigmas: Array, temper: float) -> tuple[Array, Array]:
         spread = _inverse(known + np.diag(temper / sigmas**2))
         return spread, -spread @ asked
 
-    def left(sigmas: Array) -> float:
-        rest = found(sigmas, graph.temper)[1]
-        step = np.r_[-alone @ (g[_X] + own_g[_X]) + by_rest @ rest, rest]
-        return max(1.0, disagreement(*epochs, step))
-
     # what an imperfection makes the epochs disagree is no noise
-    temper = min(graph.temper, *map(left, kinds))
+    most = found(kinds.max(axis=0), graph.temper)[1]
+    step = np.r_[-alone @ (g[_X] + own_g[_X]) + by_rest @ most, most]
+    temper = min(graph.temper, max(1.0, disagreement(*epochs, step)))
     evidence, spreads = [], []
     for sigmas in kinds:
         spread, rest = found(sigmas, temper)

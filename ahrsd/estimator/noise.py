@@ -166,7 +166,7 @@ def _floored(mag: float, gyro: float, parameters: EstimatorParameters) -> chain.
 # directions that was visited, so the information of n samples with noise s, of which s_r repeats,
 # shrinks by n s_r^2 / (cells s^2).
 
-_BANDS, _SECTORS = 4, 6  # cells of equal area, about 22 deg across
+_BANDS, _SECTORS = 8, 12  # cells of equal area, about 22 deg across
 _WHITE = 1.5  # residual variance over that of the differences up to which there is nothing else
 _LEAST = 0.005  # of a band's cell: share of the samples that makes a cell count
 
@@ -197,11 +197,26 @@ class DirectionCells:
 
     @property
     def visited(self) -> int:
-        """DirectionCells with more than a few of them."""
-        return int(np.count_nonzero(self._count > _LEAST * self._count.sum()))
+        """Cells with more than a few of them."""
+        return self._above(self._count)
+
+    @property
+    def regions(self) -> int:
+        """The same of regions of four cells, about 45 deg across."""
+        grid = self._count.reshape(_BANDS // 2, 2, _SECTORS // 2, 2)
+        return self._above(grid.sum(axis=(1, 3)))
+
+    def _above(self, count: Array) -> int:
+        return int(np.count_nonzero(count > _LEAST * count.sum()))
 
 
-def variance_inflation(cells: DirectionCells, residual_gauss: float, white_gauss: float) -> float:
-    """By how much the information shrinks, at least 1."""
+def variance_inflation(
+    cells: DirectionCells, residual_gauss: float, white_gauss: float, *, smooth: bool = False
+) -> float:
+    """By how much the information shrinks, at least 1.
+
+    smooth: what repeats is one unknown for each octant or so of directions, and not for each cell
+    """
     repeats = max(0.0, 1.0 - _WHITE * (white_gauss / residual_gauss) ** 2)
-    return max(1.0, repeats * cells.steps / max(cells.visited, 1))
+    unknowns = cells.regions if smooth else cells.visited
+    return max(1.0, repeats * cells.steps / max(unknowns, 1))

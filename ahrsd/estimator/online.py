@@ -348,7 +348,7 @@ class Estimator:
         observed = summary.observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        covariance = covariance * (1.0 + doubt**2) * self._parted
+        covariance = window.covariance() * (1.0 + doubt**2) * self._parted
         covariance = covariance + self._by_lag(window) + self._by_imperfections(window)
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
 
-#: chosen: less than the walk that every gyro has; a tenth of a degree per second
-STEADY_RAD_S, WARMING_RAD_S = 1e-5, 2e-3
 MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
 
@@ -28,28 +28,25 @@ class Imperfections:
     shape: float
     bias_rad_s: float
 
-    @property
-    def sigmas(self) -> tuple[float, ...]:
-        """Turn (3), lag, scale, shape (5), bias (3)."""
-        fixed = (*[self.turn_rad] * 3, self.lag_s, self.scale, *[self.shape] * 5)
-        return (*fixed, *[self.bias_rad_s] * 3)
-
-    @property
-    def warming(self) -> Imperfections:
-        """The same in the minutes behind switching on, when its bias follows its temperature."""
-        return replace(self, bias_rad_s=WARMING_RAD_S)
-
 
 #: as its maker calibrated it. Chosen, and not checked against a data sheet: axes within some .05
-#: deg, half a sample at 800 Hz, and what is left of a scale
-AS_SPECIFIED = Imperfections(
-    turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4, bias_rad_s=STEADY_RAD_S
-)
-#: put together from parts. Chosen: a degree between two boards, filters and buses, a gyro's 1 %
-ASSEMBLED = Imperfections(
-    turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01, bias_rad_s=STEADY_RAD_S
-)
-KINDS = (AS_SPECIFIED, ASSEMBLED, AS_SPECIFIED.warming, ASSEMBLED.warming)
+#: deg, half a sample at 800 Hz, what is left of a scale; a bias that moves less than any walks
+AS_SPECIFIED = Imperfections(turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4, bias_rad_s=1e-5)
+#: put together from parts, and just switched on. Chosen: a degree between two boards, filters and
+#: buses, a gyro's 1 %, a tenth of a degree per second that follows the temperature
+ASSEMBLED = Imperfections(turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01, bias_rad_s=2e-3)
+
+
+def instruments(kinds: Sequence[Imperfections]) -> list[tuple[float, ...]]:
+    """Sigmas of turn (3), lag, scale, shape (5), bias (3) of every instrument that may be.
+
+    Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
+    whatever the others are: a sensor that was mounted askew need not be late.
+    """
+    return [
+        (*[axes.turn_rad] * 3, late.lag_s, gyro.scale, *[gyro.shape] * 5, *[bias.bias_rad_s] * 3)
+        for axes, late, gyro, bias in product(kinds, repeat=4)
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +68,9 @@ class EstimatorParameters:
     outlier_sigma:     field residuals beyond this many sigmas lose weight quadratically [4.6, which
                        Gaussian noise exceeds once in 10^4 samples]
     mag_noise_floor_gauss, gyro_noise_floor_rad_s: never believe less noise than this
-    imperfections:     kinds of instruments that it may be; the answer is widened for what each
-                       has and the data leave open. None: it is perfect, as a simulated one
+    imperfections:     kinds that each of its imperfections may be of; the answer is widened for
+                       what they are and the data leave open. None: it is perfect, as a simulated
+                       one
     """
 
     step_rate_hz: float = 33.0
@@ -85,7 +83,7 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
-    imperfections: tuple[Imperfections, ...] = KINDS
+    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, ASSEMBLED)
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that is out of range."""

@@ -523,10 +523,21 @@ class Window:
         graph.hold_blind(BLIND, covariance)
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
-    def _repeating(self) -> float:
+    def _repeating(self, *, smooth: bool = False) -> float:
         """By how much errors that repeat with the attitude shrink the information."""
         cells = sum((e.cells for e in self.epochs if e.turned), self._folded_cells)
-        return variance_inflation(cells, self.usual.mag_gauss, self._guess.mag_gauss)
+        noise = self.usual.mag_gauss, self._guess.mag_gauss
+        return variance_inflation(cells, *noise, smooth=smooth)
+
+    def covariance(self) -> Array:
+        """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
+
+        What repeats with the attitude is taken to be smooth, as a room's gradient is. The answer
+        itself is weighed as if it were not, which is nearer to what the data alone say.
+        """
+        graph = self.graph.copy()
+        graph.temper = max(graph.temper, self._repeating(smooth=True))
+        return graph.covariance() * graph.temper
 
 
 # -- Which epochs are worth linearising again ------------------------------------------------------

@@ -104,6 +104,9 @@ def test_what_repeats_with_the_attitude_counts_once_per_cell():
     assert variance_inflation(cells, 1e-3, 1e-3) == 1.0  # white
     assert variance_inflation(cells, 1e-2, 1e-3) == pytest.approx(1000 * (1 - 1.5e-2))
     assert variance_inflation(DirectionCells(), 1e-2, 1e-3) == 1.0
+    assert cells.regions == 6  # smooth errors: fewer unknowns, so more is lost
+    smooth = variance_inflation(cells, 1e-2, 1e-3, smooth=True)
+    assert smooth == pytest.approx(2000 * (1 - 1.5e-2))
 
 
 def test_several_epochs_at_once_are_grouped_as_each_by_itself():

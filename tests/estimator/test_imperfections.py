@@ -13,6 +13,7 @@ import pieces
 import pytest
 
 from ahrsd import so3
+from ahrsd.estimator.epoch import with_drift
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, EstimatorParameters
 from ahrsd.simulation import ScenarioSettings, simulate
@@ -71,6 +72,48 @@ def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion):
         known.append(beyond(made, answer(made, gyro)))
     assert sum(np.array(perfect) > 3.0) >= 3
     assert sum(np.array(known) > 3.0) <= 1
+
+
+def test_axes_that_are_turned_and_nothing_else():
+    """A sensor mounted askew that is neither late nor wrong in scale, in level circles."""
+    perfect, known = [], []
+    for seed in range(6):
+        made = pieces.drive((("circles", 160.0),), seed)
+        gyro = troubled(made, turned(seed))
+        perfect.append(beyond(made, answer(made, gyro, pieces.IDEAL)))
+        known.append(beyond(made, answer(made, gyro)))
+    assert sum(np.array(perfect) > 3.0) >= 3
+    assert max(known) < 3.0
+
+
+@pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
+def test_a_gyro_that_warms_up_widens_its_bias(motion):
+    """Its bias goes by a tenth of a degree per second; the answer is that of the end."""
+    perfect, known = [], []
+    for seed in range(4):
+        made = pieces.drive(motion, seed)
+        t = made.block.time_s
+        course = 2e-3 * (np.exp(-2.0 * t / t[-1]) - np.exp(-2.0))
+        gyro = made.block.gyro_b_rad_s + course[:, None] * [1.0, -0.7, 0.5]
+        for errors, parameters in ((perfect, pieces.IDEAL), (known, None)):
+            found = answer(made, gyro, parameters)
+            errors.append(float(np.max(np.abs(made.errors(found)[9:]) / found.sigma[9:])))
+    assert np.mean(perfect) > 2.5
+    assert max(known) < 1.5
+
+
+def test_a_drift_is_told_from_the_epochs_times():
+    """Epochs know nothing but the bias they want: what is left of the drift until the last."""
+    wanted = np.array([1e-3, 2e-3, -1e-3])
+    times_s = np.array([0.0, 10.0, 25.0])
+    H, g = np.zeros((3, 22, 22)), np.zeros((3, 22))
+    for k, at in enumerate([-1.0, -0.6, 0.0]):
+        H[k, 9:12, 9:12] = np.eye(3)
+        g[k, 9:12] = -at * wanted
+    both, gradient = with_drift((H, g), times_s)
+    found = -np.linalg.pinv(both.sum(axis=0)) @ gradient.sum(axis=0)
+    assert np.allclose(found[9:12], 0.0)
+    assert np.allclose(found[22:], wanted)
 
 
 @pytest.mark.parametrize("motion", ["slow", "rov"])

