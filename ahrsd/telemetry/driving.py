@@ -88,6 +88,12 @@ def tilt_is_wanted(status: Mapping[str, Any]) -> bool:
     return any(not gate["ok"] and gate["gate"] in HELPED_BY_TILT for gate in status["gates"])
 
 
+def circle_is_wanted(status: Mapping[str, Any]) -> bool:
+    """Whether more of the level circle is of use: a heading is missing, or a tilt is wanted."""
+    motion = status["motion"]
+    return bool(motion is None or motion["next"]) or tilt_is_wanted(status)
+
+
 def drive_next(status: Mapping[str, Any]) -> str:
     """What to drive next; empty where the directions that were shown are enough."""
     motion, shown = status["motion"], shown_of(status)
