@@ -35,7 +35,7 @@ def screen(
     )
     log = Text("\n".join(happened) or "nothing yet")
     return Group(
-        Panel(todo, title="what to do next", subtitle=countdown(pace) or None),
+        Panel(todo, title="what to do next", subtitle=countdown(status, pace) or None),
         now,
         _gates(status, pace),
         Panel(log, title="what happened"),
@@ -43,9 +43,9 @@ def screen(
     )
 
 
-def countdown(pace: Pace) -> str:
-    """When the last of the shut gates opens; empty where nobody can say."""
-    found = pace.slowest()
+def countdown(status: Status, pace: Pace) -> str:
+    """When the last of the gates that hold a write opens; empty where nobody can say."""
+    found = pace.slowest(gate["gate"] for gate in holding(status)[0])
     return "" if found is None else f"{about(found[1])} ({found[0]} is last)"
 
 

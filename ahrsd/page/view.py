@@ -120,12 +120,10 @@ def next_step(status: Status, *, may_approve: bool) -> str:
 
 def countdown(status: Status, pace: Pace) -> str:
     """When the last gate opens, at the present rate; empty where no gate is shut."""
-    shut = holding(status)[0]
-    if not shut:
-        return ""
-    if (last := pace.slowest()) is not None:
+    shut = [gate["gate"] for gate in holding(status)[0]]
+    if (last := pace.slowest(shut)) is not None:
         return about(last[1])
-    still = [g["gate"] for g in shut if g["value"] is not None and not pace.left_s(g["gate"])]
+    still = pace.standing(shut)
     if not still:
         return ""
     return f"nobody can say how long: {counted(len(still), 'gate')} did not come nearer lately"
@@ -184,7 +182,7 @@ def heading_figures(status: Status) -> list[Figure]:
             f"{sigma:.2f}°" if known and new is not None else "",
             late,
         ),
-        Figure("Difference", number(change, "+.1f"), "°"),
+        Figure("Difference", number(change, "+z.1f"), "°"),
     ]
 
 
@@ -223,8 +221,8 @@ def reading_figures(status: Status) -> list[Figure]:
     new = _size(seen["would_be_b_gauss"])
     turning = _size(seen["gyro_b_rad_s"])
     return [
-        Figure("Roll", number(seen["roll_deg"], "+.0f"), "°"),
-        Figure("Pitch", number(seen["pitch_deg"], "+.0f"), "°"),
+        Figure("Roll", number(seen["roll_deg"], "+z.0f"), "°"),
+        Figure("Pitch", number(seen["pitch_deg"], "+z.0f"), "°"),
         Figure("Turning", number(turning, ".1f", math.degrees(1.0)), "°/s"),
         Figure("Field now", number(field, ".0f", 1e3), "mG"),
         Figure("Field as it would be", number(new, ".0f", 1e3), "mG"),

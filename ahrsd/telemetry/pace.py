@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ahrsd.evidence.segments import HistoryParameters
@@ -18,6 +18,7 @@ _EVERY_S = 1.0
 #: a segment is held out once in so long, and must have turned by 60 deg to be of use
 _HELD_OUT_S = HistoryParameters().segment_s * HistoryParameters().heldout_every
 _TURNS_DEG_S = 60.0 / HistoryParameters().segment_s
+_FOLLOWS = "evidence.complete"
 _WINDOWS, _COVERAGE = "heldout_heading.windows", "heldout_heading.coverage"
 
 LEVEL, TILTED = "level circle", "tilts"  # names of what was shown, beside those of the gates
@@ -75,15 +76,26 @@ class Pace:
         rates = [rate for _, rate in self._turning]
         return bool(rates) and sum(rates) / len(rates) >= _TURNS_DEG_S
 
-    def slowest(self) -> tuple[str, float] | None:
-        """The gate that is the last to open at the present rate; None where one stands still."""
-        gates = [name for name in self._goals if name not in (LEVEL, TILTED)]
-        left = {name: self.left_s(name) for name in gates}
+    def slowest(self, gates: Iterable[str]) -> tuple[str, float] | None:
+        """Which of these gates opens last; None where nobody can say."""
+        left = {name: self.left_s(name) for name in self._moving(gates)}
         known = {name: seconds for name, seconds in left.items() if seconds is not None}
         if not known or len(known) < len(left):
             return None
         name = max(known, key=lambda one: known[one])
         return name, known[name]
+
+    def standing(self, gates: Iterable[str]) -> list[str]:
+        """Those of these gates that were followed for long enough and do not come nearer."""
+        return [
+            name
+            for name in self._moving(gates)
+            if self.left_s(name) is None and self._at_s - self._seen[name][0][0] >= _LEAST_S
+        ]
+
+    def _moving(self, gates: Iterable[str]) -> list[str]:
+        """Gates that are measured; the count of what is not measured yet follows from others."""
+        return [name for name in gates if name in self._goals and name != _FOLLOWS]
 
 
 def _append(seen: deque[tuple[float, float]], at_s: float, value: float) -> None:

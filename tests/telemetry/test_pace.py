@@ -28,6 +28,9 @@ def test_time_at_the_present_rate(span_s, first, last, goal, expected):
     )
 
 
+ALL = ["motion.heading", "observability.heading_sigma"]
+
+
 def status(at_s, *gates, directions=""):
     return {"at_s": at_s, "gates": list(gates), "motion": motion(directions)}
 
@@ -40,9 +43,9 @@ def test_gates_are_followed_until_they_open():
         pace.take(status(float(at_s), coverage, sigma))
     assert pace.left_s("motion.heading") == pytest.approx(40.0)
     assert pace.left_s("observability.heading_sigma") == pytest.approx(120.0)
-    assert pace.slowest() == ("observability.heading_sigma", pytest.approx(120.0))
+    assert pace.slowest(ALL) == ("observability.heading_sigma", pytest.approx(120.0))
     pace.take(status(61.0, gate("motion.heading", 161.0, 200.0)))
-    assert pace.slowest() == ("motion.heading", pytest.approx(39.0))
+    assert pace.slowest(ALL) == ("motion.heading", pytest.approx(39.0))
     assert pace.left_s("observability.heading_sigma") is None
 
 
@@ -51,7 +54,19 @@ def test_nobody_says_when_all_are_open_where_one_stands_still():
     for at_s in (0.0, 30.0, 60.0):
         pace.take(status(at_s, gate("a.moves", at_s, 100.0), gate("a.stands", 1.0, 2.0)))
     assert pace.left_s("a.moves") == pytest.approx(40.0)
-    assert pace.slowest() is None
+    assert pace.slowest(["a.moves", "a.stands"]) is None
+    assert pace.standing(["a.moves", "a.stands", "not.measured"]) == ["a.stands"]
+    assert pace.slowest(["a.moves", "not.measured"]) == ("a.moves", pytest.approx(40.0))
+    assert pace.slowest([]) is None
+
+
+def test_the_count_of_what_is_not_measured_follows_from_the_others():
+    pace = Pace()
+    for at_s in (0.0, 60.0):
+        pace.take(status(at_s, gate("a.moves", at_s, 100.0), gate("evidence.complete", 7.0, 0.0)))
+    both = ["a.moves", "evidence.complete"]
+    assert pace.slowest(both) == ("a.moves", pytest.approx(40.0))
+    assert pace.standing(both) == []
 
 
 def test_a_device_that_restarted_is_followed_anew():

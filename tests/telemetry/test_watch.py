@@ -138,12 +138,12 @@ def test_a_large_terminal_shows_all_of_it():
 
 
 def test_it_counts_down_to_the_last_gate():
-    pace = Pace()
+    pace, body = Pace(), status(1)
     for at_s in (0.0, 30.0, 60.0):
-        one = gate("motion.heading") | {"value": at_s, "limit": 300.0}
-        pace.take({"at_s": at_s, "gates": [one], "motion": None})
-    assert countdown(pace) == "about 4 min at the present rate (motion.heading is last)"
-    assert countdown(Pace()) == ""
+        body["gates"][0] |= {"value": at_s, "limit": 300.0}
+        pace.take(body | {"at_s": at_s, "motion": None})
+    assert countdown(body, pace) == "about 4 min at the present rate (family.gate0 is last)"
+    assert countdown(body, Pace()) == ""
 
 
 def test_motion_that_was_not_seen_yet_says_so():
