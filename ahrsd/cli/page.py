@@ -55,7 +55,8 @@ def command(
     """
     needed = [name for name in ("starlette", "uvicorn") if not importlib.util.find_spec(name)]
     if needed:
-        raise AhrsdError(f"{' and '.join(needed)} is missing: pip install 'ahrsd[page]'")
+        are = "is" if len(needed) == 1 else "are"
+        raise AhrsdError(f"{' and '.join(needed)} {are} missing: pip install 'ahrsd[page]'")
     from ahrsd.daemon.operator_inbox import OperatorBox
     from ahrsd.page.app import Site, make_app, serve
     from ahrsd.page.feed import Feed

@@ -157,7 +157,7 @@ def drive(status: Status) -> str:
     if status["motion"]["regime"] == "unknown":
         return "Nobody knows which: the stream has no acceleration, so down is not known."
     if any(gate["gate"].startswith("heldout") for gate in holding(status)[0]):
-        return "Keep turning: every direction was shown, and is to be proven on new data."
+        return "Keep turning: enough directions were shown, and are to be proven on new data."
     return "Nothing more: all directions that the gates ask for are shown."
 
 

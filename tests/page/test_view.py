@@ -105,7 +105,7 @@ def test_next_countdown_and_drive(gathering, qualified):
         "nobody can say how long: 2 gates did not come nearer lately"
     )
     assert view.drive(gathering) == (
-        "Keep turning: every direction was shown, and is to be proven on new data."
+        "Keep turning: enough directions were shown, and are to be proven on new data."
     )
     for at_s in (200.0, 230.0):
         gathering["at_s"] = at_s
