@@ -78,16 +78,29 @@ def _token(path: Path) -> Token:
 
     try:
         text = read_regular(path, 4096, follow=False).data.decode()
-        status = path.lstat()
-        if status.st_uid not in (os.geteuid(), 0):
-            raise TokenError(f"belongs to user {status.st_uid}, who could approve writes")
-        if stat.S_IMODE(status.st_mode) & 0o077:
-            raise TokenError(f"can be read by others: chmod 600 {path}")
+        if not _kept_by_systemd(path):
+            _refuse_unless_private(path)
         return Token(token_in(text))
     except UnicodeDecodeError:
         raise AhrsdError(line(f"{path}: holds no text")) from None
     except (ForeignFileError, TokenError) as error:
         raise AhrsdError(line(f"{path}: {error}")) from None
+
+
+def _kept_by_systemd(path: Path) -> bool:
+    """Whether it is a credential of this unit: its access list admits this unit alone."""
+    folder = os.environ.get("CREDENTIALS_DIRECTORY", "")
+    return bool(folder) and path.parent == Path(folder)
+
+
+def _refuse_unless_private(path: Path) -> None:
+    from ahrsd.page.access import TokenError
+
+    status = path.lstat()
+    if status.st_uid not in (os.geteuid(), 0):
+        raise TokenError(f"belongs to user {status.st_uid}, who could approve writes")
+    if stat.S_IMODE(status.st_mode) & 0o077:
+        raise TokenError(f"can be read by others: chmod 600 {path}")
 
 
 def _listen(address: str, port: int) -> socket.socket:

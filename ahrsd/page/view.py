@@ -73,10 +73,11 @@ class GateRow:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """What would be written. `refusal`: why it cannot be approved now, empty where it can."""
+    """What would be written, or was. `refusal`: why it cannot be approved now, empty if it can."""
 
     id: str
     change: str
+    written: bool
     lines: tuple[str, ...]
     refusal: str
 
@@ -304,9 +305,9 @@ def candidate(status: Status) -> Candidate | None:
         return None
     change = proposal["heading_change_deg"]
     words = "" if change is None else f"heading changes by up to {change:.1f}°"
-    waits = back["state"] == "QUALIFIED"
+    waits, lines = back["state"] == "QUALIFIED", tuple(map(line, proposal["lines"]))
     refusal = "" if waits else f"not to be approved now: {STATES.get(back['state'], '')}"
-    return Candidate(str(proposal["id"]), words, tuple(map(line, proposal["lines"])), refusal)
+    return Candidate(str(proposal["id"]), words, back["transaction"] is not None, lines, refusal)
 
 
 def device_words(status: Status) -> str:

@@ -280,6 +280,17 @@ def test_a_token_that_others_can_read_is_none(tmp_path, token_file):
     assert "No such file" in refused("--token-file", tmp_path / "none")[0]
 
 
+def test_a_credential_of_the_unit_is_kept_by_systemd(daemon, tmp_path, token_file, monkeypatch):
+    """Its mode shows a group where an access list admits the unit's user."""
+    token_file.chmod(0o440)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    with page_of(tmp_path, "--token-file", str(token_file)) as (address, process):
+        assert address.startswith("http://127.0.0.1:")
+        assert process.poll() is None
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "of-another"))
+    assert "can be read by others" in refused("--token-file", token_file)[0]
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
 def test_a_token_of_somebody_else_is_none(token_file):
     os.chown(token_file, 12345, 12345)

@@ -164,8 +164,10 @@ def test_a_candidate_can_be_approved_only_while_it_is_qualified(qualified):
     assert (found.id, found.refusal) == ("43278c0e", "")
     assert found.change == "heading changes by up to 24.5°"
     assert found.lines[0].startswith("$VNWRG,23,")
-    qualified["write_back"]["state"] = "TRIAL"
+    assert not found.written
+    qualified["write_back"] |= {"state": "TRIAL", "transaction": "t1"}
     assert view.candidate(qualified).refusal.startswith("not to be approved now: the new values")
+    assert view.candidate(qualified).written
     qualified["write_back"]["proposal"] = None
     assert view.candidate(qualified) is None
 
