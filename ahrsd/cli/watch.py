@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -80,6 +81,8 @@ def _live(
             with lock:
                 scroll.key(key)
                 draw()
+            if scroll.ended:  # like Ctrl-C, also while no record comes
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
         with keys(pressed):
             for record in records:
@@ -90,8 +93,6 @@ def _live(
                     elif happening := event_line(record):
                         happened.append(happening)
                     draw()
-                if scroll.ended:
-                    return
 
 
 def event_line(record: Mapping[str, Any]) -> str:

@@ -99,7 +99,7 @@ class Scroll:
 
     def key(self, key: str) -> None:
         """A key was pressed, by its name or its character."""
-        if key in ("q", "\x03"):
+        if key == "q":
             self.ended = True
         step = {"down": 1, "j": 1, "up": -1, "k": -1, "page down": self._page, " ": self._page}
         step["page up"] = -self._page

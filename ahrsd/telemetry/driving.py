@@ -148,4 +148,5 @@ def _level_frame(down_b: Array) -> Array:
 
 
 def _share(seen: Bools, of: Bools) -> float:
-    return float(np.count_nonzero(seen & of) / max(np.count_nonzero(of), 1))
+    total = int(np.count_nonzero(of))
+    return int(np.count_nonzero(seen & of)) / total if total else 0.0
