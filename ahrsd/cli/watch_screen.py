@@ -37,7 +37,7 @@ def screen(
     return Group(
         Panel(todo, title="what to do next", subtitle=countdown(status, pace) or None),
         now,
-        _gates(status, pace),
+        gates_table(status, pace),
         Panel(log, title="what happened"),
         Panel(Text("\n".join(map(line, status_lines(status)))), title="ahrsd"),
     )
@@ -61,7 +61,8 @@ def shown_lines(status: Status, pace: Pace) -> list[str]:
     return [*lines, f"drive: {words}"] if words else lines
 
 
-def _gates(status: Status, pace: Pace) -> RenderableType:
+def gates_table(status: Status, pace: Pace) -> RenderableType:
+    """How many gates are green, and those that hold a write."""
     table = Table("gate", "value", "limit", "for", "opens in", expand=True, box=None)
     unmeasured: dict[str, list[str]] = {}
     for gate in holding(status)[0]:
