@@ -10,7 +10,7 @@ from typing import Any
 
 from ahrsd.errors import DeviceError
 from ahrsd.telemetry.client import DaemonConnection
-from ahrsd.telemetry.status import SCHEMA
+from ahrsd.telemetry.protocol import STATUS_SCHEMA
 
 _AGAIN_S = 1.0
 _STALE_S = 3.5  # a status comes every second
@@ -73,6 +73,6 @@ class Feed:
                 raise ValueError(str(record["error"]))
 
     def _take(self, status: dict[str, Any]) -> None:
-        if status.get("schema") != SCHEMA:
-            raise ValueError(f"the daemon tells {status.get('schema')}, not {SCHEMA}")
+        if status.get("schema") != STATUS_SCHEMA:
+            raise ValueError(f"the daemon tells {status.get('schema')}, not {STATUS_SCHEMA}")
         self.heard = Heard(status, time.monotonic())

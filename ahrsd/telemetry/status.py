@@ -9,9 +9,9 @@ from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.core import Core
 from ahrsd.events import GateResult, SamplesSeen
 from ahrsd.evidence.values import Evidence
+from ahrsd.telemetry.protocol import STATUS_SCHEMA
 from ahrsd.telemetry.readings import readings
 
-SCHEMA = "ahrsd.status/1"
 _RATE_S = 1.0  # rates are means over at least so long
 
 
@@ -52,7 +52,7 @@ class StatusMaker:
         self._tally(now_s, counters.fed_bytes, core.stream.facts.samples)
         identity = core.device_session.identity
         return {
-            "schema": SCHEMA,
+            "schema": STATUS_SCHEMA,
             "host_s": now_s,
             "uptime_s": now_s - self._started_s,
             "at_s": core.at_s,

@@ -138,6 +138,20 @@ def test_it_follows_the_daemon_and_never_shows_what_is_old(daemon, tmp_path):
         browser.until(has("#alarms", "<b id='planted'>the gyro is stuck</b>"))
         assert browser.value("document.getElementById('planted')") is None
 
+        # what a person unfolded stays so while its text is renewed
+        shut = [one | {"ok": False, "advice": f"turn {k}"} for k, one in enumerate(turned["gates"])]
+        held = [f"gate {one['gate']}: {one['advice']}" for one in shut[:9]]
+        back = turned["write_back"] | {"holds": held}
+        daemon.status = turned | {"gates": shut, "write_back": back}
+        browser.until("document.querySelector('#gates details') !== null")
+        assert "Turn 8." not in text_of(browser, "#gates")
+        browser.value("document.querySelector('#gates summary').click()")
+        assert "Turn 8." in text_of(browser, "#gates")
+        shut[0]["value"] = 77.0
+        browser.until(has("#gates", "77"))
+        assert "Turn 8." in text_of(browser, "#gates")
+        daemon.status = turned
+
         daemon.leave()
         browser.until(has("#alarms", "The daemon is away"))
         assert "Since " in text_of(browser, "#alarms")
@@ -323,3 +337,15 @@ def test_what_is_not_installed_is_named(monkeypatch):
     text, error = refused()
     assert text.endswith("starlette and uvicorn are missing: pip install 'ahrsd[page]'")
     assert error.exit_code == 2
+
+
+def test_the_process_is_small():
+    """It loads nothing of what estimates, records or draws."""
+    program = (
+        "import sys, ahrsd.page.app; heavy = {'gtsam', 'scipy', 'rerun', 'matplotlib', 'pyarrow'};"
+        "print(sorted(heavy & {name.partition('.')[0] for name in sys.modules}))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert found.stdout == "[]\n"

@@ -1,6 +1,7 @@
 """What the page says, value by value, out of statuses that a daemon told."""
 
 import pytest
+from shown_status import gate as view_gate
 
 from ahrsd.page import view
 from ahrsd.page.board import SECTIONS, Board
@@ -195,6 +196,20 @@ def test_every_section_is_there(gathering):
     assert "40 of 49 open" in found["gates"]
     assert '<path class="dot shown" d="M' in found["sphere"]
     assert 'class="now"' in found["marker"]
+
+
+def test_a_long_list_of_gates_is_folded(gathering):
+    shut = [view_gate(f"observability.gate{k}") for k in range(9)]
+    gathering["gates"] = shut
+    holds = [f"gate {one['gate']}: {one['advice']}" for one in shut]
+    gathering["write_back"]["holds"] = holds
+    text = sections(gathering)["gates"]
+    first, _, folded = text.partition("<details>")
+    assert first.count('class="gate"') == 4
+    assert "<summary>and 5 more</summary>" in folded
+    assert folded.count('class="gate"') == 5
+    gathering["write_back"]["holds"] = holds[:4]
+    assert "<details>" not in sections(gathering)["gates"]
 
 
 def test_the_form_knows_its_candidate_only_where_one_may_approve(qualified):

@@ -20,7 +20,10 @@ function take(sections) {
   const before = candidate();
   for (const [id, html] of Object.entries(sections)) {
     const place = document.getElementById(id);
-    if (place) place.innerHTML = html;
+    if (!place) continue;
+    const open = place.querySelector("details[open]") !== null;
+    place.innerHTML = html;
+    if (open) place.querySelector("details")?.setAttribute("open", "");
   }
   if (form && before && candidate() && candidate() !== before) {
     form.reset();
