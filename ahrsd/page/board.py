@@ -29,6 +29,8 @@ SECTIONS = (
     "estimate",
     "readings",
 )
+#: what a status of another version may cause
+_OTHER_VERSION = (KeyError, TypeError, ValueError, AttributeError, IndexError)
 LOOK_ELSEWHERE = "the page does not understand this daemon, it may be another version"
 
 
@@ -48,7 +50,7 @@ class Board:
         try:
             self._pace.take(heard.status)
             self._fresh.take(_field(heard.status), float(heard.status["at_s"] or 0.0))
-        except (KeyError, TypeError):
+        except _OTHER_VERSION:
             return  # `sections` says so
 
     def sections(self, heard: Heard, now_s: float) -> dict[str, str]:
@@ -57,7 +59,7 @@ class Board:
             return self._away(why, now_s - heard.at_s, heard.status is not None)
         try:
             return self._present(heard.status or {})
-        except (KeyError, TypeError) as error:
+        except _OTHER_VERSION as error:
             return self._away(f"{LOOK_ELSEWHERE}: {error!r}", now_s - heard.at_s, seen=False)
 
     def _away(self, why: str, for_s: float, seen: bool) -> dict[str, str]:

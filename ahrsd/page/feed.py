@@ -57,7 +57,7 @@ class Feed:
             try:
                 with self._connect() as daemon:
                     self._watch(daemon)
-            except (DeviceError, ValueError) as error:
+            except (DeviceError, OSError, ValueError) as error:
                 self.heard = Heard(self.heard.status, self.heard.at_s, str(error))
             self._stopped.wait(_AGAIN_S)
 

@@ -103,7 +103,9 @@ def drive_next(status: Mapping[str, Any]) -> str:
         return str(motion["next"])
     if shown is None or not tilt_is_wanted(status):
         return ""
-    return _lean(shown, (status.get("readings") or {}).get("heading_deg"))
+    seen = status.get("readings") or {}
+    new, now = seen.get("heading_would_be_deg"), seen.get("heading_deg")
+    return _lean(shown, now if new is None else new)
 
 
 def _lean(shown: Shown, heading_deg: float | None) -> str:
@@ -126,7 +128,8 @@ def _lean(shown: Shown, heading_deg: float | None) -> str:
     q, down_or_up = divmod(int(np.argmax(counts)), 2)
     name, face_deg, *leans = _QUARTERS[q]
     turn = _turn(heading_deg, face_deg)
-    return f"face {name}{turn} and {leans[down_or_up]} by up to {REACH_DEG:.0f} deg"
+    lean = f"{leans[down_or_up]} by up to {REACH_DEG:.0f} deg"
+    return f"face {name}{turn} and {lean}, if the vehicle can"
 
 
 def _turn(heading_deg: float | None, face_deg: float) -> str:

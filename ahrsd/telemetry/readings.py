@@ -20,7 +20,9 @@ def readings(seen: SamplesSeen, now_s: float) -> dict[str, object]:
     raw, force = np.mean(block.raw_b_gauss, axis=0), np.mean(block.accel_b_m_s2, axis=0)
     in_force = seen.present.apply(raw)
     would_be = np.full(3, np.nan) if seen.proposed is None else seen.proposed.apply(raw)
-    down = -force / np.linalg.norm(force)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a force of zero has no direction
+        down = -force / np.linalg.norm(force)
+        now_deg, new_deg = _heading_deg(in_force, force), _heading_deg(would_be, force)
     return {
         "time_s": float(block.time_s[-1]),
         "age_s": max(now_s - float(block.host_s[-1]), 0.0),
@@ -29,8 +31,8 @@ def readings(seen: SamplesSeen, now_s: float) -> dict[str, object]:
         "would_be_b_gauss": would_be,
         "gyro_b_rad_s": np.mean(block.gyro_b_rad_s, axis=0),
         "accel_b_m_s2": force,
-        "heading_deg": _heading_deg(in_force, force),
-        "heading_would_be_deg": _heading_deg(would_be, force),
+        "heading_deg": now_deg,
+        "heading_would_be_deg": new_deg,
         "roll_deg": float(np.degrees(np.arctan2(down[1], down[2]))),
         "pitch_deg": float(np.degrees(np.arcsin(np.clip(-down[0], -1.0, 1.0)))),
     }

@@ -247,6 +247,28 @@ def test_a_daemon_of_another_version_is_told_not_guessed(qualified):
     assert found["heading"] == ""
 
 
+def broken(status):
+    """The status with one thing missing or of another kind, for each thing in its first levels."""
+    for key, value in status.items():
+        yield key, {name: one for name, one in status.items() if name != key}
+        for odd in (None, "odd", [], {}, [None], -1e308):
+            yield key, status | {key: odd}
+        for inner in value if isinstance(value, dict) else ():
+            for odd in (None, "odd", [], {}, float("inf")):
+                yield f"{key}.{inner}", status | {key: value | {inner: odd}}
+
+
+@pytest.mark.parametrize("name", ["gathering", "qualified"])
+def test_no_status_ends_the_page(name, request):
+    whole = request.getfixturevalue(name)
+    told = 0
+    for where, status in broken(whole):
+        found = sections(status, may_approve=True)
+        assert set(found) == set(SECTIONS), where
+        told += "it may be another version" in found["alarms"]
+    assert told > 100
+
+
 def test_foreign_text_stays_text(qualified):
     qualified["write_back"]["holds"] = [EVIL]
     qualified["write_back"]["proposal"]["lines"] = [EVIL]

@@ -56,13 +56,13 @@ def test_a_sensor_that_hangs_upside_down_shows_the_same_share():
 @pytest.mark.parametrize(
     ("attitude", "words"),
     [
-        ((0.0, 0.0, -25.0), "face north and nose down by up to 30 deg"),
-        ((0.0, 0.0, 15.0), "face north and nose up by up to 30 deg"),
-        ((90.0, -25.0, 0.0), "face east and roll to the left by up to 30 deg"),
-        ((90.0, 15.0, 0.0), "face east and roll to the right by up to 30 deg"),
-        ((180.0, 0.0, 25.0), "face south and nose up by up to 30 deg"),
-        ((270.0, 25.0, 0.0), "face west and roll to the right by up to 30 deg"),
-        ((270.0, -15.0, 0.0), "face west and roll to the left by up to 30 deg"),
+        ((0.0, 0.0, -25.0), "face north and nose down by up to 30 deg, if the vehicle can"),
+        ((0.0, 0.0, 15.0), "face north and nose up by up to 30 deg, if the vehicle can"),
+        ((90.0, -25.0, 0.0), "face east and roll to the left by up to 30 deg, if the vehicle can"),
+        ((90.0, 15.0, 0.0), "face east and roll to the right by up to 30 deg, if the vehicle can"),
+        ((180.0, 0.0, 25.0), "face south and nose up by up to 30 deg, if the vehicle can"),
+        ((270.0, 25.0, 0.0), "face west and roll to the right by up to 30 deg, if the vehicle can"),
+        ((270.0, -15.0, 0.0), "face west and roll to the left by up to 30 deg, if the vehicle can"),
     ],
 )
 def test_the_attitude_that_is_missing_is_the_one_that_is_named(attitude, words):
@@ -73,8 +73,11 @@ def test_the_attitude_that_is_missing_is_the_one_that_is_named(attitude, words):
 def test_the_turn_is_told_from_where_the_vehicle_faces():
     missing = all_but([(90.0, -25.0, 0.0)])
     assert drive_next(status(missing, heading_deg=10.0)) == (
-        "face east (80 deg to the right) and roll to the left by up to 30 deg"
+        "face east (80 deg to the right) and roll to the left by up to 30 deg, if the vehicle can"
     )
+    body = status(missing, heading_deg=10.0)
+    body["readings"]["heading_would_be_deg"] = 40.0  # the better one
+    assert "east (50 deg to the right)" in drive_next(body)
     assert "east (140 deg to the left)" in drive_next(status(missing, heading_deg=230.0))
     assert "east (as now)" in drive_next(status(missing, heading_deg=100.0))
 

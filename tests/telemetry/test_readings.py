@@ -67,6 +67,18 @@ def test_lines_do_not_say_what_is_not_known():
     assert heading_line({"readings": None}) == "heading: no samples yet"
 
 
+def test_a_sensor_that_reads_nothing_has_no_heading():
+    dead = seen(350.0)
+    dead.block.accel_b_m_s2[:] = 0.0
+    dead.block.raw_b_gauss[:] = np.nan
+    found = plain(readings(dead, 1010.1))
+    assert (found["heading_deg"], found["roll_deg"]) == (None, None)
+    assert found["raw_b_gauss"] == [None, None, None]
+    assert reading_lines({"readings": found}) == [
+        "readings: of no use, the sensor sends what is no number"
+    ]
+
+
 def test_turns_go_the_short_way():
     assert turned_deg(350.0, 10.0) == 20.0
     assert turned_deg(10.0, 350.0) == -20.0
