@@ -18,6 +18,7 @@ from ahrsd.foreign_file import ForeignFileError, read_regular
 from ahrsd.printable import line
 
 if TYPE_CHECKING:
+    from ahrsd.daemon.operator_inbox import OperatorBox
     from ahrsd.page.access import Token
 
 _ANSWER_S = 5.0
@@ -63,13 +64,22 @@ def command(
 
     token = None if token_file is None else _token(token_file)
     box = OperatorBox(place.state)
+    known, feed = _names(names), Feed(place.connect)
     listener = _listen(address, port)
-    feed = Feed(place.connect)
-    site = Site(feed, lambda candidate: _approve(box, candidate), frozenset(names), token)
+    site = Site(feed, lambda candidate: _approve(box, candidate), known, token)
     _say_where(listener, token is not None)
     feed.start()
     serve(make_app(site), listener)
     feed.stop()
+
+
+def _names(given: tuple[str, ...]) -> frozenset[str]:
+    from ahrsd.page.access import host_of
+
+    for name in given:
+        if not host_of(name):
+            raise click.UsageError(f"--host {name}: must be a name such as rov.local")
+    return frozenset(map(host_of, given))
 
 
 def _token(path: Path) -> Token:
@@ -131,11 +141,10 @@ def _say_where(listener: socket.socket, may_approve: bool) -> None:
         click.echo(f"anybody who reaches {shown}:{port} can read it{more}", err=True)
 
 
-def _approve(box: object, candidate: str) -> tuple[bool, str]:
+def _approve(box: OperatorBox, candidate: str) -> tuple[bool, str]:
     """The same word as `ahrsd operator approve`."""
-    from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox
+    from ahrsd.daemon.operator_inbox import NoAnswerInTime
 
-    assert isinstance(box, OperatorBox)
     try:
         answer = box.say("approve", candidate, _ANSWER_S)
     except NoAnswerInTime as error:

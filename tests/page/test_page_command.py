@@ -320,6 +320,20 @@ def test_addresses_and_ports():
     assert error.exit_code == 75
 
 
+def test_a_name_is_one_whatever_its_port(daemon, tmp_path):
+    assert "must be a name such as rov.local" in refused("--host", "http://rov.local/")[0]
+    with page_of(tmp_path, "--host", "ROV.local:9191") as (address, _):
+        asked = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+        codes = []
+        for name in ("rov.local", "other.local"):
+            asked.request("GET", "/", headers={"Host": name})
+            answer = asked.getresponse()
+            answer.read()
+            codes.append(answer.status)
+        asked.close()
+    assert codes == [200, 421]
+
+
 def test_another_address_is_said_aloud(tmp_path):
     command = [sys.executable, "-m", "ahrsd", "page", "--state-directory", str(tmp_path)]
     process = subprocess.Popen(

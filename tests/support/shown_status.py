@@ -20,10 +20,10 @@ def level_ring(from_down, azimuth) -> bool:
     return abs(from_down - (90.0 - DIP_DEG)) <= 7.5
 
 
-def cell_of(heading_deg, roll_deg=0.0, pitch_deg=0.0) -> int:
+def cell_of(heading_deg, roll_deg=0.0, pitch_deg=0.0, dip_deg=DIP_DEG) -> int:
     """The cell in which the field is seen at an attitude."""
     h, r, p = np.radians([heading_deg, roll_deg, pitch_deg])
-    dip = np.radians(DIP_DEG)
+    dip = np.radians(dip_deg)
     field_n = np.array([np.cos(dip), 0.0, np.sin(dip)])
     yaw = np.array([[np.cos(h), -np.sin(h), 0], [np.sin(h), np.cos(h), 0], [0, 0, 1]])
     pitch = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])

@@ -70,6 +70,20 @@ def test_the_attitude_that_is_missing_is_the_one_that_is_named(attitude, words):
     assert drive_next(status(all_but([attitude]))) == words
 
 
+@pytest.mark.parametrize(
+    ("attitude", "words"),
+    [
+        ((0.0, 0.0, -15.0), "face north and nose down"),
+        ((90.0, 25.0, 0.0), "face east and roll to the right"),
+        ((270.0, 15.0, 0.0), "face west and roll to the right"),
+    ],
+)
+def test_in_the_south_where_the_field_points_up(attitude, words):
+    south = status(all_but([(*attitude, -60.0)]), dip_deg=-60.0)
+    assert drive_next(south).startswith(words)
+    assert shown_of(south).ring_deg == 150.0
+
+
 def test_the_turn_is_told_from_where_the_vehicle_faces():
     missing = all_but([(90.0, -25.0, 0.0)])
     assert drive_next(status(missing, heading_deg=10.0)) == (
