@@ -268,11 +268,6 @@ def gate_rows(status: Status, pace: Pace) -> list[GateRow]:
     return rows
 
 
-def open_gates(status: Status) -> list[GateRow]:
-    """The gates that hold nothing."""
-    return [_gate_row(gate, "") for gate in status["gates"] if gate["ok"]]
-
-
 def _gate_row(gate: Mapping[str, Any], left: str) -> GateRow:
     unit = gate["unit"]
     value, limit = (
