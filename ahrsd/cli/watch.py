@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import click
-from rich.console import Console, Group, RenderableType
+from rich.console import Console
 from rich.live import Live
-from rich.panel import Panel
-from rich.table import Table
-from rich.text import Text
 
+from ahrsd.cli.keys import keys
 from ahrsd.cli.running_daemon import DaemonPlace, place_options
+from ahrsd.cli.watch_screen import Scroll, screen
 from ahrsd.counting import counted
-from ahrsd.gates import guards_a_write
 from ahrsd.printable import line
-from ahrsd.telemetry.explain import explain_json, holding
 from ahrsd.telemetry.lines import status_lines
+from ahrsd.telemetry.pace import Pace
 
 _EVENTS = 6  # lines of what happened
-_BESIDE = 28  # lines of everything but the gates
 
 
 @click.command()
@@ -29,7 +28,7 @@ _BESIDE = 28  # lines of everything but the gates
 @click.option("--raw", is_flag=True, help="The records as JSON lines, as they come.")
 @click.option("--samples", is_flag=True, help="With --raw: the samples too.")
 def command(place: DaemonPlace, raw: bool, samples: bool) -> None:
-    """Rates, errors, what motion is missing, estimates, gates: until Ctrl-C.
+    """What to drive next and how long it takes, heading, readings, gates, rates: until q or Ctrl-C.
 
     Where stdout is not a terminal, one status is printed every time it changes by a line.
     """
@@ -53,8 +52,7 @@ def _raw(records: Iterator[Mapping[str, Any]]) -> None:
 
 
 def _show(records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]) -> None:
-    console, happened = Console(), deque[str](maxlen=_EVENTS)
-    status: Mapping[str, Any] | None = None
+    console = Console()
     said: list[str] = []
     if not console.is_terminal:
         for record in records:
@@ -62,14 +60,39 @@ def _show(records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]) ->
                 said = lines
                 click.echo(pasted("\n".join(lines)) + "\n")
         return
+    _live(console, records, pasted)
+
+
+def _live(
+    console: Console, records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]
+) -> None:
+    """Draw until the daemon or the person ends it."""
+    happened, pace, scroll = deque[str](maxlen=_EVENTS), Pace(), Scroll()
+    status: Mapping[str, Any] | None = None
+    lock = threading.Lock()
     with Live(console=console, refresh_per_second=4, screen=True) as live:
-        for record in records:
-            if record.get("record") == "status":
-                status = record
-            elif happening := event_line(record):
-                happened.append(happening)
+
+        def draw() -> None:
             if status is not None:
-                live.update(screen(status, happened, console.height - _BESIDE, pasted))
+                whole = screen(status, happened, pace, pasted)
+                live.update(scroll.seen(console, whole, console.height))
+
+        def pressed(key: str) -> None:
+            with lock:
+                scroll.key(key)
+                draw()
+            if scroll.ended:  # like Ctrl-C, also while no record comes
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+        with keys(pressed):
+            for record in records:
+                with lock:
+                    if record.get("record") == "status":
+                        status = record
+                        pace.take(status)
+                    elif happening := event_line(record):
+                        happened.append(happening)
+                    draw()
 
 
 def event_line(record: Mapping[str, Any]) -> str:
@@ -84,38 +107,3 @@ def event_line(record: Mapping[str, Any]) -> str:
         case "gap":
             return f"(this terminal was too slow: {counted(record['lost'], 'record')} lost)"
     return ""
-
-
-def screen(
-    status: Mapping[str, Any],
-    happened: deque[str],
-    most: int = 99,
-    pasted: Callable[[str], str] = str,
-) -> RenderableType:
-    """Status on top, what happened last, and `most` of the gates, nearest to the cause first."""
-    explained = explain_json(status)
-    head = Panel(Text("\n".join(map(line, status_lines(status)))), title="ahrsd")
-    todo = Panel(Text(pasted(str(explained["next"])), style="bold"), title="what to do next")
-    log = Panel(Text("\n".join(happened) or "nothing yet"), title="what happened")
-    return Group(head, todo, log, _gates(status, max(most, 3)))
-
-
-def _gates(status: Mapping[str, Any], most: int) -> RenderableType:
-    table = Table("gate", "value", "limit", "for", expand=True, title="gates that hold a write")
-    holds = holding(status)[0]
-    for gate in holds[:most]:
-        table.add_row(gate["gate"], _value(gate, "value"), _value(gate, "limit"), _for(gate))
-    counted = [gate for gate in status["gates"] if guards_a_write(gate["gate"])]
-    green = sum(gate["ok"] for gate in counted)
-    more = f"and {len(holds) - most} more; " if len(holds) > most else ""
-    table.caption = f"{more}{green} of {len(counted)} gates are green"
-    return table
-
-
-def _value(gate: Mapping[str, Any], key: str) -> str:
-    value = gate[key]
-    return "not measured" if value is None else f"{value:.3g} {gate['unit']}".strip()
-
-
-def _for(gate: Mapping[str, Any]) -> str:
-    return "" if gate["for_s"] is None else f"{gate['for_s']:.0f} s"

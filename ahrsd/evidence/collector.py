@@ -88,7 +88,7 @@ class EvidenceCollector:
         motion, field, proof = UNKNOWN_MOTION, UNKNOWN_FIELD, NO_PROOF
         if nodes is not None:
             heading_rad = gyro_heading_rad(nodes, field_0(nodes, judged))
-            motion = coverage(nodes, heading_rad)
+            motion = coverage(nodes, heading_rad, judged)
             field = comparison.field_facts(nodes, judged)
             proof = prove(nodes, heading_rad, judged, present, _LEAST_TURN_DEG)
         envelope = comparison.envelope(motion, field, world)

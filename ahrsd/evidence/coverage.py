@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ahrsd.calibration import Affine
+from ahrsd.evidence.directions import shown
 from ahrsd.evidence.heading import sectors
 from ahrsd.evidence.segments import Nodes
 from ahrsd.evidence.values import SECTOR_DEG, SECTORS, Bools, Coverage, Regime
@@ -14,12 +16,12 @@ FREE_DEG = 30.0
 _ANY_DEG = 45.0  # of heading, below which there was no motion to speak of
 
 
-def coverage(nodes: Nodes, heading_rad: Array) -> Coverage:
+def coverage(nodes: Nodes, heading_rad: Array, correction: Affine) -> Coverage:
     """Coverage of all segments; `heading_rad` (N,) is their `gyro_heading_rad`."""
+    directions = shown(correction.apply(nodes.raw_b_gauss))
     if not nodes.has_gravity:
-        return Coverage(
-            float("nan"), float("nan"), float("nan"), "unknown", "add acceleration to the stream"
-        )
+        nan = float("nan")
+        return Coverage(nan, nan, nan, "unknown", "add acceleration to the stream", directions)
     seen = sectors(heading_rad)
     down_b = nodes.down_b
     roll_deg = _half_range(np.degrees(np.unwrap(np.arctan2(down_b[:, 1], down_b[:, 2]))))
@@ -32,6 +34,8 @@ def coverage(nodes: Nodes, heading_rad: Array) -> Coverage:
         pitch_deg=pitch_deg,
         regime=_regime(heading_deg, roll_deg, pitch_deg, down_b),
         turn=turn_advice(seen, float(np.degrees(known[-1]))) if len(known) else "",
+        directions=directions,
+        down_b=np.mean(down_b, axis=0),
     )
 
 

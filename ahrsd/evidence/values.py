@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ahrsd.samples import Array
 
 Bools = NDArray[np.bool_]
 Regime = Literal["3D", "partial", "2D", "none", "unknown"]
@@ -61,6 +63,8 @@ class Coverage:
     regime: 3D (tilts by 30 deg and more), 2D (within 5 deg of its mean tilt), partial (between),
     none (turned less than 45 deg), unknown (no accelerometer)
     turn: what is missing, e.g. "turn left about 120 deg more"; empty where nothing is
+    directions: cells of `evidence.directions` in which the corrected field was seen, none: unknown
+    down_b: mean direction of down in the sensor frame, nan where unknown
     """
 
     heading_deg: float
@@ -68,6 +72,8 @@ class Coverage:
     pitch_deg: float
     regime: Regime
     turn: str
+    directions: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    down_b: Array = field(default_factory=lambda: np.full(3, np.nan))
 
     @property
     def tilts(self) -> str:

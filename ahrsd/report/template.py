@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,12 @@ def picture(draw: Callable[[], Figure], alt: str, caption: str = "") -> Picture:
 
 def render(template: str, folder: Path | None = None, **values: object) -> str:
     """The page of a template; of one in `folder`, which may extend those here, if it is given."""
+    return _environment(folder).get_template(template).render(values)
+
+
+@cache
+def _environment(folder: Path | None) -> jinja2.Environment:
+    """What has read the templates once."""
     folders = [_TEMPLATES] if folder is None else [folder, _TEMPLATES]
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folders),
@@ -45,7 +52,7 @@ def render(template: str, folder: Path | None = None, **values: object) -> str:
         keep_trailing_newline=True,
     )
     environment.filters["number"] = number
-    return environment.get_template(template).render(values)
+    return environment
 
 
 def number(value: float | None, unit: str = "") -> str:

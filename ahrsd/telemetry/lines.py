@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -79,6 +80,57 @@ def motion_line(status: Status) -> str:
 
 
 _TILTS = (("roll_deg", "roll"), ("pitch_deg", "pitch"))
+
+
+def heading_line(status: Status) -> str:
+    """The heading now and by the new calibration, and how well the new one is known."""
+    seen = status.get("readings")
+    if seen is None or (old := old_reading(status)):
+        return f"heading: {'no samples yet' if seen is None else old}"
+    if seen["heading_deg"] is None:
+        return "heading: not known, the stream has no acceleration"
+    now = f"heading: {seen['heading_deg']:.1f} deg"
+    if seen["heading_would_be_deg"] is None:
+        return f"{now}; with the new calibration: not known before it has converged"
+    change = turned_deg(seen["heading_deg"], seen["heading_would_be_deg"])
+    sigma_deg = (status["estimate"] or {}).get("heading_sigma_deg")
+    sigma = "" if sigma_deg is None else f" +- {sigma_deg:.2f} deg (1 sigma)"
+    return f"{now}; would be {seen['heading_would_be_deg']:.1f}{sigma}, {change:+.1f} deg"
+
+
+def reading_lines(status: Status) -> list[str]:
+    """Attitude, field and rates of turn now; nothing where there are none."""
+    seen = status.get("readings")
+    if seen is None or old_reading(status):
+        return []
+    raw, turn = seen["raw_b_gauss"], seen["gyro_b_rad_s"]
+    if None in raw or None in turn:
+        return ["readings: of no use, the sensor sends what is no number"]
+    size = math.hypot(*seen["corrected_b_gauss"])
+    lines = [
+        "field: raw " + ", ".join(f"{one * 1e3:+.0f}" for one in raw) + " mG; "
+        f"corrected {size * 1e3:.0f} mG",
+        "turning: " + ", ".join(f"{math.degrees(one):+.1f}" for one in turn) + " deg/s",
+    ]
+    if seen["roll_deg"] is not None:
+        lines[1] += f"; roll {seen['roll_deg']:+.1f}, pitch {seen['pitch_deg']:+.1f} deg"
+    return lines
+
+
+OLD_READING_S = 3.0  # older, a reading says nothing of now
+
+
+def old_reading(status: Status) -> str:
+    """Why the newest reading says nothing of now; empty where it does, or there is none."""
+    seen = status.get("readings")
+    if seen is None or (seen["age_s"] or 0.0) <= OLD_READING_S:
+        return ""
+    return f"the newest sample is {seen['age_s']:.0f} s old"
+
+
+def turned_deg(before_deg: float, after_deg: float) -> float:
+    """From one heading to the other, in -180..180; positive to the right."""
+    return (after_deg - before_deg + 180.0) % 360.0 - 180.0
 
 
 def estimate_lines_of(status: Status) -> list[str]:

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 SCHEMA: Final = "ahrsd.socket/1"
+STATUS_SCHEMA: Final = "ahrsd.status/1"
 STREAMS: Final = ("status", "events", "samples")
 ASKS: Final = ("status", "explain", "watch")
 LONGEST_REQUEST: Final = 4096

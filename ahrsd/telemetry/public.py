@@ -51,6 +51,8 @@ class Public:
 
     def event(self, event: events.Event) -> None:
         """Something happened in the core."""
+        if isinstance(event, events.SamplesSeen):
+            self._maker.saw(event)
         if self.socket is None:
             return
         if not isinstance(event, events.SamplesSeen):

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from ahrsd.calibration import Estimate
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.core import Core
-from ahrsd.events import GateResult
+from ahrsd.events import GateResult, SamplesSeen
 from ahrsd.evidence.values import Evidence
+from ahrsd.telemetry.protocol import STATUS_SCHEMA
+from ahrsd.telemetry.readings import readings
 
-SCHEMA = "ahrsd.status/1"
 _RATE_S = 1.0  # rates are means over at least so long
 
 
@@ -39,6 +40,11 @@ class StatusMaker:
         self._started_s = started_s
         self._mark = (started_s, 0, 0)
         self._rates = (float("nan"), float("nan"))
+        self._seen: SamplesSeen | None = None
+
+    def saw(self, samples: SamplesSeen) -> None:
+        """The newest samples."""
+        self._seen = samples
 
     def make(self, core: Core, link: LinkFacts, now_s: float) -> dict[str, object]:
         """The status at `now_s`."""
@@ -46,7 +52,7 @@ class StatusMaker:
         self._tally(now_s, counters.fed_bytes, core.stream.facts.samples)
         identity = core.device_session.identity
         return {
-            "schema": SCHEMA,
+            "schema": STATUS_SCHEMA,
             "host_s": now_s,
             "uptime_s": now_s - self._started_s,
             "at_s": core.at_s,
@@ -68,6 +74,7 @@ class StatusMaker:
                 "bytes_per_s": self._rates[0],
             },
             "stream": self._stream(core),
+            "readings": None if self._seen is None else readings(self._seen, now_s),
             "motion": _motion(core.calibrator.evidence),
             "sensors": list(core.sensors.findings.values()),
             "estimator": _estimator(core, link.estimator_stuck),
@@ -126,6 +133,9 @@ def _motion(evidence: Evidence | None) -> dict[str, object] | None:
         "roll_deg": seen.roll_deg,
         "pitch_deg": seen.pitch_deg,
         "next": seen.turn,
+        "directions": "".join("1" if cell else "0" for cell in seen.directions),
+        "down_b": seen.down_b,
+        "dip_deg": evidence.field.inclination_deg,
     }
 
 

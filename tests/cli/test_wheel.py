@@ -32,7 +32,7 @@ def test_it_holds_every_module_and_nothing_else(wheel):
         str(path.relative_to(PROJECT))
         for package in ("ahrsd", "drivers")
         for path in (PROJECT / package).rglob("*")
-        if path.suffix in (".py", ".html", ".css") or path.name == "py.typed"
+        if path.suffix in (".py", ".html", ".css", ".js", ".svg") or path.name == "py.typed"
     }
     found = {name for name in wheel.namelist() if not name.startswith("ahrsd-0.1.0.")}
     assert found - expected == set()
@@ -43,6 +43,7 @@ def test_the_unit_and_the_rules_are_data(wheel):
     data = {name for name in wheel.namelist() if ".data/" in name}
     assert data == {
         "ahrsd-0.1.0.data/data/lib/systemd/system/ahrsd.service",
+        "ahrsd-0.1.0.data/data/lib/systemd/system/ahrsd-page.service",
         "ahrsd-0.1.0.data/data/lib/systemd/system/ahrsd@.service",
         "ahrsd-0.1.0.data/data/lib/udev/rules.d/60-ahrsd.rules",
     }

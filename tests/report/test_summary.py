@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from streams import emitted, inputs
 
-from ahrsd.cli.watch import _gates as shown
+from ahrsd.cli.watch_screen import gates_table
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
@@ -24,6 +24,7 @@ from ahrsd.report.summary import (
     summary_lines,
     warnings_of,
 )
+from ahrsd.telemetry.pace import Pace
 from ahrsd.viewer.recorder import gate_table
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
@@ -144,5 +145,5 @@ def test_the_number_of_gates_is_one_number_everywhere(tmp_path):
     console = Console(width=200, record=True)
     rows = [{"gate": r.gate, "ok": r.ok, "value": 2.0, "unit": "", "limit": 1.0} for r in results]
     with console.capture() as captured:
-        console.print(shown({"gates": rows, "write_back": {"holds": []}}, 3))
+        console.print(gates_table({"gates": rows, "write_back": {"holds": []}}, Pace()))
     assert f"{len(counted) - shut} of {len(counted)} gates are green" in captured.get()

@@ -36,6 +36,21 @@ def test_the_unit_verifies_and_is_hardened(unit, tmp_path):
     assert float(score[1]) <= 1.0
 
 
+@analyzed
+def test_the_unit_of_the_page_verifies_and_is_hardened(tmp_path):
+    text = (UNITS / "ahrsd-page.service").read_text().replace("/opt/ahrsd/bin/ahrsd", "/bin/true")
+    (tmp_path / "ahrsd-page.service").write_text(text)
+    unit = str(tmp_path / "ahrsd-page.service")
+    checked = subprocess.run(
+        [ANALYZE, "verify", "--man=no", unit], capture_output=True, text=True, check=False
+    )
+    assert (checked.returncode, checked.stderr) == (0, "")
+    secure = [ANALYZE, "security", "--offline=true", unit]
+    judged = subprocess.run(secure, capture_output=True, text=True, check=False)
+    score = re.search(r"exposure level for \S+: ([0-9.]+)", judged.stdout)
+    assert float(score[1]) <= 1.3  # it has the loopback, which the daemon has not
+
+
 def test_the_template_differs_from_the_unit_only_where_an_instance_must():
     plain = (UNITS / "ahrsd.service").read_text().splitlines()
     template = (UNITS / "ahrsd@.service").read_text().splitlines()
@@ -63,6 +78,27 @@ DeviceAllow=char-pts rw
 Environment=PYTHONDONTWRITEBYTECODE=1
 WatchdogSec=6
 """
+
+
+# A person's word instead of the page; it fails where captures can be read.
+_WORD = """[Service]
+Type=oneshot
+Restart=no
+ExecStart=
+ExecStart={program} operator lock "from the page" --state-directory /var/lib/ahrsd
+ExecStart=/bin/sh -c "! ls /var/lib/ahrsd/captures"
+"""
+
+
+def _approving_drop_in():
+    """The drop-in for approving, as the guide gives it."""
+    guide = (PROJECT / "docs" / "guide" / "page.md").read_text()
+    (found,) = [
+        block for block in re.findall(r"```ini\n(.*?)```", guide, re.DOTALL) if "User=" in block
+    ]
+    return found
+
+
 # TIOCEXCL goes with the last close of a port; a pty whose master is open never sees its last close.
 _UNLOCK = "import fcntl, termios; fcntl.ioctl(open('/run/vn100'), termios.TIOCNXCL)"
 _CONFIG = """mode = "observe"
@@ -89,8 +125,26 @@ def machine():
     closed = [path for path in hidden if Path(path).stat().st_mode & 0o005 != 0o005]
     if closed:
         pytest.skip(f"the service's own user may not read {', '.join(closed)}")
-    drop_in = _DROP_IN.format(program=program, paths=" ".join(sorted(hidden)))
+    paths = " ".join(sorted(hidden))
+    drop_in = _DROP_IN.format(program=program, paths=paths)
+    page_unit = (UNITS / "ahrsd-page.service").read_text()
+    page_unit = page_unit.replace("/opt/ahrsd/bin/ahrsd", str(program))
+    page_options = f"[Service]\nProtectHome=tmpfs\nBindReadOnlyPaths={paths}\n"
+    approves = _approving_drop_in().replace("/opt/ahrsd/bin/ahrsd", str(program))
+    # credentials need a mount that this boot cannot make: the folder is named instead
+    loaded = "LoadCredential=token:/etc/ahrsd-token"
+    assert loaded in approves
+    approves = approves.replace(loaded, "Environment=CREDENTIALS_DIRECTORY=/etc/ahrsd-credentials")
+    approves = approves.replace("%d", "/etc/ahrsd-credentials")
     units = {
+        "ahrsd-page.service": page_unit,
+        "ahrsd-page.service.d/test.conf": page_options,
+        "approve.conf": approves,
+        "ahrsd-word.service": page_unit,
+        "ahrsd-word.service.d/1-test.conf": page_options,
+        "ahrsd-word.service.d/2-approve.conf": approves,
+        "ahrsd-word.service.d/3-word.conf": _WORD.format(program=program),
+        "ahrsd-token": "a1b2c3d4e5f6a7b8\n",
         "ahrsd.service": (UNITS / "ahrsd.service").read_text(),
         "ahrsd.service.d/test.conf": drop_in,
         "ahrsd.toml": _CONFIG,
@@ -162,3 +216,54 @@ def test_the_daemon_under_a_real_systemd(machine):
     machine.run("systemctl", "stop", "ahrsd")
     assert time.monotonic() - began <= 3.0
     assert machine.show("ahrsd", "Result") == "success"
+
+
+_ASK = """import sys, urllib.request
+print(urllib.request.urlopen("http://127.0.0.1:9191/").read().decode())"""
+
+
+def user_of(machine, unit):
+    pid = machine.show(unit, "MainPID")
+    return machine.run("stat", "-c", "%u", f"/proc/{pid}").stdout.strip()
+
+
+def page(machine):
+    return machine.run(sys.executable, "-c", _ASK, check=False).stdout
+
+
+@pytest.mark.timeout(240)
+def test_the_page_beside_it(machine):
+    """It shows as a stranger to the daemon; with the drop-in it may say an operator's word."""
+    machine.run("ip", "link", "set", "lo", "up")
+    machine.run("systemctl", "start", "ahrsd", "ahrsd-page")
+    device = emulate(machine)
+    try:
+        machine.until(lambda: "OBSERVING" in page(machine), 60, "a page that shows the device")
+        assert "<form" not in page(machine)
+        assert user_of(machine, "ahrsd-page") != user_of(machine, "ahrsd")
+
+        # the page is stopped in the middle of everything: the daemon does not notice
+        before = machine.show("ahrsd", "NRestarts"), machine.show("ahrsd", "MainPID")
+        machine.run("kill", "-STOP", machine.show("ahrsd-page", "MainPID"))
+        time.sleep(3.0)
+        machine.run("kill", "-KILL", machine.show("ahrsd-page", "MainPID"))
+        assert machine.show("ahrsd", "StatusText").startswith("OBSERVING")
+        assert (machine.show("ahrsd", "NRestarts"), machine.show("ahrsd", "MainPID")) == before
+
+        system = "/etc/systemd/system"
+        token = "/etc/ahrsd-credentials/token"
+        machine.run("install", "-D", "-m", "644", f"{system}/ahrsd-token", token)
+        machine.run("cp", f"{system}/approve.conf", f"{system}/ahrsd-page.service.d/approve.conf")
+        machine.run("systemctl", "daemon-reload")
+        machine.run("systemctl", "restart", "ahrsd-page")
+        machine.until(lambda: "OBSERVING" in page(machine), 60, "a page that shows the device")
+        assert 'id="approve"' in page(machine)
+        assert user_of(machine, "ahrsd-page") == user_of(machine, "ahrsd")
+        # a word from the same sandbox and user, where what the daemon recorded is not there
+        machine.run("systemctl", "start", "ahrsd-word")
+        machine.until(lambda: "LOCKED" in page(machine), 20, "a lock that is shown")
+    finally:
+        machine.run("systemctl", "stop", "ahrsd-page", "ahrsd", check=False)
+        machine.run("rm", "-f", "/etc/systemd/system/ahrsd-page.service.d/approve.conf")
+        machine.run("systemctl", "daemon-reload")
+        unplug(machine, device)

@@ -1,0 +1,70 @@
+"""`ahrsd watch` on a real terminal of 80x24: what it draws, and its keys."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+
+from ahrsd.telemetry.server import SocketServer
+
+STATUS = Path(__file__).parents[1] / "page" / "gathering.json"
+
+
+@pytest.fixture
+def terminal(tmp_path):
+    """What `watch` draws until a condition holds, and a way to press keys."""
+    server = SocketServer(tmp_path / "socket")
+    status = json.loads(STATUS.read_text())
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    before = termios.tcgetattr(theirs)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ahrsd", "watch", "--state-directory", str(tmp_path)],
+        stdin=theirs, stdout=theirs, stderr=theirs,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "", "LINES": ""},
+    )  # fmt: skip
+
+    def drawn(words: str) -> str:
+        text, end_s = "", time.monotonic() + 20.0
+        while words not in text:
+            assert time.monotonic() < end_s, f"{words!r} was not drawn: {text[-3000:]}"
+            status["at_s"] += 1.0
+            server.status(status)
+            while select.select([ours], [], [], 0.2)[0]:
+                text += os.read(ours, 1 << 16).decode(errors="replace")
+        return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+
+    yield drawn, lambda keys: os.write(ours, keys), process
+    process.kill()
+    process.wait()
+    assert termios.tcgetattr(theirs) == before  # echo and lines are back
+    os.close(ours)
+    os.close(theirs)
+    server.close()
+
+
+def test_it_fits_scrolls_and_ends_by_a_key(terminal):
+    drawn, press, process = terminal
+    text = drawn("arrows scroll, q ends")
+    assert "0 of 2 held-out segments are usable" in text
+    assert "heading: " in text
+    assert "40 of 49 gates are green" in text
+    (found,) = set(re.findall(r"lines 1-23 of (\d+)", text))
+    press(b"\x1b[B")
+    drawn(f"lines 2-24 of {found}")
+    press(b"\x1b[6~")
+    assert "stream: " in drawn(f"-{found} of {found}")
+    press(b"q")
+    assert process.wait(5) == 0
