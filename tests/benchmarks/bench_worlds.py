@@ -65,7 +65,6 @@ def answered(data: Array) -> dict[str, Any]:
             "gyro_bias_rad_s": sigma[9:],
         },
         "heading_error_deg": {"expected_worst": found.heading_sigma_deg},
-        "misfit": found.misfit,
         "observability": {"unobservable": []},
     }
 
