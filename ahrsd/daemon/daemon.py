@@ -184,6 +184,8 @@ class Daemon:
         shares = self._link.share(self.config.share)
         leaving.callback(shares.close)
         self.shell.to_client = shares.send
+        if self._public is not None:
+            self._public.feed(shares.outlets())
         for level, text in shares.announced():
             self.shell.say(level, text, self.clock.now_ns())
 

@@ -65,7 +65,7 @@ class _Reader:
             self.gone = True
 
 
-class _Listener:
+class Listener:
     """A tcp share. `lock` is for the readers and the counts."""
 
     def __init__(self, share: ShareSection, poke: _Poke) -> None:
@@ -85,7 +85,11 @@ class _Listener:
         return bool(self.readers)
 
     def write(self, messages: Sequence[bytes], seq: int, newest: bytes) -> None:
-        """To every reader; `seq` numbers the first message, and 0 says that none is numbered."""
+        """To every reader.
+
+        seq: number of the first message; a reader that loses some is told which. 0: none has one
+        newest: what a reader that connects later is told first, from now on; empty: as before
+        """
         with self.lock:
             self._newest = newest or self._newest
             waits = False
@@ -181,7 +185,7 @@ class _Listener:
             reader.connection.close()
 
 
-class _Target:
+class Target:
     """A udp share: a datagram for each message."""
 
     wanted = True
@@ -248,15 +252,13 @@ class NetworkShares:
     """Opens the shares; `close` takes them away. Raises ConfigError where one cannot be."""
 
     def __init__(self, shares: Iterable[ShareSection]) -> None:
-        self._places: dict[str, _Listener | _Target] = {}
+        self._places: dict[str, Listener | Target] = {}
         self._poke = _Poke()
         self._closing = False
         try:
             for share in shares:
                 is_tcp = share.tcp is not None
-                self._places[share.name] = (
-                    _Listener(share, self._poke) if is_tcp else _Target(share)
-                )
+                self._places[share.name] = Listener(share, self._poke) if is_tcp else Target(share)
         except ConfigError:
             self._take_away()
             raise
@@ -268,29 +270,15 @@ class NetworkShares:
         self._thread.start()
 
     @property
-    def sections(self) -> list[ShareSection]:
-        """What each was opened for."""
-        return [place.share for place in self._places.values()]
-
-    def wanted(self, name: str) -> bool:
-        """Whether anybody reads there, as far as that can be known."""
-        return self._places[name].wanted
+    def places(self) -> list[Listener | Target]:
+        """Each share; all that is not `raw` is written from outside."""
+        return list(self._places.values())
 
     def raw(self, messages: Sequence[bytes]) -> None:
         """The device's own messages, for those that want these."""
         for place in self._places.values():
             if place.share.send == "raw":
                 place.write(messages, 0, b"")
-
-    def write(
-        self, name: str, messages: Sequence[bytes], seq: int = 0, newest: bytes = b""
-    ) -> None:
-        """Messages for one share.
-
-        seq: number of the first one; a reader that loses some is told which. 0: not numbered
-        newest: what a reader that connects later is told first, from now on
-        """
-        self._places[name].write(messages, seq, newest)
 
     def facts(self) -> list[ShareFacts]:
         """How each stands."""
@@ -311,8 +299,8 @@ class NetworkShares:
         self._poke.close()
 
     @property
-    def _listeners(self) -> list[_Listener]:
-        return [place for place in self._places.values() if isinstance(place, _Listener)]
+    def _listeners(self) -> list[Listener]:
+        return [place for place in self._places.values() if isinstance(place, Listener)]
 
     # -- the thread of the connections -------------------------------------------------------------
 
@@ -329,7 +317,7 @@ class NetworkShares:
             if heard:  # who floods is read slowly, and its own connection holds it up
                 time.sleep(_AGAIN_S)
 
-    def _turn(self, listener: _Listener, reader: _Reader | None) -> bool:
+    def _turn(self, listener: Listener, reader: _Reader | None) -> bool:
         """Whether a reader said something."""
         if reader is None:
             if (new := listener.accept()) is not None:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterable
 
 from ahrsd.config.sections import ShareSection
-from ahrsd.daemon.network_shares import NetworkShares
+from ahrsd.daemon.network_shares import Listener, NetworkShares, Target
 from ahrsd.daemon.shared_ports import SharedPorts
 from ahrsd.errors import ConfigError
 from ahrsd.events import SendToClient
@@ -31,17 +31,21 @@ class Shares:
         self._splitter = MessageSplitter()
         self._ports = SharedPorts([s for s in self._sections if s.pty is not None], put, now_ns)
         try:
-            self.network = NetworkShares([s for s in self._sections if s.pty is None])
+            self._network = NetworkShares([s for s in self._sections if s.pty is None])
         except ConfigError:
             self._ports.close()
             raise
+
+    def outlets(self) -> list[Listener | Target]:
+        """Those that send more than the device's own messages: they are written from outside."""
+        return [place for place in self._network.places if place.share.send != "raw"]
 
     def heard(self, data: bytes) -> None:
         """Bytes of the device; none where nothing came for a while. Of the thread that reads it."""
         messages = self._splitter.feed(data) if data else self._splitter.silence()
         if messages:
             self._ports.measured(b"".join(messages))
-            self.network.raw(messages)
+            self._network.raw(messages)
 
     def send(self, item: SendToClient) -> None:
         """An answer for the program on one port."""
@@ -60,10 +64,10 @@ class Shares:
 
     def facts(self) -> tuple[ShareFacts, ...]:
         """How each stands, in the order of the configuration."""
-        found = {fact.name: fact for fact in (*self._ports.facts(), *self.network.facts())}
+        found = {fact.name: fact for fact in (*self._ports.facts(), *self._network.facts())}
         return tuple(found[share.name] for share in self._sections if share.name in found)
 
     def close(self) -> None:
         """Take them away; safe to call again."""
         self._ports.close()
-        self.network.close()
+        self._network.close()
