@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import re
@@ -122,6 +123,34 @@ def test_a_reader_that_never_reads_loses_its_own_and_it_is_counted(served):
     until(lambda: served.facts.readers == 1)
     assert served.facts.lost_bytes == lost  # also when it is gone
     reader.close()
+
+
+def test_a_reader_of_numbered_records_is_told_which_it_lost():
+    share = ShareSection(tcp=free(), send="corrected")
+    shares = NetworkShares([share])
+    (outlet,) = shares.places
+    assert not outlet.wanted
+    outlet.write([], 1, b'{"seq":0}\n')
+    with socket.socket() as idle:
+        idle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        idle.connect(place(share.tcp))
+        until(lambda: outlet.wanted)
+        for seq in range(1, 8001):
+            outlet.write([b'{"seq":%d,"more":"%s"}\n' % (seq, b"x" * 200)], seq, b"")
+        got = read(idle, 1 << 30, 2.0)
+        outlet.write([b'{"seq":8001}\n'], 8001, b"")
+        got += read(idle, 1 << 30, 1.0)
+        assert 0 < shares.facts()[0].lost_bytes < 8000 * 230
+    shares.close()
+    records = [json.loads(line) for line in got.splitlines()]
+    assert records[0] == {"seq": 0}  # what was newest when it came
+    gaps = [record for record in records if record.get("record") == "gap"]
+    seen = {record["seq"] for record in records if "record" not in record}
+    lost = {seq for gap in gaps for seq in range(gap["first_seq"], gap["last_seq"] + 1)}
+    assert gaps
+    assert seen | lost == set(range(8002))
+    assert seen & lost == set()
+    assert sum(gap["lost"] for gap in gaps) == len(lost)
 
 
 def test_what_a_reader_says_is_thrown_away_and_told_once(served, caplog):
