@@ -40,7 +40,7 @@ _WHY: Final = {
     errno.EADDRINUSE: "another program listens there; stop it or choose another port",
     errno.EADDRNOTAVAIL: "no interface of this machine has that address",
     errno.EACCES: "no permission; ports below 1024 are the system's, choose a higher one",
-    errno.EPERM: "no permission; under systemd give the service a network (docs/guide/sharing.md)",
+    errno.EPERM: "no permission; under systemd allow the address (docs/guide/sharing.md)",
     errno.EAFNOSUPPORT: "this process may have no such socket; under systemd give the service a "
     "network (docs/guide/sharing.md)",
 }
@@ -210,7 +210,7 @@ class Target:
                 fault = ""
             except OSError as error:
                 self._lost_bytes += len(message)
-                fault = error.strerror or str(error)
+                fault = _why(error)
             if fault != self._fault:
                 log.warning("%s: %s", self.share.name, fault or f"over: {self._fault}")
                 self._fault = fault
@@ -358,6 +358,10 @@ def _prepare(connection: socket.socket) -> None:
 
 
 def _refused(share: ShareSection, error: OSError) -> ConfigError:
+    return ConfigError([f"share.{share.kind} = {share.address.text}: {_why(error)}"])
+
+
+def _why(error: OSError) -> str:
+    """What is wrong, and what to do where that is known."""
     code = error.errno or 0
-    why = _WHY.get(code) or error.strerror or os.strerror(code)
-    return ConfigError([f"share.{share.kind} = {share.address.text}: {why}"])
+    return _WHY.get(code) or error.strerror or os.strerror(code)

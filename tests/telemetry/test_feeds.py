@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,6 +140,18 @@ def test_records_are_numbered_without_a_hole_and_each_sample_comes_once():
     assert times == sorted(set(times))
     assert len(times) >= 19 * 20  # nothing waits for its block to be full
     assert json.loads(told.outlet.newest)["record"] == "state"
+
+
+def test_the_fields_are_those_of_the_reference():
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "socket.md").read_text()
+    part = page[page.index("## Corrected samples") : page.index("## Prometheus")]
+    told = Told("corrected")
+    told.go(3.0)
+    for kind in ("sample", "state"):
+        fields = set(told.outlet.records(kind)[-1]) - {"record", "seq"}
+        table = part[part.index(f"| `{kind}`") :].split("\n\n")[0].splitlines()[2:]
+        named = [name for row in table for name in re.findall(r"`(\w+)`", row.split(" | ")[0])]
+        assert sorted(fields) == sorted(named)
 
 
 def test_a_device_that_is_gone_is_told_within_two_seconds():
