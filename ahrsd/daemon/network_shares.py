@@ -73,7 +73,7 @@ class Listener:
         self.lock = threading.Lock()
         self.readers: list[_Reader] = []
         self._lost_before = self._turned_away = self._ignored_bytes = 0
-        self._newest: bytes = b""  # the first line of who comes later
+        self._newest, self._fault = b"", ""  # the first line of who comes later
         try:
             self.socket = _listen(share.address)
         except OSError as error:
@@ -111,9 +111,13 @@ class Listener:
         """Somebody connects; None where there is no room, or nobody is there any more."""
         try:
             connection, peer = self.socket.accept()
-        except OSError as error:
-            log.warning("%s: %s", self.share.name, error.strerror)
+        except OSError as error:  # such as no descriptor left: who connects waits meanwhile
+            if self._fault != (fault := _why(error)):
+                log.warning("%s: nobody can connect: %s", self.share.name, fault)
+            self._fault = fault
+            time.sleep(_AGAIN_S)
             return None
+        self._fault = ""
         with self.lock:
             if len(self.readers) >= MOST_READERS:
                 connection.close()
@@ -176,6 +180,7 @@ class Listener:
                 lost,
                 self._turned_away,
                 self._ignored_bytes,
+                self._fault,
             )
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import resource
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -208,6 +209,30 @@ def test_readers_that_come_and_go_leave_nothing(served):
         one.close()
         until(lambda: served.facts.readers == 0)
     assert len([*Path("/proc/self/fd").iterdir()]) == before
+
+
+def test_without_descriptors_the_readers_that_are_there_go_on(served, caplog):
+    one = served.connected()
+    late = socket.socket()
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with caplog.at_level(logging.WARNING, "ahrsd"):
+        highest = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
+        held = [os.dup(0) for _ in range(highest)]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(held) + 1, before[1]))
+        try:
+            late.connect(place(served.address))
+            until(lambda: served.facts.fault)
+            served.shares.heard(TEXT)
+            assert read(one, len(TEXT)) == TEXT
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+            for fd in held:
+                os.close(fd)
+    assert caplog.text.count("nobody can connect: Too many open files") == 1
+    until(lambda: served.facts.readers == 2)
+    assert served.facts.fault == ""
+    late.close()
+    one.close()
 
 
 def test_a_reader_that_resets_its_connection_is_gone(served):
