@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
 
@@ -49,7 +49,8 @@ class InUse:
 
     by:                `REGISTERS` or `QUALIFIED`; candidate: its id
     heading_sigma_deg: 1 sigma of the worst heading by it; None: not known
-    gyro_bias_rad_s:   (3,) the best that is known, whatever is in the register; for levelling
+    levelling:         the gyro's calibration with the bias that is known best, whatever is in the
+                       register, for what integrates its rate
     """
 
     mag: Affine
@@ -59,13 +60,12 @@ class InUse:
     by: str = REGISTERS
     candidate: str | None = None
     heading_sigma_deg: float | None = None
-    gyro_bias_rad_s: Array | None = None
+    levelling: Affine = field(init=False)
+    gyro_bias_rad_s: InitVar[Array | None] = None
 
-    @property
-    def levelling(self) -> Affine:
-        """The gyro's calibration for what integrates its rate."""
-        bias = self.gyro.offset if self.gyro_bias_rad_s is None else self.gyro_bias_rad_s
-        return Affine(self.gyro.matrix, bias)
+    def __post_init__(self, gyro_bias_rad_s: Array | None) -> None:
+        bias = self.gyro.offset if gyro_bias_rad_s is None else gyro_bias_rad_s
+        object.__setattr__(self, "levelling", Affine(self.gyro.matrix, bias))
 
     def vectors(self, block: SampleBlock) -> tuple[Array, Array, Array]:
         """Field in gauss, rate in rad/s and specific force in m/s^2 of the block, (N, 3) each."""

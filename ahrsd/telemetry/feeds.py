@@ -17,6 +17,7 @@ from ahrsd.telemetry.protocol import line_of
 from ahrsd.telemetry.records import Record
 
 _NMEA_S = 0.1  # a heading so often
+_PACE_S = {"corrected": 0.01, "nmea": 0.05}  # samples are looked for; faster costs more of a core
 _OTHER_BIAS_RAD_S = 2e-3  # in 5 s half a degree of tilt
 
 
@@ -57,6 +58,7 @@ class Feed:
 
     def __init__(self, outlet: Outlet) -> None:
         self.outlet, terms = outlet, outlet.share
+        self.pace_s = _PACE_S[terms.send]
         self._nmea = terms.send == "nmea"
         self._max_sigma_deg = terms.max_heading_sigma_deg
         self._chooser, self._tilt = Chooser(terms.calibration == QUALIFIED), Tilt()
