@@ -119,6 +119,25 @@ def test_corrected_says_the_true_field_rate_and_heading_once_a_candidate_qualifi
     assert state["sigma_hard_iron_gauss"] == pytest.approx([1e-4] * 3)
 
 
+def test_when_the_candidate_is_written_the_values_stay_and_the_registers_make_them():
+    told = Told("corrected", mode=Mode.COMMIT)
+    told.until("QUALIFIED")
+    told.go(1.0)
+    told.outlet.lines.clear()
+    told.run.approve()
+    told.until("TRIAL")
+    told.go(10.0)
+    samples = told.outlet.records()
+    by = [sample["calibration"] for sample in samples]
+    assert by == sorted(by)  # first qualified, then registers, once
+    assert set(by) == {"qualified", "registers"}
+    for sample in samples:
+        R_nb, rate = told.true[round(sample["time_s"], 6)]
+        assert np.allclose(sample["mag_body_gauss"], R_nb.T @ FIELD_N, atol=6e-3)
+        assert np.allclose(sample["gyro_body_rad_s"], rate, atol=6e-3)
+    assert told.outlet.records("state")[-1]["candidate"] is None
+
+
 def test_before_that_no_heading_is_told_and_the_values_are_the_devices_own():
     told = Told("corrected", calibration="registers", max_heading_sigma_deg=1.0)
     told.until("QUALIFIED")
