@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config, check_config, default_state_directory, load_config
 from ahrsd.config.sections import DeviceSection, GatesSection, Section
 from ahrsd.config.text import print_config, reference, to_toml
@@ -224,3 +225,43 @@ def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp
     said = CliRunner().invoke(command, ["--state-directory", str(tmp_path), "--print-config"])
     assert said.exit_code == 0
     assert load(tmp_path, said.output).state_directory == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        ("", "the place is missing: write one of pty, tcp and udp"),
+        ('pty = "/x"\ntcp = "127.0.0.1:1"', "pty and tcp are both given"),
+        ('tcp = "localhost:2101"', "such as 127.0.0.1:2101 or [::1]:2101; a name is not looked up"),
+        ('tcp = "::1:2101"', "such as 127.0.0.1:2101 or [::1]:2101"),
+        ('tcp = "[127.0.0.1]:2101"', "such as 127.0.0.1:2101 or [::1]:2101"),
+        ('tcp = "127.0.0.1"', "such as 127.0.0.1:2101 or [::1]:2101"),
+        ('udp = "127.0.0.1:70000"', "a port is 1 to 65535"),
+        ('tcp = "0.0.0.0:2101"', "could be read by other machines; write other_hosts = true"),
+        ('udp = "192.168.1.255:10110"', "would leave this machine; write other_hosts = true"),
+        ('udp = "0.0.0.0:1"\nother_hosts = true', "nobody is there"),
+        ('tcp = "224.0.0.1:1"\nother_hosts = true', "a group of hosts, for udp only"),
+        ('tcp = "127.0.0.1:2101"\nowner = true', "owner is for pty; this share is tcp"),
+        ('udp = "127.0.0.1:2101"\ngroup = "x"', "group is for pty; this share is udp"),
+        ('pty = "/x"\nsend = "nmea"', "send is for tcp and udp; this share is pty"),
+        ('pty = "/x"\nownr = true', "share.0.ownr = True: unknown key; did you mean owner?"),
+    ],
+)
+def test_a_share_that_cannot_be_is_one_line(tmp_path, share, words):
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, f"[[share]]\n{share}\n")
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_shares_of_every_kind_come_back_from_their_text(tmp_path):
+    config = load(
+        tmp_path,
+        '[[share]]\npty = "/x"\nowner = true\n'
+        '[[share]]\ntcp = "[::1]:2101"\nsend = "corrected"\ncalibration = "registers"\n'
+        '[[share]]\nudp = "192.168.1.255:10110"\nsend = "nmea"\nother_hosts = true\n',
+    )
+    names = [share.name for share in config.share]
+    assert names == ["/x", "tcp [::1]:2101", "udp 192.168.1.255:10110"]
+    assert load(tmp_path, print_config(config)) == config
+    assert [policy.name for policy in core_settings(config).shares] == ["/x"]

@@ -59,7 +59,11 @@ def core_settings(
         stream_rate_hz=stream_rate_hz,
         columns_max_age_s=config.terms.max_age_s,
         warm_start_s=config.estimator.warm_start_s,
-        shares=tuple(SharePolicy(s.name, s.owner, s.save, s.reset) for s in config.share),
+        shares=tuple(
+            SharePolicy(s.name, s.owner, s.save, s.reset)
+            for s in config.share
+            if s.pty is not None  # who reads over the network says nothing
+        ),
     )
 
 

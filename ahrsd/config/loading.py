@@ -11,7 +11,7 @@ import difflib
 import os
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
@@ -172,8 +172,23 @@ def check_config(body: dict[str, Any], source: str) -> Config:
 
 def section_of(location: tuple[int | str, ...]) -> type[BaseModel]:
     """The table that holds the key at `location`."""
-    annotation = Config.model_fields[str(location[0])].annotation if len(location) > 1 else Config
+    name = str(location[0])
+    if len(location) == 1:
+        return Config
+    if (listed := listed_sections().get(name)) is not None:
+        return listed
+    annotation = Config.model_fields[name].annotation
     return annotation if isinstance(annotation, type) else Config
+
+
+def listed_sections() -> dict[str, type[Section]]:
+    """Tables that may be there several times, by name: those that a tuple holds."""
+    found = {}
+    for name, field in Config.model_fields.items():
+        inside = get_args(field.annotation)
+        if inside and isinstance(inside[0], type) and issubclass(inside[0], Section):
+            found[name] = inside[0]
+    return found
 
 
 def _explain(detail: ErrorDetails) -> str:

@@ -8,15 +8,25 @@ from __future__ import annotations
 
 import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from ahrsd.config.addresses import Address
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.gates.limits import GateLimits
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 
 Baud = Literal["auto", 9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600]
+
+
+_PLACES: Final = ("pty", "tcp", "udp")  # of a share, exactly one
+_KEYS_OF: Final = {  # which of them a key of a share is for
+    **dict.fromkeys(("owner", "save", "reset", "group"), ("pty",)),
+    **dict.fromkeys(
+        ("send", "other_hosts", "calibration", "max_heading_sigma_deg"), ("tcp", "udp")
+    ),
+}
 
 
 class Section(BaseModel):
@@ -55,31 +65,64 @@ class DeviceSection(Section):
 
 
 class ShareSection(Section):
-    """A port on which another program finds the device, as if it had it alone."""
+    """A place where another program finds the device: a port of its own, or an address."""
 
     pty: Path | None = None
-    """Path of the port; the other program opens it in place of the device's own."""
+    """Path of a port; the other program opens it in place of the device's own."""
+    tcp: str | None = None
+    """Address to listen at, such as 127.0.0.1:2101 or [::1]:2101; whoever connects only reads."""
+    udp: str | None = None
+    """Address to send to, such as 127.0.0.1:5005: a datagram for each message."""
+    send: Literal["raw", "corrected", "nmea"] = "raw"
+    """What tcp and udp send; raw: the device's messages byte for byte; corrected: JSON lines with
+    the calibrated field and rate (docs/reference/socket.md); nmea: HDM and XDR, ten a second."""
+    other_hosts: bool = False
+    """Needed for an address of tcp or udp that is not of this machine alone (127.0.0.0/8, ::1)."""
+    calibration: Literal["qualified", "registers"] = "qualified"
+    """What corrected and nmea are calibrated by; qualified: a candidate that passed every gate is
+    applied here, before and without a write; registers: only what is in the device."""
+    max_heading_sigma_deg: float = Field(default=5.0, gt=0.0, le=180.0)
+    """Magnetic heading by that calibration that is known less well than this (1 sigma) is left out
+    of corrected and nmea. [deg]"""
     owner: bool = False
-    """Its program may set outputs and other settings of the device, in RAM; at most one may. The
-    others read and listen. Nobody writes what calibrates."""
+    """The program on the pty may set outputs and other settings of the device, in RAM; at most one
+    may. The others read and listen. Nobody writes what calibrates."""
     save: Literal["refuse", "clean"] = "clean"
     """What becomes of VNWNV of the owner; clean: sent once nothing unproven is in the device's RAM
     (a calibration on trial is undone first)."""
     reset: Literal["refuse", "announce"] = "announce"
     """What becomes of VNRST of the owner."""
     group: str | None = None
-    """Group that may open the port; default: the daemon's."""
+    """Group that may open the pty; default: the daemon's."""
 
     @model_validator(mode="after")
-    def _has_a_port(self) -> ShareSection:
+    def _is_one_place(self) -> ShareSection:
+        given = [kind for kind in _PLACES if getattr(self, kind) is not None]
+        if len(given) != 1:
+            found = f"{' and '.join(given)} are both given" if given else "the place is missing"
+            raise ValueError(f"{found}: write one of pty, tcp and udp; a [[share]] for each")
+        for key, kind in _KEYS_OF.items():
+            set_ = getattr(self, key) != type(self).model_fields[key].get_default()
+            if set_ and given[0] not in kind:
+                raise ValueError(f"{key} is for {' and '.join(kind)}; this share is {given[0]}")
         if self.pty is None:
-            raise ValueError("pty, the path of the port, is missing")
+            self.address.check(self.kind, other_hosts=self.other_hosts)
         return self
+
+    @property
+    def kind(self) -> str:
+        """pty, tcp or udp."""
+        return next(kind for kind in _PLACES if getattr(self, kind) is not None)
 
     @property
     def name(self) -> str:
         """How people and the log call it."""
-        return str(self.pty)
+        return str(self.pty) if self.pty is not None else f"{self.kind} {getattr(self, self.kind)}"
+
+    @property
+    def address(self) -> Address:
+        """Of tcp and udp. Raises ValueError where it is none."""
+        return Address.parse(self.kind, str(getattr(self, self.kind)))
 
 
 class CaptureSection(Section):

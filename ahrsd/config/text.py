@@ -17,8 +17,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from ahrsd.config.loading import Config
-from ahrsd.config.sections import ShareSection
+from ahrsd.config.loading import Config, listed_sections
 
 _WIDTH = 96
 _SIGNS = ((Ge, "ge", ">="), (Gt, "gt", ">"), (Le, "le", "<="), (Lt, "lt", "<"))
@@ -88,7 +87,7 @@ def _sections(config: Config) -> Iterator[tuple[str, BaseModel]]:
 
 def _listed() -> dict[str, BaseModel]:
     """Tables that may be there several times, with their defaults."""
-    return {"share": ShareSection.model_construct()}
+    return {name: section.model_construct() for name, section in listed_sections().items()}
 
 
 def _keys(section: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:

@@ -180,12 +180,14 @@ class Daemon:
             self._finish()
 
     def _share(self, leaving: ExitStack) -> None:
-        """Other programs find the device on ports of their own."""
-        ports = self._link.share(self.config.share)
-        leaving.callback(ports.close)
-        self.shell.to_client = ports.send
-        names = ", ".join(share.name for share in self.config.share)
-        self.shell.say(logging.INFO, f"the device is shared on {names}", self.clock.now_ns())
+        """Other programs find the device at places of their own."""
+        shares = self._link.share(self.config.share)
+        leaving.callback(shares.close)
+        self.shell.to_client = shares.send
+        if self._public is not None:
+            self._public.feed(shares.outlets())
+        for level, text in shares.announced():
+            self.shell.say(level, text, self.clock.now_ns())
 
     def _after_a_bug(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """On the way out: whatever it was, the device is put back; what was raised goes on."""
@@ -363,7 +365,7 @@ class Daemon:
             viewer_fault="" if counters is None else counters.last_fault,
             interlock="none" if self._interlock is None else "safe" if self._safe else "not safe",
             complaints=tuple(text for text in self._complaints.values() if text),
-            shares=() if self._link.shared is None else self._link.shared.opened(),
+            shares=() if self._link.shared is None else self._link.shared.facts(),
             estimator_stuck=self.shell.worker is not None and self.shell.worker.stuck,
         )
 

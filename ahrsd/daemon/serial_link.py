@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from ahrsd.config.sections import ShareSection
-from ahrsd.daemon.shared_ports import SharedPorts
+from ahrsd.daemon.shares import Shares
 from ahrsd.inputs import ClientLeft, ClientSent
 from drivers.serial_port import (
     LISTEN_S,
@@ -185,7 +185,7 @@ class SerialLink:
         self.path, self.baud = path, baud
         self.inbox = Inbox(patient_bytes=patient_bytes)
         self._now_ns = now_ns
-        self.shared: SharedPorts | None = None
+        self.shared: Shares | None = None
         self._port: SerialPort | None = None
         self._reader: SerialReader | None = None
         self._doubtful: itertools.cycle[int] | None = None
@@ -208,12 +208,12 @@ class SerialLink:
         share = None if self.shared is None else self.shared.heard
         self._reader = SerialReader(self._port, self.inbox, self._now_ns, share)
 
-    def share(self, shares: Iterable[ShareSection]) -> SharedPorts:
-        """Other programs find the device on ports of their own; the caller closes them.
+    def share(self, shares: Iterable[ShareSection]) -> Shares:
+        """Other programs find the device at places of their own; the caller closes them.
 
         Raises ConfigError where one cannot be.
         """
-        self.shared = SharedPorts(shares, self.inbox.add, self._now_ns)
+        self.shared = Shares(shares, self.inbox.add, self._now_ns)
         return self.shared
 
     def has_more(self) -> bool:

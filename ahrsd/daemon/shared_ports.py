@@ -1,7 +1,7 @@
 """Virtual serial ports on which other programs find the device: ptys with stable names.
 
-Two threads write into a port: the one that reads the device (measurements, as soon as they are
-whole) and the daemon's (answers). A third one reads what the programs write, at the rate of a real
+Two threads write into a port: the one that reads the device (measurements) and the daemon's
+(answers). A third one reads what the programs write, at the rate of a real
 line, so nobody can flood the daemon. What a program does not read is lost for it alone.
 
 What ptys ask for, each met with real drivers: the port is raw before anybody opens it, else its
@@ -29,7 +29,7 @@ from ahrsd.config.sections import ShareSection
 from ahrsd.errors import ConfigError
 from ahrsd.events import SendToClient
 from ahrsd.inputs import ClientLeft, ClientSent
-from ahrsd.sharing.message_splitter import MessageSplitter
+from ahrsd.sharing.share_facts import ShareFacts
 
 log = logging.getLogger("ahrsd")
 
@@ -48,6 +48,7 @@ class _Port:
 
     share: ShareSection
     master: int
+    target: str  # of the name: the pty's own
     lock: threading.Lock = field(default_factory=threading.Lock)
     unread: bytearray = field(default_factory=bytearray)
     open: bool = False
@@ -93,25 +94,22 @@ class SharedPorts:
         now_ns: Callable[[], int],
     ) -> None:
         self._put, self._now_ns = put, now_ns
-        self._splitter = MessageSplitter()
         self._ports: dict[str, _Port] = {}
         self._closing = False
         try:
             for share in shares:
-                self._ports[share.name] = _Port(share, _open_pty(share))
+                self._ports[share.name] = _Port(share, *_open_pty(share))
         except ConfigError:
             self._take_away()
             raise
         self._thread = threading.Thread(target=self._work, name="shared-ports", daemon=True)
         self._thread.start()
 
-    def heard(self, data: bytes) -> None:
-        """Bytes of the device; none where nothing came for a while."""
-        whole = self._splitter.feed(data) if data else self._splitter.silence()
-        if whole:
-            for port in self._ports.values():
-                if port.streams:
-                    port.write(whole)
+    def measured(self, data: bytes) -> None:
+        """Whole messages of the device that answer nobody."""
+        for port in self._ports.values():
+            if port.streams:
+                port.write(data)
 
     def send(self, item: SendToClient) -> None:
         """An answer for the program on one port."""
@@ -120,9 +118,12 @@ class SharedPorts:
                 port.streams = item.stream
             port.write(item.data)
 
-    def opened(self) -> tuple[tuple[str, bool], ...]:
-        """Each port, and whether a program has it open."""
-        return tuple((name, port.open) for name, port in self._ports.items())
+    def facts(self) -> list[ShareFacts]:
+        """Each port: whether a program has it open, and what it did not read."""
+        return [
+            ShareFacts(name, readers=int(port.open), lost_bytes=port.lost_bytes)
+            for name, port in self._ports.items()
+        ]
 
     def close(self) -> None:
         """Take the ports away; safe to call again."""
@@ -133,8 +134,9 @@ class SharedPorts:
 
     def _take_away(self) -> None:
         for port in self._ports.values():
-            with contextlib.suppress(OSError):
-                Path(port.share.name).unlink()
+            with contextlib.suppress(OSError):  # the name may be somebody else's by now
+                if str(Path(port.share.name).readlink()) == port.target:
+                    Path(port.share.name).unlink()
             os.close(port.master)
         self._ports = {}
 
@@ -172,7 +174,9 @@ class SharedPorts:
             with port.lock:
                 port.open = port.used = port.streams = True
         elif port.used and now_s - port.left_s > _RENEW_S:
-            old, port.master, port.used = port.master, _open_pty(port.share), False
+            old = port.master
+            port.master, port.target = _open_pty(port.share)
+            port.used = False
             os.close(old)
 
     def _read(self, port: _Port) -> None:
@@ -197,8 +201,8 @@ def _may_say(port: _Port, now_s: float) -> bool:
     return port.allowance >= 1.0
 
 
-def _open_pty(share: ShareSection) -> int:
-    """A raw pty under the share's name; returns its master. Raises ConfigError."""
+def _open_pty(share: ShareSection) -> tuple[int, str]:
+    """A raw pty under the share's name; its master and its own name. Raises ConfigError."""
     path = Path(share.name)
     if _is_somebodys(path):
         raise ConfigError(
@@ -224,7 +228,7 @@ def _open_pty(share: ShareSection) -> int:
         ) from error
     finally:
         os.close(slave)  # held open it would keep TIOCEXCL of a program that died
-    return master
+    return master, target
 
 
 def _is_somebodys(path: Path) -> bool:

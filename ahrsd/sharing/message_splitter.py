@@ -28,12 +28,12 @@ class MessageSplitter:
         self._held = b""  # bytes that did not come out yet
         self._base = 0  # offset of the first of them in the stream
 
-    def feed(self, chunk: bytes) -> bytes:
+    def feed(self, chunk: bytes) -> list[bytes]:
         """Take bytes, cut anywhere; whole messages, and what is none, for the clients."""
         self._held += chunk
         frames = self._deframer.feed(chunk)
         pieces = sorted([*frames, *self._deframer.take_skipped()], key=lambda it: it.offset)
-        out = bytearray()
+        out = []
         for piece in pieces:
             length = len(piece.data) if isinstance(piece, Skipped) else piece.length
             data, self._held = self._held[:length], self._held[length:]
@@ -41,10 +41,10 @@ class MessageSplitter:
             if isinstance(piece, Sentence) and is_reply(piece.body):
                 self.replies += 1
             else:
-                out += data
-        return bytes(out)
+                out.append(data)
+        return out
 
-    def silence(self) -> bytes:
+    def silence(self) -> list[bytes]:
         """Nothing came for a while: what waits for more bytes is no message and comes out."""
         self._deframer.drop_pending()
         return self.feed(b"")

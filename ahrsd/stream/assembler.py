@@ -17,7 +17,6 @@ damage in front of each, never by what else came with them.
 from __future__ import annotations
 
 from collections import Counter, deque
-from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -413,7 +412,7 @@ class Stream:
         extracted = extractor.extract_table(np.array(self._rows, dtype=np.float64))
         if extracted.time_s is None:
             return []
-        steps = deepcopy(self._timeline).extend(extracted.time_s, extracted.usable)
+        steps = self._timeline.copied().extend(extracted.time_s, extracted.usable)
         arrivals = np.array(self._arrivals)
         host_s = self._line(steps.time_s, arrivals)
         found = sample_blocks(extractor, extracted, steps, host_s, self.epochs, arrivals)

@@ -15,6 +15,7 @@ Three things live here, all without a clock of their own:
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Final
@@ -212,6 +213,12 @@ class StreamTimeline:
     def period_s(self) -> float:
         """Median step of late; nan before two samples."""
         return self._period_s
+
+    def copied(self) -> StreamTimeline:
+        """One that goes on from here by itself; everything in it but the memory is immutable."""
+        other = copy(self)
+        other._recent = self._recent.copy()
+        return other
 
     def extend(self, time_s: Array, usable: Mask | None = None) -> TimelineSteps:
         """Steps of N further samples at device times (N,).

@@ -65,9 +65,9 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "meaning": STATES[state],
         "mode": status["mode"],
         "mode_now": status["mode_now"],
-        "stream": _stream(status),
+        "stream": stream_trouble(status),
         "sensors": list(status["sensors"]),
-        "estimator": _estimator(status),
+        "estimator": estimator_trouble(status),
         "warm_start": str(status.get("warm_start", "")),
         "files": list(status["complaints"]),
         "mismatch": _mismatch(status),
@@ -95,7 +95,7 @@ def holding(status: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[st
     return shut, others
 
 
-def _stream(status: Mapping[str, Any]) -> str:
+def stream_trouble(status: Mapping[str, Any]) -> str:
     """What is wrong with the stream; empty where nothing is."""
     if not status["link"]["open"]:
         return f"no device on {status['link']['port']}: waiting for it"
@@ -109,7 +109,7 @@ def _stream(status: Mapping[str, Any]) -> str:
     return ""
 
 
-def _estimator(status: Mapping[str, Any]) -> str:
+def estimator_trouble(status: Mapping[str, Any]) -> str:
     """Why there is no estimator now; empty where there is one."""
     found = status["estimator"]
     if found["state"] == "FAILED":
@@ -135,7 +135,7 @@ def _next(
     """One thing to do: what is nearest to the cause comes first."""
     if status["sensors"] and status["link"]["open"]:
         return str(status["sensors"][0])
-    if wrong := _stream(status):
+    if wrong := stream_trouble(status):
         return wrong
     if state in _NEXT:
         return _NEXT[state]

@@ -37,14 +37,33 @@ def device_line(status: Status) -> str:
 
 
 def share_lines(status: Status) -> list[str]:
-    """Ports on which other programs find the device, and what became of their commands."""
-    lines = []
-    for share in status.get("shares", ()):
-        others = [f"{share[what]} {what}" for what in ("refused", "dropped") if share[what]]
+    """Where other programs find the device, and what became of their commands and their bytes."""
+    return [
+        f"share: {share['port']} " + ", ".join([*_used(share), *_troubles(share)])
+        for share in status.get("shares", ())
+    ]
+
+
+def _used(share: Status) -> list[str]:
+    if not share.get("send"):
         used = "in use" if share["open"] else "not open"
-        asked = counted(share["commands"], "command")
-        lines.append(f"share: {share['port']} {used}, " + ", ".join([asked, *others]))
-    return lines
+        return [used, counted(share["commands"], "command")]
+    readers = share["readers"]
+    return [share["send"], "sent" if readers is None else counted(readers, "reader")]
+
+
+_TROUBLES = {
+    "refused": "refused",
+    "dropped": "dropped",
+    "lost_bytes": "bytes lost by a reader that is too slow",
+    "turned_away": "turned away",
+    "ignored_bytes": "bytes of readers thrown away",
+}
+
+
+def _troubles(share: Status) -> list[str]:
+    found = [f"{share[key]} {words}" for key, words in _TROUBLES.items() if share.get(key)]
+    return [*found, *filter(None, [share.get("fault")])]
 
 
 def stream_line(status: Status) -> str:

@@ -17,6 +17,7 @@ class Outbox:
     def __init__(self, limit_bytes: int = LIMIT_BYTES) -> None:
         self.limit_bytes = limit_bytes
         self.dropped = 0  # records, since the client came
+        self.lost_bytes = 0  # of what was dropped
         self._data = bytearray()
         self._gap: tuple[int, int, int] | None = None  # count, first seq, last seq
 
@@ -30,6 +31,12 @@ class Outbox:
         self._data += line
         return True
 
+    def offer(self, message: bytes) -> None:
+        """A message that nobody is told of where there is no room for it; it is counted."""
+        if not self.answer(message):
+            self.dropped += 1
+            self.lost_bytes += len(message)
+
     def record(self, line: bytes, seq: int) -> None:
         """A record that is watched; dropped, and counted, where there is no room."""
         note = self._gap_line(seq)
@@ -37,6 +44,7 @@ class Outbox:
             count, first, _ = self._gap or (0, seq, seq)
             self._gap = (count + 1, first, seq)
             self.dropped += 1
+            self.lost_bytes += len(line)
             return
         self._data += note + line
         self._gap = None

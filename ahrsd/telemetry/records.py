@@ -52,18 +52,17 @@ def record_of(event: events.Event) -> Record:
     raise TypeError(f"{type(event).__name__} is not for the socket")
 
 
-def samples_record(block: SampleBlock, present: Affine, first: int = 0) -> Record:
-    """The samples of a block from row `first` on; `present` is register 23."""
-    raw_b_gauss = block.raw_b_gauss[first:]
+def samples_record(block: SampleBlock, present: Affine) -> Record:
+    """The samples of a block; `present` is register 23."""
     return {
         "record": "samples",
-        "time_s": block.time_s[first:],
-        "host_s": block.host_s[first:],
-        "raw_b_gauss": raw_b_gauss,
-        "gyro_b_rad_s": block.gyro_b_rad_s[first:],
-        "corrected_b_gauss": present.apply(raw_b_gauss),
+        "time_s": block.time_s,
+        "host_s": block.host_s,
+        "raw_b_gauss": block.raw_b_gauss,
+        "gyro_b_rad_s": block.gyro_b_rad_s,
+        "corrected_b_gauss": present.apply(block.raw_b_gauss),
         "calibration_epoch": block.epoch,
-        "gap_before": block.gap_before and not first,
+        "gap_before": block.gap_before,
     }
 
 
@@ -74,25 +73,26 @@ class Newest:
         self._ahead: set[float] = set()  # told, and their block is not full yet
         self._was_full = False
 
-    def waiting(self, blocks: Sequence[SampleBlock], present: Affine) -> list[Record]:
+    def waiting(self, blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
         """What waits for its block to be full, and was not told yet."""
         if self._was_full:
             self._ahead.clear()
             self._was_full = False
-        records = [record for block in blocks if (record := self._rest(block, present))]
+        parts = [part for block in blocks if (part := self._rest(block)) is not None]
         for block in blocks:
             self._ahead.update(block.time_s.tolist())
-        return records
+        return parts
 
-    def full(self, block: SampleBlock, present: Affine) -> Record | None:
+    def full(self, block: SampleBlock) -> SampleBlock | None:
         """The part of a block that was not told while it waited."""
         self._was_full = True
-        return self._rest(block, present)
+        return self._rest(block)
 
-    def _rest(self, block: SampleBlock, present: Affine) -> Record | None:
+    def _rest(self, block: SampleBlock) -> SampleBlock | None:
         new = (k for k, at_s in enumerate(block.time_s.tolist()) if at_s not in self._ahead)
-        first = next(new, None)
-        return None if first is None else samples_record(block, present, first)
+        if (first := next(new, None)) is None:
+            return None
+        return block.part(slice(first, None), gap_before=block.gap_before and not first)
 
 
 def _at(kind: str, at_s: float, host_s: float) -> Record:

@@ -9,6 +9,7 @@ from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.core import Core
 from ahrsd.events import GateResult, SamplesSeen
 from ahrsd.evidence.values import Evidence
+from ahrsd.sharing.share_facts import ShareFacts
 from ahrsd.telemetry.protocol import STATUS_SCHEMA
 from ahrsd.telemetry.readings import readings
 
@@ -30,7 +31,7 @@ class LinkFacts:
     interlock: str = "none"  # none, safe, not safe
     complaints: tuple[str, ...] = ()  # what is wrong with files of the vehicle or of an operator
     estimator_stuck: bool = False
-    shares: tuple[tuple[str, bool], ...] = ()  # shared ports, and whether a program has each open
+    shares: tuple[ShareFacts, ...] = ()
 
 
 class StatusMaker:
@@ -84,10 +85,7 @@ class StatusMaker:
             "gates": [_gate(gate, core.at_s) for gate in core.calibrator.gates],
             "write_back": _write_back(core),
             "interlock": link.interlock,
-            "shares": [
-                {"port": port, "open": is_open, **core.clients.counts(port)}
-                for port, is_open in link.shares
-            ],
+            "shares": [_share(share, core.clients.counts(share.name)) for share in link.shares],
             "complaints": list(link.complaints),
             "capture": {"file": link.capture, "error": link.capture_error},
             "viewer": {"dropped": link.viewer_dropped, "fault": link.viewer_fault},
@@ -120,6 +118,20 @@ class StatusMaker:
             "refused": [str(error) for error in core.stream.refused.values()],
             "waits_for": list(core.vehicle.waits_for),
         }
+
+
+def _share(share: ShareFacts, counts: dict[str, int]) -> dict[str, object]:
+    return {
+        "port": share.name,
+        "open": share.readers is None or share.readers > 0,
+        "send": share.send,
+        "readers": share.readers,
+        "lost_bytes": share.lost_bytes,
+        "turned_away": share.turned_away,
+        "ignored_bytes": share.ignored_bytes,
+        "fault": share.fault,
+        **counts,
+    }
 
 
 def _motion(evidence: Evidence | None) -> dict[str, object] | None:

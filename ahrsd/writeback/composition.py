@@ -82,7 +82,7 @@ def compose(
     present_gyro = _affine(registers, GYRO)
     _refuse_unusable(estimate)
     _refuse_moved(estimate, present, present_gyro)
-    proposed = {MAG: _wire(MAG, Affine(_matrix(estimate, present), estimate.hard_iron_gauss))}
+    proposed = {MAG: _wire(MAG, correction(estimate, present))}
     if gyro_is_raw:
         proposed[GYRO] = _wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
     written = Affine.from_register(_floats(proposed[MAG]))
@@ -138,6 +138,11 @@ def apart_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
 def _scale(written: Affine, estimate: Estimate) -> float:
     """How much larger the written correction makes the field than A^-1 does."""
     return float(np.cbrt(np.linalg.det(written.matrix) * np.linalg.det(estimate.soft_iron)))
+
+
+def correction(estimate: Estimate, present: Affine) -> Affine:
+    """What register 23 would be by this estimate, the scale s by the rule above, not rounded."""
+    return Affine(_matrix(estimate, present), estimate.hard_iron_gauss)
 
 
 def _matrix(estimate: Estimate, present: Affine) -> Array:

@@ -1,10 +1,12 @@
 """What a shared port costs a driver: the time from the device's port to the driver's, and bytes.
 
-    python tests/benchmarks/bench_sharing.py [--rate HZ] [--seconds S] [--json FILE]
+    python tests/benchmarks/bench_sharing.py [--rate HZ] [--seconds S] [--way NAME] [--json FILE]
 
 A writer puts binary packets with the host's time into a pty, a reader stamps each when it is whole:
-directly, through `ahrsd run` with a shared port (mode passive), and through socat where that is
-installed. Median and 99 % of the delay in ms, messages lost, and the daemon's share of a core.
+directly, through `ahrsd run` (mode passive) with a shared port or with a raw share over tcp, and
+through socat where that is installed. `crowd`: over tcp with 15 readers more, one of which never
+reads; the losses are those of all that read. Median and 99 % of the delay in ms, messages lost, and
+the daemon's share of a core.
 Run it on a quiet machine: the figures are those of the scheduler otherwise.
 """
 
@@ -16,6 +18,8 @@ import json
 import os
 import select
 import shutil
+import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -24,6 +28,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +39,19 @@ from cabled_units import crc16
 
 HEAD = bytes([0xFA, 0x01]) + struct.pack("<H", 0x0001 | 0x0008 | 0x0020 | 0x0400)
 PATIENCE_S = 30.0
-Opened = Callable[[str, Path], contextlib.AbstractContextManager[tuple[int, int | None]]]
+CROWD = 14
+
+
+@dataclass
+class Way:
+    """Where to read, the process between, and what other readers lost by the end."""
+
+    reader: int
+    pid: int | None = None
+    others_lost: int = 0
+
+
+Opened = Callable[[str, Path], contextlib.AbstractContextManager[Way]]
 
 
 def packet(number: int) -> bytes:
@@ -86,41 +103,116 @@ def read(reader: int, seconds: float) -> tuple[np.ndarray, int]:
 
 
 @contextlib.contextmanager
-def direct(_device: str, _folder: Path) -> Iterator[tuple[int, int | None]]:
+def direct(device: str, _folder: Path) -> Iterator[Way]:
     """The device's own port."""
-    yield os.open(_device, os.O_RDWR | os.O_NOCTTY), None
+    yield Way(os.open(device, os.O_RDWR | os.O_NOCTTY))
 
 
 @contextlib.contextmanager
-def shared(device: str, folder: Path) -> Iterator[tuple[int, int | None]]:
-    """`ahrsd run` on the device's port, and its shared one."""
-    port, config = folder / "shared", folder / "ahrsd.toml"
+def running(command: list[str]) -> Iterator[int]:
+    """A program that shares the port; its process."""
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, stdout=quiet, stderr=quiet) as process:
+        try:
+            yield process.pid
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def ahrsd(device: str, folder: Path, share: str) -> list[str]:
+    """The command of `ahrsd run` with this share."""
+    config = folder / "ahrsd.toml"
     config.write_text(
         f'mode = "passive"\nstate_directory = "{folder}"\n[device]\nport = "{device}"\n'
-        f'baud = 115200\n[[share]]\npty = "{port}"\n'
+        f"baud = 115200\n[[share]]\n{share}\n"
     )
-    command = [sys.executable, "-m", "ahrsd", "run", "--config", str(config)]
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, stdout=quiet, stderr=quiet) as process:
-        try:
-            yield opened(port), process.pid
-        finally:
-            process.terminate()
-            process.wait()
+    return [sys.executable, "-m", "ahrsd", "run", "--config", str(config)]
 
 
 @contextlib.contextmanager
-def socat(device: str, folder: Path) -> Iterator[tuple[int, int | None]]:
+def shared(device: str, folder: Path) -> Iterator[Way]:
+    """A shared port of `ahrsd run`."""
+    port = folder / "shared"
+    with running(ahrsd(device, folder, f'pty = "{port}"')) as pid:
+        yield Way(opened(port), pid)
+
+
+@contextlib.contextmanager
+def tcp(device: str, folder: Path) -> Iterator[Way]:
+    """A raw share over tcp."""
+    place = free_place()
+    with running(ahrsd(device, folder, f'tcp = "127.0.0.1:{place}"')) as pid:
+        yield Way(connected(place).detach(), pid)
+
+
+@contextlib.contextmanager
+def crowd(device: str, folder: Path) -> Iterator[Way]:
+    """The same with 14 readers in another process, and one that never reads."""
+    place, way = free_place(), Way(-1)
+    with contextlib.ExitStack() as leaving:
+        way.pid = leaving.enter_context(
+            running(ahrsd(device, folder, f'tcp = "127.0.0.1:{place}"'))
+        )
+        idle = leaving.enter_context(connected(place))
+        idle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        drain = leaving.enter_context(
+            subprocess.Popen(
+                [sys.executable, __file__, "--drain", str(place)], stdout=subprocess.PIPE
+            )
+        )
+        assert drain.stdout is not None
+        assert drain.stdout.readline() == b"connected\n"
+        way.reader = connected(place).detach()
+        yield way
+        os.kill(way.pid, signal.SIGTERM)  # the readers say what they have when it ends
+        way.others_lost = int(drain.stdout.readline())
+
+
+def drain(place: int) -> None:
+    """Read until the other side ends, and print how many packets are missing, of all readers."""
+    readers = dict.fromkeys((connected(place) for _ in range(CROWD)), b"")
+    print("connected", flush=True)
+    left, missing, last = set(readers), 0, dict.fromkeys(readers, -1)
+    while left:
+        for one in select.select(list(left), [], [])[0]:
+            data = one.recv(1 << 16)
+            if not data:
+                left.discard(one)
+            got = readers[one] + data
+            while (start := got.find(HEAD)) >= 0 and len(got) >= start + SIZE:
+                number = int(struct.unpack_from("<Qf", got, start + 4)[1])
+                missing += number - last[one] - 1 if last[one] >= 0 else 0
+                last[one], got = number, got[start + SIZE :]
+            readers[one] = got
+    print(missing, flush=True)
+
+
+@contextlib.contextmanager
+def socat(device: str, folder: Path) -> Iterator[Way]:
     """socat between the two."""
     port = folder / "socat"
-    command = ["socat", f"{device},raw,echo=0", f"pty,raw,echo=0,link={port}"]
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, stdout=quiet, stderr=quiet) as process:
+    with running(["socat", f"{device},raw,echo=0", f"pty,raw,echo=0,link={port}"]) as pid:
+        yield Way(opened(port), pid)
+
+
+def free_place() -> int:
+    """A tcp port that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def connected(place: int) -> socket.socket:
+    """A connection, as soon as somebody listens."""
+    end_s = time.monotonic() + PATIENCE_S
+    while True:
         try:
-            yield opened(port), process.pid
-        finally:
-            process.terminate()
-            process.wait()
+            return socket.create_connection(("127.0.0.1", place))
+        except ConnectionRefusedError:
+            if time.monotonic() > end_s:
+                raise SystemExit(f"nobody listens at {place}") from None
+            time.sleep(0.05)
 
 
 def opened(port: Path) -> int:
@@ -148,20 +240,21 @@ def measured(way: Opened, rate_hz: float, seconds: float) -> dict[str, float]:
         if way is not direct:
             os.close(slave)
         writer.start()
-        with way(device, Path(folder)) as (reader, pid):
+        with way(device, Path(folder)) as there:
             time.sleep(1.0)
+            pid = there.pid
             used_s, begun_s = cpu_s(pid) if pid else 0.0, time.monotonic()
-            delays, lost = read(reader, seconds)
+            delays, lost = read(there.reader, seconds)
             share = (cpu_s(pid) - used_s) / (time.monotonic() - begun_s) if pid else 0.0
             stop.set()
             writer.join()
-            os.close(reader)
+            os.close(there.reader)
     os.close(master)
     return {
         "packets": len(delays),
         "median_ms": round(float(np.median(delays)), 3),
         "p99_ms": round(float(np.percentile(delays, 99)), 3),
-        "lost": lost,
+        "lost": lost + there.others_lost,
         "core_percent": round(100.0 * share, 1),
     }
 
@@ -171,14 +264,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--rate", type=float, action="append", help="Hz; default 200 and 800")
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--way", action="append", help="direct, shared, tcp, crowd, socat; all")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--drain", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    ways: dict[str, Opened] = {"direct": direct, "shared": shared}
+    if options.drain:
+        drain(options.drain)
+        return
+    ways: dict[str, Opened] = {"direct": direct, "shared": shared, "tcp": tcp, "crowd": crowd}
     if shutil.which("socat"):
         ways["socat"] = socat
     found = {}
     for rate_hz in options.rate or (200.0, 800.0):
         for name, way in ways.items():
+            if options.way and name not in options.way:
+                continue
             found[f"{name} {rate_hz:.0f} Hz"] = row = measured(way, rate_hz, options.seconds)
             print(f"{name:8} {rate_hz:4.0f} Hz", row, flush=True)
     if options.json:

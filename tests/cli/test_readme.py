@@ -60,3 +60,13 @@ def test_the_configuration_of_the_operating_page_is_one():
     assert body is not None
     config = check_config(tomllib.loads(body[1]), "operating.md")
     assert config.mode == "stage"
+
+
+def test_every_configuration_of_the_sharing_page_is_one():
+    page = (PROJECT / "docs" / "guide" / "sharing.md").read_text()
+    bodies = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    shares = [
+        share for body in bodies for share in check_config(tomllib.loads(body), "sharing.md").share
+    ]
+    assert {share.kind for share in shares} == {"pty", "tcp", "udp"}
+    assert {share.send for share in shares} == {"raw", "corrected", "nmea"}

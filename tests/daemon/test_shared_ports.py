@@ -17,6 +17,7 @@ from cabled_units import sentence
 
 from ahrsd.config.sections import ShareSection
 from ahrsd.daemon.shared_ports import SharedPorts
+from ahrsd.daemon.shares import Shares
 from ahrsd.errors import ConfigError
 from ahrsd.events import SendToClient
 from ahrsd.inputs import ClientLeft, ClientSent
@@ -49,11 +50,11 @@ class Shared:
         self.paths = [folder / "vn100", folder / "log"]
         self.said: list[ClientSent | ClientLeft] = []
         shares = [ShareSection(pty=path, owner=path.name == "vn100") for path in self.paths]
-        self.ports = SharedPorts(shares, self.said.append, time.monotonic_ns)
+        self.ports = Shares(shares, self.said.append, time.monotonic_ns)
 
     def opened(self, number: int = 0) -> Program:
         program = Program(self.paths[number])
-        until(lambda: self.ports.opened()[number][1])
+        until(lambda: self.ports.facts()[number].readers)
         return program
 
     def text(self, number: int = 0) -> str:
@@ -121,7 +122,7 @@ def test_closed_and_opened_at_once_it_is_the_same_port(shared):
     one.close()
     again = Program(shared.paths[0])
     assert shared.paths[0].readlink() == target
-    until(lambda: shared.ports.opened()[0][1])
+    until(lambda: shared.ports.facts()[0].readers)
     shared.ports.heard(TEXT)
     assert TEXT in again.read(len(TEXT))
     again.close()
@@ -141,7 +142,7 @@ def test_a_program_that_is_killed_leaves_the_name_usable(shared):
     command = [sys.executable, "-c", code, str(target)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as first:
         assert first.stdout.readline() == b"mine\n"
-        until(lambda: shared.ports.opened()[0][1])
+        until(lambda: shared.ports.facts()[0].readers)
         first.kill()
     until(lambda: shared.paths[0].readlink() != target)
     again = shared.opened()
@@ -158,7 +159,9 @@ def test_a_program_that_never_reads_costs_only_itself(shared):
         shared.ports.heard(TEXT)
         got += reader.read(len(TEXT))
     assert got == TEXT * 2000
-    assert len(idle.read(1 << 20, 1.0)) < len(got)
+    lost = [fact.lost_bytes for fact in shared.ports.facts()]
+    assert lost[1] == 0
+    assert len(idle.read(1 << 20, 1.0)) == len(got) - lost[0] > 0
     idle.close()
     reader.close()
 
@@ -199,6 +202,27 @@ def test_a_name_that_is_somebodys_is_refused_and_kept(tmp_path, what):
     with pytest.raises(ConfigError, match="something of that name"):
         SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns)
     assert os.path.lexists(path)
+
+
+@pytest.mark.parametrize("taker", ["another run", "a file", "nobody"])
+def test_a_name_that_somebody_took_meanwhile_is_left_to_them(tmp_path, taker):
+    path = tmp_path / "vn100"
+    ports = SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns)
+    path.unlink()
+    if taker == "another run":
+        path.symlink_to("/dev/pts/99999")
+    elif taker == "a file":
+        path.write_text("theirs")
+    ports.close()
+    assert os.path.lexists(path) == (taker != "nobody")
+
+
+def test_after_a_program_left_the_fresh_port_is_taken_away_too(shared):
+    target = shared.paths[0].readlink()
+    shared.opened().close()
+    until(lambda: shared.paths[0].readlink() != target)
+    shared.ports.close()
+    assert not os.path.lexists(shared.paths[0])
 
 
 def test_what_a_killed_run_left_is_replaced(tmp_path):

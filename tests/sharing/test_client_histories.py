@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
-from client_histories import ClientHistory
+from client_histories import SHARES, ClientHistory
 
 from ahrsd.sharing import client_commands
 from ahrsd.sharing.arbiter import Arbiter
@@ -33,14 +34,19 @@ def test_a_client_that_may_write_what_calibrates_would_be_seen(monkeypatch):
     assert played(0).wrong["calibration"] > 0
 
 
-def test_an_answer_to_the_wrong_client_would_be_seen(monkeypatch):
-    say = Arbiter._say
+class Crossed(Arbiter):
+    """Each answer goes to the other client."""
 
-    def to_the_other(self, name, data, stream=None):
-        say(self, "log" if name == "owner" else "owner", data, stream)
+    def take_answers(self):
+        other = {"owner": "log", "log": "owner"}
+        return [replace(answer, client=other[answer.client]) for answer in super().take_answers()]
 
-    monkeypatch.setattr(Arbiter, "_say", to_the_other)
-    assert played(0).wrong["wrong answers"] > 0
+
+def test_an_answer_to_the_wrong_client_would_be_seen():
+    history = ClientHistory(0)
+    history.run.core.clients.arbiter = Crossed(SHARES)
+    history.play()
+    assert history.wrong["wrong answers"] > 0
 
 
 def played(seed):

@@ -24,17 +24,17 @@ def cut(stream: bytes, rng: np.random.Generator) -> list[bytes]:
 
 def test_a_message_comes_out_with_its_last_byte_and_not_before():
     splitter = MessageSplitter()
-    assert splitter.feed(TEXT[:-1]) == b""
-    assert splitter.feed(TEXT[-1:]) == TEXT
+    assert splitter.feed(TEXT[:-1]) == []
+    assert splitter.feed(TEXT[-1:]) == [TEXT]
     one = packet(bytes(range(8)))
-    assert splitter.feed(one[:-1]) == b""
-    assert splitter.feed(one[-1:] + one[:3]) == one
+    assert splitter.feed(one[:-1]) == []
+    assert splitter.feed(one[-1:] + one[:3]) == [one]
 
 
 @pytest.mark.parametrize("body", REPLIES)
 def test_a_reply_between_messages_is_kept_back(body):
     splitter = MessageSplitter()
-    assert splitter.feed(TEXT + sentence(body) + TEXT) == TEXT + TEXT
+    assert splitter.feed(TEXT + sentence(body) + TEXT) == [TEXT, TEXT]
     assert splitter.replies == 1
     assert is_reply(body)
     assert not is_reply("VNYMR,1")
@@ -43,7 +43,7 @@ def test_a_reply_between_messages_is_kept_back(body):
 def test_a_damaged_reply_is_no_reply():
     bad = b"$VNRRG,01,VN-100*00\r\n"
     splitter = MessageSplitter()
-    assert splitter.feed(TEXT + bad + TEXT) + splitter.silence() == TEXT + bad + TEXT
+    assert b"".join(splitter.feed(TEXT + bad + TEXT) + splitter.silence()) == TEXT + bad + TEXT
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -61,8 +61,8 @@ def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
         piece = [TEXT, TEXT, packet(rng.bytes(8)), harmless][kind - 1]
         stream, wanted = stream + piece, wanted + piece
     splitter = MessageSplitter()
-    out = b"".join(splitter.feed(chunk) for chunk in cut(stream, rng)) + splitter.silence()
-    assert out == wanted
+    pieces = [piece for chunk in cut(stream, rng) for piece in splitter.feed(chunk)]
+    assert b"".join(pieces + splitter.silence()) == wanted
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -72,5 +72,6 @@ def test_how_the_bytes_are_cut_changes_nothing(seed):
     outs = []
     for _ in range(3):
         splitter = MessageSplitter()
-        outs.append(b"".join(map(splitter.feed, cut(stream, rng))) + splitter.silence())
+        pieces = [piece for chunk in cut(stream, rng) for piece in splitter.feed(chunk)]
+        outs.append(b"".join(pieces + splitter.silence()))
     assert outs[0] == outs[1] == outs[2] == stream

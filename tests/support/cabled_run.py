@@ -74,6 +74,7 @@ class CabledRun:
         self.notes: list[tuple[str, str]] = []
         self.states: list[str] = []
         self.taken: list[inputs.Input] = []
+        self.listeners: list[Callable[[events.Event], None]] = []
         self.now_s, self._serial = 1.0, 0
         self.feed(inputs.WallClock(self.now_ns, 8e8))
         self.feed(inputs.LinkOpened(self.now_ns, "cable", 115200))
@@ -97,6 +98,8 @@ class CabledRun:
             one = waiting.pop(0)
             self.taken.append(one)
             for event in self.core.handle(one):
+                for listener in self.listeners:
+                    listener(event)
                 match event:
                     case events.Send(data):
                         self.cable.receive(data)

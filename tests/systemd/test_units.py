@@ -267,3 +267,55 @@ def test_the_page_beside_it(machine):
         machine.run("rm", "-f", "/etc/systemd/system/ahrsd-page.service.d/approve.conf")
         machine.run("systemctl", "daemon-reload")
         unplug(machine, device)
+
+
+_SHARES = (
+    _CONFIG
+    + """
+[[share]]
+tcp = "127.0.0.1:2101"
+[[share]]
+tcp = "127.0.0.1:2102"
+send = "corrected"
+"""
+)
+
+
+@pytest.mark.timeout(240)
+def test_network_shares_need_the_drop_in_of_the_operating_page(machine):
+    page = (PROJECT / "docs" / "guide" / "operating.md").read_text(encoding="utf-8")
+    drop_in = re.search(r"```\n(\[Service\]\n.*?)```", page, re.DOTALL)[1]
+    write = "import sys; open(sys.argv[1], 'w').write(sys.argv[2])"
+    more = "/etc/systemd/system/ahrsd.service.d/network.conf"
+    machine.run(sys.executable, "-c", write, "/etc/ahrsd.toml", _SHARES)
+    device = emulate(machine)
+    try:
+        machine.run("systemctl", "start", "ahrsd", check=False)
+        failed = lambda: machine.show("ahrsd", "ActiveState") == "failed"  # noqa: E731
+        machine.until(failed, 40, "a start that is refused")
+        assert machine.show("ahrsd", "ExecMainStatus") == "2"  # and so not tried again and again
+        said = machine.run("journalctl", "--no-pager", "-u", "ahrsd").stdout
+        assert (
+            "share.tcp = 127.0.0.1:2101: this process may have no such socket; under systemd"
+            in said
+        )
+
+        machine.run(sys.executable, "-c", write, more, drop_in)
+        machine.run("systemctl", "daemon-reload")
+        machine.run("systemctl", "reset-failed", "ahrsd")
+        machine.run("systemctl", "start", "ahrsd")
+        status = lambda: machine.show("ahrsd", "StatusText")  # noqa: E731
+        machine.until(lambda: status().startswith("OBSERVING"), 40, "a device that is seen")
+        # whether a packet passes IPAddressAllow is erratic in namespaces on a host with cgroups of
+        # both versions, so what is looked at is who listens in the network that all see
+        listening = machine.run("cat", "/proc/net/tcp").stdout
+        assert [f"0100007F:{port:04X} 00000000:0000 0A" in listening for port in (2101, 2102)] == [
+            True,
+            True,
+        ]
+    finally:
+        machine.run("systemctl", "stop", "ahrsd", check=False)
+        machine.run("rm", "-f", more)
+        machine.run("systemctl", "daemon-reload")
+        machine.run("cp", "/etc/systemd/system/ahrsd.toml", "/etc/ahrsd.toml")
+        unplug(machine, device)

@@ -7,7 +7,7 @@ import numpy as np
 from ahrsd.calibration import Affine
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.telemetry.records import Newest
+from ahrsd.telemetry.records import Newest, samples_record
 from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.sentences import MESSAGES
@@ -31,9 +31,10 @@ def told(times, layout=BINARY):
     for k, at_s in enumerate(times):
         full = stream.take(message(layout, at_s, draw), 100.0 + k / 40.0)
         blocks += full
-        records += [newest.full(block, PRESENT) for block in full]
-        records += newest.waiting(stream.peek(), PRESENT)
-    return [record for record in records if record is not None], blocks
+        records += [newest.full(block) for block in full]
+        records += newest.waiting(stream.peek())
+    parts = [part for part in records if part is not None]
+    return [samples_record(part, PRESENT) for part in parts], blocks
 
 
 def test_each_sample_is_told_once_as_its_block_has_it():
