@@ -60,11 +60,11 @@ def command(
         raise AhrsdError(f"{' and '.join(needed)} {are} missing: pip install 'ahrsd[page]'")
     from ahrsd.daemon.operator_inbox import OperatorBox
     from ahrsd.page.app import Site, make_app, serve
-    from ahrsd.page.feed import Feed
+    from ahrsd.page.feed import DaemonFeed
 
     token = None if token_file is None else _token(token_file)
     box = OperatorBox(place.state)
-    known, feed = _names(names), Feed(place.connect)
+    known, feed = _names(names), DaemonFeed(place.connect)
     listener = _listen(address, port)
     site = Site(feed, lambda candidate: _approve(box, candidate), known, token)
     _say_where(listener, token is not None)

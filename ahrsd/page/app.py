@@ -33,7 +33,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 import ahrsd
 from ahrsd.page.access import Token, comes_from_here, form_mark, host_is_known, is_form_mark
 from ahrsd.page.board import TEMPLATES, Board
-from ahrsd.page.feed import Feed
+from ahrsd.page.feed import DaemonFeed
 from ahrsd.report.template import render
 
 MOST_BROWSERS = 32
@@ -70,7 +70,7 @@ class Site:
     approve: says the word for a candidate's id; whether it was accepted, and why not
     """
 
-    feed: Feed
+    feed: DaemonFeed
     approve: Callable[[str], tuple[bool, str]]
     names: frozenset[str] = frozenset()
     token: Token | None = None

@@ -35,7 +35,7 @@ class Heard:
         return ""
 
 
-class Feed:
+class DaemonFeed:
     """Watches the daemon in a thread of its own; connects again by itself."""
 
     def __init__(self, connect: Callable[[], DaemonConnection]) -> None:
