@@ -167,9 +167,10 @@ class Daemon:
         """Until stopped. Raises PortError only where the port cannot be opened the first time."""
         with ExitStack() as leaving:
             leaving.callback(self.shell.folded.finish)
+            leaving.callback(self._link.unshare)  # behind the next: its thread writes there
             leaving.callback(self._link.close)
             if self.config.share:
-                self._share(leaving)
+                self._share()
             leaving.push(self._after_a_bug)
             self._tell_wall()
             if self._terms:
@@ -179,10 +180,9 @@ class Daemon:
                 self._turn(_LONGEST_WAIT_S)
             self._finish()
 
-    def _share(self, leaving: ExitStack) -> None:
+    def _share(self) -> None:
         """Other programs find the device at places of their own."""
         shares = self._link.share(self.config.share)
-        leaving.callback(shares.close)
         self.shell.to_client = shares.send
         if self._public is not None:
             self._public.feed(shares.outlets())

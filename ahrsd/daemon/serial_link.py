@@ -209,12 +209,17 @@ class SerialLink:
         self._reader = SerialReader(self._port, self.inbox, self._now_ns, share)
 
     def share(self, shares: Iterable[ShareSection]) -> Shares:
-        """Other programs find the device at places of their own; the caller closes them.
+        """Other programs find the device at places of their own, until `unshare`.
 
         Raises ConfigError where one cannot be.
         """
         self.shared = Shares(shares, self.inbox.add, self._now_ns)
         return self.shared
+
+    def unshare(self) -> None:
+        """Take the places away, once the port is closed; safe to call again."""
+        if self.shared is not None:
+            self.shared.close()
 
     def has_more(self) -> bool:
         """Whether bytes lie in the port that the thread has not come to read."""

@@ -156,14 +156,20 @@ def test_readers_in_passive_get_every_byte_and_the_device_hears_none_of_theirs(v
         run.until(lambda: len(first.data) > enough and len(corrected.records("sample")) > 100)
         shares = {share["port"].split()[0]: share for share in run.status()["shares"][:3]}
         run.until(lambda: heard.data.count(b"$HCHDM") > 20)
+        got = first.data  # the last bytes before the end may be in no capture
+        time.sleep(0.5)
         assert run.stop() == 0
         heard.close()
     assert bytes(run.heard) == b""
+    warnings = [line for line in run.log.splitlines() if "WARNING" in line]
+    assert [line for line in warnings if "shar" in line or "tcp" in line or "udp" in line] == [
+        line for line in warnings if "what it sends is thrown away" in line
+    ]
     assert run.log.count("what it sends is thrown away") == 1
     assert shares["tcp"]["readers"] == 1
     (capture,) = (tmp_path / "captures").glob("*.mcap")
     device = b"".join(it.data for it in CaptureReader(capture) if isinstance(it, Received))
-    assert first.data in device  # in one piece
+    assert got in device  # in one piece
     assert doomed.data in device
     numbers = [r["seq"] for r in corrected.records("sample") + corrected.records("state")]
     numbers.sort()
@@ -181,7 +187,7 @@ def test_readers_in_passive_get_every_byte_and_the_device_hears_none_of_theirs(v
 
 
 def test_a_device_that_is_unplugged_leaves_the_readers_and_comes_back_to_them(vehicle):
-    run = vehicle("observe", faults=("unplug@12",))
+    run = vehicle("observe", faults=("unplug@20",))
     raw, corrected = run.reader(run.raw), run.reader(run.corrected)
     run.until(lambda: any(not r["device_present"] for r in corrected.records("state")))
     gone = next(r for r in corrected.records("state") if not r["device_present"])
