@@ -78,9 +78,10 @@ class ShareSection(Section):
     the calibrated field and rate (docs/reference/socket.md); nmea: HDM and XDR, ten a second."""
     other_hosts: bool = False
     """Needed for an address of tcp or udp that is not of this machine alone (127.0.0.0/8, ::1)."""
-    calibration: Literal["qualified", "registers"] = "qualified"
-    """What corrected and nmea are calibrated by; qualified: a candidate that passed every gate is
-    applied here, before and without a write; registers: only what is in the device."""
+    calibration: Literal["registers", "qualified"] = "registers"
+    """What corrected and nmea are calibrated by; registers: only what is in the device; qualified:
+    a candidate that passed every gate is applied here, before and without a write or an approval,
+    so a heading moves by it while the vehicle is under way."""
     max_heading_sigma_deg: float = Field(default=5.0, gt=0.0, le=180.0)
     """Magnetic heading by that calibration that is known less well than this (1 sigma) is left out
     of corrected and nmea. [deg]"""

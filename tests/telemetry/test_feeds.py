@@ -96,7 +96,7 @@ def apart_deg(one, other):
 
 
 def test_corrected_says_the_true_field_rate_and_heading_once_a_candidate_qualified():
-    told = Told("corrected")
+    told = Told("corrected", calibration="qualified")
     told.until("QUALIFIED")
     told.outlet.lines.clear()
     told.go(20.0)
@@ -119,8 +119,16 @@ def test_corrected_says_the_true_field_rate_and_heading_once_a_candidate_qualifi
     assert state["sigma_hard_iron_gauss"] == pytest.approx([1e-4] * 3)
 
 
+def test_by_itself_a_share_has_what_is_in_the_device_until_somebody_approves():
+    told = Told("corrected")
+    told.until("QUALIFIED")
+    told.go(5.0)
+    assert {sample["calibration"] for sample in told.outlet.records()} == {"registers"}
+    assert told.outlet.records()[-1]["magnetic_heading_deg"] is None  # it is wrong by degrees
+
+
 def test_when_the_candidate_is_written_the_values_stay_and_the_registers_make_them():
-    told = Told("corrected", mode=Mode.COMMIT)
+    told = Told("corrected", mode=Mode.COMMIT, calibration="qualified")
     told.until("QUALIFIED")
     told.go(1.0)
     told.outlet.lines.clear()
@@ -151,7 +159,7 @@ def test_before_that_no_heading_is_told_and_the_values_are_the_devices_own():
 
 
 def test_records_are_numbered_without_a_hole_and_each_sample_comes_once():
-    told = Told("corrected")
+    told = Told("corrected", calibration="qualified")
     told.go(20.0)
     assert [json.loads(line)["seq"] for line in told.outlet.lines] == told.outlet.numbers
     assert told.outlet.numbers == list(range(1, len(told.outlet.numbers) + 1))
@@ -164,7 +172,7 @@ def test_records_are_numbered_without_a_hole_and_each_sample_comes_once():
 def test_the_fields_are_those_of_the_reference():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "socket.md").read_text()
     part = page[page.index("## Corrected samples") : page.index("## Prometheus")]
-    told = Told("corrected")
+    told = Told("corrected", calibration="qualified")
     told.go(3.0)
     for kind in ("sample", "state"):
         fields = set(told.outlet.records(kind)[-1]) - {"record", "seq"}
@@ -174,7 +182,7 @@ def test_the_fields_are_those_of_the_reference():
 
 
 def test_a_device_that_is_gone_is_told_within_two_seconds():
-    told = Told("corrected")
+    told = Told("corrected", calibration="qualified")
     told.until("QUALIFIED")
     told.run.feed(inputs.LinkLost(told.run.now_ns, "unplugged"))
     told.outlet.lines.clear()
@@ -186,14 +194,14 @@ def test_a_device_that_is_gone_is_told_within_two_seconds():
 
 
 def test_nobody_who_reads_costs_nothing():
-    told = Told("corrected")
+    told = Told("corrected", calibration="qualified")
     told.outlet.wanted = False
     told.go(5.0)
     assert told.outlet.records() == []
 
 
 def test_nmea_is_a_true_heading_ten_times_a_second_and_an_empty_one_when_the_device_is_gone():
-    told = Told("nmea")
+    told = Told("nmea", calibration="qualified")
     told.go(3.0)
     assert set(told.outlet.lines[::2]) == {b"$HCHDM,,M*07\r\n"}
     told.until("QUALIFIED")
@@ -224,7 +232,7 @@ def test_nmea_is_a_true_heading_ten_times_a_second_and_an_empty_one_when_the_dev
 
 
 def test_in_passive_a_candidate_for_the_stream_as_it_is_is_applied_too():
-    told = Told("corrected", binary=False, mode=Mode.PASSIVE)
+    told = Told("corrected", binary=False, mode=Mode.PASSIVE, calibration="qualified")
     told.until("QUALIFIED")
     told.outlet.lines.clear()
     told.go(10.0)
