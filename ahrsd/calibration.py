@@ -107,6 +107,8 @@ class Estimate:
                      of the field; 0 where they may be right
     contradicted_s:  since when the newest motion contradicts the answer, as if the iron were
                      another; None where it agrees
+    widened_by:      what makes the most of the heading's sigma and what motion would shrink it;
+                     empty where the sigma is small or nothing makes more than half of it
     """
 
     soft_iron: Array
@@ -127,6 +129,7 @@ class Estimate:
     mag_lag_s: float = 0.0
     gyro_misscaled: float = 0.0
     contradicted_s: float | None = None
+    widened_by: str = ""
 
     @property
     def correction(self) -> Affine:

@@ -307,6 +307,8 @@ _OF_ANGLE = np.r_[12:15, 16:22]
 _FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
 _MOTION = np.ix_(np.r_[9:15, SCALE:23], np.r_[9:15, SCALE:23])
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
+IMPERFECTIONS = ("axes", "lag", "scales", "bias")
+_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:13])  # of what is considered
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
 _LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
@@ -486,8 +488,9 @@ def considered(
     graph: Graph,
     parameters: EstimatorParameters,
     before: tuple[Array, Array],
-) -> Array:
-    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12).
+) -> tuple[Array, dict[str, Array]]:
+    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); and what
+    each of `IMPERFECTIONS` alone adds, which together may be more or less.
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
@@ -514,16 +517,21 @@ def considered(
     most = found(kinds.max(axis=0), graph.temper)[1]
     step = np.r_[-alone @ (g[_X] + own_g[_X]) + by_rest @ most, most]
     temper = min(graph.temper, max(1.0, disagreement(*epochs, step)))
-    evidence, spreads = [], []
+    evidence, spreads, alone_spreads = [], [], []
     for sigmas in kinds:
         spread, rest = found(sigmas, temper)
         told = np.linalg.slogdet(np.eye(len(rest)) + known / temper * np.outer(sigmas, sigmas))[1]
         evidence.append(0.5 * (float(-asked @ rest) / temper - float(told)))
-        wrong = by_rest @ rest
-        spreads.append(temper * by_rest @ spread @ by_rest.T + np.outer(wrong, wrong))
+        found_spread = temper * spread + np.outer(rest, rest)
+        spreads.append(by_rest @ found_spread @ by_rest.T)
+        alone_spreads.append(
+            [by_rest[:, i] @ found_spread[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
+        )
     likely = np.exp(np.array(evidence) - max(evidence))
-    added = np.einsum("k,kij->ij", likely / likely.sum(), np.array(spreads))
-    return np.asarray((added + added.T) / 2)
+    likely /= likely.sum()
+    added = np.einsum("k,kij->ij", likely, np.array(spreads))
+    each = np.einsum("k,kpij->pij", likely, np.array(alone_spreads))
+    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True))
 
 
 def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:

@@ -304,10 +304,10 @@ class Estimator:
         known = window.lag_known() if window.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> Array:
-        """What an instrument that is not perfect adds to the covariance (12, 12)."""
+    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array]]:
+        """What an instrument that is not perfect adds to the covariance (12, 12), and each part."""
         if not self.parameters.imperfections:
-            return np.zeros((12, 12))
+            return np.zeros((12, 12)), {}
         before = window.folded_information.at(window.graph.c, window.lag_s)
         try:
             said = self._informations.whole(window.epochs, window.graph)
@@ -315,7 +315,7 @@ class Estimator:
             times_s = np.array([(float(t[0]) + float(t[-1])) / 2 for t in moving])
             return considered(said, times_s, window.graph, self.parameters, before)
         except np.linalg.LinAlgError:
-            return np.zeros((12, 12))
+            return np.zeros((12, 12)), {}
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -348,8 +348,11 @@ class Estimator:
         observed = summary.observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        covariance = window.covariance() * (1.0 + doubt**2) * self._parted
-        covariance = covariance + self._by_lag(window) + self._by_imperfections(window)
+        by_instrument, parts = self._by_imperfections(window)
+        tempered = window.covariance()
+        parts |= {"motion": graph.covariance(), "misfit": tempered - graph.covariance()}
+        covariance = tempered * (1.0 + doubt**2) * self._parted
+        covariance = covariance + self._by_lag(window) + by_instrument
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = summary.unit_volume(graph.c)
         K = np.eye(12)
@@ -382,4 +385,5 @@ class Estimator:
             mag_lag_s=window.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
+            widened_by=summary.widened_by(graph.c, parts, down, dip, heading),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -58,6 +58,34 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     row = (across[:, None, :] @ J)[:, 0]
     variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
     return float(np.degrees(np.sqrt(np.max(variance))))
+
+
+_TELLS_DEG = 0.5  # a heading that is known better needs no advice
+_WIDENED = {
+    "motion": "the motion so far tells too little: turn through all headings, and roll and pitch",
+    "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
+    "motion at another place, away from steel and currents, once it is warm",
+    "axes": "the magnetometer's axes may be turned against the gyro's: roll and pitch as well",
+    "lag": "the field's readings may be late: turn fast and slow, both ways",
+    "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
+    "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
+}
+
+
+def widened_by(
+    c: Array, parts: Mapping[str, Array], down: Array, dip_rad: float, sigma_deg: float
+) -> str:
+    """What makes more than half of the variance of a heading known to `sigma_deg`, in words.
+
+    parts: covariances (12, 12) that add up to that of the answer, more or less
+    """
+    if not sigma_deg > _TELLS_DEG:
+        return ""
+    variances = {n: heading_sigma_deg(c, one, down, dip_rad) ** 2 for n, one in parts.items()}
+    most = max(variances, key=lambda name: variances[name])
+    if not variances[most] > 0.5 * sum(variances.values()):
+        return ""
+    return f"heading known to {sigma_deg:.1f} deg (1 sigma) only: {_WIDENED[most]}"
 
 
 def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:

@@ -56,7 +56,9 @@ def calibration_json(
     if estimate is None:
         return base | _nothing(warnings)
     written, refusal = _registers(estimate, registers, gyro_is_raw)
-    said = [*warnings, *estimate.warnings, *refusal, *why_not_converged(estimate, wrong)]
+    widened = [estimate.widened_by] if estimate.widened_by else []
+    not_yet = why_not_converged(estimate, wrong)
+    said = [*warnings, *estimate.warnings, *refusal, *not_yet, *widened]
     return (
         base
         | _found(estimate, heading or HeadingErrors())

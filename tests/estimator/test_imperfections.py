@@ -86,6 +86,21 @@ def test_axes_that_are_turned_and_nothing_else():
     assert max(known) < 3.0
 
 
+def test_what_makes_the_most_of_the_sigma_is_named_with_what_would_shrink_it():
+    level = (("circles", 160.0),)
+    askew = pieces.drive(level, 1)
+    found = answer(askew, troubled(askew, turned(1)))
+    assert found.heading_sigma_deg > 0.5
+    assert "axes may be turned against the gyro's: roll and pitch" in found.widened_by
+    rich = pieces.drive(RICH, 1)
+    found = answer(rich)
+    assert found.heading_sigma_deg < 0.5
+    assert found.widened_by == ""
+    field = rich.block.raw_b_gauss + 0.02 * np.sin(3.0 * rich.block.raw_b_gauss / 0.1)
+    place = answer(replace(rich, block=replace(rich.block, raw_b_gauss=field)))
+    assert "the field differs with place or attitude" in place.widened_by
+
+
 @pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
 def test_a_gyro_that_warms_up_widens_its_bias(motion):
     """Its bias goes by a tenth of a degree per second; the answer is that of the end."""
