@@ -21,6 +21,7 @@ from ahrsd.diagnosis.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
+from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.offline.track import checked, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
@@ -147,6 +148,7 @@ def load_model(path: Path) -> RepairedModel:
         raise AhrsdError(f"{path}: {error}") from None
 
 
+@on_one_thread
 def diagnose_recording(
     real: Path,
     *,

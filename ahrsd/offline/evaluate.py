@@ -37,6 +37,7 @@ from ahrsd.evaluation.references import (
     optical,
 )
 from ahrsd.events import SamplesSeen
+from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.offline.replay import replay
 from ahrsd.printable import printable
 from ahrsd.recording.bytestream import read_chunks
@@ -60,6 +61,7 @@ _GPS_TIME = ("t_s", "time_s")
 _GPS_PLACE = ("lat_deg", "lon_deg")
 
 
+@on_one_thread
 def evaluate(
     recording: Path,
     calibration_path: Path,

@@ -20,6 +20,7 @@ from ahrsd.core.settings import BESIDE_KEY, CoreSettings
 from ahrsd.daemon.core_runner import Listener, Shell, Viewer
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
+from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
 from ahrsd.recording.opening import Recording, RecordingKind, open_recording
@@ -47,6 +48,7 @@ class Replayed:
         return CONFIG_KEY in self.recording.header
 
 
+@on_one_thread
 def replay(
     path: Path,
     config: Config,

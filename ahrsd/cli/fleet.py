@@ -1,0 +1,186 @@
+"""`ahrsd fleet`: an archive of recordings, each calibrated and diagnosed, and what all of them say."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
+from ahrsd.cli.progress import duration_words, fleet_progress
+from ahrsd.cli.recording_options import columns_option
+from ahrsd.counting import counted
+from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+
+if TYPE_CHECKING:
+    from ahrsd.fleet.driver import Progress
+    from ahrsd.recording.column_names import ColumnMap
+
+_FOLDER = click.Path(path_type=Path)
+_UNITS = {
+    "--limit": {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0},
+    "--memory": {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30},
+}
+
+
+@click.group()
+def command() -> None:
+    """Calibrate and diagnose an archive of recordings; one recording is one row, exactly once.
+
+    A run may be killed at any moment: the same command goes on with what is missing.
+    """
+
+
+@command.command()
+@click.argument("archive")
+@click.option("-o", "--output", type=_FOLDER, required=True, help="The folder of the rows.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Processes; default: one for each core.")
+@click.option("--cluster", metavar="tcp://...", help="A Dask scheduler, instead of processes here.")
+@click.option("--limit", default="600s", show_default=True, help="Time for a recording: s, min, h.")
+@click.option("--memory", default="2G", show_default=True, help="Memory for a recording: M, G.")
+@click.option("--retry-failed", "again", is_flag=True, help="Do those again that gave no answer.")
+@click.option("--folders", default="vehicle", show_default=True, metavar="LEVEL,...",
+              help="What the archive's folders name, from the top: vehicle, place, serial, or -.")  # fmt: skip
+@click.option("--vehicle", help="The vehicle of all recordings.")
+@click.option("--place", help="The place of all recordings.")
+@click.option("--match", "patterns", multiple=True, metavar="GLOB",
+              help="File names that are recordings; default: by their suffixes.")  # fmt: skip
+@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@columns_option
+@click.option("--report", "folder", type=_FOLDER, help="A page about the fleet in here.")
+def run(
+    archive: str,
+    output: Path,
+    jobs: int | None,
+    cluster: str | None,
+    limit: str,
+    memory: str,
+    again: bool,
+    folders: str,
+    vehicle: str | None,
+    place: str | None,
+    patterns: tuple[str, ...],
+    rate_hz: float | None,
+    columns: ColumnMap,
+    folder: Path | None,
+) -> None:
+    """Give every recording of ARCHIVE a row: a folder, or an address such as s3://bucket/dives.
+
+    What takes too long or too much memory, crashes or is no recording is a row with its reason.
+    Exit 1 where not one recording gave an answer; 75 where another run is at work, or the cluster
+    is gone.
+    """
+    from ahrsd.fleet.archive import Archive
+    from ahrsd.fleet.driver import Place
+    from ahrsd.fleet.driver import run as run_fleet
+    from ahrsd.fleet.work import Orders
+
+    if folder is not None:
+        make_folder(folder, ("report.html",))
+    orders = Orders(
+        out=str(output.resolve()),
+        columns=columns,
+        rate_hz=rate_hz,
+        levels=_levels(folders),
+        vehicle=vehicle,
+        place=place,
+        limit_s=_amount("--limit", limit),
+        memory_bytes=round(_amount("--memory", memory)),
+        again=again,
+    )
+    where = Place(jobs or os.cpu_count() or 1, cluster)
+    source = Archive(archive if "://" in archive else str(Path(archive).resolve()), patterns)
+    with fleet_progress() as show:
+        done = run_fleet(
+            source, orders, where, lambda p: show(p.done, p.total, p.failed, p.per_minute)
+        )
+    for line in _end_lines(done, output):
+        click.echo(line)
+    if folder is not None:
+        _write_page(output, folder)
+    raise SystemExit(EXIT_NO if done.done and done.failed == done.done else EXIT_DONE)
+
+
+def _end_lines(done: Progress, output: Path) -> list[str]:
+    """What a run says in the end."""
+    from ahrsd.fleet.work import summary
+
+    lines = [f"{output}: {counted(done.done, 'recording', ',')}: {summary(done.outcomes)}"]
+    if done.before:
+        lines.append(f"  {counted(done.before, 'recording', ',')} had a row already")
+    if done.left_out:
+        names = ", ".join(f"{number} {suffix}" for suffix, number in done.left_out.most_common(5))
+        lines.append(f"  left out, no recordings by their names: {names} (--match takes others)")
+    if done.failed:
+        lines.append(f"  why: ahrsd fleet ask {output} failures")
+    return lines
+
+
+def _levels(text: str) -> tuple[str, ...]:
+    from ahrsd.fleet.work import ROLES
+
+    names = tuple(name.strip() for name in text.split(","))
+    if wrong := [name for name in names if name not in (*ROLES, "-")]:
+        raise AhrsdError(f"--folders {wrong[0]}: a level is one of {', '.join(ROLES)}, or -")
+    return names
+
+
+def _amount(option: str, text: str) -> float:
+    units = _UNITS[option]
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([A-Za-z]*)", text.strip())
+    factor = None if found is None else units.get(found[2].removesuffix("iB").removesuffix("B"))
+    if found is None or factor is None or float(found[1]) <= 0.0:
+        raise AhrsdError(f"{option} {text}: a number with one of {', '.join(filter(None, units))}")
+    return float(found[1]) * factor
+
+
+@command.command()
+@click.argument("output", metavar="OUT", type=_FOLDER)
+@click.option("--json", "json_path", help="The same as JSON into this file, - for stdout.")
+@click.option("--report", "folder", type=_FOLDER, help="A page about the fleet in here.")
+def status(output: Path, json_path: str | None, folder: Path | None) -> None:
+    """How many rows there are, of what, and whether a run is at work."""
+    from ahrsd.fleet.questions import Rows
+    from ahrsd.fleet.store import Store
+
+    refuse_unwritable(json_path)
+    store = Store(output)
+    store.check()
+    with Rows(store) as rows:
+        body = rows.counts()
+    body["at_work"], body["run"] = store.at_work(), store.told()
+    if json_path is not None:
+        write_json(json_path, body)
+    if json_path != "-":
+        for line in _status_lines(output, body):
+            click.echo(line)
+    if folder is not None:
+        make_folder(folder, ("report.html",))
+        _write_page(output, folder)
+
+
+def _status_lines(output: Path, body: dict[str, object]) -> list[str]:
+    raise NotImplementedError
+
+
+@command.command()
+@click.argument("output", metavar="OUT", type=_FOLDER)
+def compact(output: Path) -> None:
+    """Move rows that a run left in the spool into Parquet; a run does it by itself."""
+    from ahrsd.fleet.store import Store
+
+    store = Store(output)
+    store.check()
+    with store.alone():
+        moved = store.compact()
+    click.echo(f"{output}: {counted(moved, 'row', ',')} moved; {counted(len(store.parts()), 'part')}")
+
+
+def _write_page(output: Path, folder: Path) -> None:
+    raise NotImplementedError
+
+
+_ = duration_words

@@ -1,0 +1,190 @@
+"""A run: what of the archive has no row yet, through a bounded window, on this machine or a cluster.
+
+The driver keeps nothing of what is done: rows are on the disk before it hears of them. It may be
+killed at any moment; started again it looks which stamps have rows and goes on with the others.
+"""
+
+from __future__ import annotations
+
+import collections
+import importlib.util
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import ThreadPoolExecutor as Threads
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from ahrsd.errors import EXIT_BUSY, AhrsdError
+from ahrsd.fleet.archive import Archive, Entry
+from ahrsd.fleet.guard import Guard, Task, guarded
+from ahrsd.fleet.row import ANSWERED
+from ahrsd.fleet.store import Known, Store
+from ahrsd.fleet.work import THERE, Answer, Orders, examine, stamp
+
+_WINDOW = 4  # recordings in flight for each process
+_COMPACTED = 4096  # rows in the spool after which they are moved
+_TOLD_S = 2.0
+
+Submit = Callable[[Entry], "Future[Answer]"]
+
+
+@dataclass(slots=True)
+class Progress:
+    """How far a run is.
+
+    left_out: files that by their name are no recordings, by suffix; before: recordings with a row
+    """
+
+    total: int = 0
+    before: int = 0
+    left_out: collections.Counter[str] = field(default_factory=collections.Counter)
+    outcomes: collections.Counter[str] = field(default_factory=collections.Counter)
+    begun_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def done(self) -> int:
+        """Recordings of this run."""
+        return sum(self.outcomes.values())
+
+    @property
+    def failed(self) -> int:
+        """Those of them that gave no answer."""
+        return self.done - sum(self.outcomes[name] for name in (*ANSWERED, THERE))
+
+    @property
+    def per_minute(self) -> float:
+        """Recordings a minute since the start."""
+        return 60.0 * self.done / max(time.monotonic() - self.begun_s, 1e-9)
+
+    def json(self) -> dict[str, object]:
+        """For `status`."""
+        return {
+            "total": self.total,
+            "before": self.before,
+            "done": self.done,
+            "failed": self.failed,
+            "per_minute": round(self.per_minute, 3),
+            "process": os.getpid(),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where recordings are examined: so many processes here, or a Dask cluster."""
+
+    jobs: int
+    cluster: str | None = None
+    task: Task = examine
+
+
+def run(
+    archive: Archive, orders: Orders, place: Place, tell: Callable[[Progress], None]
+) -> Progress:
+    """Give every recording of the archive its row; what happened.  AhrsdError.
+
+    tell: called after each recording; where a run is interrupted, all rows so far are kept
+    """
+    store = Store(Path(orders.out))
+    store.create()
+    with store.alone():
+        store.compact()
+        known = store.known("stamp", failures=not orders.again)
+        progress = _planned(archive, orders, known)
+        tell(progress)
+        missing = (one for one in archive.entries() if not known.holds(stamp(one, orders)))
+        told_s = 0.0
+        with _executor(place, orders) as (submit, window):
+            for answer in answers(missing, submit, window):
+                progress.outcomes[answer.outcome] += 1
+                tell(progress)
+                if time.monotonic() - told_s > _TOLD_S:
+                    store.tell(progress.json())
+                    told_s = time.monotonic()
+                if progress.done % _COMPACTED == 0:
+                    store.compact()
+        store.compact()
+        store.tell(progress.json())
+    return progress
+
+
+def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:
+    """How much there is to do."""
+    progress = Progress()
+
+    def other(name: str) -> None:
+        progress.left_out[Path(name).suffix or "without a suffix"] += 1
+
+    for entry in archive.entries(other):
+        progress.total += 1
+        progress.before += known.holds(stamp(entry, orders))
+    progress.total -= progress.before
+    progress.begun_s = time.monotonic()
+    return progress
+
+
+def answers(entries: Iterable[Entry], submit: Submit, window: int) -> Iterator[Answer]:
+    """The answers as they come, with at most `window` recordings in flight."""
+    waiting = iter(entries)
+    flight = {submit(entry) for entry in islice(waiting, window)}
+    while flight:
+        done, flight = wait(flight, return_when=FIRST_COMPLETED)
+        for future in done:
+            answer = future.result()
+            flight |= {submit(entry) for entry in islice(waiting, 1)}
+            yield answer
+
+
+@contextmanager
+def _executor(place: Place, orders: Orders) -> Iterator[tuple[Submit, int]]:
+    """What takes a recording, and how many may be in flight."""
+    if place.cluster is not None:
+        with _dask(place.cluster) as (executor, workers):
+            yield partial(_submitted, executor, orders), _WINDOW * workers
+        return
+    guard = Guard(place.jobs, orders.memory_bytes, place.task)
+    threads = Threads(place.jobs, thread_name_prefix="fleet")
+    try:
+        yield lambda entry: threads.submit(guard.examine, entry, orders), _WINDOW * place.jobs
+    finally:
+        threads.shutdown(wait=False, cancel_futures=True)
+        guard.close()
+
+
+def _submitted(executor: Executor, orders: Orders, entry: Entry) -> Future[Answer]:
+    return executor.submit(guarded, entry, orders)
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[tuple[Executor, int]]:
+    """An executor on a cluster, and how many threads it has.  AhrsdError."""
+    if importlib.util.find_spec("distributed") is None:
+        raise AhrsdError("--cluster: Dask runs it; install it: pip install 'ahrsd[cluster]'")
+    from distributed import Client
+    from distributed.scheduler import KilledWorker
+
+    try:
+        client = Client(address, timeout=20, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise _Gone(f"--cluster {address}: no scheduler answers: {error}; start one") from error
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise _Gone(f"--cluster {address}: it has no workers; start some: dask worker {address}")
+        try:
+            yield client.get_executor(pure=False), threads
+        except (CancelledError, KilledWorker) as error:
+            raise _Gone(
+                f"--cluster {address}: the cluster gave up ({type(error).__name__}); all rows so "
+                "far are kept: start it again, and then the same command"
+            ) from error
+
+
+class _Gone(AhrsdError):
+    exit_code = EXIT_BUSY
+
+

@@ -1,0 +1,138 @@
+"""A process of its own round each recording: a limit of time, one of memory, and a crash that stays
+one row.
+
+Memory is limited by the kernel (RLIMIT_DATA), not by looking at the resident size again and again:
+it holds at the moment of the allocation, so that a recording that asks for 20 GB at once takes none
+of them from its neighbours, and the refusal comes up in the task's own words. What is counted is
+what was asked for; Arrow's own pool reserves a gigabyte that it never touches, so the processes use
+the system's allocator.
+
+A recording whose process died is tried again, because whoever killed it may have meant another;
+after `TRIES` its end is its row. On a cluster every Dask worker has a guard with one process.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import multiprocessing
+import os
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import TimeoutError as LateError
+from typing import TYPE_CHECKING
+
+from ahrsd.errors import AhrsdError
+from ahrsd.fleet import row as rows
+from ahrsd.fleet.archive import Entry, sweep
+from ahrsd.fleet.work import Answer, Orders, examine, keep_loss
+
+if TYPE_CHECKING:
+    from pebble import ProcessPool
+
+TRIES = 3
+_RECYCLED = 200  # recordings after which a process is replaced: whatever leaked is gone
+_PR_SET_PDEATHSIG = 1
+_START_S = 120.0
+#: read by the processes when they load numpy and Arrow
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
+
+Task = Callable[[Entry, Orders], Answer]
+
+
+class Guard:
+    """Processes that examine recordings; `examine` may be called from as many threads."""
+
+    def __init__(self, processes: int, memory_bytes: int, task: Task = examine) -> None:
+        if importlib.util.find_spec("pebble") is None:
+            raise AhrsdError("fleet: pebble runs it; install it: pip install 'ahrsd[fleet]'")
+        if multiprocessing.current_process().daemon:
+            raise AhrsdError(
+                "this Dask worker may not start processes: start it with "
+                "DASK_DISTRIBUTED__WORKER__DAEMON=False in its environment"
+            )
+        from pebble import ProcessPool
+
+        sweep()
+        for name, value in _ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        self._task, self._memory_bytes = task, memory_bytes
+        self._pool: ProcessPool = ProcessPool(
+            processes,
+            max_tasks=_RECYCLED,
+            initializer=_begin,
+            initargs=(os.getpid(), memory_bytes),
+            context=multiprocessing.get_context("spawn"),
+        )
+        # the processes belong to the thread that starts them: this one, which outlives them
+        self._pool.schedule(_ready, timeout=_START_S).result()
+
+    def examine(self, entry: Entry, orders: Orders) -> Answer:
+        """The answer about a recording, whose row is on the disk; it waits for it."""
+        for number in range(1, TRIES + 1):
+            begun = time.monotonic()
+            future = self._pool.schedule(
+                self._task, args=[entry, orders], timeout=orders.limit_s or None
+            )
+            error = future.exception()
+            if error is None:
+                answer: Answer = future.result()
+                return answer
+            outcome, words = self._loss(error, orders)
+            if outcome == rows.CRASHED and number < TRIES:
+                continue
+            spent = time.monotonic() - begun
+            return keep_loss(entry, orders, outcome, words, tries=number, seconds=spent)
+        raise AssertionError("the last try returns")
+
+    def _loss(self, error: BaseException, orders: Orders) -> tuple[str, str]:
+        """The outcome that an error of a process is, and its words."""
+        from pebble import ProcessExpired
+
+        if isinstance(error, LateError):
+            return rows.TOO_SLOW, f"stopped after {orders.limit_s:g} s (--limit)"
+        if isinstance(error, MemoryError):
+            return rows.TOO_LARGE, f"asked for more than {self._memory_bytes >> 20} MiB (--memory)"
+        if isinstance(error, ProcessExpired):
+            code = error.exitcode
+            how = f"by signal {-code} ({_signal(-code)})" if code < 0 else f"with code {code}"
+            return rows.CRASHED, f"its process ended {how}, {TRIES} times"
+        return rows.BUG, f"{type(error).__name__}: {error}"
+
+    def close(self) -> None:
+        """End the processes; what they were at has no row yet."""
+        self._pool.stop()
+        self._pool.join()
+
+
+def _signal(number: int) -> str:
+    return signal.Signals(number).name if number in signal.valid_signals() else "unknown"
+
+
+def _begin(parent: int, memory_bytes: int) -> None:
+    """In a new process: end with the parent, and hold the limits."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it died before that took effect
+        os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver's to answer
+    if memory_bytes:
+        resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
+
+
+def _ready() -> int:
+    return os.getpid()
+
+
+_own: dict[int, Guard] = {}
+_lock = threading.Lock()
+
+
+def guarded(entry: Entry, orders: Orders) -> Answer:
+    """`Guard.examine` of this process's own guard: the task of a Dask worker."""
+    with _lock:
+        if orders.memory_bytes not in _own:
+            _own[orders.memory_bytes] = Guard(1, orders.memory_bytes)
+    return _own[orders.memory_bytes].examine(entry, orders)
