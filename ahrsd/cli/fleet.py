@@ -1,4 +1,4 @@
-"""`ahrsd fleet`: an archive of recordings, each calibrated and diagnosed, and what all of them say."""
+"""`ahrsd fleet`: every recording of an archive calibrated and diagnosed, and what all say."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
-from ahrsd.cli.progress import duration_words, fleet_progress
+from ahrsd.cli.progress import fleet_progress
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
@@ -43,7 +43,7 @@ def command() -> None:
 @click.option("--memory", default="2G", show_default=True, help="Memory for a recording: M, G.")
 @click.option("--retry-failed", "again", is_flag=True, help="Do those again that gave no answer.")
 @click.option("--folders", default="vehicle", show_default=True, metavar="LEVEL,...",
-              help="What the archive's folders name, from the top: vehicle, place, serial, or -.")  # fmt: skip
+              help="What folders name, from the top: vehicle, place, serial, or -.")  # fmt: skip
 @click.option("--vehicle", help="The vehicle of all recordings.")
 @click.option("--place", help="The place of all recordings.")
 @click.option("--match", "patterns", multiple=True, metavar="GLOB",
@@ -145,6 +145,7 @@ def status(output: Path, json_path: str | None, folder: Path | None) -> None:
     """How many rows there are, of what, and whether a run is at work."""
     from ahrsd.fleet.questions import Rows
     from ahrsd.fleet.store import Store
+    from ahrsd.fleet.told import status_lines
 
     refuse_unwritable(json_path)
     store = Store(output)
@@ -155,15 +156,11 @@ def status(output: Path, json_path: str | None, folder: Path | None) -> None:
     if json_path is not None:
         write_json(json_path, body)
     if json_path != "-":
-        for line in _status_lines(output, body):
+        for line in status_lines(str(output), body):
             click.echo(line)
     if folder is not None:
         make_folder(folder, ("report.html",))
         _write_page(output, folder)
-
-
-def _status_lines(output: Path, body: dict[str, object]) -> list[str]:
-    raise NotImplementedError
 
 
 @command.command()
@@ -176,11 +173,52 @@ def compact(output: Path) -> None:
     store.check()
     with store.alone():
         moved = store.compact()
-    click.echo(f"{output}: {counted(moved, 'row', ',')} moved; {counted(len(store.parts()), 'part')}")
+    click.echo(
+        f"{output}: {counted(moved, 'row', ',')} moved; {counted(len(store.parts()), 'part')}"
+    )
+
+
+@command.command()
+@click.argument("output", metavar="OUT", type=_FOLDER)
+@click.argument("question", metavar="drift|recurring|failures|SELECT")
+@click.option("--json", "json_path", help="The whole answer as JSON into this file, - for stdout.")
+def ask(output: Path, question: str, json_path: str | None) -> None:
+    """What the rows of OUT say.
+
+    \b
+    drift       hard iron, gyro bias and heading error of each device over time and temperature,
+                with standard deviations and change points; largest heading error first
+    recurring   findings more frequent on a device, a vehicle, at a place or a temperature
+    failures    what gave no answer, and why
+    SELECT ...  one query over the table `recordings`; nothing can be written
+    """
+    from ahrsd.fleet import told
+    from ahrsd.fleet.questions import Answered, Rows
+    from ahrsd.fleet.store import Store
+
+    refuse_unwritable(json_path)
+    answer: Answered
+    with Rows(Store(output)) as rows:
+        if question == "drift":
+            found = rows.drift()
+            body, lines = [one.json() for one in found], told.drift_lines(found)
+        else:
+            if question == "recurring":
+                answer = rows.recurring()
+                lines = told.recurring_lines(answer)
+            elif question == "failures":
+                answer = rows.failures()
+                lines = told.failure_lines(answer)
+            else:
+                answer = rows.sql(question)
+                lines = told.table_lines(answer.columns, answer.rows)
+            body = answer.json()
+    if json_path is not None:
+        write_json(json_path, body)
+    if json_path != "-":
+        for line in lines:
+            click.echo(line)
 
 
 def _write_page(output: Path, folder: Path) -> None:
     raise NotImplementedError
-
-
-_ = duration_words

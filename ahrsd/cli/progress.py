@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import click
+
 
 @contextmanager
 def count_progress(label: str) -> Iterator[Callable[[int, int], None] | None]:
@@ -75,6 +77,8 @@ def fleet_progress(every_s: float = 60.0) -> Iterator[Callable[[int, int, int, f
 
 
 def _lines(every_s: float) -> Callable[[int, int, int, float], None]:
+    from ahrsd.fleet.told import duration
+
     said_s = time.monotonic()
 
     def show(done: int, total: int, failed: int, per_minute: float) -> None:
@@ -82,20 +86,11 @@ def _lines(every_s: float) -> Callable[[int, int, int, float], None]:
         if time.monotonic() - said_s < every_s or not done:
             return
         said_s = time.monotonic()
-        left = duration_words(60.0 * (total - done) / per_minute)
-        print(
+        left = duration(60.0 * (total - done) / per_minute)
+        click.echo(
             f"{done:,} of {total:,} recordings, {failed:,} failed, {per_minute:.3g} a minute, "
             f"{left} left",
-            file=sys.stderr,
+            err=True,
         )
 
     return show
-
-
-def duration_words(seconds: float) -> str:
-    """A duration for a person: 40 s, 12 min, 3.5 h, 6 days."""
-    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * size:
-            number = seconds / size
-            return f"{number:.1f} {unit}" if number < 10 else f"{number:.0f} {unit}"
-    return f"{seconds:.0f} s"

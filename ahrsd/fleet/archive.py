@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,7 @@ def _on_disk(root: Path) -> Iterator[Entry]:
                     continue
                 if not one.is_dir():
                     yield from _file(one, names)
-                elif os.path.exists(os.path.join(one.path, _ROS_2)):
+                elif Path(one.path, _ROS_2).exists():
                     yield _folder(Path(one.path), names)
                 elif not one.is_symlink():
                     waiting.append((one.path, (*names, one.name)))
@@ -124,11 +125,14 @@ def _file_system(root: str) -> tuple[Any, str]:
     import fsspec
 
     try:
-        return fsspec.core.url_to_fs(root, use_listings_cache=False)
+        system, path = fsspec.core.url_to_fs(root, use_listings_cache=False)
     except ImportError as error:
         raise AhrsdError(f"{root}: {error}; for s3:// that is: pip install 'ahrsd[s3]'") from error
     except ValueError as error:
-        raise AhrsdError(f"{root}: {error}; give a folder, or an address such as s3://bucket/dives")
+        raise AhrsdError(
+            f"{root}: {error}; give a folder, or an address such as s3://bucket/dives"
+        ) from error
+    return system, str(path)
 
 
 def _remote(root: str) -> Iterator[Entry]:
@@ -145,7 +149,7 @@ def _remote(root: str) -> Iterator[Entry]:
 
 def _object(system: Any, facts: dict[str, Any], names: tuple[str, ...]) -> Entry:  # noqa: ANN401
     when = facts.get("LastModified") or facts.get("mtime") or facts.get("last_modified")
-    stamp = when.timestamp() if hasattr(when, "timestamp") else when
+    stamp = when.timestamp() if isinstance(when, datetime) else when
     return Entry(
         system.unstrip_protocol(facts["name"]),
         int(facts.get("size") or 0),

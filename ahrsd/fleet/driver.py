@@ -1,4 +1,4 @@
-"""A run: what of the archive has no row yet, through a bounded window, on this machine or a cluster.
+"""A run: what of the archive has no row yet, through a bounded window, here or on a cluster.
 
 The driver keeps nothing of what is done: rows are on the disk before it hears of them. It may be
 killed at any moment; started again it looks which stamps have rows and goes on with the others.
@@ -97,19 +97,32 @@ def run(
         progress = _planned(archive, orders, known)
         tell(progress)
         missing = (one for one in archive.entries() if not known.holds(stamp(one, orders)))
-        told_s = 0.0
-        with _executor(place, orders) as (submit, window):
-            for answer in answers(missing, submit, window):
-                progress.outcomes[answer.outcome] += 1
-                tell(progress)
-                if time.monotonic() - told_s > _TOLD_S:
-                    store.tell(progress.json())
-                    told_s = time.monotonic()
-                if progress.done % _COMPACTED == 0:
-                    store.compact()
+        if progress.total:
+            _through(missing, orders, place, store, progress, tell)
         store.compact()
         store.tell(progress.json())
     return progress
+
+
+def _through(
+    missing: Iterable[Entry],
+    orders: Orders,
+    place: Place,
+    store: Store,
+    progress: Progress,
+    tell: Callable[[Progress], None],
+) -> None:
+    told_s = 0.0
+    with _executor(place, orders) as (submit, window):
+        progress.begun_s = time.monotonic()
+        for answer in answers(missing, submit, window):
+            progress.outcomes[answer.outcome] += 1
+            tell(progress)
+            if time.monotonic() - told_s > _TOLD_S:
+                store.tell(progress.json())
+                told_s = time.monotonic()
+            if progress.done % _COMPACTED == 0:
+                store.compact()
 
 
 def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:
@@ -168,13 +181,15 @@ def _dask(address: str) -> Iterator[tuple[Executor, int]]:
     from distributed.scheduler import KilledWorker
 
     try:
-        client = Client(address, timeout=20, set_as_default=False)
+        client = Client(address, timeout=20, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise _Gone(f"--cluster {address}: no scheduler answers: {error}; start one") from error
     with client:
         threads = sum(client.nthreads().values())
         if not threads:
-            raise _Gone(f"--cluster {address}: it has no workers; start some: dask worker {address}")
+            raise _Gone(
+                f"--cluster {address}: it has no workers; start some: dask worker {address}"
+            )
         try:
             yield client.get_executor(pure=False), threads
         except (CancelledError, KilledWorker) as error:
@@ -186,5 +201,3 @@ def _dask(address: str) -> Iterator[tuple[Executor, int]]:
 
 class _Gone(AhrsdError):
     exit_code = EXIT_BUSY
-
-

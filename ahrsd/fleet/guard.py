@@ -104,7 +104,7 @@ class Guard:
 
     def close(self) -> None:
         """End the processes; what they were at has no row yet."""
-        self._pool.stop()
+        self._pool.stop()  # type: ignore[no-untyped-call]
         self._pool.join()
 
 

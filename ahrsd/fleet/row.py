@@ -88,9 +88,11 @@ def error_words(errors: Mapping[str, Exception]) -> dict[str, str | None]:
     whats: dict[str, list[str]] = {}
     remedies = []
     for command, error in errors.items():
-        known = isinstance(error, RecordingError)
-        whats.setdefault(error.what if known else str(error), []).append(command)
-        remedies += [error.remedy] if known else []
+        if isinstance(error, RecordingError):
+            whats.setdefault(error.what, []).append(command)
+            remedies.append(error.remedy)
+        else:
+            whats.setdefault(str(error), []).append(command)
     said = "; ".join(f"{' and '.join(commands)}: {what}" for what, commands in whats.items())
     return {
         "error": printable(said, LINE) or None,

@@ -127,9 +127,7 @@ class Store:
     def known(self, column: str, *, failures: bool) -> Known:
         """All texts of a column, of the spool and of the parts; without `failures` those of rows
         with an answer."""
-        spooled = [
-            row[column] for row in self.spooled() if failures or row["outcome"] in ANSWERED
-        ]
+        spooled = [row[column] for row in self.spooled() if failures or row["outcome"] in ANSWERED]
         return Known([*spooled, *_column(tuple(self.parts()), column, failures)])
 
     def rows(self) -> tuple[pyarrow.Table, list[Path]]:

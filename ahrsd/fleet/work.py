@@ -11,10 +11,9 @@ import hashlib
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from json import dumps
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from ahrsd import __version__
 from ahrsd.errors import AhrsdError
@@ -24,6 +23,8 @@ from ahrsd.fleet.row import Row
 from ahrsd.fleet.store import Store
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
+
+_T = TypeVar("_T")
 
 ROLES = ("vehicle", "place", "serial")  # what a level of folders may name
 THERE = "was there"  # the answer about the same bytes under another name
@@ -174,10 +175,16 @@ def _answers(path: Path, entry: Entry, orders: Orders) -> Row:
     from ahrsd.offline.calibrate import calibrate
     from ahrsd.offline.diagnose import diagnose_recording
 
-    given = {"rate_hz": orders.rate_hz, "columns": orders.columns}
+    rate_hz, columns = orders.rate_hz, orders.columns
     errors: dict[str, Exception] = {}
-    result = _tried("calibrate", errors, partial(calibrate, path, Config(), **given))
-    found = _tried("diagnose", errors, partial(diagnose_recording, path, **given))
+    result = _tried(
+        "calibrate",
+        errors,
+        lambda: calibrate(path, Config(), rate_hz=rate_hz, columns=columns),
+    )
+    found = _tried(
+        "diagnose", errors, lambda: diagnose_recording(path, rate_hz=rate_hz, columns=columns)
+    )
     out: Row = {"outcome": (rows.DONE, rows.PARTLY, rows.REFUSED)[len(errors)]}
     out |= rows.error_words(errors)
     out |= rows.recorded(result, entry.url.rpartition("/")[2], entry.modified_s)
@@ -191,7 +198,7 @@ def _answers(path: Path, entry: Entry, orders: Orders) -> Row:
     return out
 
 
-def _tried(name: str, errors: dict[str, Exception], ask: Callable[[], Any]) -> Any:  # noqa: ANN401
+def _tried(name: str, errors: dict[str, Exception], ask: Callable[[], _T]) -> _T | None:
     try:
         return ask()
     except AhrsdError as error:
