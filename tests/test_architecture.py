@@ -30,6 +30,7 @@ SHELL = (
     "ahrsd.daemon",
     "ahrsd.demo",
     "ahrsd.fleet.archive",
+    "ahrsd.fleet.cluster",
     "ahrsd.fleet.driver",
     "ahrsd.fleet.guard",
     "ahrsd.fleet.questions",

@@ -7,21 +7,18 @@ killed at any moment; started again it looks which stamps have rows and goes on 
 from __future__ import annotations
 
 import collections
-import importlib.util
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures import ThreadPoolExecutor as Threads
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from ahrsd.errors import EXIT_BUSY, AhrsdError
 from ahrsd.fleet.archive import Archive, Entry
-from ahrsd.fleet.guard import Guard, Task, guarded
+from ahrsd.fleet.guard import Guard, Task
 from ahrsd.fleet.row import ANSWERED
 from ahrsd.fleet.store import Known, Store
 from ahrsd.fleet.work import THERE, Answer, Orders, examine, stamp
@@ -156,8 +153,10 @@ def answers(entries: Iterable[Entry], submit: Submit, window: int) -> Iterator[A
 def _executor(place: Place, orders: Orders) -> Iterator[tuple[Submit, int]]:
     """What takes a recording, and how many may be in flight."""
     if place.cluster is not None:
-        with _dask(place.cluster) as (executor, workers):
-            yield partial(_submitted, executor, orders), _WINDOW * workers
+        from ahrsd.fleet.cluster import connected
+
+        with connected(place.cluster, orders) as (submit, processes):
+            yield submit, _WINDOW * processes
         return
     guard = Guard(place.jobs, orders.memory_bytes, place.task)
     threads = Threads(place.jobs, thread_name_prefix="fleet")
@@ -166,38 +165,3 @@ def _executor(place: Place, orders: Orders) -> Iterator[tuple[Submit, int]]:
     finally:
         threads.shutdown(wait=False, cancel_futures=True)
         guard.close()
-
-
-def _submitted(executor: Executor, orders: Orders, entry: Entry) -> Future[Answer]:
-    return executor.submit(guarded, entry, orders)
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[tuple[Executor, int]]:
-    """An executor on a cluster, and how many threads it has.  AhrsdError."""
-    if importlib.util.find_spec("distributed") is None:
-        raise AhrsdError("--cluster: Dask runs it; install it: pip install 'ahrsd[cluster]'")
-    from distributed import Client
-    from distributed.scheduler import KilledWorker
-
-    try:
-        client = Client(address, timeout=20, set_as_default=False)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise _Gone(f"--cluster {address}: no scheduler answers: {error}; start one") from error
-    with client:
-        threads = sum(client.nthreads().values())
-        if not threads:
-            raise _Gone(
-                f"--cluster {address}: it has no workers; start some: dask worker {address}"
-            )
-        try:
-            yield client.get_executor(pure=False), threads
-        except (CancelledError, KilledWorker) as error:
-            raise _Gone(
-                f"--cluster {address}: the cluster gave up ({type(error).__name__}); all rows so "
-                "far are kept: start it again, and then the same command"
-            ) from error
-
-
-class _Gone(AhrsdError):
-    exit_code = EXIT_BUSY

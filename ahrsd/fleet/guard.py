@@ -19,7 +19,6 @@ import multiprocessing
 import os
 import resource
 import signal
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import TimeoutError as LateError
@@ -51,8 +50,7 @@ class Guard:
             raise AhrsdError("fleet: pebble runs it; install it: pip install 'ahrsd[fleet]'")
         if multiprocessing.current_process().daemon:
             raise AhrsdError(
-                "this Dask worker may not start processes: start it with "
-                "DASK_DISTRIBUTED__WORKER__DAEMON=False in its environment"
+                "a process of this Dask worker may not start others: start it with --no-nanny"
             )
         from pebble import ProcessPool
 
@@ -124,15 +122,3 @@ def _begin(parent: int, memory_bytes: int) -> None:
 
 def _ready() -> int:
     return os.getpid()
-
-
-_own: dict[int, Guard] = {}
-_lock = threading.Lock()
-
-
-def guarded(entry: Entry, orders: Orders) -> Answer:
-    """`Guard.examine` of this process's own guard: the task of a Dask worker."""
-    with _lock:
-        if orders.memory_bytes not in _own:
-            _own[orders.memory_bytes] = Guard(1, orders.memory_bytes)
-    return _own[orders.memory_bytes].examine(entry, orders)

@@ -36,6 +36,7 @@ def main() -> int:
     try:
         reader = under_fire(fleet, given.recordings, given.kills, given.seed, 0.5)
     finally:
+        fleet.stop()
         if cluster is not None:
             cluster.stop()
     found = summary(fleet, reader)

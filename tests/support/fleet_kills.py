@@ -1,4 +1,4 @@
-"""A fleet's run under SIGKILL: recordings, a driver that is started again, who is killed, what holds.
+"""A fleet's run under SIGKILL: recordings, a driver started again, who is killed, what holds.
 
 Used by the short test and by the full one (tests/benchmarks/fleet_kill.py).
 """
@@ -30,7 +30,6 @@ PYTHON = sys.executable
 ENVIRONMENT = {
     **os.environ,
     "OPENBLAS_NUM_THREADS": "1",
-    "DASK_DISTRIBUTED__WORKER__DAEMON": "False",
     "PYTHONUNBUFFERED": "1",
 }
 
@@ -67,21 +66,19 @@ class Cluster:
     def start(self) -> None:
         """Whatever of the three does not run."""
         commands = {
-            "scheduler": ["scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard",
-                          "--no-jupyter", "--pid-file", ""],
+            "scheduler": ["scheduler", "--host", "127.0.0.1", "--port", str(self.port)],
             **{
-                f"worker {n}": ["worker", self.address, "--nthreads", "1", "--host", "127.0.0.1",
-                                "--no-dashboard", "--local-directory", str(self.folder / f"w{n}")]
+                f"worker {n}": ["worker", self.address, "--no-nanny", "--nthreads", "1",
+                                "--local-directory", str(self.folder / f"w{n}")]
                 for n in (1, 2)
             },
         }  # fmt: skip
-        commands["scheduler"] = commands["scheduler"][:-2]
         for name, words in commands.items():
             if name not in self.processes or self.processes[name].poll() is not None:
                 log = (self.folder / f"{name.replace(' ', '')}.log").open("ab")
                 with log:
                     self.processes[name] = subprocess.Popen(
-                        [PYTHON, "-m", "distributed.cli.dask_" + words[0], *words[1:]],
+                        [PYTHON, "-m", "dask", *words, "--no-dashboard"],
                         stdout=log, stderr=log, env=ENVIRONMENT,
                     )  # fmt: skip
         self._answering()
@@ -154,12 +151,19 @@ class Fleet:
             victim.send_signal(signal.SIGKILL)
         except psutil.NoSuchProcess:
             return
+        psutil.wait_procs([victim], timeout=GRACE_S)
         if kind in ("driver", "worker"):
             self.left_running += still_running(below)
-        if self.cluster is not None:
-            self.cluster.start()
         if kind in ("driver", "scheduler"):
             self.driver.wait(timeout=120)
+        if self.cluster is not None:
+            self.cluster.start()
+
+    def stop(self) -> None:
+        """Whatever of it still runs."""
+        if self.driver is not None and self.driver.poll() is None:
+            self.driver.kill()
+            self.driver.wait()
 
     def finish(self, *options: str, timeout_s: float = 600.0) -> int:
         """Run to the end; the exit code."""
