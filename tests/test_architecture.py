@@ -33,6 +33,7 @@ SHELL = (
     "ahrsd.fleet.cluster",
     "ahrsd.fleet.driver",
     "ahrsd.fleet.guard",
+    "ahrsd.fleet.page",
     "ahrsd.fleet.questions",
     "ahrsd.fleet.store",
     "ahrsd.fleet.work",

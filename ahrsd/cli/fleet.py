@@ -221,4 +221,8 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
 
 
 def _write_page(output: Path, folder: Path) -> None:
-    raise NotImplementedError
+    from ahrsd.fleet.page import write_page
+
+    path = folder / "report.html"
+    write_page(output, path)
+    click.echo(f"report: {path}")

@@ -12,6 +12,7 @@
     trend      drift and change points of one device's calibrations
     questions  what the rows say: drift, recurring, failures, SQL
     told       answers as lines for a person
+    page       and as one page
 
 The row is written by the process that made it, before anybody is told. So whoever is killed, what
 is in the folder is whole, and the same command goes on with what is missing.

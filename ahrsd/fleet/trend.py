@@ -128,11 +128,12 @@ class _Batch:
         day, lines, root = np.zeros((D, N)), np.zeros((D, N, 3)), np.zeros((D, N))
         Y, scale, scatter = np.zeros((D, N, k)), np.ones((D, k)), np.zeros((D, k))
         for i, (one, n) in enumerate(zip(every, length, strict=True)):
-            scatter[i] = _scatter(one)
+            lines[i, :n] = _lines(one)
+            scatter[i] = _scatter(one, lines[i, :n, 2])
             variance = one.sigmas**2 + scatter[i] ** 2 + _TINY**2
             scale[i] = np.sqrt(variance.mean(axis=0))
             root[i, :n] = np.sqrt(1.0 / (variance / scale[i] ** 2).mean(axis=1))
-            day[i, :n], lines[i, :n], Y[i, :n] = one.day, _lines(one), one.values / scale[i]
+            day[i, :n], Y[i, :n] = one.day, one.values / scale[i]
         return _Batch(length, day, lines, root, Y, scale, scatter)
 
     def steps(self) -> tuple[_Rows, Array]:
@@ -213,12 +214,14 @@ class _Batch:
         return Change(float(before), float(after), size, sigma, gain)
 
 
-def _scatter(series: Series) -> Array:
-    """(k,) beyond the sigmas, from each point to the next."""
+def _scatter(series: Series, degrees: Array) -> Array:
+    """(k,) beyond the sigmas, from each point to the next; what follows the temperature is not."""
     if len(series.day) < FEWEST:
         return np.zeros(series.values.shape[1])
-    step = np.abs(np.diff(series.values, axis=0)) / np.sqrt(2.0)
-    seen: Array = (_MAD * np.median(step, axis=0)) ** 2
+    step, warmer = np.diff(series.values, axis=0), np.diff(degrees)
+    if warmer.any():
+        step -= np.outer(warmer, warmer @ step / (warmer @ warmer))
+    seen: Array = (_MAD * np.median(np.abs(step), axis=0)) ** 2 / 2.0
     return np.sqrt(np.maximum(seen - np.median(series.sigmas**2, axis=0), 0.0))
 
 
