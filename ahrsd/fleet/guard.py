@@ -14,6 +14,7 @@ after `TRIES` its end is its row. On a cluster every Dask worker has a guard wit
 from __future__ import annotations
 
 import ctypes
+import importlib
 import importlib.util
 import multiprocessing
 import os
@@ -38,6 +39,7 @@ _PR_SET_PDEATHSIG = 1
 _START_S = 120.0
 #: read by the processes when they load numpy and Arrow
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
+_LOADED = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")
 
 Task = Callable[[Entry, Orders], Answer]
 
@@ -111,11 +113,13 @@ def _signal(number: int) -> str:
 
 
 def _begin(parent: int, memory_bytes: int) -> None:
-    """In a new process: end with the parent, and hold the limits."""
+    """In a new process: end with the parent, load what a recording needs, and hold the limits."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before that took effect
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver's to answer
+    for name in _LOADED:  # now, so that the limit of time is the recording's alone
+        importlib.import_module(name)
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
 

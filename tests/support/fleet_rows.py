@@ -62,7 +62,7 @@ def by_name(entry, orders) -> Answer:
     if "hang" in name:
         time.sleep(600)
     if "hog" in name:
-        waste = [bytearray(64 << 20) for _ in range(100)]
+        waste = [bytearray(512 << 20) for _ in range(10)]
         return Answer(str(len(waste)), "done")
     if "kill" in name:
         os.kill(os.getpid(), signal.SIGKILL)
