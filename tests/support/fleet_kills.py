@@ -64,7 +64,22 @@ class Cluster:
         return f"tcp://127.0.0.1:{self.port}"
 
     def start(self) -> None:
-        """Whatever of the three does not run."""
+        """Whatever of the three does not run, until all are there: a worker whose scheduler died
+        ends by itself some seconds later."""
+        from distributed import Client
+
+        until = time.monotonic() + 120
+        while True:
+            self._start_missing()
+            try:
+                with Client(self.address, timeout=10, set_as_default=False) as client:
+                    client.wait_for_workers(2, timeout=5)
+                    return
+            except OSError:  # no scheduler, or too few workers
+                if time.monotonic() > until:
+                    raise
+
+    def _start_missing(self) -> None:
         commands = {
             "scheduler": ["scheduler", "--host", "127.0.0.1", "--port", str(self.port)],
             **{
@@ -75,27 +90,11 @@ class Cluster:
         }  # fmt: skip
         for name, words in commands.items():
             if name not in self.processes or self.processes[name].poll() is not None:
-                log = (self.folder / f"{name.replace(' ', '')}.log").open("ab")
-                with log:
+                with (self.folder / f"{name.replace(' ', '')}.log").open("ab") as log:
                     self.processes[name] = subprocess.Popen(
                         [PYTHON, "-m", "dask", *words, "--no-dashboard"],
                         stdout=log, stderr=log, env=ENVIRONMENT,
                     )  # fmt: skip
-        self._answering()
-
-    def _answering(self) -> None:
-        """Wait until scheduler and both workers are there."""
-        from distributed import Client
-
-        until = time.monotonic() + 60
-        while True:
-            try:
-                with Client(self.address, timeout=10, set_as_default=False) as client:
-                    client.wait_for_workers(2, timeout=30)
-                    return
-            except OSError:
-                if time.monotonic() > until:
-                    raise
 
     def stop(self) -> None:
         for process in self.processes.values():
