@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from pebble import ProcessPool
 
 TRIES = 3
-_RECYCLED = 200  # recordings after which a process is replaced: whatever leaked is gone
+_RECYCLED = 500  # recordings after which a process is replaced: whatever leaked is gone
 _PR_SET_PDEATHSIG = 1
 _START_S = 120.0
 #: read by the processes when they load numpy and Arrow

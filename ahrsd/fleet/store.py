@@ -165,6 +165,11 @@ class Store:
         self._remove_others(self.parts())
         return len(files)
 
+    def add_part(self, table: pyarrow.Table) -> None:
+        """Rows that were made elsewhere, all of one device; only for who holds `alone`."""
+        listed = self.parts()
+        self._publish([*listed, *(self._part(table, name) for name in _folders(table))])
+
     def _part(self, table: pyarrow.Table, name: str) -> Path:
         serial = None if name == _folder(None) else int(name.partition("=")[2])
         column = table["serial_number"]
