@@ -30,7 +30,7 @@ _SCRATCH = "ahrsd-fleet-"
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ArchiveEntry:
     """One recording of an archive.
 
     url:     path, or address with its protocol
@@ -54,7 +54,7 @@ class Archive:
     root: str
     patterns: tuple[str, ...] = ()
 
-    def entries(self, left_out: Callable[[str], None] = lambda _: None) -> Iterator[Entry]:
+    def entries(self, left_out: Callable[[str], None] = lambda _: None) -> Iterator[ArchiveEntry]:
         """Every recording; `left_out` is told the names of other files.  AhrsdError."""
         listed = _remote(self.root) if is_remote(self.root) else _on_disk(Path(self.root))
         for entry in listed:
@@ -76,7 +76,7 @@ def is_remote(root: str) -> bool:
     return "://" in root
 
 
-def _on_disk(root: Path) -> Iterator[Entry]:
+def _on_disk(root: Path) -> Iterator[ArchiveEntry]:
     if not root.is_dir():
         what = "is no folder" if root.exists() else "does not exist"
         raise AhrsdError(f"{printable(root, 500)}: {what}; give the folder of the recordings")
@@ -102,20 +102,20 @@ def _on_disk(root: Path) -> Iterator[Entry]:
                     waiting.append((one.path, (*names, one.name)))
 
 
-def _file(one: os.DirEntry[str], names: tuple[str, ...]) -> Iterator[Entry]:
+def _file(one: os.DirEntry[str], names: tuple[str, ...]) -> Iterator[ArchiveEntry]:
     try:
         status = one.stat()
     except OSError:  # a link to nothing: its row says what is wrong
-        yield Entry(one.path, 0, "", names)
+        yield ArchiveEntry(one.path, 0, "", names)
         return
-    yield Entry(one.path, status.st_size, str(status.st_mtime_ns), names, status.st_mtime)
+    yield ArchiveEntry(one.path, status.st_size, str(status.st_mtime_ns), names, status.st_mtime)
 
 
-def _folder(path: Path, names: tuple[str, ...]) -> Entry:
+def _folder(path: Path, names: tuple[str, ...]) -> ArchiveEntry:
     states = [part.stat() for part in path.iterdir()]
     last = max(state.st_mtime_ns for state in states)
     size = sum(state.st_size for state in states)
-    return Entry(str(path), size, str(last), names, last / 1e9, is_folder=True)
+    return ArchiveEntry(str(path), size, str(last), names, last / 1e9, is_folder=True)
 
 
 def _file_system(root: str) -> tuple[Any, str]:
@@ -135,7 +135,7 @@ def _file_system(root: str) -> tuple[Any, str]:
     return system, str(path)
 
 
-def _remote(root: str) -> Iterator[Entry]:
+def _remote(root: str) -> Iterator[ArchiveEntry]:
     system, top = _file_system(root)
     if not system.isdir(top):
         raise AhrsdError(f"{root}: is no folder of {system.protocol}; check the address")
@@ -147,10 +147,10 @@ def _remote(root: str) -> Iterator[Entry]:
                 yield _object(system, facts, names)
 
 
-def _object(system: Any, facts: dict[str, Any], names: tuple[str, ...]) -> Entry:  # noqa: ANN401
+def _object(system: Any, facts: dict[str, Any], names: tuple[str, ...]) -> ArchiveEntry:  # noqa: ANN401
     when = facts.get("LastModified") or facts.get("mtime") or facts.get("last_modified")
     stamp = when.timestamp() if isinstance(when, datetime) else when
-    return Entry(
+    return ArchiveEntry(
         system.unstrip_protocol(facts["name"]),
         int(facts.get("size") or 0),
         str(facts.get("ETag") or when or ""),
@@ -160,7 +160,7 @@ def _object(system: Any, facts: dict[str, Any], names: tuple[str, ...]) -> Entry
 
 
 @contextmanager
-def local_file(entry: Entry) -> Iterator[Path]:
+def local_file(entry: ArchiveEntry) -> Iterator[Path]:
     """The recording as a file of this machine; a copy of a remote one is gone afterwards.
 
     OSError where it cannot be had.

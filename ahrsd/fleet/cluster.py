@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from ahrsd.errors import EXIT_BUSY, AhrsdError
-from ahrsd.fleet.archive import Entry
-from ahrsd.fleet.guard import Guard
+from ahrsd.fleet.archive import ArchiveEntry
+from ahrsd.fleet.guard import Guard, Task
 from ahrsd.fleet.work import Answer, Orders
 
 START = "start some on every machine: dask worker {address} --no-nanny --nthreads CORES"
@@ -29,8 +29,8 @@ _lock = threading.Lock()
 
 @contextmanager
 def connected(
-    address: str, orders: Orders
-) -> Iterator[tuple[Callable[[Entry], Future[Answer]], int]]:
+    address: str, orders: Orders, task: Task, loads: tuple[str, ...]
+) -> Iterator[tuple[Callable[[ArchiveEntry], Future[Answer]], int]]:
     """What takes a recording, and how many are examined at once.  AhrsdError."""
     if importlib.util.find_spec("distributed") is None:
         raise AhrsdError("--cluster: Dask runs it; install it: pip install 'ahrsd[cluster]'")
@@ -49,7 +49,7 @@ def connected(
             raise ClusterGoneError(address, f"has no workers; {START.format(address=address)}")
         executor = client.get_executor(pure=False)
         try:
-            yield lambda entry: executor.submit(on_worker, entry, orders), processes
+            yield lambda entry: executor.submit(on_worker, entry, orders, task, loads), processes
         except (CancelledError, KilledWorker) as error:
             raise ClusterGoneError(
                 address,
@@ -67,12 +67,13 @@ class ClusterGoneError(AhrsdError):
         super().__init__(f"--cluster {address}: {what}")
 
 
-def on_worker(entry: Entry, orders: Orders) -> Answer:
+def on_worker(entry: ArchiveEntry, orders: Orders, task: Task, loads: tuple[str, ...]) -> Answer:
     """The task of a Dask worker."""
     from distributed import get_worker
 
     worker: Any = get_worker()
     with _lock:
         if orders.memory_bytes not in _guards:
-            _guards[orders.memory_bytes] = Guard(worker.state.nthreads, orders.memory_bytes)
+            threads: int = worker.state.nthreads
+            _guards[orders.memory_bytes] = Guard(threads, orders.memory_bytes, task, loads)
     return _guards[orders.memory_bytes].examine(entry, orders)

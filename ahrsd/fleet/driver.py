@@ -17,17 +17,17 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-from ahrsd.fleet.archive import Archive, Entry
+from ahrsd.fleet.archive import Archive, ArchiveEntry
 from ahrsd.fleet.guard import Guard, Task
 from ahrsd.fleet.row import ANSWERED
 from ahrsd.fleet.store import Known, Store
-from ahrsd.fleet.work import THERE, Answer, Orders, examine, stamp
+from ahrsd.fleet.work import THERE, Answer, Orders, stamp
 
 _WINDOW = 4  # recordings in flight for each process
 _COMPACTED = 4096  # rows in the spool after which they are moved
 _TOLD_S = 2.0
 
-Submit = Callable[[Entry], "Future[Answer]"]
+Submit = Callable[[ArchiveEntry], "Future[Answer]"]
 
 
 @dataclass(slots=True)
@@ -72,11 +72,15 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where recordings are examined: so many processes here, or a Dask cluster."""
+    """Where recordings are examined: so many processes here, or a Dask cluster.
+
+    loads: modules that the task needs
+    """
 
     jobs: int
+    task: Task
+    loads: tuple[str, ...] = ()
     cluster: str | None = None
-    task: Task = examine
 
 
 def run(
@@ -102,7 +106,7 @@ def run(
 
 
 def _through(
-    missing: Iterable[Entry],
+    missing: Iterable[ArchiveEntry],
     orders: Orders,
     place: Place,
     store: Store,
@@ -137,7 +141,7 @@ def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:
     return progress
 
 
-def answers(entries: Iterable[Entry], submit: Submit, window: int) -> Iterator[Answer]:
+def answers(entries: Iterable[ArchiveEntry], submit: Submit, window: int) -> Iterator[Answer]:
     """The answers as they come, with at most `window` recordings in flight."""
     waiting = iter(entries)
     flight = {submit(entry) for entry in islice(waiting, window)}
@@ -155,10 +159,10 @@ def _executor(place: Place, orders: Orders) -> Iterator[tuple[Submit, int]]:
     if place.cluster is not None:
         from ahrsd.fleet.cluster import connected
 
-        with connected(place.cluster, orders) as (submit, processes):
+        with connected(place.cluster, orders, place.task, place.loads) as (submit, processes):
             yield submit, _WINDOW * processes
         return
-    guard = Guard(place.jobs, orders.memory_bytes, place.task)
+    guard = Guard(place.jobs, orders.memory_bytes, place.task, place.loads)
     threads = Threads(place.jobs, thread_name_prefix="fleet")
     try:
         yield lambda entry: threads.submit(guard.examine, entry, orders), _WINDOW * place.jobs

@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING
 
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import row as rows
-from ahrsd.fleet.archive import Entry, sweep
-from ahrsd.fleet.work import Answer, Orders, examine, keep_loss
+from ahrsd.fleet.archive import ArchiveEntry, sweep
+from ahrsd.fleet.work import Answer, Orders, keep_loss
 
 if TYPE_CHECKING:
     from pebble import ProcessPool
@@ -39,15 +39,18 @@ _PR_SET_PDEATHSIG = 1
 _START_S = 120.0
 #: read by the processes when they load numpy and Arrow
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
-_LOADED = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")
-
-Task = Callable[[Entry, Orders], Answer]
+Task = Callable[[ArchiveEntry, Orders], Answer]
 
 
 class Guard:
-    """Processes that examine recordings; `examine` may be called from as many threads."""
+    """Processes that do a task; `examine` may be called from as many threads.
 
-    def __init__(self, processes: int, memory_bytes: int, task: Task = examine) -> None:
+    loads: modules that the task needs, which a process loads before its first recording
+    """
+
+    def __init__(
+        self, processes: int, memory_bytes: int, task: Task, loads: tuple[str, ...] = ()
+    ) -> None:
         if importlib.util.find_spec("pebble") is None:
             raise AhrsdError("fleet: pebble runs it; install it: pip install 'ahrsd[fleet]'")
         if multiprocessing.current_process().daemon:
@@ -64,13 +67,13 @@ class Guard:
             processes,
             max_tasks=_RECYCLED,
             initializer=_begin,
-            initargs=(os.getpid(), memory_bytes),
+            initargs=(os.getpid(), memory_bytes, loads),
             context=multiprocessing.get_context("spawn"),
         )
         # the processes belong to the thread that starts them: this one, which outlives them
         self._pool.schedule(_ready, timeout=_START_S).result()
 
-    def examine(self, entry: Entry, orders: Orders) -> Answer:
+    def examine(self, entry: ArchiveEntry, orders: Orders) -> Answer:
         """The answer about a recording, whose row is on the disk; it waits for it."""
         for number in range(1, TRIES + 1):
             begun = time.monotonic()
@@ -112,13 +115,13 @@ def _signal(number: int) -> str:
     return signal.Signals(number).name if number in signal.valid_signals() else "unknown"
 
 
-def _begin(parent: int, memory_bytes: int) -> None:
+def _begin(parent: int, memory_bytes: int, loads: tuple[str, ...]) -> None:
     """In a new process: end with the parent, load what a recording needs, and hold the limits."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before that took effect
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver's to answer
-    for name in _LOADED:  # now, so that the limit of time is the recording's alone
+    for name in loads:  # now, so that the limit of time is the recording's alone
         importlib.import_module(name)
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))

@@ -10,7 +10,7 @@ import numpy as np
 from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import told
-from ahrsd.fleet.questions import DeviceDrift, Rows
+from ahrsd.fleet.questions import DeviceDrift, FleetRows
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.trend import Trend
 from ahrsd.printable import LINE, printable
@@ -31,7 +31,7 @@ _MISMATCHES = """
 
 def write_page(output: Path, path: Path) -> None:
     """The page of the fleet in `output`.  AhrsdError where it cannot be written."""
-    with Rows(Store(output)) as rows:
+    with FleetRows(Store(output)) as rows:
         page = _page(output, rows)
     try:
         write_fleet_report(path, page)
@@ -39,7 +39,7 @@ def write_page(output: Path, path: Path) -> None:
         raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _page(output: Path, rows: Rows) -> FleetPage:
+def _page(output: Path, rows: FleetRows) -> FleetPage:
     counts, drifts = rows.counts(), rows.drift()
     mismatches = {name: f"{n} of {of}" for name, n, of in rows.sql(_MISMATCHES).rows}
     failures = rows.failures().rows
@@ -69,7 +69,7 @@ def _page(output: Path, rows: Rows) -> FleetPage:
 
 
 def _line(one: DeviceDrift, mismatches: str) -> DeviceLine:
-    slope = one.iron.per_year
+    slope = one.iron.per_year * one.iron.days / 365.25
     return DeviceLine(
         device=printable(one.device),
         vehicle=printable(one.vehicle or "–"),
@@ -77,7 +77,7 @@ def _line(one: DeviceDrift, mismatches: str) -> DeviceLine:
         newest=told.date(one.last_day),
         heading_sigma_deg=one.heading_sigma_deg,
         heading_kept_deg=one.heading_kept_deg,
-        iron_mg_per_year=1e3 * float(np.linalg.norm(slope)) if np.isfinite(slope).all() else None,
+        iron_drift_mg=1e3 * float(np.linalg.norm(slope)) if np.isfinite(slope).all() else None,
         steps=len(one.iron.changes) + len(one.bias.changes),
         mismatches=mismatches,
     )
@@ -104,7 +104,7 @@ def _steps(found: Trend) -> tuple[tuple[float, float], ...]:
     return tuple((change.before_day, change.after_day) for change in found.changes)
 
 
-def _findings(rows: Rows) -> Sequence[FindingLine]:
+def _findings(rows: FleetRows) -> Sequence[FindingLine]:
     """Those that come again on a vehicle, by vehicle."""
     found = [row for row in rows.recurring().rows if row[1] == "vehicle"]
     lines = [

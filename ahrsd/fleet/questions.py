@@ -71,7 +71,7 @@ _FAILURES = f"""
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class AnswerTable:
     """A table: names of columns, and rows."""
 
     columns: tuple[str, ...]
@@ -120,7 +120,7 @@ class DeviceDrift:
         }
 
 
-class Rows:
+class FleetRows:
     """The rows of a fleet in DuckDB; a context manager."""
 
     def __init__(self, store: Store) -> None:
@@ -129,7 +129,7 @@ class Rows:
         self._store = store
         self._connection = _opened(store)
 
-    def __enter__(self) -> Rows:
+    def __enter__(self) -> FleetRows:
         return self
 
     def __exit__(
@@ -140,7 +140,7 @@ class Rows:
     ) -> None:
         self._connection.close()
 
-    def sql(self, query: str) -> Answered:
+    def sql(self, query: str) -> AnswerTable:
         """The answer to one SELECT.  AhrsdError in DuckDB's words where it is none."""
         import duckdb
 
@@ -152,10 +152,10 @@ class Rows:
         except duckdb.Error as error:
             raise AhrsdError(f"ask: {line(str(error).strip().partition(chr(10))[0])}") from error
 
-    def _ask(self, query: str) -> Answered:
+    def _ask(self, query: str) -> AnswerTable:
         found = self._retried(query)
         names = tuple(name for name, *_ in found.description or ())
-        return Answered(names, found.fetchall())
+        return AnswerTable(names, found.fetchall())
 
     def _retried(self, query: str) -> duckdb.DuckDBPyConnection:
         """Run it; where a part was replaced meanwhile, over the new ones."""
@@ -187,11 +187,11 @@ class Rows:
             "in_spool": sum(1 for _ in self._store.spool.glob("*.json")),
         }
 
-    def failures(self) -> Answered:
+    def failures(self) -> AnswerTable:
         """What gave no answer, or half of one, and why; the most frequent reason first."""
         return self._ask(_FAILURES)
 
-    def recurring(self) -> Answered:
+    def recurring(self) -> AnswerTable:
         """Findings that come again on the same device, vehicle, place, or at the same temperature.
 
         p: the probability that of all pairs of its kind one comes so often, if it were as frequent
@@ -206,7 +206,7 @@ class Rows:
                 out.append((effect, kind, name, found, size, found / size, everywhere / total, p))
         out.sort(key=lambda row: (row[-1], -row[3], row[0], row[1], str(row[2])))
         columns = ("effect", "by", "which", "found", "of", "share", "share_everywhere", "p")
-        return Answered(columns, out)
+        return AnswerTable(columns, out)
 
     def drift(self) -> list[DeviceDrift]:
         """Every device with two calibrations or more; the largest heading error first."""
@@ -306,6 +306,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - of DuckDB
 
 def _trend_json(found: Trend, unit: str) -> dict[str, Any]:
     return {
+        "days": found.days,
         f"per_year_{unit}": _plain(found.per_year.tolist()),
         f"per_year_sigma_{unit}": _plain(found.per_year_sigma.tolist()),
         f"per_degc_{unit}": _plain(found.per_degree.tolist()),

@@ -10,17 +10,16 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from ahrsd.errors import RecordingError
-from ahrsd.events import SamplesSeen
+from ahrsd.events import Event, SamplesSeen
 from ahrsd.printable import LINE, printable
 
 if TYPE_CHECKING:
     from ahrsd.diagnosis.diagnosis import Diagnosis
-    from ahrsd.offline.calibrate import BatchResult
 
 Row = dict[str, Any]
 
@@ -82,6 +81,18 @@ _IN_NAME = re.compile(
 _WORDS = 12  # findings and warnings that are kept
 
 
+class Calibrated(Protocol):
+    """What `calibrate` answers, as far as a row takes it."""
+
+    @property
+    def events(self) -> tuple[Event, ...]: ...  # noqa: D102
+    @property
+    def facts(self) -> Mapping[str, str]: ...  # noqa: D102
+    def json(self, method: str) -> dict[str, object]: ...  # noqa: D102
+    def reasons(self) -> list[str]: ...  # noqa: D102
+    def all_warnings(self) -> list[str]: ...  # noqa: D102
+
+
 def error_words(errors: Mapping[str, Exception]) -> dict[str, str | None]:
     """`error` and `remedy` by command; the recording's name is in neither, so that the same error
     of a thousand recordings is the same text."""
@@ -100,7 +111,7 @@ def error_words(errors: Mapping[str, Exception]) -> dict[str, str | None]:
     }
 
 
-def calibration_columns(result: BatchResult) -> Row:
+def calibration_columns(result: Calibrated) -> Row:
     """What `calibrate` says."""
     body: Any = result.json("magyc")
     out: Row = {
@@ -146,7 +157,7 @@ def diagnosis_columns(found: Diagnosis) -> Row:
 
 
 def recorded(
-    result: BatchResult | None, name: str, modified_s: float | None
+    result: Calibrated | None, name: str, modified_s: float | None
 ) -> dict[str, str | None]:
     """When it was recorded and by what that is known: the recording itself, else its name, else
     the file's own date, which a copy may have changed."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ahrsd.counting import counted
-from ahrsd.fleet.questions import Answered, DeviceDrift
-from ahrsd.fleet.trend import Change, Trend
+from ahrsd.fleet.questions import AnswerTable, DeviceDrift
+from ahrsd.fleet.trend import StepChange, Trend
 from ahrsd.printable import printable
 from ahrsd.samples import Array
 
@@ -76,26 +76,30 @@ def heading_words(one: DeviceDrift) -> str:
 
 
 def trend_words(found: Trend, unit: str) -> str:
-    """Drift in time and with temperature, for 1e-3 of the unit of the values."""
+    """Drift over the time that was seen and with temperature, for 1e-3 of the values' unit.
+
+    Nothing is said per year: a few days say nothing of one.
+    """
+    years = found.days / 365.25
     parts = [
-        f"{_vector(slope)} +- {_vector(sigma, sign='')} {unit} per {per}"
+        f"{_vector(slope)} +- {_vector(sigma, sign='')} {unit} {per}"
         for slope, sigma, per in (
-            (found.per_year, found.per_year_sigma, "year"),
-            (found.per_degree, found.per_degree_sigma, "degC"),
+            (years * found.per_year, years * found.per_year_sigma, f"in {found.days:.3g} days"),
+            (found.per_degree, found.per_degree_sigma, "per degC"),
         )
         if np.isfinite(slope).all()
     ]
     return "; ".join(parts) or "too few calibrations for a drift"
 
 
-def change_words(change: Change, unit: str) -> str:
+def change_words(change: StepChange, unit: str) -> str:
     """A step in words."""
     first, last = date(change.before_day), date(change.after_day)
     when = f"on {first}" if first == last else f"between {first} and {last}"
     return f"steps by {_vector(change.size)} +- {_vector(change.sigma, sign='')} {unit} {when}"
 
 
-def recurring_lines(found: Answered) -> list[str]:
+def recurring_lines(found: AnswerTable) -> list[str]:
     """Findings that come again; what is no more than chance is left to --json."""
     rows = [row for row in found.rows if row[-1] < _LIKELY]
     if not rows:
@@ -109,7 +113,7 @@ def recurring_lines(found: Answered) -> list[str]:
     )
 
 
-def failure_lines(found: Answered) -> list[str]:
+def failure_lines(found: AnswerTable) -> list[str]:
     """Each reason, how often, what to do, and one of its recordings."""
     if not found.rows:
         return ["every recording gave an answer"]

@@ -46,7 +46,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class StepChange:
     """A step: after day `before` and not later than day `after`; size, sigma (k,)."""
 
     before_day: float
@@ -60,16 +60,17 @@ class Change:
 class Trend:
     """per_year, per_degree (k,) with sigmas: nan where the series does not tell.
 
-    scatter (k,): standard deviation of a point beside its own sigma
+    scatter (k,): standard deviation of a point beside its own sigma; days: from first to last
     """
 
     points: int
+    days: float
     per_year: Array
     per_year_sigma: Array
     per_degree: Array
     per_degree_sigma: Array
     scatter: Array
-    changes: tuple[Change, ...]
+    changes: tuple[StepChange, ...]
 
 
 def binned(series: Series, most: int = MOST_POINTS) -> Series:
@@ -205,13 +206,15 @@ class _Batch:
             for j, row in enumerate(steps)
             if row < self.length[i]
         )
-        return Trend(int(self.length[i]), *slopes[0], *slopes[1], self.scatter[i], changes)
+        n = int(self.length[i])
+        days = float(self.day[i, n - 1] - self.day[i, 0])
+        return Trend(n, days, *slopes[0], *slopes[1], self.scatter[i], changes)
 
-    def _change(self, i: int, row: int, size: Array, sigma: Array, gain: float) -> Change:
+    def _change(self, i: int, row: int, size: Array, sigma: Array, gain: float) -> StepChange:
         used = np.flatnonzero(self.root[i] > 0.0)
         place = int(np.searchsorted(used, row))
         before, after = self.day[i, used[place - 1]], self.day[i, used[place]]
-        return Change(float(before), float(after), size, sigma, gain)
+        return StepChange(float(before), float(after), size, sigma, gain)
 
 
 def _scatter(series: Series, degrees: Array) -> Array:

@@ -13,16 +13,19 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from ahrsd import __version__
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import row as rows
-from ahrsd.fleet.archive import Entry, local_file, pieces
-from ahrsd.fleet.row import Row
+from ahrsd.fleet.archive import ArchiveEntry, local_file, pieces
+from ahrsd.fleet.row import Calibrated, Row
 from ahrsd.fleet.store import Store
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
+
+if TYPE_CHECKING:
+    from ahrsd.diagnosis.diagnosis import Diagnosis
 
 _T = TypeVar("_T")
 
@@ -66,7 +69,7 @@ class Answer:
     outcome: str
 
 
-def stamp(entry: Entry, orders: Orders) -> str:
+def stamp(entry: ArchiveEntry, orders: Orders) -> str:
     """Names a recording by place, size and date, with version and options."""
     return _digest([_place(entry)], orders)
 
@@ -84,7 +87,7 @@ def content(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _place(entry: Entry) -> bytes:
+def _place(entry: ArchiveEntry) -> bytes:
     words = f"{entry.url}\0{entry.size_bytes}\0{entry.changed}"
     return words.encode("utf-8", "surrogateescape")
 
@@ -94,8 +97,22 @@ def _digest(parts: Iterable[bytes], orders: Orders) -> str:
     return hashlib.sha256(b"\0".join(said)).hexdigest()[:32]
 
 
-def examine(entry: Entry, orders: Orders) -> Answer:
-    """Calibrate and diagnose a recording, and make its row durable."""
+@dataclass(frozen=True, slots=True)
+class Examiner:
+    """Calibrates and diagnoses a recording, and makes its row durable.
+
+    calibrate, diagnose: the library's functions, given by who starts a run
+    """
+
+    calibrate: Callable[[Path, Orders], Calibrated]
+    diagnose: Callable[[Path, Orders], Diagnosis]
+
+    def __call__(self, entry: ArchiveEntry, orders: Orders) -> Answer:
+        """The answer, once the row is on the disk."""
+        return _examined(self, entry, orders)
+
+
+def _examined(by: Examiner, entry: ArchiveEntry, orders: Orders) -> Answer:
     from ahrsd.daemon.heap import keep_heap
 
     begun, begun_cpu = time.monotonic(), time.process_time()
@@ -108,7 +125,7 @@ def examine(entry: Entry, orders: Orders) -> Answer:
             if store.has(own, failures=not orders.again):
                 return Answer(own, THERE)
             found = [_labels(entry, orders), {"key": own, "content_sha256": sha256}]
-            found.append(_answers(path, entry, orders))
+            found.append(_answers(by, path, entry, orders))
     except OSError as error:
         return keep_loss(entry, orders, rows.UNREADABLE, error.strerror or str(error))
     spent: Row = {
@@ -122,7 +139,13 @@ def examine(entry: Entry, orders: Orders) -> Answer:
 
 
 def keep_loss(
-    entry: Entry, orders: Orders, outcome: str, words: str, *, tries: int = 1, seconds: float = 0.0
+    entry: ArchiveEntry,
+    orders: Orders,
+    outcome: str,
+    words: str,
+    *,
+    tries: int = 1,
+    seconds: float = 0.0,
 ) -> Answer:
     """The row of a recording that gave no answer."""
     sha256 = None
@@ -147,7 +170,7 @@ def keep_loss(
     return Answer(own, outcome)
 
 
-def _labels(entry: Entry, orders: Orders) -> Row:
+def _labels(entry: ArchiveEntry, orders: Orders) -> Row:
     """Whose recording it is: by its folders, or by what was said of all."""
     named = dict(zip(orders.levels, entry.folders))
     serial = named.get("serial", "")
@@ -169,22 +192,11 @@ def _text(name: str | None) -> str | None:
     return None if name is None else printable(name, 200)
 
 
-def _answers(path: Path, entry: Entry, orders: Orders) -> Row:
+def _answers(by: Examiner, path: Path, entry: ArchiveEntry, orders: Orders) -> Row:
     """The columns that `calibrate` and `diagnose` give, and what they refused."""
-    from ahrsd.config.loading import Config
-    from ahrsd.offline.calibrate import calibrate
-    from ahrsd.offline.diagnose import diagnose_recording
-
-    rate_hz, columns = orders.rate_hz, orders.columns
     errors: dict[str, Exception] = {}
-    result = _tried(
-        "calibrate",
-        errors,
-        lambda: calibrate(path, Config(), rate_hz=rate_hz, columns=columns),
-    )
-    found = _tried(
-        "diagnose", errors, lambda: diagnose_recording(path, rate_hz=rate_hz, columns=columns)
-    )
+    result = _tried("calibrate", errors, lambda: by.calibrate(path, orders))
+    found = _tried("diagnose", errors, lambda: by.diagnose(path, orders))
     out: Row = {"outcome": (rows.DONE, rows.PARTLY, rows.REFUSED)[len(errors)]}
     out |= rows.error_words(errors)
     out |= rows.recorded(result, entry.url.rpartition("/")[2], entry.modified_s)

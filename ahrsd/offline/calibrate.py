@@ -21,11 +21,10 @@ from ahrsd.diagnosis.model_file import RepairedModel
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.model_checks import Misalignment
 from ahrsd.events import Estimated, Event, SamplesSeen
-from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.offline.replay import Replayed, replay
 from ahrsd.offline.track import faults, without_terms
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.report.calibration_json import calibration_json, why_not_converged
 from ahrsd.report.summary import serial_of, warnings_of
 

@@ -21,11 +21,10 @@ from ahrsd.diagnosis.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.offline.track import checked, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.recording.opening import open_recording
 from ahrsd.samples import SampleBlock
 

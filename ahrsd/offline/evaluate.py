@@ -37,12 +37,11 @@ from ahrsd.evaluation.references import (
     optical,
 )
 from ahrsd.events import SamplesSeen
-from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.offline.replay import replay
 from ahrsd.printable import printable
 from ahrsd.recording.bytestream import read_chunks
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import TABLE_BYTES, TABLE_ROWS, refuse_beyond
+from ahrsd.recording.limits import TABLE_BYTES, TABLE_ROWS, on_one_thread, refuse_beyond
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array

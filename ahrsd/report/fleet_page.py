@@ -39,7 +39,7 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True)
 class DeviceLine:
-    """A device in the fleet's table; iron and bias: lengths of the drift a year, None: not told."""
+    """A device in the fleet's table; iron_drift_mg: from first to last, without steps."""
 
     device: str
     vehicle: str
@@ -47,7 +47,7 @@ class DeviceLine:
     newest: str
     heading_sigma_deg: float
     heading_kept_deg: float
-    iron_mg_per_year: float | None
+    iron_drift_mg: float | None
     steps: int
     mismatches: str
 

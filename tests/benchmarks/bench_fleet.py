@@ -28,20 +28,21 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 from fleet_kills import write_archive
-from fleet_rows import sleeping
+from fleet_rows import nothing, sleeping
 
+from ahrsd.cli.fleet import EXAMINER, LOADS
 from ahrsd.fleet.archive import Archive
 from ahrsd.fleet.driver import Place, run
-from ahrsd.fleet.questions import Rows
+from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import SCHEMA, Store
-from ahrsd.fleet.work import Orders, examine
+from ahrsd.fleet.work import Orders
 
 TASK_S = 2.0
 DEVICES, DAY_MS = 500, 86_400_000
 
 
 def ran(
-    archive: Path, out: Path, jobs: int, task=examine, tell=lambda _: None
+    archive: Path, out: Path, jobs: int, task=EXAMINER, tell=lambda _: None
 ) -> tuple[float, int]:
     """Wall seconds between the first and the last answer, and how many."""
     shutil.rmtree(out, ignore_errors=True)
@@ -53,7 +54,12 @@ def ran(
             del begun[2:-1]
         tell(progress)
 
-    done = run(Archive(str(archive)), Orders(out=str(out)), Place(jobs, task=task), told)
+    done = run(
+        Archive(str(archive)),
+        Orders(out=str(out)),
+        Place(jobs, task, LOADS if task is EXAMINER else ()),
+        told,
+    )
     return begun[-1] - begun[0], done.done - 1
 
 
@@ -90,7 +96,7 @@ def scaling(folder: Path) -> None:
     print(f"2 processes are {rates[1] / rates[0]:.2f} times as fast as one")
 
 
-def memory(folder: Path, most: int) -> None:
+def memory(folder: Path, most: int, *, kept: bool) -> None:
     """Resident size of the driver as the tasks go by."""
     archive = simulated(folder, most, 0)
     said: dict[int, float] = {}
@@ -101,7 +107,7 @@ def memory(folder: Path, most: int) -> None:
                 said[number] = _resident_mb()
                 print(f"{number:,} tasks: {said[number]:.1f} MB", flush=True)
 
-    wall_s, count = ran(archive, folder / "out", 2, sleeping, tell)
+    wall_s, count = ran(archive, folder / "out", 2, sleeping if kept else nothing, tell)
     print(f"{count:,} tasks in {wall_s:.0f} s; {len(Store(folder / 'out').parts())} parts")
 
 
@@ -113,7 +119,7 @@ def ask(folder: Path, rows: int) -> None:
     known = store.known("stamp", failures=True)
     print(f"what a resumed run reads: {time.monotonic() - begun:.2f} s, {len(known):,} stamps")
     begun = time.monotonic()
-    with Rows(store) as asked:
+    with FleetRows(store) as asked:
         print(f"opened in {time.monotonic() - begun:.2f} s")
         for question in (asked.drift, asked.recurring, asked.failures, asked.counts):
             for _ in range(2):
@@ -189,11 +195,12 @@ def main() -> None:
     words = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     words.add_argument("what", choices=["overhead", "scaling", "memory", "ask", "threads"])
     words.add_argument("--most", type=int, help="Tasks of memory, rows of ask.")
+    words.add_argument("--rows", action="store_true", help="Tasks of memory leave their rows.")
     given = words.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="bench-fleet-"))
     try:
         if given.what == "memory":
-            memory(folder, given.most or 100_000)
+            memory(folder, given.most or 100_000, kept=given.rows)
         elif given.what == "ask":
             ask(folder, given.most or 1_000_000)
         else:

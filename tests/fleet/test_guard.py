@@ -9,7 +9,7 @@ from fleet_rows import by_name, nothing
 
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import guard
-from ahrsd.fleet.archive import Archive, Entry
+from ahrsd.fleet.archive import Archive, ArchiveEntry
 from ahrsd.fleet.driver import Place, answers, run
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.work import Answer, Orders
@@ -27,7 +27,7 @@ def ended(tmp_path_factory):
         (folder / "archive" / f"{name}.mcap").write_bytes(name.encode())
     orders = Orders(out=str(folder / "out"), limit_s=9.0, memory_bytes=1 << 30)
     begun = time.monotonic()
-    done = run(Archive(str(folder / "archive")), orders, Place(2, task=by_name), lambda _: None)
+    done = run(Archive(str(folder / "archive")), orders, Place(2, by_name), lambda _: None)
     assert time.monotonic() - begun < 120
     table, parts = Store(folder / "out").rows()
     assert (table.num_rows, len(parts)) == (0, 1)
@@ -68,7 +68,7 @@ def test_no_more_are_in_flight_than_the_window():
     flying: list[Future[Answer]] = []
     most = 0
 
-    def submit(entry: Entry) -> Future[Answer]:
+    def submit(entry: ArchiveEntry) -> Future[Answer]:
         nonlocal most
         future: Future[Answer] = Future()
         flying.append(future)
@@ -79,7 +79,7 @@ def test_no_more_are_in_flight_than_the_window():
             flying.clear()
         return future
 
-    entries = (Entry(str(i), 0, "") for i in range(100))
+    entries = (ArchiveEntry(str(i), 0, "") for i in range(100))
     assert len(list(answers(entries, submit, 5))) == 100
     assert most == 5
 
@@ -87,4 +87,4 @@ def test_no_more_are_in_flight_than_the_window():
 def test_without_pebble_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(AhrsdError, match=r"pip install 'ahrsd\[fleet\]'"):
-        guard.Guard(1, 0)
+        guard.Guard(1, 0, nothing)

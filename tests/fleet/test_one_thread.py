@@ -7,8 +7,8 @@ import threadpoolctl
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.offline.evaluate import evaluate
-from ahrsd.offline.one_thread import on_one_thread
 from ahrsd.offline.replay import replay
+from ahrsd.recording.limits import on_one_thread
 
 
 def threads() -> list[int]:

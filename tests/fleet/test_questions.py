@@ -8,7 +8,7 @@ from fleet_rows import row, store_of
 
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import told
-from ahrsd.fleet.questions import Rows
+from ahrsd.fleet.questions import FleetRows
 
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
@@ -25,7 +25,7 @@ def drifting(first: int, serial: int | None, slope: float, *, step: float = 0.0,
 
 def test_drift_of_each_device_worst_first(tmp_path):
     rows = [*drifting(0, 1, 1e-3), *drifting(100, 2, 0.0, step=0.02), *drifting(200, None, 4e-3)]
-    with Rows(store_of(tmp_path / "out", rows)) as asked:
+    with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         found = asked.drift()
     assert [one.device for one in found] == ["2", "rov9", "1"]
     stepped, unnamed, slow = found
@@ -49,7 +49,7 @@ def test_drift_of_each_device_worst_first(tmp_path):
 
 def test_what_has_not_converged_or_has_no_time_is_no_calibration(tmp_path):
     rows = [row(1, day=0.0), row(2, day=1.0, converged=False), row(3)]
-    with Rows(store_of(tmp_path / "out", rows)) as asked:
+    with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         assert asked.drift() == []
     assert told.drift_lines([]) == ["no device has two calibrations whose time is known"]
 
@@ -63,7 +63,7 @@ def test_findings_recur_by_vehicle_place_and_temperature(tmp_path):
                 temperature_c=5.0 if i < 50 else 25.0,
                 effects=("motor_current",) if bad and i % 2 == 0 else ())
         )  # fmt: skip
-    with Rows(store_of(tmp_path / "out", rows)) as asked:
+    with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         found = asked.recurring()
     effect, by, which, n, of, share, everywhere, p = found.rows[0]
     assert (effect, by, which, n, of) == ("motor_current", "device", "rov0", 10, 20)
@@ -84,7 +84,7 @@ def test_failures_by_reason_the_most_frequent_first(tmp_path):
     rows += [row(i, outcome="refused", error="is empty", remedy="record again") for i in (2, 3)]
     rows += [row(4, outcome="too slow", error="stopped after 600 s")]
     rows += [row(5, outcome="partly done", error="diagnose: is too short")]
-    with Rows(store_of(tmp_path / "out", rows)) as asked:
+    with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         found = asked.failures()
     assert [r[:3] for r in found.rows] == [
         ("refused", "is empty", 2),
@@ -100,7 +100,7 @@ def test_failures_by_reason_the_most_frequent_first(tmp_path):
 
 def test_sql_reads_the_rows(tmp_path):
     store = store_of(tmp_path / "out", [row(1), row(2, vehicle="rov2")], compacted=False)
-    with Rows(store) as asked:
+    with FleetRows(store) as asked:
         found = asked.sql("select vehicle, count(*) as n from recordings group by 1 order by 1")
     assert found.columns == ("vehicle", "n")
     assert found.rows == [("rov1", 1), ("rov2", 1)]
@@ -126,7 +126,7 @@ def test_sql_writes_nothing_and_reads_nothing_else(tmp_path, query):
     secret = tmp_path / "secret.txt"
     secret.write_text("x")
     store = store_of(tmp_path / "out", [row(1)])
-    with Rows(store) as asked, pytest.raises(AhrsdError, match=r"^ask: [^\n]+$"):
+    with FleetRows(store) as asked, pytest.raises(AhrsdError, match=r"^ask: [^\n]+$"):
         asked.sql(query.format(out=tmp_path))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "secret.txt"]
 
@@ -135,7 +135,7 @@ def test_of_several_versions_the_newest_row_of_each_recording_counts(tmp_path):
     old = [row(i, version="0.1.0", finished_utc="2026-01-01T00:00:00+00:00") for i in (1, 2)]
     new = row(9, version="0.2.0", content_sha256=f"{1:064x}", recording="dive_1.mcap",
               finished_utc="2026-02-01T00:00:00+00:00")  # fmt: skip
-    with Rows(store_of(tmp_path / "out", [*old, new])) as asked:
+    with FleetRows(store_of(tmp_path / "out", [*old, new])) as asked:
         found = asked.sql("select recording, version from recordings order by 1").rows
         counts = asked.counts()
     assert found == [("dive_1.mcap", "0.2.0"), ("dive_2.mcap", "0.1.0")]
@@ -145,7 +145,7 @@ def test_of_several_versions_the_newest_row_of_each_recording_counts(tmp_path):
 
 def test_parts_that_are_replaced_while_they_are_asked_are_looked_up_again(tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
-    with Rows(store) as asked:
+    with FleetRows(store) as asked:
         store.put(row(2))
         store.compact()  # the part that was opened is gone
         assert asked.sql("select count(*) from recordings").rows == [(2,)]
@@ -156,7 +156,7 @@ def test_foreign_texts_do_not_reach_the_terminal(tmp_path):
         row(i, day=i, vehicle="\x1b[2J", serial_number=None, effects=("drift",)) for i in range(9)
     ]
     rows += [row(20, outcome="refused", error="\x1b]0;x", recording="a\x1bb")]
-    with Rows(store_of(tmp_path / "out", rows)) as asked:
+    with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         lines = [
             *told.drift_lines(asked.drift()),
             *told.failure_lines(asked.failures()),

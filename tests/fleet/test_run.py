@@ -12,11 +12,12 @@ from fleet_kills import write_archive
 from fleet_rows import row, store_of
 from ros_files import sensor
 
+from ahrsd.cli.fleet import EXAMINER, LOADS
 from ahrsd.config.loading import Config
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive
 from ahrsd.fleet.driver import Place, Progress, run
-from ahrsd.fleet.questions import Rows
+from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.work import Orders
 from ahrsd.offline.calibrate import calibrate
@@ -25,7 +26,7 @@ from ahrsd.offline.diagnose import diagnose_recording
 pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
-PLACE = Place(jobs=2)
+PLACE = Place(2, EXAMINER, LOADS)
 
 
 def ran(archive: Path | str, out: Path, **orders: object) -> Progress:
@@ -33,7 +34,7 @@ def ran(archive: Path | str, out: Path, **orders: object) -> Progress:
 
 
 def rows(out: Path) -> dict[str, dict[str, object]]:
-    with Rows(Store(out)) as asked:
+    with FleetRows(Store(out)) as asked:
         found = asked.sql("select * from recordings").json()
     assert len({one["key"] for one in found}) == len(found)
     return {Path(one["recording"]).name: one for one in found}
@@ -133,7 +134,7 @@ def test_a_file_that_was_mended_has_a_row_of_its_own(archive, tmp_path):
     assert dict(ran(small, tmp_path / "out").outcomes) == {"refused": 1}
     (small / "dive.csv").write_text("a,c\n1,2\n")
     assert dict(ran(small, tmp_path / "out").outcomes) == {"refused": 1}
-    with Rows(Store(tmp_path / "out")) as asked:
+    with FleetRows(Store(tmp_path / "out")) as asked:
         assert asked.counts()["recordings"] == 2
 
 
@@ -152,7 +153,7 @@ def test_options_are_in_the_key_and_labels_come_from_folders(archive, tmp_path):
     assert (tmp_path / "out" / "parts" / "serial=100032").is_dir()
     assert ran(tmp_path / "archive", tmp_path / "out", **given).done == 0
     assert ran(tmp_path / "archive", tmp_path / "out", rate_hz=25.0, **given).done == 1
-    with Rows(Store(tmp_path / "out")) as asked:
+    with FleetRows(Store(tmp_path / "out")) as asked:
         every = asked.sql("select options, converged from recordings").rows
     assert every == [(json.dumps({"rate_hz": 25.0}), found["converged"])]
 

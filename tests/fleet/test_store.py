@@ -1,4 +1,4 @@
-"""Rows are there exactly once, wherever a process was stopped."""
+"""FleetRows are there exactly once, wherever a process was stopped."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import pytest
 from fleet_rows import row, store_of
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.questions import Rows
+from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Known, Store
 
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
 
 def recordings(store: Store) -> list[str]:
-    with Rows(store) as rows:
+    with FleetRows(store) as rows:
         return [name for (name,) in rows.sql("select recording from recordings order by 1").rows]
 
 
@@ -78,7 +78,7 @@ def test_a_row_made_anew_takes_the_place_of_the_old_one_in_another_part(tmp_path
     store = store_of(tmp_path / "out", [failed, row(2)])
     store.put(row(1, serial_number=100))
     for _ in range(2):
-        with Rows(store) as rows:
+        with FleetRows(store) as rows:
             found = rows.sql("select key, outcome, serial_number from recordings order by key").rows
         assert found == [(f"{1:032x}", "done", 100), (f"{2:032x}", "done", 100)]
         store.compact()

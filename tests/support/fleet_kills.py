@@ -131,7 +131,7 @@ class Fleet:
         self.starts += 1
 
     def rows(self) -> int:
-        """Rows that are there now."""
+        """FleetRows that are there now."""
         return len(keys_of(self.out)) if (self.out / "parts.json").exists() else 0
 
     def kill_one(self, rng: random.Random) -> None:

@@ -1,4 +1,4 @@
-"""Rows of a fleet by hand, and tasks that go wrong in every way a task can."""
+"""FleetRows of a fleet by hand, and tasks that go wrong in every way a task can."""
 
 from __future__ import annotations
 

@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
+from ahrsd.cli.fleet import answers
+from ahrsd.cli.output_files import make_folder
 from ahrsd.cli.progress import fleet_progress
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.fleet.row import Calibrated
+from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
 
 if TYPE_CHECKING:
+    from ahrsd.diagnosis.diagnosis import Diagnosis
     from ahrsd.fleet.driver import Progress
     from ahrsd.recording.column_names import ColumnMap
 
@@ -24,6 +28,25 @@ _UNITS = {
     "--limit": {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0},
     "--memory": {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30},
 }
+
+
+def calibrated(path: Path, orders: Orders) -> Calibrated:
+    """`ahrsd calibrate` of one recording of an archive."""
+    from ahrsd.config.loading import Config
+    from ahrsd.offline.calibrate import calibrate
+
+    return calibrate(path, Config(), rate_hz=orders.rate_hz, columns=orders.columns)
+
+
+def diagnosed(path: Path, orders: Orders) -> Diagnosis:
+    """`ahrsd diagnose` of one recording of an archive."""
+    from ahrsd.offline.diagnose import diagnose_recording
+
+    return diagnose_recording(path, rate_hz=orders.rate_hz, columns=orders.columns)
+
+
+EXAMINER = Examiner(calibrated, diagnosed)
+LOADS = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")  # slow to import
 
 
 @click.group()
@@ -76,7 +99,6 @@ def run(
     from ahrsd.fleet.archive import Archive
     from ahrsd.fleet.driver import Place
     from ahrsd.fleet.driver import run as run_fleet
-    from ahrsd.fleet.work import Orders
 
     if folder is not None:
         make_folder(folder, ("report.html",))
@@ -91,7 +113,7 @@ def run(
         memory_bytes=round(_amount("--memory", memory)),
         again=again,
     )
-    where = Place(jobs or os.cpu_count() or 1, cluster)
+    where = Place(jobs or os.cpu_count() or 1, EXAMINER, LOADS, cluster)
     source = Archive(archive if "://" in archive else str(Path(archive).resolve()), patterns)
     with fleet_progress() as show:
         done = run_fleet(
@@ -100,14 +122,12 @@ def run(
     for line in _end_lines(done, output):
         click.echo(line)
     if folder is not None:
-        _write_page(output, folder)
+        answers.write_page(output, folder)
     raise SystemExit(EXIT_NO if done.done and done.failed == done.done else EXIT_DONE)
 
 
 def _end_lines(done: Progress, output: Path) -> list[str]:
     """What a run says in the end."""
-    from ahrsd.fleet.work import summary
-
     lines = [f"{output}: {counted(done.done, 'recording', ',')}: {summary(done.outcomes)}"]
     if done.before:
         lines.append(f"  {counted(done.before, 'recording', ',')} had a row already")
@@ -120,8 +140,6 @@ def _end_lines(done: Progress, output: Path) -> list[str]:
 
 
 def _levels(text: str) -> tuple[str, ...]:
-    from ahrsd.fleet.work import ROLES
-
     names = tuple(name.strip() for name in text.split(","))
     if wrong := [name for name in names if name not in (*ROLES, "-")]:
         raise AhrsdError(f"--folders {wrong[0]}: a level is one of {', '.join(ROLES)}, or -")
@@ -137,92 +155,5 @@ def _amount(option: str, text: str) -> float:
     return float(found[1]) * factor
 
 
-@command.command()
-@click.argument("output", metavar="OUT", type=_FOLDER)
-@click.option("--json", "json_path", help="The same as JSON into this file, - for stdout.")
-@click.option("--report", "folder", type=_FOLDER, help="A page about the fleet in here.")
-def status(output: Path, json_path: str | None, folder: Path | None) -> None:
-    """How many rows there are, of what, and whether a run is at work."""
-    from ahrsd.fleet.questions import Rows
-    from ahrsd.fleet.store import Store
-    from ahrsd.fleet.told import status_lines
-
-    refuse_unwritable(json_path)
-    store = Store(output)
-    store.check()
-    with Rows(store) as rows:
-        body = rows.counts()
-    body["at_work"], body["run"] = store.at_work(), store.told()
-    if json_path is not None:
-        write_json(json_path, body)
-    if json_path != "-":
-        for line in status_lines(str(output), body):
-            click.echo(line)
-    if folder is not None:
-        make_folder(folder, ("report.html",))
-        _write_page(output, folder)
-
-
-@command.command()
-@click.argument("output", metavar="OUT", type=_FOLDER)
-def compact(output: Path) -> None:
-    """Move rows that a run left in the spool into Parquet; a run does it by itself."""
-    from ahrsd.fleet.store import Store
-
-    store = Store(output)
-    store.check()
-    with store.alone():
-        moved = store.compact()
-    click.echo(
-        f"{output}: {counted(moved, 'row', ',')} moved; {counted(len(store.parts()), 'part')}"
-    )
-
-
-@command.command()
-@click.argument("output", metavar="OUT", type=_FOLDER)
-@click.argument("question", metavar="drift|recurring|failures|SELECT")
-@click.option("--json", "json_path", help="The whole answer as JSON into this file, - for stdout.")
-def ask(output: Path, question: str, json_path: str | None) -> None:
-    """What the rows of OUT say.
-
-    \b
-    drift       hard iron, gyro bias and heading error of each device over time and temperature,
-                with standard deviations and change points; largest heading error first
-    recurring   findings more frequent on a device, a vehicle, at a place or a temperature
-    failures    what gave no answer, and why
-    SELECT ...  one query over the table `recordings`; nothing can be written
-    """
-    from ahrsd.fleet import told
-    from ahrsd.fleet.questions import Answered, Rows
-    from ahrsd.fleet.store import Store
-
-    refuse_unwritable(json_path)
-    answer: Answered
-    with Rows(Store(output)) as rows:
-        if question == "drift":
-            found = rows.drift()
-            body, lines = [one.json() for one in found], told.drift_lines(found)
-        else:
-            if question == "recurring":
-                answer = rows.recurring()
-                lines = told.recurring_lines(answer)
-            elif question == "failures":
-                answer = rows.failures()
-                lines = told.failure_lines(answer)
-            else:
-                answer = rows.sql(question)
-                lines = told.table_lines(answer.columns, answer.rows)
-            body = answer.json()
-    if json_path is not None:
-        write_json(json_path, body)
-    if json_path != "-":
-        for line in lines:
-            click.echo(line)
-
-
-def _write_page(output: Path, folder: Path) -> None:
-    from ahrsd.fleet.page import write_page
-
-    path = folder / "report.html"
-    write_page(output, path)
-    click.echo(f"report: {path}")
+for _other in (answers.status, answers.compact, answers.ask):
+    command.add_command(_other)
