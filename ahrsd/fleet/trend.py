@@ -27,6 +27,7 @@ _SPREAD_C = 1.0  # standard deviation of temperature below which nothing can be 
 _KNOWN = 0.8  # of the points, that have to have a temperature
 _MAD = 1.4826
 _TINY = 1e-12
+_DEPENDENT = 1e-10  # eigenvalue of columns of length one, below which they depend on others
 _ROUNDS = 4  # of fits without points that stood alone
 
 _Rows = NDArray[np.int64]
@@ -242,8 +243,11 @@ def _lines(series: Series) -> Array:
 
 
 def _basis(X: Array) -> Array:
-    """(D, N, p) with orthonormal columns; 0 for what depends on columns before it."""
-    Q, R = np.linalg.qr(X)
-    size = np.abs(np.diagonal(R, axis1=1, axis2=2))
-    kept: Array = Q * (size > 1e-9 * np.maximum(size.max(axis=1), _TINY)[:, None])[:, None, :]
-    return kept
+    """(D, N, p): orthonormal columns that span those of X, and 0 for what these depend on."""
+    size = np.linalg.norm(X, axis=1, keepdims=True)
+    unit = X / np.where(size > 0.0, size, 1.0)
+    weight, turn = np.linalg.eigh(unit.transpose(0, 2, 1) @ unit)
+    kept = weight > _DEPENDENT
+    scale = np.where(kept, 1.0 / np.sqrt(np.where(kept, weight, 1.0)), 0.0)
+    spanned: Array = unit @ (turn * scale[:, None, :])
+    return spanned

@@ -68,6 +68,16 @@ def test_two_steps_are_told_in_order():
     assert found.changes[1].size == pytest.approx(-2 * STEP, abs=1e-3)
 
 
+@pytest.mark.parametrize("n", [8, 12, 60])
+def test_a_step_is_one_step_where_no_temperature_is_known(n):
+    one = series(6, n, step_at=n // 2, warm=False)
+    one.values[:] = 0.1 + np.arange(n)[:, None] // (n // 2) * STEP  # without any scatter
+    (found,) = trends([one])
+    (change,) = found.changes
+    assert change.after_day == one.day[n // 2]
+    assert change.size == pytest.approx(STEP, rel=1e-6)
+
+
 def test_what_a_series_does_not_tell_is_nan():
     cold, two = series(1, warm=False), series(1, 2)
     found = trends([cold, two])
