@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive, ArchiveEntry
 from ahrsd.fleet.guard import Guard, Task
 from ahrsd.fleet.row import ANSWERED
@@ -98,10 +99,16 @@ def run(
         progress = _planned(archive, orders, known)
         tell(progress)
         missing = (one for one in archive.entries() if not known.holds(stamp(one, orders)))
-        if progress.total:
-            _through(missing, orders, place, store, progress, tell)
-        store.compact()
-        store.tell(progress.json())
+        try:
+            if progress.total:
+                _through(missing, orders, place, store, progress, tell)
+            store.compact()
+            store.tell(progress.json())
+        except OSError as error:
+            raise AhrsdError(
+                f"{orders.out}: a row cannot be written: {error.strerror or error}; all rows so "
+                "far are kept: make room, then the same command"
+            ) from error
     return progress
 
 

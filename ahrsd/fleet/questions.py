@@ -237,6 +237,18 @@ def _drifts(devices: list[tuple[Any, ...]], table: Array) -> Iterator[DeviceDrif
 
 
 def _opened(store: Store) -> duckdb.DuckDBPyConnection:
+    """A connection to the rows; where a part was replaced meanwhile, to the new ones."""
+    import duckdb
+
+    for _ in range(_RACES):
+        try:
+            return _connected(store)
+        except duckdb.IOException:
+            continue
+    return _connected(store)
+
+
+def _connected(store: Store) -> duckdb.DuckDBPyConnection:
     """A connection that can read the rows and nothing else, and write nothing."""
     import duckdb
 

@@ -38,6 +38,7 @@ from ahrsd.fleet.row import ANSWERED, COLUMNS, Row
 _FORMAT = "ahrsd.fleet/1"
 _SMALL_ROWS = 4096  # a part with fewer takes the next rows of its device
 _UNKNOWN = "unknown"
+_RACES = 20  # times that the list of parts may change while they are read
 
 _TYPES: dict[str, Any] = {
     "text": pyarrow.string(),
@@ -101,8 +102,13 @@ class Store:
         """Whether a row with this key is there; without `failures` only one with an answer."""
         if (self.spool / f"{key}.json").exists():
             return True
-        parts = tuple(self.parts())
-        return bool(parts) and _known(parts, "key", failures).holds(key)
+        for _ in range(_RACES):
+            parts = tuple(self.parts())
+            try:
+                return bool(parts) and _known(parts, "key", failures).holds(key)
+            except FileNotFoundError:  # the driver has just replaced one: the list has changed
+                continue
+        raise AhrsdError(f"{self._list}: names parts that are not there; give another folder")
 
     def spooled(self) -> Iterator[Row]:
         """The rows that are in no part yet; one that is moved meanwhile is left out."""

@@ -105,6 +105,19 @@ def test_what_is_known_may_leave_failures_out(tmp_path):
     assert not store.has(f"{2:032x}", failures=False)
 
 
+def test_a_part_that_is_replaced_while_a_worker_looks_is_looked_up_again(tmp_path, monkeypatch):
+    store = store_of(tmp_path / "out", [row(1)])
+    old = store.parts()
+    store.put(row(2))
+    store.compact()  # the first part is gone
+    lists = iter([old, store.parts(), store.parts()])
+    monkeypatch.setattr(Store, "parts", lambda _: next(lists))
+    assert store.has(f"{1:032x}", failures=True)
+    monkeypatch.setattr(Store, "parts", lambda _: old)
+    with pytest.raises(AhrsdError, match="names parts that are not there"):
+        store.has(f"{3:032x}", failures=True)
+
+
 def test_nothing_is_known_of_nothing():
     assert not Known([]).holds("0" * 32)
 
