@@ -22,6 +22,7 @@ import resource
 import signal
 import time
 from collections.abc import Callable
+from concurrent.futures import CancelledError, wait
 from concurrent.futures import TimeoutError as LateError
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,7 @@ TRIES = 3
 _RECYCLED = 500  # recordings after which a process is replaced: whatever leaked is gone
 _PR_SET_PDEATHSIG = 1
 _START_S = 120.0
+_LOOKS_S = 0.5
 #: read by the processes when they load numpy and Arrow
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
 Task = Callable[[ArchiveEntry, Orders], Answer]
@@ -62,7 +64,7 @@ class Guard:
         sweep()
         for name, value in _ENVIRONMENT.items():
             os.environ.setdefault(name, value)
-        self._task, self._memory_bytes = task, memory_bytes
+        self._task, self._memory_bytes, self._closed = task, memory_bytes, False
         self._pool: ProcessPool = ProcessPool(
             processes,
             max_tasks=_RECYCLED,
@@ -80,11 +82,16 @@ class Guard:
             future = self._pool.schedule(
                 self._task, args=[entry, orders], timeout=orders.limit_s or None
             )
+            while not wait([future], _LOOKS_S).done:
+                if self._closed:  # the pool leaves what it was at without an answer
+                    raise CancelledError
             error = future.exception()
             if error is None:
                 answer: Answer = future.result()
                 return answer
             outcome, words = self._loss(error, orders)
+            if self._closed:
+                raise CancelledError
             if outcome == rows.CRASHED and number < TRIES:
                 continue
             spent = time.monotonic() - begun
@@ -107,6 +114,7 @@ class Guard:
 
     def close(self) -> None:
         """End the processes; what they were at has no row yet."""
+        self._closed = True
         self._pool.stop()  # type: ignore[no-untyped-call]
         self._pool.join()
 
