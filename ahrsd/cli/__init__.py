@@ -24,6 +24,7 @@ COMMANDS: dict[str, str] = {
     "simulate": "A recording of a scenario, with the truth beside it.",
     "montecarlo": "Accuracy of the methods against truth and against the Cramér-Rao bound.",
     "diagnose": "Where a simulation and a recording differ, and which physics was left out.",
+    "fleet": "An archive of recordings: every one calibrated and diagnosed, and what all say.",
     "challenge": "Sealed blind trials of `diagnose`: make cases, run tools, score.",
     "operator": "A person's word to the running daemon: approve, lock, unlock, rollback.",
     "status": "How the running daemon stands.",

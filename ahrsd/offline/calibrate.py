@@ -7,8 +7,8 @@ the registers of its time; all of its samples then go through an estimator of th
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from ahrsd.events import Estimated, Event, SamplesSeen
 from ahrsd.offline.replay import Replayed, replay
 from ahrsd.offline.track import faults, without_terms
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.report.calibration_json import calibration_json, why_not_converged
 from ahrsd.report.summary import serial_of, warnings_of
 
@@ -34,6 +34,7 @@ class BatchResult:
     """What `ahrsd calibrate` says.
 
     wrong: units, axes, signs and times that cannot be as recorded, in words
+    facts: what the recording says of itself: a capture's header, or those of another program's
     """
 
     name: str
@@ -43,6 +44,7 @@ class BatchResult:
     warnings: tuple[str, ...]
     misalignment: Misalignment | None = None
     wrong: tuple[str, ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def samples(self) -> int:
@@ -107,6 +109,7 @@ class BatchResult:
             raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
 
 
+@on_one_thread
 def calibrate(
     path: Path,
     config: Config,
@@ -149,7 +152,14 @@ def calibrate(
         *([] if calibrator.step is None else [calibrator.step.words]),
     )
     return BatchResult(
-        done.recording.name, done.core, estimate, tuple(seen), warnings, turned, tuple(wrong)
+        done.recording.name,
+        done.core,
+        estimate,
+        tuple(seen),
+        warnings,
+        turned,
+        tuple(wrong),
+        {**done.recording.header, **done.recording.facts},
     )
 
 

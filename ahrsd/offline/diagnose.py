@@ -24,7 +24,7 @@ from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.track import checked, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import TABLE_ROWS
+from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.recording.opening import open_recording
 from ahrsd.samples import SampleBlock
 
@@ -147,6 +147,7 @@ def load_model(path: Path) -> RepairedModel:
         raise AhrsdError(f"{path}: {error}") from None
 
 
+@on_one_thread
 def diagnose_recording(
     real: Path,
     *,

@@ -41,7 +41,7 @@ from ahrsd.offline.replay import replay
 from ahrsd.printable import printable
 from ahrsd.recording.bytestream import read_chunks
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import TABLE_BYTES, TABLE_ROWS, refuse_beyond
+from ahrsd.recording.limits import TABLE_BYTES, TABLE_ROWS, on_one_thread, refuse_beyond
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array
@@ -60,6 +60,7 @@ _GPS_TIME = ("t_s", "time_s")
 _GPS_PLACE = ("lat_deg", "lon_deg")
 
 
+@on_one_thread
 def evaluate(
     recording: Path,
     calibration_path: Path,

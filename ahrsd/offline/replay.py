@@ -21,7 +21,7 @@ from ahrsd.daemon.core_runner import Listener, Shell, Viewer
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, RegistersKnown, Samples, TermsKnown
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
-from ahrsd.recording.limits import GARBAGE_BYTES, refuse_beyond
+from ahrsd.recording.limits import GARBAGE_BYTES, on_one_thread, refuse_beyond
 from ahrsd.recording.opening import Recording, RecordingKind, open_recording
 from ahrsd.stream.assembler import NoSamplesError
 from ahrsd.writeback.permissions import Mode
@@ -47,6 +47,7 @@ class Replayed:
         return CONFIG_KEY in self.recording.header
 
 
+@on_one_thread
 def replay(
     path: Path,
     config: Config,

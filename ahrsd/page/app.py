@@ -122,7 +122,7 @@ class Fanout:
             self.browsers -= 1
 
 
-class Guard:
+class HostGuard:
     """Refuses requests under foreign names, and puts the headers on every answer."""
 
     def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
@@ -205,7 +205,7 @@ def make_app(site: Site) -> Starlette:
         Route("/static/{name}", static),
         Route("/approve", approve, methods=["POST"]),
     ]
-    guard = Middleware(Guard, names=site.names)
+    guard = Middleware(HostGuard, names=site.names)
     app = Starlette(routes=routes, middleware=[guard], lifespan=life)
     app.state.fanout = fanout
     return app

@@ -28,7 +28,7 @@ _AGAINST = frozenset({State.ROLLED_BACK, State.LOCKED, State.FAULT, State.FLASH_
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Known:
+class ChoiceFacts:
     """What the choice depends on.
 
     unit:    who the device is; None where nobody asked it
@@ -92,7 +92,7 @@ class Chooser:
     _made_from: tuple[object, ...] = ()
     _made: InUse | None = field(default=None)
 
-    def choose(self, known: Known) -> InUse:
+    def choose(self, known: ChoiceFacts) -> InUse:
         """The calibration of what comes now."""
         basis = known.unit, tuple(known.registers.get(number) for number in _COMPENSATING)
         if basis != self._basis:
@@ -108,7 +108,7 @@ class Chooser:
             self._made, self._made_from = self._make(known), made_from
         return self._made
 
-    def _make(self, known: Known) -> InUse:
+    def _make(self, known: ChoiceFacts) -> InUse:
         device = Compensation.from_registers(known.registers)
         registers = InUse(device.mag, device.gyro, device.accel, device.rotation)
         estimate = known.estimate if known.trusted else None

@@ -11,7 +11,7 @@ from ahrsd.core.core import Core
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.sharing.nmea import attitude, hdm, xdr
 from ahrsd.sharing.tilt import Tilt, pitch_deg, roll_deg
-from ahrsd.telemetry.calibration_in_use import QUALIFIED, Chooser, InUse, Known
+from ahrsd.telemetry.calibration_in_use import QUALIFIED, Chooser, InUse, ChoiceFacts
 from ahrsd.telemetry.corrected import headings_deg, sample_records, state_record
 from ahrsd.telemetry.protocol import line_of
 from ahrsd.telemetry.records import Record
@@ -124,11 +124,11 @@ def _pitch_roll(block: SampleBlock) -> tuple[Array, Array] | None:
     return pitch, roll
 
 
-def _known(core: Core) -> Known:
+def _known(core: Core) -> ChoiceFacts:
     """What the choice of a calibration depends on, now."""
     session, calibrator = core.device_session, core.calibrator
     estimate = calibrator.estimate
-    return Known(
+    return ChoiceFacts(
         None if session.identity is None else session.identity.unit,
         core.registers,
         core.writeback.state,

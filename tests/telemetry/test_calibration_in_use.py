@@ -10,7 +10,7 @@ from cabled_run import BIAS, IRON, estimate
 
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.telemetry.calibration_in_use import QUALIFIED, REGISTERS, Chooser, Known
+from ahrsd.telemetry.calibration_in_use import QUALIFIED, REGISTERS, Chooser, ChoiceFacts
 from ahrsd.writeback.composition import compose
 from ahrsd.writeback.states import State
 
@@ -18,7 +18,7 @@ ONE = Affine.identity().to_register()
 FACTORY = {23: ONE, 25: ONE, 84: ONE, 26: (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)}
 PROPOSAL = compose(estimate(), FACTORY)
 WRITTEN = {**FACTORY, **PROPOSAL.new}
-NOW = Known("unit", FACTORY, State.QUALIFIED, PROPOSAL, estimate(), trusted=True)
+NOW = ChoiceFacts("unit", FACTORY, State.QUALIFIED, PROPOSAL, estimate(), trusted=True)
 
 
 def block(raw, registers):

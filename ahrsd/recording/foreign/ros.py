@@ -485,6 +485,7 @@ def _sensors(path: Path, found: _Found, choice: Choice, topics: list[str]) -> Se
         out.accel, out.names["accel"] = accel.stream(shift_s, device), accel.name
     _covariates(found, out, gyro, shift_s, device)
     began = datetime.fromtimestamp(found.base_ns / 1e9, UTC).isoformat()
+    out.facts["recorded_utc"] = began
     clock = "the device's (TimeStartup)" if device else f"the headers' stamps, s since {began}"
     if not device and not (mag.has_stamps and gyro.has_stamps):
         clock = f"the recorder's, s since {began}"

@@ -1,0 +1,213 @@
+"""What a fleet costs beside its recordings: overhead, scaling, the driver's memory, questions.
+
+    python tests/benchmarks/bench_fleet.py overhead   ms a task beside the task, of all processes
+    python tests/benchmarks/bench_fleet.py scaling    recordings a minute, 1 and 2 processes
+    python tests/benchmarks/bench_fleet.py memory     the driver from 10^3 to 10^5 simulated tasks
+    python tests/benchmarks/bench_fleet.py ask        questions over 10^6 made-up rows
+    python tests/benchmarks/bench_fleet.py threads    CPU of a library caller, 1 BLAS thread or all
+
+`overhead` and `scaling` also say what a task of 2 s makes of it; `scaling` needs two idle cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+from fleet_kills import write_archive
+from fleet_rows import nothing, sleeping
+
+from ahrsd.cli.fleet import EXAMINER, LOADS
+from ahrsd.fleet.archive import Archive
+from ahrsd.fleet.driver import Place, run
+from ahrsd.fleet.questions import FleetRows
+from ahrsd.fleet.store import SCHEMA, Store
+from ahrsd.fleet.work import Orders
+
+TASK_S = 2.0
+DEVICES, DAY_MS = 500, 86_400_000
+
+
+def ran(
+    archive: Path, out: Path, jobs: int, task=EXAMINER, tell=lambda _: None
+) -> tuple[float, int]:
+    """Wall seconds between the first and the last answer, and how many."""
+    shutil.rmtree(out, ignore_errors=True)
+    begun: list[float] = []
+
+    def told(progress) -> None:
+        if progress.done:
+            begun.append(time.monotonic())
+            del begun[2:-1]
+        tell(progress)
+
+    done = run(
+        Archive(str(archive)),
+        Orders(out=str(out)),
+        Place(jobs, task, LOADS if task is EXAMINER else ()),
+        told,
+    )
+    return begun[-1] - begun[0], done.done - 1
+
+
+def simulated(folder: Path, number: int, milliseconds: int) -> Path:
+    """An archive of tasks that sleep as long as their file is large."""
+    archive = folder / f"archive{number}"
+    for i in range(number):
+        own = archive / f"rov{i // 1000}"
+        own.mkdir(parents=True, exist_ok=True)
+        (own / f"{i}.mcap").write_bytes(bytes(milliseconds))
+    return archive
+
+
+def overhead(folder: Path) -> None:
+    for milliseconds, number in ((0, 2000), (200, 200)):
+        archive = simulated(folder / str(milliseconds), number, milliseconds)
+        cpu = _cpu()
+        wall_s, count = ran(archive, folder / "out", 2, sleeping)
+        beside_ms = 1e3 * (2 * wall_s / count) - milliseconds
+        print(
+            f"tasks of {milliseconds} ms, 2 processes: {beside_ms:.2f} ms beside each "
+            f"({beside_ms / TASK_S / 10:.2f} % of one of {TASK_S:g} s), "
+            f"{1e3 * (_cpu() - cpu) / count:.2f} ms CPU with starting and compacting"
+        )
+
+
+def scaling(folder: Path) -> None:
+    write_archive(folder / "archive", 24, seconds=60.0)
+    rates = []
+    for jobs in (1, 2):
+        wall_s, count = ran(folder / "archive", folder / f"out{jobs}", jobs)
+        rates.append(60.0 * count / wall_s)
+        print(f"{jobs} processes: {rates[-1]:.1f} recordings a minute")
+    print(f"2 processes are {rates[1] / rates[0]:.2f} times as fast as one")
+
+
+def memory(folder: Path, most: int, *, kept: bool) -> None:
+    """Resident size of the driver as the tasks go by."""
+    archive = simulated(folder, most, 0)
+    said: dict[int, float] = {}
+
+    def tell(progress) -> None:
+        for number in (1_000, 10_000, 30_000, 100_000):
+            if progress.done == number:
+                said[number] = _resident_mb()
+                print(f"{number:,} tasks: {said[number]:.1f} MB", flush=True)
+
+    wall_s, count = ran(archive, folder / "out", 2, sleeping if kept else nothing, tell)
+    print(f"{count:,} tasks in {wall_s:.0f} s; {len(Store(folder / 'out').parts())} parts")
+
+
+def ask(folder: Path, rows: int) -> None:
+    store = made_up(folder / "rows", rows)
+    size = sum(part.stat().st_size for part in store.parts()) / 1e6
+    print(f"{rows:,} rows, {len(store.parts())} parts, {size:.0f} MB")
+    begun = time.monotonic()
+    known = store.known("stamp", failures=True)
+    print(f"what a resumed run reads: {time.monotonic() - begun:.2f} s, {len(known):,} stamps")
+    begun = time.monotonic()
+    with FleetRows(store) as asked:
+        print(f"opened in {time.monotonic() - begun:.2f} s")
+        for question in (asked.drift, asked.recurring, asked.failures, asked.counts):
+            for _ in range(2):
+                begun, cpu = time.monotonic(), time.process_time()
+                question()
+                print(
+                    f"{question.__name__}: {time.monotonic() - begun:.2f} s, "
+                    f"{time.process_time() - cpu:.2f} s CPU"
+                )
+        stepped = [one for one in asked.drift() if one.iron.changes]
+    print(f"devices with a step: {len(stepped)} (one in ten has one)")
+
+
+def made_up(root: Path, rows: int) -> Store:
+    """A store of devices of which one in ten steps by 10 mG on each axis half-way."""
+    rng = np.random.default_rng(0)
+    store = Store(root)
+    store.create()
+    each = rows // DEVICES
+    for device in range(DEVICES):
+        at = 20_000 * DAY_MS + np.sort(rng.integers(0, 365 * DAY_MS, each))
+        step = 0.01 * (np.arange(each) > each // 2) if device % 10 == 0 else 0.0
+        names = [f"{device * each + i:032x}" for i in range(each)]
+        found = np.where(rng.random(each) > 0.8, 1, 0)
+        finding = {"effect": "motor_current", "probability": 0.9, "frame": "sensor", "words": "w"}
+        columns = {
+            "key": names, "stamp": names, "version": ["0.1.0"] * each, "options": [""] * each,
+            "outcome": ["done"] * each, "serial_number": [100_032_000 + device] * each,
+            "vehicle": [f"rov{device % 50}"] * each, "recorded_by": ["its name"] * each,
+            "recorded_utc": pyarrow.array(at).cast(pyarrow.timestamp("ms")),
+            "temperature_c": rng.normal(15.0, 5.0, each), "converged": rng.random(each) > 0.2,
+            "field_gauss": np.full(each, 0.5), "heading_sigma_deg": rng.random(each),
+            "findings": [[finding] if one else [] for one in found], "seconds": np.full(each, 2.0),
+            **{f"hard_iron_{a}_gauss": rng.normal(0.05, 0.002, each) + step for a in "xyz"},
+            **{f"hard_iron_sigma_{a}_gauss": np.full(each, 1e-4) for a in "xyz"},
+            **{f"gyro_bias_{a}_rad_s": rng.normal(0.0, 1e-3, each) for a in "xyz"},
+            **{f"gyro_bias_sigma_{a}_rad_s": np.full(each, 1e-4) for a in "xyz"},
+        }  # fmt: skip
+        empty = {one.name: pyarrow.nulls(each, one.type) for one in SCHEMA}
+        store.add_part(pyarrow.table({**empty, **columns}, schema=SCHEMA))
+    return store
+
+
+def threads(folder: Path) -> None:
+    write_archive(folder / "archive", 1, seconds=120.0)
+    (path,) = (folder / "archive").rglob("*.parquet")
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from ahrsd.offline.diagnose import diagnose_recording as ask\n"
+        "ask = ask if sys.argv[2] == 'one' else ask.__wrapped__\n"
+        "t = time.process_time(); ask(Path(sys.argv[1])); print(time.process_time() - t)"
+    )
+    env = {name: value for name, value in os.environ.items() if "OPENBLAS" not in name}
+    for how in ("one", "all"):
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(path), how],
+            env=env, check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        print(f"diagnose as a library, {how}: {float(done.stdout):.2f} s CPU")
+
+
+def _cpu() -> float:
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def main() -> None:
+    words = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    words.add_argument("what", choices=["overhead", "scaling", "memory", "ask", "threads"])
+    words.add_argument("--most", type=int, help="Tasks of memory, rows of ask.")
+    words.add_argument("--rows", action="store_true", help="Tasks of memory leave their rows.")
+    given = words.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="bench-fleet-"))
+    try:
+        if given.what == "memory":
+            memory(folder, given.most or 100_000, kept=given.rows)
+        elif given.what == "ask":
+            ask(folder, given.most or 1_000_000)
+        else:
+            {"overhead": overhead, "scaling": scaling, "threads": threads}[given.what](folder)
+    finally:
+        shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    main()

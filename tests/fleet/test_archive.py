@@ -1,0 +1,88 @@
+"""Which files of an archive are recordings, on a disk and behind fsspec."""
+
+from __future__ import annotations
+
+import pytest
+
+from ahrsd.errors import AhrsdError
+from ahrsd.fleet.archive import Archive, local_file
+
+FILES = ("rov1/harbour/a.mcap", "rov1/b.csv.gz", "c.ULG", "rov2/d.vnraw")
+OTHERS = ("readme.md", "rov1/b.csv.gz.truth.json", "rov1/b.gps.csv.gz", "rov2/.hidden.csv")
+
+
+@pytest.fixture
+def archive(tmp_path):
+    for name in (*FILES, *OTHERS):
+        path = tmp_path / "archive" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    return tmp_path / "archive"
+
+
+def names(entries, root):
+    return sorted(entry.url.removeprefix(f"{root}/") for entry in entries)
+
+
+def test_recordings_are_told_by_their_names_and_others_are_counted(archive):
+    left_out = []
+    entries = list(Archive(str(archive)).entries(left_out.append))
+    assert names(entries, archive) == sorted(FILES)
+    assert sorted(left_out) == ["b.csv.gz.truth.json", "b.gps.csv.gz", "readme.md"]
+    folders = {entry.url.rpartition("/")[2]: entry.folders for entry in entries}
+    assert folders["a.mcap"] == ("rov1", "harbour")
+    assert folders["c.ULG"] == ()
+
+
+def test_patterns_replace_the_suffixes(archive):
+    entries = Archive(str(archive), ("*.md", "a.*")).entries()
+    assert names(entries, archive) == ["readme.md", "rov1/harbour/a.mcap"]
+
+
+def test_a_folder_of_ros_2_is_one_recording(archive):
+    bag = archive / "rov3" / "bag"
+    bag.mkdir(parents=True)
+    (bag / "metadata.yaml").write_text("x")
+    (bag / "bag_0.db3").write_bytes(b"12345")
+    found = {entry.url: entry for entry in Archive(str(archive)).entries()}
+    assert f"{bag}/bag_0.db3" not in found
+    assert found[str(bag)].size_bytes == 6
+    assert found[str(bag)].folders == ("rov3",)
+
+
+def test_fsspec_lists_the_same_and_gives_the_bytes(archive):
+    pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
+    root = f"file://{archive}"
+    entries = list(Archive(root).entries())
+    assert names(entries, root) == sorted(FILES)
+    one = next(entry for entry in entries if entry.url.endswith("a.mcap"))
+    assert one.folders == ("rov1", "harbour")
+    assert one.size_bytes == len(FILES[0])
+    with local_file(one) as path:
+        assert path != archive / FILES[0]
+        assert path.name == "a.mcap"
+        assert path.read_bytes() == FILES[0].encode()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("root", "words"),
+    [
+        ("{}/none", "does not exist; give the folder"),
+        ("{}/c.ULG", "is no folder"),
+        ("file://{}/none", "is no folder"),
+        ("nobody://x", "Protocol not known"),
+        ("s3://bucket/dives", "pip install 'ahrsd[s3]'"),
+    ],
+)
+def test_what_cannot_be_listed_is_said(archive, root, words):
+    if root.startswith("s3"):
+        try:
+            import s3fs  # noqa: F401
+        except ImportError:
+            pass
+        else:
+            pytest.skip("s3fs is installed")
+    with pytest.raises(AhrsdError) as told:
+        list(Archive(root.format(archive)).entries())
+    assert words in str(told.value)

@@ -1,0 +1,90 @@
+"""Whatever a task does, it is one row, and the others go on."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from fleet_rows import by_name, nothing
+
+from ahrsd.errors import AhrsdError
+from ahrsd.fleet import guard
+from ahrsd.fleet.archive import Archive, ArchiveEntry
+from ahrsd.fleet.driver import Place, answers, run
+from ahrsd.fleet.store import Store
+from ahrsd.fleet.work import Answer, Orders
+
+pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
+
+NAMES = ("good1", "hang", "good2", "hog", "kill", "good3", "once", "bug", "good4")
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("guarded")
+    (folder / "archive").mkdir()
+    for name in NAMES:
+        (folder / "archive" / f"{name}.mcap").write_bytes(name.encode())
+    orders = Orders(out=str(folder / "out"), limit_s=9.0, memory_bytes=1 << 30)
+    begun = time.monotonic()
+    done = run(Archive(str(folder / "archive")), orders, Place(2, by_name), lambda _: None)
+    assert time.monotonic() - begun < 120
+    table, parts = Store(folder / "out").rows()
+    assert (table.num_rows, len(parts)) == (0, 1)
+    import pyarrow.parquet
+
+    found = pyarrow.parquet.read_table(parts[0], partitioning=None).to_pylist()
+    assert done.done == len(found) == len(NAMES)
+    return {one["recording"].rpartition("/")[2].removesuffix(".mcap"): one for one in found}
+
+
+def test_good_ones_are_done_beside_bad_ones(ended):
+    good = [ended[name]["outcome"] for name in NAMES if "good" in name]
+    assert good == ["done"] * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "outcome", "words"),
+    [
+        ("hang", "too slow", "stopped after 9 s (--limit)"),
+        ("hog", "out of memory", "asked for more than 1024 MiB (--memory)"),
+        ("kill", "crashed", "its process ended by signal 9 (SIGKILL), 3 times"),
+        ("bug", "internal error", "KeyError: 'nobody foresaw it'"),
+    ],
+)
+def test_a_failure_is_a_row_with_its_words(ended, name, outcome, words):
+    assert (ended[name]["outcome"], ended[name]["error"]) == (outcome, words)
+    assert len(ended[name]["content_sha256"]) == 64
+
+
+def test_what_was_killed_once_is_done_at_the_second_try(ended):
+    assert ended["once"]["outcome"] == "done"
+    assert ended["kill"]["tries"] == guard.TRIES == 3
+
+
+def test_no_more_are_in_flight_than_the_window():
+    from concurrent.futures import Future
+
+    flying: list[Future[Answer]] = []
+    most = 0
+
+    def submit(entry: ArchiveEntry) -> Future[Answer]:
+        nonlocal most
+        future: Future[Answer] = Future()
+        flying.append(future)
+        most = max(most, len(flying))
+        if len(flying) == 5 or entry.url == "99":
+            for one in flying:
+                one.set_result(nothing(entry, Orders(out="")))
+            flying.clear()
+        return future
+
+    entries = (ArchiveEntry(str(i), 0, "") for i in range(100))
+    assert len(list(answers(entries, submit, 5))) == 100
+    assert most == 5
+
+
+def test_without_pebble_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(AhrsdError, match=r"pip install 'ahrsd\[fleet\]'"):
+        guard.Guard(1, 0, nothing)
