@@ -11,7 +11,7 @@ from ahrsd.core.core import Core
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.sharing.nmea import attitude, hdm, xdr
 from ahrsd.sharing.tilt import Tilt, pitch_deg, roll_deg
-from ahrsd.telemetry.calibration_in_use import QUALIFIED, Chooser, InUse, ChoiceFacts
+from ahrsd.telemetry.calibration_in_use import QUALIFIED, ChoiceFacts, Chooser, InUse
 from ahrsd.telemetry.corrected import headings_deg, sample_records, state_record
 from ahrsd.telemetry.protocol import line_of
 from ahrsd.telemetry.records import Record
