@@ -218,57 +218,6 @@ def test_the_daemon_under_a_real_systemd(machine):
     assert machine.show("ahrsd", "Result") == "success"
 
 
-_ASK = """import sys, urllib.request
-print(urllib.request.urlopen("http://127.0.0.1:9191/").read().decode())"""
-
-
-def user_of(machine, unit):
-    pid = machine.show(unit, "MainPID")
-    return machine.run("stat", "-c", "%u", f"/proc/{pid}").stdout.strip()
-
-
-def page(machine):
-    return machine.run(sys.executable, "-c", _ASK, check=False).stdout
-
-
-@pytest.mark.timeout(240)
-def test_the_page_beside_it(machine):
-    """It shows as a stranger to the daemon; with the drop-in it may say an operator's word."""
-    machine.run("ip", "link", "set", "lo", "up")
-    machine.run("systemctl", "start", "ahrsd", "ahrsd-page")
-    device = emulate(machine)
-    try:
-        machine.until(lambda: "OBSERVING" in page(machine), 60, "a page that shows the device")
-        assert "<form" not in page(machine)
-        assert user_of(machine, "ahrsd-page") != user_of(machine, "ahrsd")
-
-        # the page is stopped in the middle of everything: the daemon does not notice
-        before = machine.show("ahrsd", "NRestarts"), machine.show("ahrsd", "MainPID")
-        machine.run("kill", "-STOP", machine.show("ahrsd-page", "MainPID"))
-        time.sleep(3.0)
-        machine.run("kill", "-KILL", machine.show("ahrsd-page", "MainPID"))
-        assert machine.show("ahrsd", "StatusText").startswith("OBSERVING")
-        assert (machine.show("ahrsd", "NRestarts"), machine.show("ahrsd", "MainPID")) == before
-
-        system = "/etc/systemd/system"
-        token = "/etc/ahrsd-credentials/token"
-        machine.run("install", "-D", "-m", "644", f"{system}/ahrsd-token", token)
-        machine.run("cp", f"{system}/approve.conf", f"{system}/ahrsd-page.service.d/approve.conf")
-        machine.run("systemctl", "daemon-reload")
-        machine.run("systemctl", "restart", "ahrsd-page")
-        machine.until(lambda: "OBSERVING" in page(machine), 60, "a page that shows the device")
-        assert 'id="approve"' in page(machine)
-        assert user_of(machine, "ahrsd-page") == user_of(machine, "ahrsd")
-        # a word from the same sandbox and user, where what the daemon recorded is not there
-        machine.run("systemctl", "start", "ahrsd-word")
-        machine.until(lambda: "LOCKED" in page(machine), 20, "a lock that is shown")
-    finally:
-        machine.run("systemctl", "stop", "ahrsd-page", "ahrsd", check=False)
-        machine.run("rm", "-f", "/etc/systemd/system/ahrsd-page.service.d/approve.conf")
-        machine.run("systemctl", "daemon-reload")
-        unplug(machine, device)
-
-
 _SHARES = (
     _CONFIG
     + """
@@ -318,4 +267,55 @@ def test_network_shares_need_the_drop_in_of_the_operating_page(machine):
         machine.run("rm", "-f", more)
         machine.run("systemctl", "daemon-reload")
         machine.run("cp", "/etc/systemd/system/ahrsd.toml", "/etc/ahrsd.toml")
+        unplug(machine, device)
+
+
+_ASK = """import sys, urllib.request
+print(urllib.request.urlopen("http://127.0.0.1:9191/").read().decode())"""
+
+
+def user_of(machine, unit):
+    pid = machine.show(unit, "MainPID")
+    return machine.run("stat", "-c", "%u", f"/proc/{pid}").stdout.strip()
+
+
+def page(machine):
+    return machine.run(sys.executable, "-c", _ASK, check=False).stdout
+
+
+@pytest.mark.timeout(240)
+def test_the_page_beside_it(machine):
+    """It shows as a stranger to the daemon; with the drop-in it may say an operator's word."""
+    machine.run("ip", "link", "set", "lo", "up")
+    machine.run("systemctl", "start", "ahrsd", "ahrsd-page")
+    device = emulate(machine)
+    try:
+        machine.until(lambda: "OBSERVING" in page(machine), 60, "a page that shows the device")
+        assert "<form" not in page(machine)
+        assert user_of(machine, "ahrsd-page") != user_of(machine, "ahrsd")
+
+        # the page is stopped in the middle of everything: the daemon does not notice
+        before = machine.show("ahrsd", "NRestarts"), machine.show("ahrsd", "MainPID")
+        machine.run("kill", "-STOP", machine.show("ahrsd-page", "MainPID"))
+        time.sleep(3.0)
+        machine.run("kill", "-KILL", machine.show("ahrsd-page", "MainPID"))
+        assert machine.show("ahrsd", "StatusText").startswith("OBSERVING")
+        assert (machine.show("ahrsd", "NRestarts"), machine.show("ahrsd", "MainPID")) == before
+
+        system = "/etc/systemd/system"
+        token = "/etc/ahrsd-credentials/token"
+        machine.run("install", "-D", "-m", "644", f"{system}/ahrsd-token", token)
+        machine.run("cp", f"{system}/approve.conf", f"{system}/ahrsd-page.service.d/approve.conf")
+        machine.run("systemctl", "daemon-reload")
+        machine.run("systemctl", "restart", "ahrsd-page")
+        machine.until(lambda: "OBSERVING" in page(machine), 60, "a page that shows the device")
+        assert 'id="approve"' in page(machine)
+        assert user_of(machine, "ahrsd-page") == user_of(machine, "ahrsd")
+        # a word from the same sandbox and user, where what the daemon recorded is not there
+        machine.run("systemctl", "start", "ahrsd-word")
+        machine.until(lambda: "LOCKED" in page(machine), 20, "a lock that is shown")
+    finally:
+        machine.run("systemctl", "stop", "ahrsd-page", "ahrsd", check=False)
+        machine.run("rm", "-f", "/etc/systemd/system/ahrsd-page.service.d/approve.conf")
+        machine.run("systemctl", "daemon-reload")
         unplug(machine, device)
