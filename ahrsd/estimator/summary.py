@@ -85,7 +85,7 @@ def widened_by(
     most = max(variances, key=lambda name: variances[name])
     if not variances[most] > 0.5 * sum(variances.values()):
         return ""
-    return f"heading known to {sigma_deg:.1f} deg (1 sigma) only: {_WIDENED[most]}"
+    return _WIDENED[most]
 
 
 def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:

@@ -56,7 +56,7 @@ def calibration_json(
     if estimate is None:
         return base | _nothing(warnings)
     written, refusal = _registers(estimate, registers, gyro_is_raw)
-    widened = [estimate.widened_by] if estimate.widened_by else []
+    widened = [f"most of the heading's sigma: {estimate.widened_by}"] * bool(estimate.widened_by)
     not_yet = why_not_converged(estimate, wrong)
     said = [*warnings, *estimate.warnings, *refusal, *not_yet, *widened]
     return (

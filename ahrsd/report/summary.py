@@ -163,6 +163,7 @@ def estimate_lines(estimate: Estimate | None, wrong: Sequence[str] = ()) -> list
         f"  hard iron  {', '.join(values[:3])} mG",
         f"  gyro bias  {', '.join(values[3:])} mrad/s",
         f"  heading    {heading_words(estimate.heading_sigma_deg)}",
+        *([f"             most of it: {estimate.widened_by}"] if estimate.widened_by else []),
         *([f"  lag        the field is {late_ms:.1f} ms late against the gyro"] if late_ms else []),
         *(f"  {text}" for text in why_not_converged(estimate, wrong)),
     ]

@@ -1,0 +1,29 @@
+"""What an estimate says in lines for a person."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from cabled_run import estimate
+
+from ahrsd.report.calibration_json import calibration_json
+from ahrsd.report.summary import estimate_lines
+
+ADVICE = "the gyro's scales may be off by a percent: turn about every axis, and back again"
+
+
+def test_what_makes_the_most_of_the_sigma_is_told_below_the_heading():
+    found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
+    assert estimate_lines(found) == [
+        "  hard iron  +50.00 +- 0.10, -30.00 +- 0.10, +40.00 +- 0.10 mG",
+        "  gyro bias  +10.000 +- 0.100, -20.000 +- 0.100, +5.000 +- 0.100 mrad/s",
+        "  heading    known to 1.70 deg (1 sigma, worst direction)",
+        f"             most of it: {ADVICE}",
+    ]
+    assert len(estimate_lines(replace(found, widened_by=""))) == 3
+
+
+def test_and_is_a_warning_for_programs():
+    found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
+    said = calibration_json("x", found, {}, method="magyc", samples=1, gyro_is_raw=True)
+    assert said["warnings"] == [f"most of the heading's sigma: {ADVICE}"]
