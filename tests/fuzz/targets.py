@@ -29,7 +29,8 @@ from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 
 Target = Callable[[bytes], None]
-_FOLDER = Path(tempfile.mkdtemp(prefix="ahrsd-fuzz-"))
+_SCRATCH = tempfile.TemporaryDirectory(prefix="ahrsd-fuzz-")  # gone with the process
+_FOLDER = Path(_SCRATCH.name)
 
 
 def deframer(data: bytes) -> None:
