@@ -16,6 +16,7 @@ from __future__ import annotations
 import ctypes
 import importlib
 import importlib.util
+import logging
 import multiprocessing
 import os
 import resource
@@ -129,6 +130,7 @@ def _begin(parent: int, memory_bytes: int, loads: tuple[str, ...]) -> None:
     if os.getppid() != parent:  # it died before that took effect
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver's to answer
+    logging.getLogger("ahrsd").setLevel(logging.CRITICAL)  # what a recording has to say: in its row
     for name in loads:  # now, so that the limit of time is the recording's alone
         importlib.import_module(name)
     if memory_bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,8 @@ from ahrsd.fleet.store import Store
 from ahrsd.fleet.work import Orders
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.diagnose import diagnose_recording
+from ahrsd.offline.simulate import write_experiment
+from ahrsd.simulation import ScenarioSettings, simulate
 
 pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
@@ -187,3 +190,16 @@ def test_a_run_refuses_a_place_where_another_is_at_work(archive, tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     with store.alone(), pytest.raises(AhrsdError, match="another `ahrsd fleet`"):
         ran(archive, tmp_path / "out")
+
+
+def test_what_a_recording_has_to_say_is_in_its_row_and_not_between_the_lines(tmp_path, capfd):
+    """The gyro's x axis is negated, which is told by the core while it reads, and by the verdict."""
+    made = simulate(ScenarioSettings("wam", "slow", seed=1, samples=3000))
+    gyro = made.samples.gyro_b_rad_s * [-1.0, 1.0, 1.0]
+    (tmp_path / "archive").mkdir()
+    mirrored = replace(made, samples=replace(made.samples, gyro_b_rad_s=gyro))
+    write_experiment(tmp_path / "archive" / "a.csv", mirrored)
+    ran(tmp_path / "archive", tmp_path / "out")
+    (only,) = rows(tmp_path / "out").values()
+    assert "the gyro's x y z are the magnetometer's -x y z" in only["verdict"]
+    assert capfd.readouterr().err == ""
