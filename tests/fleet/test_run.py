@@ -193,7 +193,7 @@ def test_a_run_refuses_a_place_where_another_is_at_work(archive, tmp_path):
 
 
 def test_what_a_recording_has_to_say_is_in_its_row_and_not_between_the_lines(tmp_path, capfd):
-    """The gyro's x axis is negated, which is told by the core while it reads, and by the verdict."""
+    """The gyro's x axis is negated, which the core tells while it reads, and the verdict."""
     made = simulate(ScenarioSettings("wam", "slow", seed=1, samples=3000))
     gyro = made.samples.gyro_b_rad_s * [-1.0, 1.0, 1.0]
     (tmp_path / "archive").mkdir()
