@@ -215,7 +215,7 @@ def variance_inflation(
 ) -> float:
     """By how much the information shrinks, at least 1.
 
-    smooth: what repeats is one unknown for each octant or so of directions, and not for each cell
+    smooth: what repeats is one unknown for each region of 45 deg of directions, not for each cell
     """
     repeats = max(0.0, 1.0 - _WHITE * (white_gauss / residual_gauss) ** 2)
     unknowns = cells.regions if smooth else cells.visited

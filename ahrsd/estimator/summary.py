@@ -77,7 +77,8 @@ def widened_by(
 ) -> str:
     """What makes more than half of the variance of a heading known to `sigma_deg`, in words.
 
-    parts: covariances (12, 12) that add up to that of the answer, more or less
+    c, down, dip_rad: as for `heading_sigma_deg`; parts: covariances (12, 12) by the names of
+    `_WIDENED`, which add up to that of the answer but for what they have in common
     """
     if not sigma_deg > _TELLS_DEG:
         return ""

@@ -3,7 +3,6 @@
     {"ask": "status"}                                one answer, `ahrsd.status/1`
     {"ask": "explain"}                               one answer, `ahrsd.explain/1`
     {"ask": "watch", "of": ["status", "events"]}     records until the client goes
-    {"ask": "tell", "verb": "lock", "argument": ".."}  a person's word (see `ahrsd operator`)
 
 Every record that is watched has a `seq`; where a slow reader lost some, a `gap` record says which.
 """
