@@ -150,7 +150,10 @@ class FleetRows:
                 raise AhrsdError("ask: one SELECT over the table `recordings` can be asked")
             return self._ask(query)
         except duckdb.Error as error:
-            raise AhrsdError(f"ask: {line(str(error).strip().partition(chr(10))[0])}") from error
+            words = line(str(error).strip().partition(chr(10))[0])
+            if isinstance(error, duckdb.ParserException):
+                words += "; a question is drift, recurring, failures, or a SELECT over `recordings`"
+            raise AhrsdError(f"ask: {words}") from error
 
     def _ask(self, query: str) -> AnswerTable:
         found = self._retried(query)

@@ -149,3 +149,10 @@ def test_the_page_in_a_browser(said, out, tmp_path, width_px):
     assert seen["headings"] == [
         "Fleet out", "Devices, worst first", "Drift", "Findings by vehicle", "What gave no answer",
     ]  # fmt: skip
+
+
+def test_a_question_that_is_none_is_told_which_there_are(said, out):
+    code, _, err = said("ask", out, "nonsense")
+    assert code == 2
+    assert err.endswith("a question is drift, recurring, failures, or a SELECT over `recordings`\n")
+    assert err.count("\n") == 1
