@@ -76,6 +76,7 @@ def _watch(place: DaemonPlace, server: FoxgloveServer, stopped: threading.Event)
     with place.connect() as daemon:
         topics = Topics(time.time() - time.monotonic())
         server.back()
+        click.echo(f"{daemon.path}: the daemon answers", err=True)
         for record in daemon.watch(("status", "events", "samples")):
             if stopped.is_set():
                 return

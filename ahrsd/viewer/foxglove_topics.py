@@ -4,7 +4,7 @@
 |---|---|---|
 | /magnetometer/raw, .../corrected | x, y, z, norm [gauss]; by register 23 in force | each sample |
 | /angular_rate | x, y, z [rad/s] | each sample |
-| /field/raw, /field/corrected | the same as a cloud of points [gauss]: a sphere where all is well | 1 s |
+| /field/raw, /field/corrected | a cloud of points [gauss]: a sphere where all is well | 1 s |
 | /attitude | heading now and by the newest estimate, roll, pitch [deg] | 1 s |
 | /estimate | hard iron [gauss], gyro bias [rad/s], heading's sigma [deg] | each estimate |
 | /write_back | state, what holds a write back | each change, 1 s |

@@ -169,6 +169,7 @@ def test_a_foxglove_reads_every_topic_and_can_write_to_none(shown):
         assert b"hello" in found["/log"]
         assert struct.pack("<3f", 0.2, 0.0, 0.0) in found["/field/corrected"]
         assert base64.b64decode(topics["/log"]["schema"])  # a Foxglove knows what it is
+    assert process.stderr.readline().endswith("socket: the daemon answers\n")
     process.send_signal(signal.SIGTERM)
     assert process.wait(10.0) == 0
 
