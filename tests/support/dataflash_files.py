@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-SIZES = {"Q": "Q", "I": "I", "B": "B", "H": "H", "h": "h", "f": "f", "c": "h", "C": "H", "L": "i", "e": "i",
-         "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
+SIZES = {"Q": "Q", "I": "I", "B": "B", "H": "H", "h": "h", "f": "f", "c": "h", "C": "H", "L": "i",
+         "e": "i", "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
 TYPES = {
     "PARM": (1, "QNf", "TimeUS,Name,Value"),
     "MSG": (2, "QZ", "TimeUS,Message"),
