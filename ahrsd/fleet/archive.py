@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,16 @@ SUFFIXES = (
 _BESIDE = ("*.gps.csv", "*.gps.csv.gz")  # what `evaluate` reads beside a recording
 _ROS_2 = "metadata.yaml"  # makes a folder one recording
 _SCRATCH = "ahrsd-fleet-"
+#: modules below fsspec and the base of what they raise beside OSError
+_STORAGE_ERRORS = (
+    ("aiohttp", "ClientError"),
+    ("botocore.exceptions", "BotoCoreError"),
+    ("botocore.exceptions", "ClientError"),
+    ("google.auth.exceptions", "GoogleAuthError"),
+    ("gcsfs.retry", "HttpError"),
+    ("azure.core.exceptions", "AzureError"),
+    ("paramiko.ssh_exception", "SSHException"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +170,14 @@ def _as_os_error() -> Iterator[None]:
     """What a storage's library raises, each classes of its own, is an OSError."""
     try:
         yield
-    except (AhrsdError, OSError):
-        raise
-    except Exception as error:
+    except _storage_errors() as error:
         raise OSError(f"{type(error).__name__}: {error}") from error
+
+
+def _storage_errors() -> tuple[type[Exception], ...]:
+    """Of the libraries that are loaded by now."""
+    loaded = ((sys.modules.get(module), name) for module, name in _STORAGE_ERRORS)
+    return tuple(getattr(module, name) for module, name in loaded if module is not None)
 
 
 def _object(system: Any, facts: dict[str, Any], names: tuple[str, ...]) -> ArchiveEntry:  # noqa: ANN401

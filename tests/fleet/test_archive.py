@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import pytest
 
 from ahrsd.errors import AhrsdError
@@ -88,12 +91,18 @@ def test_what_cannot_be_listed_is_said(archive, root, words):
     assert words in str(told.value)
 
 
-def test_a_storage_that_fails_in_words_of_its_own_ends_in_one_line():
+def test_a_storage_that_fails_in_words_of_its_own_ends_in_one_line(monkeypatch):
     """The libraries of storages raise classes of their own, such as botocore's."""
     fsspec = pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
 
-    class NoEndpoint(Exception):
+    class BotoCoreError(Exception):
         pass
+
+    class NoEndpoint(BotoCoreError):
+        pass
+
+    library = SimpleNamespace(BotoCoreError=BotoCoreError, ClientError=BotoCoreError)
+    monkeypatch.setitem(sys.modules, "botocore.exceptions", library)
 
     class Failing(fsspec.AbstractFileSystem):
         protocol = "failing"

@@ -91,8 +91,8 @@ def test_values_and_labels(scraped):
     assert found["ahrsd_flash_writes_total", ()] == 3.0
     pty, tcp = "/run/ahrsd/vn100", "tcp 127.0.0.1:2101"
     assert found["ahrsd_share_open", (pty,)] == 1.0
-    assert found["ahrsd_share_commands_total", (pty, "absorbed")] == 2.0
-    assert ("ahrsd_share_commands_total", (tcp, "answered")) not in found
+    assert found["ahrsd_share_commands_total", ("absorbed", pty)] == 2.0
+    assert ("ahrsd_share_commands_total", ("answered", tcp)) not in found
     assert found["ahrsd_share_readers", (tcp,)] == 0.0
     assert ("ahrsd_share_readers", (pty,)) not in found
     assert found["ahrsd_share_turned_away_total", (tcp,)] == 3.0
