@@ -22,7 +22,7 @@ from typing import Any
 
 from seeds import chapter5, dive, norms, page, summary
 
-PARTS = {"chapter5": chapter5.everything, "dive": dive.everything, "norms": norms.everything}
+PARTS = {"norms": norms.everything, "dive": dive.everything, "chapter5": chapter5.everything}
 
 
 def each_of(jobs: int) -> chapter5.Each:

@@ -39,6 +39,7 @@ Answering = Callable[[Experiment], MethodAnswer]
 Each = Callable[[str, Callable[..., Said], Sequence[tuple[Any, ...]]], list[Said]]
 
 SETS = ("wam", "mam", "lam")
+RUNS = {"slow": (100, 100, 50), "rov": (10, 10, 10)}  # of each set; [R] has 100
 WRONG = 1.05
 RAW = (28.864, 60.330)  # [R]'s figures of the judging set before any calibration
 JUDGE = Turning("judge", (5.0, 80.0, 180.0), "slow", 10_000, 25.0, 0.010, 5e-3)
@@ -53,7 +54,7 @@ FIGURE_4 = {
 BLOCK = 1000
 SMOOTHED_SAMPLES = 22  # as many independent readings a filter of 51 samples and order 2 averages
 PARTS = tuple(range(10, 110, 10))  # percent of the data, for the incremental graph
-FEW = 20  # runs with what is beside the tables
+FEW = 10  # runs with what is beside the tables
 
 
 def settings(kind: str, motion: str, seed: int) -> ScenarioSettings:
@@ -273,8 +274,12 @@ def everything(full: bool, each: Each) -> Said:
     """[R]'s sets in both motions, and [M]'s."""
     judge_seed, chosen = chosen_judge(CANDIDATES if full else 3)
     out: Said = {"judge": chosen}
-    for motion, runs in (("slow", 100 if full else 1), ("rov", 20 if full else 1)):
-        tasks = [(kind, motion, seed, judge_seed) for kind in SETS for seed in range(runs)]
+    for motion, runs in RUNS.items():
+        tasks = [
+            (kind, motion, seed, judge_seed)
+            for kind, count in zip(SETS, runs, strict=True)
+            for seed in range(count if full else 1)
+        ]
         found = each(f"[R] chapter 5, {motion}", one_run, tasks)
         out[motion] = {
             kind: [run for task, run in zip(tasks, found, strict=True) if task[0] == kind]

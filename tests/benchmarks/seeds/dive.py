@@ -27,7 +27,7 @@ from ahrsd.evaluation.references import Fixes, HeadingReference
 from ahrsd.evaluation.track import EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.montecarlo.accuracy import MethodAnswer
-from ahrsd.montecarlo.runs from ahrsd.samples import Array
+from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, Iron
 from ahrsd.simulation.scenarios import generator
 from ahrsd.world_field import world_field
