@@ -1,11 +1,12 @@
 """The figures that the seeds print, beside the same methods here, ours and the floor.
 
-    python tests/benchmarks/bench_seeds.py                                     # short: a minute
-    python tests/benchmarks/bench_seeds.py --full --jobs 2 --cache DIR --output docs/validation
+    python tests/benchmarks/bench_seeds.py                                  # short: half a minute
+    python tests/benchmarks/bench_seeds.py --runs 100 --jobs 2 --cache DIR --output docs/validation
 
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023, chapters 5 and 6; [M] Rodriguez-Martinez & Troni,
-Figure 4; [L] Lichlyter, thesis, Mississippi State 2022, chapter 3. `--cache` keeps the runs of each
-part; a part that is there is not run again. `--output` gets seeds.md and seeds/figures.json.
+Figure 4; [L] Lichlyter, thesis, Mississippi State 2022, chapter 3. `--cache` keeps each run: what
+was stopped or is to be larger goes on; another version of the code needs another folder. `--output`
+gets seeds.md and seeds/figures.json.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -25,59 +26,67 @@ from seeds import chapter5, dive, norms, page, summary
 PARTS = {"norms": norms.everything, "dive": dive.everything, "chapter5": chapter5.everything}
 
 
-def each_of(jobs: int) -> chapter5.Each:
-    """Runs one after the other, or in so many processes; says how far it is."""
+class Runs:
+    """Runs of any function, one after the other or in processes; each is kept where asked."""
 
-    def one_by_one(
-        what: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
-    ) -> list[Any]:
-        out = []
-        for task in tasks:
-            out.append(function(*task))
-            _say(what, len(out), len(tasks))
-        return out
+    def __init__(self, jobs: int, cache: Path | None) -> None:
+        self.jobs, self.cache = jobs, cache
 
-    def beside(
-        what: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
+    def each(
+        self, what: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
     ) -> list[Any]:
+        """Results in the order of the tasks; what is in the cache is not run again."""
+        path = None if self.cache is None else self.cache / f"{function.__name__}.jsonl"
+        known = {} if path is None else kept(path)
+        missing = [task for task in tasks if json.dumps(task) not in known]
+        for task, result in self._done(function, missing):
+            known[json.dumps(task)] = json.loads(json.dumps(result))
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps([task, result]) + "\n")
+            sys.stderr.write(f"{what}: {' '.join(map(str, task[:3]))}\n")
+        return [known[json.dumps(task)] for task in tasks]
+
+    def _done(
+        self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
+    ) -> Iterator[tuple[tuple[Any, ...], Any]]:
+        if self.jobs == 1 or len(tasks) < 2:
+            for task in tasks:
+                yield task, function(*task)
+            return
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read by the processes' numpy
-        out = []
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            for future in [pool.submit(function, *task) for task in tasks]:
-                out.append(future.result())
-                _say(what, len(out), len(tasks))
-        return out
-
-    return one_by_one if jobs == 1 else beside
+        with ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn")) as pool:
+            waiting = {pool.submit(function, *task): task for task in tasks}
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
 
 
-def _say(what: str, done: int, of: int) -> None:
-    if done == of or done % 10 == 0:
-        sys.stderr.write(f"{what}: {done} of {of}\n")
-
-
-def runs_of(part: str, full: bool, jobs: int, cache: Path | None) -> Any:
-    """All runs of a part, from the cache where it has them."""
-    kept = None if cache is None else cache / f"{part}-{'full' if full else 'short'}.json"
-    if kept is not None and kept.exists():
-        return json.loads(kept.read_text(encoding="utf-8"))
-    found = PARTS[part](full, each_of(jobs))
-    if kept is not None:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_text(json.dumps(found), encoding="utf-8")
-    return json.loads(json.dumps(found))  # names of numbers become text, as from the cache
+def kept(path: Path) -> dict[str, Any]:
+    """Results by task; a last line that was cut is run again."""
+    found = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        try:
+            task, result = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        found[json.dumps(task)] = result
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what is missing, print the page, write it where asked."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--full", action="store_true", help="as many runs as the seeds have")
+    parser.add_argument("--runs", type=int, default=1, help="of [R]'s sets; 1 is the short form")
     parser.add_argument("--jobs", type=int, default=1, help="processes beside each other")
-    parser.add_argument("--cache", type=Path, help="folder of the runs of each part")
+    parser.add_argument("--cache", type=Path, help="folder of the runs already done")
     parser.add_argument("--output", type=Path, help="folder for seeds.md and seeds/figures.json")
     chosen = parser.parse_args(arguments)
-    runs = {part: runs_of(part, chosen.full, chosen.jobs, chosen.cache) for part in PARTS}
-    figures = summary.of(runs, full=chosen.full)
+    if chosen.runs < 1 or chosen.jobs < 1:
+        parser.error("--runs and --jobs must be at least 1")
+    each = Runs(chosen.jobs, chosen.cache).each
+    runs = {part: everything(chosen.runs, each) for part, everything in PARTS.items()}
+    figures = summary.of(json.loads(json.dumps(runs)))
     text = page.page(figures)
     if chosen.output is not None:
         (chosen.output / "seeds").mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ Answering = Callable[[Experiment], MethodAnswer]
 Each = Callable[[str, Callable[..., Said], Sequence[tuple[Any, ...]]], list[Said]]
 
 SETS = ("wam", "mam", "lam")
-RUNS = {"slow": (100, 100, 50), "rov": (10, 10, 10)}  # of each set; [R] has 100
+SAMPLES, SHORT = 10_000, 2_500  # of a run, full and in the short form
 WRONG = 1.05
 RAW = (28.864, 60.330)  # [R]'s figures of the judging set before any calibration
 JUDGE = Turning("judge", (5.0, 80.0, 180.0), "slow", 10_000, 25.0, 0.010, 5e-3)
@@ -57,9 +57,9 @@ PARTS = tuple(range(10, 110, 10))  # percent of the data, for the incremental gr
 FEW = 10  # runs with what is beside the tables
 
 
-def settings(kind: str, motion: str, seed: int) -> ScenarioSettings:
+def settings(kind: str, motion: str, seed: int, samples: int = SAMPLES) -> ScenarioSettings:
     """[R]'s experiment as its tables were made."""
-    return ScenarioSettings(kind, motion, seed, iron=SENSOR)
+    return ScenarioSettings(kind, motion, seed, samples, iron=SENSOR)
 
 
 def published(method: str, **changes: Any) -> Answering:
@@ -250,9 +250,10 @@ def judge_of(seed: int) -> Judge:
     return Judge(JUDGE.experiment(seed))
 
 
-def one_run(kind: str, motion: str, seed: int, judge_seed: int) -> Said:
+def one_run(kind: str, motion: str, seed: int, judge_seed: int, samples: int) -> Said:
     """Every method on one set of one seed, and the incremental graph on parts of the data."""
-    experiment, judge = simulate(settings(kind, motion, seed)), judge_of(judge_seed)
+    experiment = simulate(settings(kind, motion, seed, samples))
+    judge = judge_of(judge_seed)
     others = OTHERWISE if seed < FEW else {}
     methods = AS_PRINTED | {"ours": OURS} | others
     out = {name: scored(answering, experiment, judge) for name, answering in methods.items()}
@@ -263,32 +264,34 @@ def one_run(kind: str, motion: str, seed: int, judge_seed: int) -> Said:
     return {"seed": seed, "methods": out, "parts": parts}
 
 
-def figure_4(kind: str, seed: int) -> Said:
-    """[M]'s seven methods and ours on a set of its own; errors only."""
-    experiment = FIGURE_4[kind].experiment(seed)
+def figure_4(kind: str, seed: int, share: float) -> Said:
+    """[M]'s seven methods and ours on a set of its own, or the first share of it; errors only."""
+    whole = FIGURE_4[kind]
+    experiment = replace(whole, samples=round(share * whole.samples)).experiment(seed)
     methods = {name: scored(method, experiment) for name, method in OF_FIGURE_4.items()}
     return {"seed": seed, "methods": methods}
 
 
-def everything(full: bool, each: Each) -> Said:
-    """[R]'s sets in both motions, and [M]'s."""
+def everything(runs: int, each: Each) -> Said:
+    """[R]'s sets in both motions, and [M]'s; one run, the short form, has a quarter of the data."""
+    full = runs > 1
     judge_seed, chosen = chosen_judge(CANDIDATES if full else 3)
     out: Said = {"judge": chosen}
-    for motion, runs in RUNS.items():
+    samples, few = SAMPLES if full else SHORT, max(1, runs // 10)
+    for motion, count in (("slow", runs), ("rov", few)):
         tasks = [
-            (kind, motion, seed, judge_seed)
-            for kind, count in zip(SETS, runs, strict=True)
-            for seed in range(count if full else 1)
+            (kind, motion, seed, judge_seed, samples) for seed in range(count) for kind in SETS
         ]
         found = each(f"[R] chapter 5, {motion}", one_run, tasks)
-        out[motion] = {
-            kind: [run for task, run in zip(tasks, found, strict=True) if task[0] == kind]
-            for kind in SETS
-        }
-    tasks_4 = [(kind, seed) for kind in SETS for seed in range(10 if full else 1)]
-    found = each("[M] Figure 4", figure_4, tasks_4)
-    out["figure 4"] = {
-        kind: [run for task, run in zip(tasks_4, found, strict=True) if task[0] == kind]
+        out[motion] = by_set(tasks, found)
+    tasks_4 = [(kind, seed, samples / SAMPLES) for seed in range(few) for kind in SETS]
+    out["figure 4"] = by_set(tasks_4, each("[M] Figure 4", figure_4, tasks_4))
+    return out
+
+
+def by_set(tasks: Sequence[tuple[Any, ...]], found: list[Said]) -> dict[str, list[Said]]:
+    """Runs by the set, which is a task's first word."""
+    return {
+        kind: [run for task, run in zip(tasks, found, strict=True) if task[0] == kind]
         for kind in SETS
     }
-    return out

@@ -275,13 +275,14 @@ def varying_field(runs: int) -> dict[str, Said]:
     return out
 
 
-def everything(full: bool, each: Each) -> Said:
-    """All of [L]; `full` with its number of runs."""
-    runs, few, motions = (500, 50, 20) if full else (30, 5, 2)
+def everything(runs: int, each: Each) -> Said:
+    """All of [L]; with its own numbers of runs, 500 and 50, but in the short form."""
+    full = runs > 1
+    many, few, motions = (500, 50, 20) if full else (20, 2, 1)
     tasks = [
-        ("noise", (runs, motions)),
-        ("bias", (50 if full else 3,)),
-        ("mean_errors", (runs, few)),
+        ("noise", (many, motions)),
+        ("bias", (50 if full else 1,)),
+        ("mean_errors", (many, few)),
         ("varying", (few,)),
     ]
     found = each("[L]", part, tasks)

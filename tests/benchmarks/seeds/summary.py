@@ -10,12 +10,11 @@ import numpy as np
 Said = dict[str, Any]
 
 
-def of(runs: Said, *, full: bool) -> Said:
+def of(runs: Said) -> Said:
     """Everything that the page is made from."""
     five, dive = runs["chapter5"], runs["dive"]
     return {
         "schema": "ahrsd.seeds/1",
-        "full": full,
         "judge": five["judge"],
         "chapter5": {
             motion: {kind: methods(rows) for kind, rows in five[motion].items()}
@@ -27,7 +26,7 @@ def of(runs: Said, *, full: bool) -> Said:
             "hard_iron_scale": dive["hard_iron_scale"],
             "without": table([run["without"] for run in dive["runs"]]),
             "exp1": table([run["exp1"] for run in dive["runs"]]),
-            "exp2": table([run["exp2"] for run in dive["runs"] if "exp2" in run]),
+            "exp2": table(dive["exp2"]),
             "parts": parts(dive["runs"]),
         },
         "norms": runs["norms"],
