@@ -23,7 +23,7 @@ from typing import Any
 
 from seeds import chapter5, dive, norms, page, summary
 
-PARTS = {"norms": norms.everything, "dive": dive.everything, "chapter5": chapter5.everything}
+PARTS = {"norms": norms.everything, "chapter5": chapter5.everything, "dive": dive.everything}
 
 
 class Runs:

@@ -39,7 +39,7 @@ Answering = Callable[[Experiment], MethodAnswer]
 Each = Callable[[str, Callable[..., Said], Sequence[tuple[Any, ...]]], list[Said]]
 
 SETS = ("wam", "mam", "lam")
-SAMPLES, SHORT = 10_000, 2_500  # of a run, full and in the short form
+SAMPLES, SHORT = 10_000, 1_500  # of a run, full and in the short form
 WRONG = 1.05
 RAW = (28.864, 60.330)  # [R]'s figures of the judging set before any calibration
 JUDGE = Turning("judge", (5.0, 80.0, 180.0), "slow", 10_000, 25.0, 0.010, 5e-3)
@@ -54,7 +54,7 @@ FIGURE_4 = {
 BLOCK = 1000
 SMOOTHED_SAMPLES = 22  # as many independent readings a filter of 51 samples and order 2 averages
 PARTS = tuple(range(10, 110, 10))  # percent of the data, for the incremental graph
-FEW = 10  # runs with what is beside the tables
+FEW = 1  # runs with what is beside the tables
 
 
 def settings(kind: str, motion: str, seed: int, samples: int = SAMPLES) -> ScenarioSettings:
@@ -273,11 +273,11 @@ def figure_4(kind: str, seed: int, share: float) -> Said:
 
 
 def everything(runs: int, each: Each) -> Said:
-    """[R]'s sets in both motions, and [M]'s; one run, the short form, has a quarter of the data."""
+    """[R]'s sets in both motions, and [M]'s; one run, the short form, has 60 s of each."""
     full = runs > 1
     judge_seed, chosen = chosen_judge(CANDIDATES if full else 3)
     out: Said = {"judge": chosen}
-    samples, few = SAMPLES if full else SHORT, max(1, runs // 10)
+    samples, few = SAMPLES if full else SHORT, max(1, runs // 4)
     for motion, count in (("slow", runs), ("rov", few)):
         tasks = [
             (kind, motion, seed, judge_seed, samples) for seed in range(count) for kind in SETS
