@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq
 from scipy.signal import lfilter
-from seeds.chapter5 import OURS, Answering, Each, Said, published
+from seeds.chapter5 import OURS, Answering, Each, Said, published, unguarded
 from seeds.turning import Turning, sensed
 
 from ahrsd import so3
@@ -227,8 +227,14 @@ METHODS: dict[str, Answering] = {
 }
 
 
+#: calibrated on the survey the least-squares methods and graphs are refused by our own check of the
+#: motion, which [R]'s do not have: they are asked without it too
+ON_EXP2 = METHODS | {
+    f"{name}, unchecked": unguarded(f"magical-{name.lower()}")
+    for name in ("LS", "NLS", "BFG", "IFG")
+}
 #: minutes each on 250,000 samples: only where so many runs are asked for
-SLOW_ON_EXP2, MANY = ("NLS", "TWOSTEP", "IFG"), 40
+SLOW_ON_EXP2, MANY = ("TWOSTEP", "NLS, unchecked", "IFG, unchecked"), 40
 
 
 def scored(answering: Answering, experiment: Experiment, dive: Dive) -> Said:
@@ -275,18 +281,18 @@ def on_exp1(seed: int, scale: float, exp1_s: float) -> Said:
     return out
 
 
-def on_exp2(seed: int, scale: float, name: str) -> Said:
-    """A method calibrated on the survey itself: the incremental graph takes minutes there."""
+def on_survey(seed: int, scale: float, name: str) -> Said:
+    """A method calibrated on EXP2 itself."""
     dive = Dive(seed, scale, 10.0)
-    return scored(METHODS[name], dive.exp2, dive)
+    return scored(ON_EXP2[name], dive.exp2, dive)
 
 
 def everything(runs: int, each: Each) -> Said:
     """The dive over seeds; in short form one seed, a shorter EXP1 and no calibration on EXP2."""
     full, scale = runs > 1, hard_iron_scale()
-    tasks = [(seed, scale, EXP1_S if full else SHORT_S) for seed in range(max(1, runs // 4))]
+    tasks = [(seed, scale, EXP1_S if full else SHORT_S) for seed in range(max(1, runs // 10))]
     found = each("[R] chapter 6, EXP1", on_exp1, tasks)
-    names = [name for name in METHODS if full and (runs >= MANY or name not in SLOW_ON_EXP2)]
-    survey = each("[R] chapter 6, EXP2", on_exp2, [(0, scale, name) for name in names])
+    names = [name for name in ON_EXP2 if full and (runs >= MANY or name not in SLOW_ON_EXP2)]
+    survey = each("[R] chapter 6, EXP2", on_survey, [(0, scale, name) for name in names])
     exp2 = [dict(zip(names, survey, strict=True))] if full else []
     return {"hard_iron_scale": scale, "runs": found, "exp2": exp2}

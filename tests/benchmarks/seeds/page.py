@@ -35,6 +35,7 @@ def page(figures: Said) -> str:
         tables,
         judge=figures["judge"],
         runs={kind: slow[kind]["seeds"][1] + 1 for kind in SETS},
+        dives=figures["dive"]["without"]["raw"]["runs"],
         methods={kind: slow[kind]["methods"] for kind in SETS},
         of=figures["dive"],
         norms=figures["norms"]["mean_errors"],
@@ -243,8 +244,9 @@ def table_6_2(figures: Said) -> list[str]:
         here = figures["dive"][on]
         for name, words in methods.items():
             rows.append([on.upper(), name, "[R]", *_printed_cells(words)])
-            if name in here:
-                rows.append(["", "", answers(here[name]), *_parameters(here[name])])
+            for same in (name, f"{name}, unchecked"):
+                if same in here:
+                    rows.append(["", same, answers(here[same]), *_parameters(here[same])])
         if "ours" in here:
             rows.append([on.upper(), "ours", answers(here["ours"]), *_parameters(here["ours"])])
     return table(["set", "method", "", *printed.NAMES], rows)
@@ -340,7 +342,7 @@ def varying(figures: Said) -> list[str]:
         rms = np.sqrt(said["mean_square"]).tolist()
         given = "its mean" if told == "constant" else "as measured, 5 mG"
         rows.append([f"`{method}`", given, _three(said["mean"], 2), _three(rms, 2)])
-    return table(["method", "is given |H_k|", "mean bias error, mG", "RMS, mG"], rows)
+    return table(["method", "is given the field's size", "mean bias error, mG", "RMS, mG"], rows)
 
 
 # -- in short --------------------------------------------------------------------------------------
