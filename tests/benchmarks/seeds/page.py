@@ -41,6 +41,12 @@ def page(figures: Said) -> str:
         norms=figures["norms"]["mean_errors"],
         variance=[x for row in motions for x in row["variance_ahead_percent"]],
         even=motions[0]["ahead_percent"],
+        value=value,
+        worst_heading=max(
+            said["heading_deg"]["mean"]
+            for name, said in figures["dive"]["exp1"].items()
+            if name in ("LS", "NLS", "BFG", "IFG") and said["answers"]
+        ),
         parts_of_exp1=_three(figures["dive"]["parts"]["median_deg"], 2),
         scaled_iron=_three([figures["dive"]["hard_iron_scale"] * b for b in HARD_IRON_MG], 3),
     )
@@ -53,6 +59,16 @@ def table(head: list[str], rows: list[list[str]]) -> list[str]:
 
 def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
+
+
+def value(
+    said: Said, key: str, digits: int, what: str = "mean", position: int | None = None
+) -> str:
+    """A mean or standard deviation over the answers; "-" where there is none."""
+    if key not in said:
+        return "-"
+    found = said[key][what]
+    return f"{found if position is None else found[position]:.{digits}f}"
 
 
 def number(said: Said, key: str, digits: int = 2) -> str:
@@ -262,8 +278,8 @@ def _parameters(said: Said) -> list[str]:
 # -- [L] -------------------------------------------------------------------------------------------
 
 
-def _three(values: list[float], digits: int = 4) -> str:
-    return ", ".join(f"{value:.{digits}f}" for value in values)
+def _three(values: list[float | None], digits: int = 4) -> str:
+    return ", ".join("-" if value is None else f"{value:.{digits}f}" for value in values)
 
 
 def mean_errors(figures: Said) -> list[str]:
