@@ -36,13 +36,14 @@ from ahrsd.diagnosis.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.diagnosis.levels import without_levels
 from ahrsd.diagnosis.likelier_forms import without_likelier_forms
 from ahrsd.diagnosis.limits import LIMITS, Limits
+from ahrsd.diagnosis.locate import FRAMES
 from ahrsd.diagnosis.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.diagnosis.missing import lost_turns
 from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import fit_null, unusable
 from ahrsd.diagnosis.omnibus import omnibus
-from ahrsd.diagnosis.ordinary import held_against
+from ahrsd.diagnosis.ordinary import beside_ordinary
 from ahrsd.diagnosis.own_form import without_trifles
 from ahrsd.diagnosis.passing import without_passing
 from ahrsd.diagnosis.pauses import without_jumps
@@ -50,7 +51,6 @@ from ahrsd.diagnosis.predictive import checks, usual_noise
 from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.quick import Quick, cleaned, quick, without_quick
 from ahrsd.diagnosis.refined import left_alone, refined
-from ahrsd.diagnosis.remainder_sizes import sizes_left
 from ahrsd.diagnosis.resting import resting
 from ahrsd.diagnosis.search import (
     HARDLY_TURNED,
@@ -305,10 +305,11 @@ def _left(done: _Searched, problem: Problem, facts: Sequence[Fact], fast: Quick)
 
 def _sized(left: Unexplained, done: _Searched) -> Unexplained:
     """What is left beside what recordings ordinarily leave; of bursts and hums nobody knows."""
-    course = done.short is None and left.where is not None and left.where.band_hz is None
-    if not (left.detected and course):
+    course = left.detected and done.short is None
+    if not course or left.where is None or left.where.band_hz is not None:
         return left
-    return replace(left, ordinary=held_against(sizes_left(done.state)))
+    frame = next(frame for frame in FRAMES if frame == left.where.frame)
+    return replace(left, ordinary=beside_ordinary(done.state, frame))
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

@@ -15,9 +15,9 @@ beyond the ordinary, and a field that differs from place to place is not.
     within   every component that is there is below its limit: what is left is ordinary, and is told
              with its size
     beyond   one is not: unknown
-    cleaner  beside its largest field the recording leaves less than real ones do: of a simulation,
-             or of a sensor better than any that was measured, these sizes say nothing, and whatever
-             stands out of its noise is unknown, however small
+    cleaner  beside one source, drawn finely, the recording leaves less than real ones do: of a
+             simulation, or of a sensor better than any that was measured, these sizes say nothing,
+             and whatever stands out of its noise is unknown, however small
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ from scipy.special import stdtrit
 
 from ahrsd.diagnosis.diagnosis import Component, Diagnosis, Ordinary
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.remainder_sizes import Left, Size
+from ahrsd.diagnosis.locate import Frame
+from ahrsd.diagnosis.remainder_sizes import Left, Size, beside_one_source, sizes_left
+from ahrsd.diagnosis.search import State
 
 #: share of ordinary recordings that stay below a limit
 LEVEL = 0.95
@@ -82,7 +84,7 @@ class Table:
     """Everything that was measured on so many recordings.
 
     components: by name;  field, heading, gyro: everything together, gauss, degrees, rad/s
-    beside: the fields but for the largest component, gauss
+    beside: the fields that are left beside one source, gauss
     """
 
     recordings: int
@@ -130,7 +132,7 @@ def table_of(measured: Sequence[Left]) -> Table:
         field=whole([left.field_gauss for left in measured]),
         heading=whole([left.heading_deg for left in measured]),
         gyro=whole([left.gyro_rad_s for left in measured]),
-        beside=whole([beside_the_largest(left) for left in measured]),
+        beside=whole([left.beside_gauss for left in measured]),
     )
 
 
@@ -157,22 +159,25 @@ def is_there(one: Size) -> bool:
     return one.evidence_nats > LIMITS.unknown_nats and one.size > LEAST
 
 
-def beside_the_largest(left: Left) -> float:
-    """Root sum square of the fields but for the largest component, gauss."""
-    fields = sorted(one.size for one in left.sizes if one.heading_deg is not None)
-    return float(np.sqrt(np.sum(np.square(fields[:-1]))))
+def beside_ordinary(state: State, frame: Frame) -> Ordinary:
+    """What is left beside a state's names, of which most is in this frame, and what is ordinary."""
+    left = sizes_left(state)
+    if left.beside_gauss > TABLE.beside.from_on():
+        fine = beside_one_source(state, frame)
+        left = replace(left, beside_gauss=min(left.beside_gauss, fine))
+    return held_against(left)
 
 
 def held_against(left: Left, table: Table = TABLE) -> Ordinary:
     """The sizes of what is left, beside what recordings ordinarily leave."""
     told = tuple(_beside(one, table) for one in left.sizes)
     beyond = [one for one in told if one.there and one.size > one.up_to]
-    beside, least = beside_the_largest(left), table.beside.from_on()
+    least = table.beside.from_on()
     why = None
-    if beside < least:
+    if left.beside_gauss < least:
         why = (
-            "cleaner than the real recordings of which this would be ordinary: beside its largest "
-            f"part it leaves {1e3 * beside:.2g} mG, they {1e3 * least:.2g} mG or more"
+            "cleaner than the real recordings of which this would be ordinary: beside one source "
+            f"it leaves {1e3 * left.beside_gauss:.2g} mG, they {1e3 * least:.2g} mG or more"
         )
     elif beyond:
         why = "beyond the ordinary: " + ", ".join(map(_more, beyond))
@@ -185,6 +190,8 @@ def held_against(left: Left, table: Table = TABLE) -> Ordinary:
         heading_up_to_deg=table.heading.up_to(),
         gyro_rad_s=left.gyro_rad_s,
         gyro_up_to_rad_s=table.gyro.up_to(),
+        beside_gauss=left.beside_gauss,
+        beside_from_gauss=least,
         recordings=table.recordings,
         components=told,
     )
