@@ -135,7 +135,7 @@ class Ordinary:
 
     within: whether it is ordinary;  why: in a sentence, if it is not
     field_gauss, heading_deg, gyro_rad_s: everything together, and what ordinary recordings leave
-    beside_gauss, beside_from_gauss: fields left beside one source, and what real recordings leave
+    beside_gauss, beside_from_gauss: fields but for the largest, and what real recordings leave
     recordings: untouched real recordings that this was measured on
     """
 

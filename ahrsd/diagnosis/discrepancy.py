@@ -77,16 +77,12 @@ def discrepancy(basis: Base) -> Discrepancy:
     shapes = shapes_of(basis.context)
     columns = together(basis, COURSES, cut, shapes)
     widths = [3 * PIECES] * len(COURSES) + [part.width for part, _ in shapes]
-    return random_effects_of(basis, columns, np.repeat(np.arange(len(widths)), widths))
-
-
-def random_effects_of(basis: Base, columns: Together, group: NDArray[np.intp]) -> Discrepancy:
-    """Those of these columns; group (q,): number of the variance that a column has."""
+    group = np.repeat(np.arange(len(widths)), widths)
     products = columns.products()
     G, s = projected_with(basis, columns, products)
     left = left_beside(basis, columns, G, s)
     noise = max(1.0, colour(left, basis.rate_hz) * float(np.mean(left**2)))
-    nats, sizes = fitted(G, s, group, noise, np.zeros(int(group[-1]) + 1))
+    nats, sizes = fitted(G, s, group, noise, np.zeros(len(widths)))
     known = group >= PLACES
     by_place = 0.0
     if known.any():

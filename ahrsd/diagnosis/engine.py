@@ -36,14 +36,13 @@ from ahrsd.diagnosis.hygiene import hygiene, put_right, would_have_shown
 from ahrsd.diagnosis.levels import without_levels
 from ahrsd.diagnosis.likelier_forms import without_likelier_forms
 from ahrsd.diagnosis.limits import LIMITS, Limits
-from ahrsd.diagnosis.locate import FRAMES
 from ahrsd.diagnosis.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.diagnosis.missing import lost_turns
 from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import fit_null, unusable
 from ahrsd.diagnosis.omnibus import omnibus
-from ahrsd.diagnosis.ordinary import beside_ordinary
+from ahrsd.diagnosis.ordinary import held_against, is_one_source
 from ahrsd.diagnosis.own_form import without_trifles
 from ahrsd.diagnosis.passing import without_passing
 from ahrsd.diagnosis.pauses import without_jumps
@@ -51,6 +50,7 @@ from ahrsd.diagnosis.predictive import checks, usual_noise
 from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.quick import Quick, cleaned, quick, without_quick
 from ahrsd.diagnosis.refined import left_alone, refined
+from ahrsd.diagnosis.remainder_sizes import sizes_left
 from ahrsd.diagnosis.resting import resting
 from ahrsd.diagnosis.search import (
     HARDLY_TURNED,
@@ -308,8 +308,8 @@ def _sized(left: Unexplained, done: _Searched) -> Unexplained:
     course = left.detected and done.short is None
     if not course or left.where is None or left.where.band_hz is not None:
         return left
-    frame = next(frame for frame in FRAMES if frame == left.where.frame)
-    return replace(left, ordinary=beside_ordinary(done.state, frame))
+    sizes = sizes_left(done.state)
+    return replace(left, ordinary=held_against(sizes, one_source=is_one_source(left)))
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

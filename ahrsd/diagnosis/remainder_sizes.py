@@ -21,12 +21,11 @@ from ahrsd.diagnosis.discrepancy import (
     PIECES,
     Discrepancy,
     fitted,
-    random_effects_of,
     shapes_of,
 )
 from ahrsd.diagnosis.exam import random_effects
 from ahrsd.diagnosis.search import State, formed_basis_of
-from ahrsd.diagnosis.together import projected_with, together
+from ahrsd.diagnosis.together import projected_with
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -41,8 +40,6 @@ COMPONENTS = {
 }
 #: where no accelerometer says what is level: the horizontal part of the field at 60 degrees of dip
 LEVEL_SHARE = 0.5
-#: pieces of a course that is drawn finely, and as long as this at least
-FINE, FINE_S = 120, 1.5
 #: smallest horizontal part of the field in which a heading is told
 LEAST_SHARE = 0.1
 
@@ -67,7 +64,7 @@ class Left:
     """Everything that is left beside the names.
 
     field_gauss, heading_deg: of all fields together;  gyro_rad_s: of all errors of the gyro
-    beside_gauss: of the fields but for one thing, the largest or what the unknown is taken for
+    beside_gauss: of the fields but for the largest component
     """
 
     sizes: tuple[Size, ...]
@@ -111,35 +108,6 @@ def sizes_of(values: Sequence[Array], nats: Mapping[str, float], context: Contex
     fields = sorted(one.size for one in sizes if one.heading_deg is not None)
     beside = float(np.linalg.norm(fields[:-1]))
     return Left(tuple(sizes), deviation(field), whole_deg, deviation(rate), beside)
-
-
-def beside_one_source(state: State, frame: locate.Frame) -> float:
-    """Size of the fields, gauss, that are left beside one course of this frame, drawn finely.
-
-    One thing that nobody logged changes quicker than the pieces of a course; what these cannot
-    follow looks like a bit of everything else.  In pieces of seconds it is itself, and where it is
-    alone nothing else is left; the many small things of a real recording are no one course.
-    """
-    basis = formed_basis_of(state)
-    context = basis.context
-    count = int(np.clip(context.track.duration_s / FINE_S, PIECES, FINE))
-    fine = locate.segments(context.track.time_s, count)
-    cut = locate.segments(context.track.time_s, PIECES)
-    units = dict(COURSES)
-    others = [other for other in units if other != frame]
-    parts = [(locate.frame_columns(context, other, cut), units[other]) for other in others]
-    parts += shapes_of(context)
-    columns = together(basis, [(frame, units[frame])], fine, parts)
-    widths = [3 * count, *(part.width for part, _ in parts)]
-    found = random_effects_of(basis, columns, np.repeat(np.arange(len(widths)), widths))
-    G, s = projected_with(basis, columns, found.products)
-    value = likeliest(found, G, s) * columns.units
-    take, sizes = calibration_of(context), []
-    for k, (part, _) in enumerate(parts, start=1):
-        if part.mag is not None:
-            added = less_calibration(_added(part, value[found.group == k]), take)
-            sizes.append(deviation(added))
-    return float(np.linalg.norm(sizes))
 
 
 def _nothing(cut: locate.Segments) -> Array:

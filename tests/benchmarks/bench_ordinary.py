@@ -23,7 +23,7 @@ from typing import Any
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.ordinary import Row, Table, held_against, table_of
+from ahrsd.diagnosis.ordinary import Row, Table, held_against, is_one_source, table_of
 from ahrsd.diagnosis.remainder_sizes import Left, Size
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -45,11 +45,15 @@ NAMES = {"attached_magnet": STEPS}
 
 @dataclass(frozen=True)
 class Measured:
-    """One diagnosis: its recording, the names given, and what is left; None where nothing is."""
+    """One diagnosis: its recording, the names given, and what is left; None where nothing is.
+
+    one_source: whether that is one source of fixed direction on the sensor
+    """
 
     name: str
     given: list[str]
     left: Left | None
+    one_source: bool
 
     @property
     def kind(self) -> str:
@@ -98,7 +102,8 @@ def measured(name: str, path: Path) -> Iterator[Measured]:
 
 
 def of_diagnosis(name: str, found: Diagnosis) -> Measured:
-    return Measured(name, [one.effect for one in found.findings], left_of(found))
+    names = [one.effect for one in found.findings]
+    return Measured(name, names, left_of(found), is_one_source(found.unexplained))
 
 
 def measure(out: Path, words: Sequence[str]) -> None:
@@ -132,7 +137,7 @@ def read(files: Sequence[Path]) -> list[Measured]:
     out = []
     for file in files:
         for one in json.loads(file.read_text(encoding="utf-8")).values():
-            out.append(Measured(one["name"], one["given"], _left(one["left"])))
+            out.append(Measured(**{**one, "left": _left(one["left"])}))
     return out
 
 
@@ -169,7 +174,8 @@ def judged(all_of: Sequence[Measured]) -> list[str]:
             rows.append(f"| {one.name} | {one.kind} | no course | | | |")
             continue
         others = [other.of_table for other in untouched if other.data_set != one.data_set]
-        by = [held_against(one.left, table) for table in (whole, table_of(others))]
+        tables = (whole, table_of(others))
+        by = [held_against(one.left, table, one_source=one.one_source) for table in tables]
         said = ["ordinary" if found.within else "beyond" for found in by]
         rows.append(
             f"| {one.name} | {one.kind} | {size_text(one.left)} | {said[0]} | {said[1]} | "

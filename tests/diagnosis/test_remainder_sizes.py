@@ -17,7 +17,6 @@ from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.remainder_sizes import (
     Left,
     Size,
-    beside_one_source,
     calibration_of,
     deviation,
     heading_off_deg,
@@ -116,17 +115,6 @@ def test_a_heading_is_off_by_the_field_across(made):
     assert heading_off_deg(along, context) < 0.05 * heading_off_deg(added, context)
 
 
-def test_one_source_alone_leaves_nothing_beside_it(made):
-    track = track_of(made)
-    t = track.time_s - track.time_s[0]
-    current = np.repeat(np.random.default_rng(3).uniform(0.0, 1.0, 60), SAMPLES // 60)
-    assert len(current) == len(t)
-    alone = fitted(with_field(track, current[:, None] * np.array([8e-3, -15e-3, 9e-3])))
-    many = fitted(lived_in(made, 1.0))
-    assert beside_one_source(alone, "sensor") < 0.1 * sizes_left(alone).field_gauss
-    assert beside_one_source(many, "sensor") > 0.2 * sizes_left(many).field_gauss
-
-
 def test_a_room_a_crooked_sensor_and_a_gyro_are_ordinary_and_four_times_as_much_is_not(made):
     once = held_against(sizes_left(fitted(lived_in(made, 1.0))))
     assert once.within, once.why
@@ -154,7 +142,7 @@ def test_a_current_that_nobody_logged_is_unknown_in_a_simulation(made):
     found = beyond_ordinary(diagnose(with_field(track, added)))
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "sensor"
-    assert found.unexplained.ordinary.why.startswith("cleaner than the real recordings")
+    assert not found.unexplained.ordinary.within
 
 
 @pytest.mark.slow
