@@ -18,7 +18,6 @@ from ahrsd.diagnosis.aligned import align, differing
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.logged import diagnose_logged
 from ahrsd.diagnosis.model_file import RepairedModel, from_text
-from ahrsd.diagnosis.ordinary import beyond_ordinary
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
@@ -181,7 +180,7 @@ def diagnose_recording(
 
 def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
     try:
-        return beyond_ordinary(diagnose_logged(track, spec, recording=printable(path.name, 200)))
+        return diagnose_logged(track, spec, recording=printable(path.name, 200))
     except np.linalg.LinAlgError:
         raise RecordingError(
             path,
