@@ -172,18 +172,17 @@ def is_one_source(unknown: Unexplained) -> bool:
 def held_against(left: Left, table: Table = TABLE, *, one_source: bool = False) -> Ordinary:
     """The sizes of what is left, beside what recordings ordinarily leave."""
     told = tuple(_beside(one, table) for one in left.sizes)
-    beyond = [one for one in told if one.there and one.size > one.up_to]
     least = table.beside.from_on()
-    why = None
+    reasons = [_more(one) for one in told if one.there and one.size > one.up_to]
+    if one_source:
+        reasons.append("one source of fixed direction on the sensor, which is no sum of small ones")
+    why = "beyond the ordinary: " + ", ".join(reasons) if reasons else None
     if left.beside_gauss < least:
         why = (
             "cleaner than the real recordings of which this would be ordinary: beside its largest "
-            f"part it leaves {1e3 * left.beside_gauss:.2g} mG, they {1e3 * least:.2g} mG or more"
+            f"part it leaves {told_size(left.beside_gauss, 'gauss')}, they "
+            f"{told_size(least, 'gauss')} or more"
         )
-    elif beyond:
-        why = "beyond the ordinary: " + ", ".join(map(_more, beyond))
-    elif one_source:
-        why = "one source of fixed direction on the sensor: what is ordinary is no one thing"
     return Ordinary(
         within=why is None,
         why=why,
@@ -220,8 +219,8 @@ def _more(one: Component) -> str:
 
 
 def told_size(size: float, unit: str) -> str:
-    """`9.1 mG`, `23 mrad/s`."""
-    return f"{1e3 * size:.2g} {'mG' if unit == 'gauss' else 'mrad/s'}"
+    """`9.1 mG`, `620 mrad/s`: two digits."""
+    return f"{float(f'{1e3 * size:.2g}'):g} {'mG' if unit == 'gauss' else 'mrad/s'}"
 
 
 def limit_text(one: Component) -> str:

@@ -144,7 +144,7 @@ def test_one_source_on_the_sensor_is_no_sum_of_small_things():
     assert held_against(small, TABLE).within
     one = held_against(small, TABLE, one_source=True)
     assert not one.within
-    assert one.why.startswith("one source of fixed direction on the sensor")
+    assert one.why.startswith("beyond the ordinary: one source of fixed direction on the sensor")
 
 
 @pytest.mark.parametrize(
