@@ -36,13 +36,16 @@ MOST_ASKED = 2
 ON_TIME_S = 1.0
 
 
-def diagnose_logged(track: Track, spec: Spec | None = None, *, recording: str = "") -> Diagnosis:
+def diagnose_logged(
+    track: Track, spec: Spec | None = None, *, recording: str = "", simulated: bool = False
+) -> Diagnosis:
     """`diagnose`, with what columns with holes and wrong clocks can still say.
 
-    What is left is unknown only where it is beyond the ordinary.
+    What is left of a recording that is not known to be simulated is unknown only where it is beyond
+    the ordinary.
     ValueError, one line, where nothing can be fitted.
     """
-    return beyond_ordinary(_with_holes(track, spec, recording))
+    return beyond_ordinary(_with_holes(track, spec, recording), simulated=simulated)
 
 
 def _with_holes(track: Track, spec: Spec | None, recording: str) -> Diagnosis:

@@ -38,6 +38,10 @@ from ahrsd.diagnosis.remainder_sizes import Left, Size
 LEVEL = 0.95
 #: gauss and rad/s: what is smaller is nothing, whatever it is worth
 LEAST = 1e-4
+#: said of a simulation that leaves what a real recording may
+SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
+#: recordings in which a component must be there before any size of it is ordinary
+FEWEST = 3
 #: share of an unknown of the sensor that one direction explains: of eight untouched recordings that
 #: turned .57 to .72, of an unlogged current and of magnets .86 to .99 (of one .57)
 ONE_SOURCE = 0.8
@@ -69,9 +73,14 @@ class Row:
     asked: int
 
     def up_to(self, level: float = LEVEL) -> float:
-        """What the next recording stays below with this probability, whether it is there or not."""
-        beyond = (1.0 - level) * self.asked / max(self.seen, 1)
-        return self._at(1.0 - beyond) if self.seen and beyond < 1.0 else 0.0
+        """What the next recording stays below with this probability, whether it is there or not.
+
+        0 where next to no recording has any: then to have some is not ordinary.
+        """
+        if self.seen < FEWEST:
+            return 0.0
+        beyond = (1.0 - level) * self.asked / self.seen
+        return self._at(1.0 - beyond) if beyond < 1.0 else 0.0
 
     def from_on(self, level: float = LEVEL) -> float:
         """What the next one in which it is there stays above."""
@@ -224,17 +233,21 @@ def told_size(size: float, unit: str) -> str:
 
 
 def limit_text(one: Component) -> str:
-    """`up to 72 mG`."""
-    return f"up to {told_size(one.up_to, one.unit)}"
+    """`up to 72 mG`, or that none is."""
+    return f"up to {told_size(one.up_to, one.unit)}" if one.up_to > 0.0 else "none"
 
 
-def beyond_ordinary(found: Diagnosis) -> Diagnosis:
+def beyond_ordinary(found: Diagnosis, *, simulated: bool = False) -> Diagnosis:
     """The answer in which what is left is unknown only where it is beyond the ordinary.
 
     Its address, evidence and `p_value` stay: that something is left is as sure as before.
+    simulated: known to be no real recording, of which nothing is ordinary
     """
     left = found.unexplained
     if not left.detected or left.ordinary is None or not left.ordinary.within:
         return found
+    if simulated:
+        told = replace(left.ordinary, within=False, why=SIMULATED)
+        return replace(found, unexplained=replace(left, ordinary=told))
     left = replace(left, detected=False)
     return replace(found, unexplained=left, mismatch=bool(found.findings))

@@ -74,7 +74,8 @@ def test_a_limit_is_what_the_next_recording_stays_below():
     half = Row(8e-3, 0.5, 10, 20)  # of those that have it one in ten may be beyond
     less = np.exp(0.5 * np.sqrt(1 + 1 / 10) * student.ppf(0.90, FREEDOM))
     assert half.up_to() == pytest.approx(8e-3 * less)
-    assert Row(8e-3, 0.5, 1, 20).up_to() == 0.0  # one in twenty has any: to have some is beyond
+    assert Row(8e-3, 0.5, 2, 20).up_to() == 0.0  # next to none has any: to have some is beyond
+    assert Row(8e-3, 0.5, 3, 20).up_to() > 8e-3
     assert Row(0.0, 0.5, 0, 20).up_to() == 0.0
 
 
@@ -129,7 +130,7 @@ def test_as_much_as_others_leave_is_ordinary_and_four_times_as_much_is_not():
 def test_a_course_on_the_sensor_is_beyond_where_no_recording_has_one():
     one = held_against(left(by_attitude=8e-3, sensor_course=2e-3), TABLE)
     assert not one.within
-    assert "a course in time on the sensor, 2 mG where up to 0 mG is ordinary" in one.why
+    assert "a course in time on the sensor, 2 mG where none is ordinary" in one.why
 
 
 def test_of_a_clean_world_nothing_is_ordinary_however_small():
@@ -206,6 +207,15 @@ def test_what_is_beyond_stays_unknown_and_says_by_how_much():
     assert "something that the library has no name for" in said
     assert "part       a field by attitude: 80 mG, 8 deg of heading, 100 nats" in said
     assert "yardstick  beyond the ordinary: a field by attitude, 80 mG where up to" in said
+
+
+def test_nothing_is_ordinary_in_a_recording_that_is_known_to_be_simulated():
+    before = found(left(by_attitude=8e-3, world=10e-3))
+    after = beyond_ordinary(before, simulated=True)
+    assert after.mismatch
+    assert after.unexplained.detected
+    assert not after.unexplained.ordinary.within
+    assert "yardstick  a simulated recording" in "\n".join(lines(after))
 
 
 def test_an_unknown_without_a_yardstick_stays_one():
