@@ -23,6 +23,7 @@ from ahrsd.diagnosis.ordinary import (
 from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.remainder_sizes import Left, Size
 from ahrsd.diagnosis.spoken import lines, verdict
+from ahrsd.report.diagnosis_page import write_diagnosis_report
 
 #: of twenty recordings, none of which has a course on the sensor
 TABLE = Table(
@@ -207,6 +208,23 @@ def test_what_is_beyond_stays_unknown_and_says_by_how_much():
     assert "something that the library has no name for" in said
     assert "part       a field by attitude: 80 mG, 8 deg of heading, 100 nats" in said
     assert "yardstick  beyond the ordinary: a field by attitude, 80 mG where up to" in said
+
+
+def test_the_page_says_which_of_both_it_is(tmp_path):
+    page = tmp_path / "report.html"
+    before = found(left(by_attitude=8e-3, world=10e-3))
+    write_diagnosis_report(page, beyond_ordinary(before), "ahrsd diagnose walk.csv")
+    said = page.read_text(encoding="utf-8")
+    assert "Left, and ordinary" in said
+    assert "13 mG, 1.3 deg of heading" in said
+    assert "a field by attitude: 8 mG, 0.8 deg of heading, 100 nats (ordinary: up to " in said
+    assert "Unknown, here" not in said
+    beyond = found(left(by_attitude=80e-3, world=10e-3))
+    write_diagnosis_report(page, beyond_ordinary(beyond), "ahrsd diagnose walk.csv")
+    said = page.read_text(encoding="utf-8")
+    assert "Unknown, here" in said
+    assert "beyond the ordinary: a field by attitude, 80 mG where up to " in said
+    assert "Left, and ordinary" not in said
 
 
 def test_nothing_is_ordinary_in_a_recording_that_is_known_to_be_simulated():
