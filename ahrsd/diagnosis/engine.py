@@ -42,7 +42,7 @@ from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import fit_null, unusable
 from ahrsd.diagnosis.omnibus import omnibus
-from ahrsd.diagnosis.ordinary import held_against, is_one_source
+from ahrsd.diagnosis.ordinary import held_against, is_course_on_sensor
 from ahrsd.diagnosis.own_form import without_trifles
 from ahrsd.diagnosis.passing import without_passing
 from ahrsd.diagnosis.pauses import without_jumps
@@ -309,7 +309,7 @@ def _sized(left: Unexplained, done: _Searched) -> Unexplained:
     if not course or left.where is None or left.where.band_hz is not None:
         return left
     sizes = sizes_left(done.state)
-    return replace(left, ordinary=held_against(sizes, one_source=is_one_source(left)))
+    return replace(left, ordinary=held_against(sizes, on_sensor=is_course_on_sensor(left)))
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

@@ -15,8 +15,8 @@ beyond the ordinary, and a field that differs from place to place is not.
     within   every component that is there is below its limit: what is left is ordinary, and is told
              with its size
     beyond   one is not: unknown
-    alone    it is one source of fixed direction on the sensor, as an unlogged current or a magnet
-             is: one thing and no sum of small ones, whatever its size
+    sensor   it is located as a course in time on the sensor, as an unlogged current or a magnet is:
+             what its quick part leaves looks like a bit of every component, so its size says little
     cleaner  beside its largest field the recording leaves less than real ones do: of a simulation,
              or of a sensor better than any that was measured, these sizes say nothing, and whatever
              stands out of its noise is unknown, however small
@@ -42,9 +42,6 @@ LEAST = 1e-3
 SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
 #: recordings in which a component must be there before any size of it is ordinary
 FEWEST = 3
-#: share of an unknown of the sensor that one direction explains: of eight untouched recordings that
-#: turned .57 to .72, of an unlogged current and of magnets .86 to .99 (of one .57)
-ONE_SOURCE = 0.8
 #: of the logarithms' Student t
 FREEDOM = 4.0
 _ROUNDS = 100
@@ -171,20 +168,19 @@ def is_there(one: Size) -> bool:
     return one.evidence_nats > LIMITS.unknown_nats and one.size > LEAST
 
 
-def is_one_source(unknown: Unexplained) -> bool:
-    """Whether most of it is one vector that swells and fades on the sensor."""
-    share, where = unknown.single_source_share, unknown.where
-    course = bool(unknown.course) and where is not None and where.frame == "sensor"
-    return course and share is not None and share > ONE_SOURCE
+def is_course_on_sensor(unknown: Unexplained) -> bool:
+    """Whether it is located as something that changes with time on the sensor."""
+    where = unknown.where
+    return bool(unknown.course) and where is not None and where.frame == "sensor"
 
 
-def held_against(left: Left, table: Table = TABLE, *, one_source: bool = False) -> Ordinary:
+def held_against(left: Left, table: Table = TABLE, *, on_sensor: bool = False) -> Ordinary:
     """The sizes of what is left, beside what recordings ordinarily leave."""
     told = tuple(_beside(one, table) for one in left.sizes)
     least = table.beside.from_on()
     reasons = [_more(one) for one in told if one.there and one.size > one.up_to]
-    if one_source:
-        reasons.append("one source of fixed direction on the sensor, which is no sum of small ones")
+    if on_sensor:
+        reasons.append("it changes with time on the sensor, as an unlogged current does")
     why = "beyond the ordinary: " + ", ".join(reasons) if reasons else None
     if left.beside_gauss < least:
         why = (

@@ -23,7 +23,7 @@ from typing import Any
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.ordinary import Row, Table, held_against, is_one_source, table_of
+from ahrsd.diagnosis.ordinary import Row, Table, held_against, is_course_on_sensor, table_of
 from ahrsd.diagnosis.remainder_sizes import Left, Size
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -47,13 +47,13 @@ NAMES = {"attached_magnet": STEPS}
 class Measured:
     """One diagnosis: its recording, the names given, and what is left; None where nothing is.
 
-    one_source: whether that is one source of fixed direction on the sensor
+    on_sensor: whether that is located as a course in time on the sensor
     """
 
     name: str
     given: list[str]
     left: Left | None
-    one_source: bool
+    on_sensor: bool
 
     @property
     def kind(self) -> str:
@@ -103,7 +103,7 @@ def measured(name: str, path: Path) -> Iterator[Measured]:
 
 def of_diagnosis(name: str, found: Diagnosis) -> Measured:
     names = [one.effect for one in found.findings]
-    return Measured(name, names, left_of(found), is_one_source(found.unexplained))
+    return Measured(name, names, left_of(found), is_course_on_sensor(found.unexplained))
 
 
 def measure(out: Path, words: Sequence[str]) -> None:
@@ -175,7 +175,7 @@ def judged(all_of: Sequence[Measured]) -> list[str]:
             continue
         others = [other.of_table for other in untouched if other.data_set != one.data_set]
         tables = (whole, table_of(others))
-        by = [held_against(one.left, table, one_source=one.one_source) for table in tables]
+        by = [held_against(one.left, table, on_sensor=one.on_sensor) for table in tables]
         said = ["ordinary" if found.within else "beyond" for found in by]
         rows.append(
             f"| {one.name} | {one.kind} | {size_text(one.left)} | {said[0]} | {said[1]} | "

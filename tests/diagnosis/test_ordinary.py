@@ -16,7 +16,7 @@ from ahrsd.diagnosis.ordinary import (
     Table,
     beyond_ordinary,
     held_against,
-    is_one_source,
+    is_course_on_sensor,
     spread_of,
     table_of,
 )
@@ -141,27 +141,27 @@ def test_of_a_clean_world_nothing_is_ordinary_however_small():
     assert "it leaves 0.1 mG" in one.why
 
 
-def test_one_source_on_the_sensor_is_no_sum_of_small_things():
+def test_what_changes_with_time_on_the_sensor_is_never_ordinary():
     small = left(by_attitude=8e-3, world=10e-3)
     assert held_against(small, TABLE).within
-    one = held_against(small, TABLE, one_source=True)
+    one = held_against(small, TABLE, on_sensor=True)
     assert not one.within
-    assert one.why.startswith("beyond the ordinary: one source of fixed direction on the sensor")
+    assert one.why == (
+        "beyond the ordinary: it changes with time on the sensor, as an unlogged current does"
+    )
 
 
 @pytest.mark.parametrize(
-    ("frame", "share", "course", "alone"),
+    ("frame", "course", "on_sensor"),
     [
-        ("sensor", 0.93, ((0.0, 1e-3), (1.0, -1e-3)), True),
-        ("sensor", 0.72, ((0.0, 1e-3), (1.0, -1e-3)), False),
-        ("world", 0.96, ((0.0, 1e-3), (1.0, -1e-3)), False),  # a room may well have one
-        ("sensor", 0.93, (), False),  # of a condition, not of a time
+        ("sensor", ((0.0, 1e-3), (1.0, -1e-3)), True),
+        ("world", ((0.0, 1e-3), (1.0, -1e-3)), False),
+        ("sensor", (), False),  # of a condition, not of a time
     ],
 )
-def test_a_source_has_a_direction_on_the_sensor(frame, share, course, alone):
-    where = Where(((0.0, 9.0),), ("x",), frame)
-    one = Unexplained(True, where, single_source_share=share, course=course)
-    assert is_one_source(one) is alone
+def test_a_course_on_the_sensor(frame, course, on_sensor):
+    one = Unexplained(True, Where(((0.0, 9.0),), ("x",), frame), course=course)
+    assert is_course_on_sensor(one) is on_sensor
 
 
 def test_what_is_ordinary_is_no_mismatch_and_is_not_silent():
