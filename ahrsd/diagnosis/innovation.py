@@ -17,6 +17,13 @@ gain held the sensitivities are exact (s: deviation of a turn by those of
     T = F H+ - dt [h-]x Jl W_k,   X_k = A T + D_k,   H+ = T - K X_k
 
 Whitened by S = L L^T: under the null L^-1 e = L^-1 X dtheta + white of variance 1.
+
+These are the derivatives of the innovations, which a descent needs.  To regress on (`regressing`)
+they will not do: F and e of one row hold the same noise of the gyro (errors in variables), and of
+5 mrad/s beside .1 mG that made a field that turns with the heading of 440 nats in nothing.  There F
+is of the smoothed rate in X_k, and stays as it is in what H+ hands on to the rows behind, whose
+noise is another.
+
 A run's first row starts the field from its reading (`used` is false there): h+ = A^-1 (m - b).
 Where that row has no reading the field starts from the nominal one, unsure by half of its size: the
 first reading decides.
@@ -24,7 +31,7 @@ first reading decides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,6 +190,24 @@ def sensitivities(filtered: Filtered, columns: Columns) -> Array:
     if filtered.recursion is None:
         raise ValueError("this run of the filter was made without sensitivities")
     return filtered.recursion.run(columns.gyro, columns.mag)
+
+
+def regressing(filtered: Filtered, rate_b_rad_s: Array) -> Filtered:
+    """The run with sensitivities in which no innovation finds the gyro's noise of its own row.
+
+    rate_b_rad_s: (N, 3) without bias and without that noise
+    ValueError where the run was not `sensitive`.
+    """
+    if filtered.recursion is None:
+        raise ValueError("this run of the filter was made without sensitivities")
+    track, size = filtered.track, filtered.recursion.states
+    opens = _laid_out(track)[1]
+    turn = so3.exp(-rate_b_rad_s * np.nan_to_num(track.dt_s, nan=0.0)[:, None])
+    turn[opens] = 0.0
+    matrix = filtered.recursion.matrix.copy()
+    root = matrix[:, :3, size + 3 :]  # what a field on the reading is whitened by
+    matrix[:, :3, :3] = root @ filtered.model.soft_iron @ turn
+    return replace(filtered, recursion=Recursion(filtered.recursion.layout, matrix))
 
 
 def nuisance_columns(filtered: Filtered) -> Columns:
