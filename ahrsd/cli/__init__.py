@@ -30,6 +30,7 @@ COMMANDS: dict[str, str] = {
     "status": "How the running daemon stands.",
     "watch": "The running daemon, live on a terminal.",
     "page": "A page for the phone at the vehicle: what to drive, heading, gates, alarms.",
+    "foxglove": "The running daemon for Foxglove, on a WebSocket.",
     "explain": "Which gate holds a write back, since when, and what would open it.",
     "bundle": "A support archive: journal, newest capture, status, versions.",
     "registers": "Read, compare, write and roll back the device's registers.",

@@ -10,7 +10,8 @@ Two kinds of statistic, both over the newest samples:
       m_k - m_(k-1) = -(G theta_k) x (m - o)
 
   is linear in g and in the products g_i o_j (9 unknowns). g = 1 is a right gyroscope, 1/57.3 one in
-  deg/s, -1 one with the wrong sign. Soft iron and scale errors move g by tens of percent at most.
+  deg/s, -1 one with the wrong sign. Scale errors move g by percents; soft iron shows a tenth of the
+  turn about one axis as one about another, which is much for an axis that hardly turns.
 
 All limits are in `SensorLimits`. Nothing is decided here: a finding is for a person.
 """
@@ -44,6 +45,7 @@ class SensorLimits:
     sure:             1-sigma of an axis' g over its size below which the axis is spoken of
     degrees:          g of a gyroscope in deg/s, between
     negated:          g below which an axis has the wrong sign
+    soft_iron:        share of a turn that may be shown as one about another axis
     readings, share:  of so many readings, more than this share must not be unusable
     """
 
@@ -62,6 +64,7 @@ class SensorLimits:
     sure: float = 0.2
     degrees: tuple[float, float] = (0.012, 0.025)
     negated: float = -0.4
+    soft_iron: float = 0.1
     readings: int = 500
     share: float = 0.01
 
@@ -227,11 +230,11 @@ class SensorChecks:
         p, fit = self.limits, self._fit()
         if fit is None:
             return
-        g, sigma = fit
+        g, sigma, feigned = fit
         # what a scale of 1/57 means is small beside 1 and must be known beside itself
         known = [k for k in range(3) if sigma[k] < p.sure * abs(g[k])]
         degrees = [k for k in known if p.degrees[0] < abs(g[k]) < p.degrees[1]]
-        negated = [k for k in known if g[k] < p.negated]
+        negated = [k for k in known if g[k] + feigned[k] < p.negated]
         if degrees and len(degrees) == len(known):
             yield (
                 "gyroscope unit",
@@ -247,8 +250,9 @@ class SensorChecks:
                 "two sensors do not share one frame; nothing that is calibrated from them is right",
             )
 
-    def _fit(self) -> tuple[Array, Array] | None:
-        """g (3,) with its 1-sigma, per axis; None where the field says too little."""
+    def _fit(self) -> tuple[Array, Array, Array] | None:
+        """g (3,) with its 1-sigma, and how much of it soft iron may feign, per axis; None where the
+        field says too little."""
         p = self.limits
         pairs = [
             (one, two)
@@ -289,7 +293,10 @@ class SensorChecks:
         for row, k in enumerate(used):
             if k < 3 and not lost[row]:
                 g[k], sigma[k] = found[row] / size[k], np.sqrt(spread[row]) / size[k]
-        return g, sigma
+        turned = np.sqrt(np.mean(angle**2, axis=0))
+        shown = np.abs(np.nan_to_num(g)) * turned  # by the field
+        others = np.sqrt(np.maximum(shown @ shown - shown**2, 0.0))
+        return g, sigma, p.soft_iron * others / np.maximum(turned, 1e-12)
 
 
 def _changed(before: dict[str, str], now: dict[str, str]) -> list[str]:

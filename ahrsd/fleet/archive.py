@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ahrsd.errors import AhrsdError
-from ahrsd.printable import printable
+from ahrsd.printable import line, printable
 
 SUFFIXES = (
     ".mcap", ".vnraw", ".vnbin", ".bin", ".log", ".txt", ".csv", ".parquet", ".bag", ".db3", ".ulg",
@@ -27,6 +28,16 @@ SUFFIXES = (
 _BESIDE = ("*.gps.csv", "*.gps.csv.gz")  # what `evaluate` reads beside a recording
 _ROS_2 = "metadata.yaml"  # makes a folder one recording
 _SCRATCH = "ahrsd-fleet-"
+#: modules below fsspec and the base of what they raise beside OSError
+_STORAGE_ERRORS = (
+    ("aiohttp", "ClientError"),
+    ("botocore.exceptions", "BotoCoreError"),
+    ("botocore.exceptions", "ClientError"),
+    ("google.auth.exceptions", "GoogleAuthError"),
+    ("gcsfs.retry", "HttpError"),
+    ("azure.core.exceptions", "AzureError"),
+    ("paramiko.ssh_exception", "SSHException"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,14 +148,36 @@ def _file_system(root: str) -> tuple[Any, str]:
 
 def _remote(root: str) -> Iterator[ArchiveEntry]:
     system, top = _file_system(root)
-    if not system.isdir(top):
-        raise AhrsdError(f"{root}: is no folder of {system.protocol}; check the address")
-    for folder, _, files in system.walk(top, detail=True):
-        below = folder[len(top) :].strip("/")
-        names = tuple(below.split("/")) if below else ()
-        for name, facts in files.items():
-            if not name.startswith("."):
-                yield _object(system, facts, names)
+    try:
+        with _as_os_error():
+            if not system.isdir(top):
+                raise AhrsdError(f"{root}: holds no folder of that name; check the address")
+            for folder, _, files in system.walk(top, detail=True, on_error="raise"):
+                below = folder[len(top) :].strip("/")
+                names = tuple(below.split("/")) if below else ()
+                for name, facts in files.items():
+                    if not name.startswith("."):
+                        yield _object(system, facts, names)
+    except OSError as error:
+        raise AhrsdError(
+            f"{root}: cannot be listed: {line(error.strerror or str(error))}; check the address, "
+            "the network and the credentials"
+        ) from error
+
+
+@contextmanager
+def _as_os_error() -> Iterator[None]:
+    """What a storage's library raises, each classes of its own, is an OSError."""
+    try:
+        yield
+    except _storage_errors() as error:
+        raise OSError(f"{type(error).__name__}: {error}") from error
+
+
+def _storage_errors() -> tuple[type[Exception], ...]:
+    """Of the libraries that are loaded by now."""
+    loaded = ((sys.modules.get(module), name) for module, name in _STORAGE_ERRORS)
+    return tuple(getattr(module, name) for module, name in loaded if module is not None)
 
 
 def _object(system: Any, facts: dict[str, Any], names: tuple[str, ...]) -> ArchiveEntry:  # noqa: ANN401
@@ -172,7 +205,8 @@ def local_file(entry: ArchiveEntry) -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix=f"{_SCRATCH}{os.getpid()}-"))
     try:
         target = folder / entry.url.rpartition("/")[2]
-        system.get_file(path, str(target))
+        with _as_os_error():
+            system.get_file(path, str(target))
         yield target
     finally:
         shutil.rmtree(folder, ignore_errors=True)

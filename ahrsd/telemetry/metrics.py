@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from ahrsd.sharing.arbiter import COUNTED
 from ahrsd.telemetry.explain import STATES
 
 Status = Mapping[str, Any]
@@ -65,6 +66,27 @@ def _states(status: Status) -> Samples:
 
 def _locked(status: Status) -> Samples:
     return [((), float(status["write_back"]["locked"] is not None))]
+
+
+def _shares(name: str) -> Callable[[Status], Samples]:
+    """One figure of each share; absent where a share has none, as UDP has no readers."""
+
+    def read(status: Status) -> Samples:
+        every = [(share["port"], share[name]) for share in status["shares"]]
+        return [((port,), float(value)) for port, value in every if value is not None]
+
+    return read
+
+
+def _commands(status: Status) -> Samples:
+    """What became of the commands that clients of ptys sent."""
+    return [
+        ((share["port"], outcome), float(share[outcome]))
+        for share in status["shares"]
+        if not share["send"]
+        for outcome in COUNTED
+        if outcome != "commands"  # all of them
+    ]
 
 
 def _capture(status: Status) -> Samples:
@@ -139,6 +161,36 @@ METRICS: Final = (
         "Batches that the viewer did not take",
         (),
         _number("viewer", "dropped"),
+    ),
+    MetricRow("ahrsd_share_open", "gauge", "Somebody reads it", ("share",), _shares("open")),
+    MetricRow("ahrsd_share_readers", "gauge", "Readers over TCP", ("share",), _shares("readers")),
+    MetricRow(
+        "ahrsd_share_lost_bytes",
+        "counter",
+        "Bytes that readers lost who were too slow",
+        ("share",),
+        _shares("lost_bytes"),
+    ),
+    MetricRow(
+        "ahrsd_share_turned_away",
+        "counter",
+        "Readers turned away",
+        ("share",),
+        _shares("turned_away"),
+    ),
+    MetricRow(
+        "ahrsd_share_ignored_bytes",
+        "counter",
+        "Bytes that readers sent, who can write nothing",
+        ("share",),
+        _shares("ignored_bytes"),
+    ),
+    MetricRow(
+        "ahrsd_share_commands",
+        "counter",
+        "Commands of clients, by what became of them",
+        ("share", "outcome"),
+        _commands,
     ),
 )
 

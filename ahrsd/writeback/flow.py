@@ -372,6 +372,7 @@ class Flow:
             self.outbox.record(RecordKind.PROVEN, reason=reason, unsent=True)
 
     def _enter_saving(self, reason: str) -> None:
+        self.safe.save_from_s = self.outbox.host_s
         make = partial(save, self.transaction(), self.session_keys)
         self.outbox.run("save", Purpose.SAVE, make)
 
@@ -467,8 +468,9 @@ class Flow:
             self.outbox.record(RecordKind.FLASH_ACKED, serial=self.transaction().serial)
             self.signal(Signal.DONE, "the device acknowledged the save")
         else:
-            self.outbox.note("warning", f"not saved: {outcome}")
-            self.signal(Signal.NOT_SENT, str(outcome))
+            reason = self.safe.save_too_late(self.outbox.host_s) or str(outcome)
+            self.outbox.note("warning", f"not saved: {reason}")
+            self.signal(Signal.NOT_SENT, reason)
             if outcome.differing:
                 self.outbox.ask(IdentifyAgain())
         self._set_up_stream()

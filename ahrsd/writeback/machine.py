@@ -282,8 +282,7 @@ class WriteBack:
         else:
             self.confirmed_s = self._recheck.asked_s
             self._restarts.answered(self._recheck.asked_s, host_s)
-            took_s = host_s - self._recheck.asked_s
-            self._safe.asking_took_s = min(took_s, self.policy.recheck_s)
+            self._safe.asking_took(host_s - self._recheck.asked_s)
             flow.proven_to_s = self._sampled_to_s if flow.passed else None
         return self._answer()
 

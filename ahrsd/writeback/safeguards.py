@@ -5,6 +5,7 @@ Everything here fails closed: what is not known, not fresh or not readable count
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 
 from ahrsd.events import GateResult
@@ -20,6 +21,9 @@ from drivers.vn100.registers import Values
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
 UNEXAMINED_S = 2.0  # samples that the estimate has not seen yet may hold a step
+SAVE_CHECKS_S = 0.5  # what stands before VNWNV reads every register, and no sample comes meanwhile
+SAVE_CHECKS_PER_ASKING = 6.0  # four to five times the answers of asking it who it is
+ASKINGS = 5  # of so many the quickest had no late answer; more, and a line that slowed is not seen
 NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
 
 
@@ -41,7 +45,8 @@ class Safeguards:
         self.proof_waits = ""  # why they must be proven again
         self.sampled_s: float | None = None  # host time of the newest sample
         self.examined_s: float | None = None  # and of the newest one in the estimate
-        self.asking_took_s = 0.0  # until the device had said who it is; samples came meanwhile
+        self._asking_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
+        self.save_from_s = float("-inf")  # when the save was decided
         self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
         self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
         self._serial = policy.serial
@@ -65,6 +70,7 @@ class Safeguards:
         """Judge a device that was identified and read; the first one is the one to write to."""
         self.journal_ok = journal_readable
         self.gates = self.flash_gates = ()  # what was judged before is of before
+        self._asking_s.clear()
         hsi = registers.get(HSI_CONTROL)
         self._hsi_applied = hsi is None or hsi[1] == HSI_APPLIED
         self._serial = identity.serial if self._serial is None else self._serial
@@ -160,6 +166,29 @@ class Safeguards:
             reasons.append(f"the newest verdict is {host_s - self.judged_s:.0f} s old")
         return reasons + self.unexamined()
 
+    def asking_took(self, took_s: float) -> None:
+        """The device was asked who it is and what it holds, and answered as it ought to."""
+        self._asking_s.append(took_s)
+
+    @property
+    def _on_this_line_s(self) -> float:
+        """How long it takes to ask that, where no answer is late; samples wait meanwhile."""
+        return min(self._asking_s, default=0.0)
+
+    def save_too_late(self, host_s: float) -> str:
+        """Why what was judged when the save was decided is too old by now; empty where it is not.
+
+        The checks before VNWNV pause the stream, so nobody sees what happens to the vehicle. They
+        may last as long as they do on this line with no answer late.
+        """
+        most_s = max(SAVE_CHECKS_S, SAVE_CHECKS_PER_ASKING * self._on_this_line_s)
+        if (took_s := host_s - self.save_from_s) <= most_s:
+            return ""
+        return (
+            f"the device's answers were late: {took_s:.1f} s without a sample since the save was "
+            f"decided, {most_s:.1f} s are allowed"
+        )
+
     def examined(self, to_s: float) -> bool:
         """Whether the estimate has taken the samples up to this host time into account."""
         return self.examined_s is None or self.examined_s >= to_s
@@ -169,7 +198,7 @@ class Safeguards:
         if self.sampled_s is None or self.examined_s is None:
             return []
         late_s = self.sampled_s - self.examined_s
-        if late_s <= UNEXAMINED_S + self.asking_took_s:
+        if late_s <= UNEXAMINED_S + self._on_this_line_s:
             return []
         return [f"the newest {late_s:.0f} s of samples are not judged yet"]
 
@@ -192,6 +221,7 @@ class Safeguards:
                 and self.journal_ok
                 and not (self.void or self.disagrees or self.proof_waits or self.theirs)
                 and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
+                and not self.save_too_late(host_s)
             )
         return True
 

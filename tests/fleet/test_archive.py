@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import pytest
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.archive import Archive, local_file
+from ahrsd.fleet.archive import Archive, ArchiveEntry, local_file
 
 FILES = ("rov1/harbour/a.mcap", "rov1/b.csv.gz", "c.ULG", "rov2/d.vnraw")
 OTHERS = ("readme.md", "rov1/b.csv.gz.truth.json", "rov1/b.gps.csv.gz", "rov2/.hidden.csv")
@@ -70,7 +73,7 @@ def test_fsspec_lists_the_same_and_gives_the_bytes(archive):
     [
         ("{}/none", "does not exist; give the folder"),
         ("{}/c.ULG", "is no folder"),
-        ("file://{}/none", "is no folder"),
+        ("file://{}/none", "holds no folder of that name"),
         ("nobody://x", "Protocol not known"),
         ("s3://bucket/dives", "pip install 'ahrsd[s3]'"),
     ],
@@ -86,3 +89,36 @@ def test_what_cannot_be_listed_is_said(archive, root, words):
     with pytest.raises(AhrsdError) as told:
         list(Archive(root.format(archive)).entries())
     assert words in str(told.value)
+
+
+def test_a_storage_that_fails_in_words_of_its_own_ends_in_one_line(monkeypatch):
+    """The libraries of storages raise classes of their own, such as botocore's."""
+    fsspec = pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
+
+    class BotoCoreError(Exception):
+        pass
+
+    class NoEndpoint(BotoCoreError):
+        pass
+
+    library = SimpleNamespace(BotoCoreError=BotoCoreError, ClientError=BotoCoreError)
+    monkeypatch.setitem(sys.modules, "botocore.exceptions", library)
+
+    class Failing(fsspec.AbstractFileSystem):
+        protocol = "failing"
+
+        def isdir(self, path):
+            raise NoEndpoint("could not connect to the endpoint\nhttp://store")
+
+        def get_file(self, rpath, lpath, **_):
+            raise NoEndpoint("connection reset")
+
+    fsspec.register_implementation("failing", Failing, clobber=True)
+    with pytest.raises(AhrsdError) as told:
+        list(Archive("failing://dives").entries())
+    (line,) = str(told.value).splitlines()
+    assert line.startswith("failing://dives: cannot be listed: NoEndpoint: could not connect")
+    assert line.endswith("check the address, the network and the credentials")
+    entry = ArchiveEntry("failing://dives/a.mcap", 1, "", ())
+    with pytest.raises(OSError, match="NoEndpoint: connection reset"), local_file(entry):
+        pass

@@ -107,8 +107,8 @@ def test_covariates_come_along(tmp_path):
     times = np.arange(0.0, 60.0, 0.5)
     more = [
         [(t, df.message("BAT", df.us(t), 0, 12.5, 0.5 * t)) for t in times],
-        [(t, df.message("GPS", df.us(t), 0, 3, 600000000 + round(100 * t), 50000000, 1000, 2.5))
-         for t in times],
+        [(t, df.message("GPS", df.us(t), 0, 3, 345_618_000 + round(1000 * t), 2403 * (t > 5.0),
+                        600000000 + round(100 * t), 50000000, 1000, 2.5)) for t in times],
         [(t, df.message("ATT", df.us(t), 100, -200, round(100 * ((350 + t) % 360))))
          for t in times],
     ]  # fmt: skip
@@ -127,6 +127,8 @@ def test_covariates_come_along(tmp_path):
     yaw = (350.0 + at + 180.0) % 360.0 - 180.0
     np.testing.assert_allclose(rows.covariates["vn_yaw_deg"][inside], yaw[inside], atol=0.02)
     np.testing.assert_allclose(rows.covariates["temperature_c"], 31.5, atol=1e-4)
+    # 2,403 weeks and four days behind 1980-01-06, and the 18 leap seconds that UTC is behind
+    assert open_recording(path).facts["recorded_utc"] == "2026-01-29T00:00:00.000+00:00"
 
 
 def test_bytes_that_are_no_message_are_counted(tmp_path):

@@ -126,13 +126,20 @@ def test_readings_that_repeat_are_left_out(tmp_path):
     assert any("2400 of 3000 magnetometer readings repeat" in note for note in recording.notes)
 
 
+def utc_us(time_s):
+    """Of the receiver, which does not know it yet in the first seconds."""
+    return 1_769_644_800_000_000 + round(1e6 * time_s) if time_s > 3.0 else 0
+
+
 def test_covariates_come_along(tmp_path):
     times = np.arange(0.0, 30.0, 0.5)
     more = [("battery_status", 0, t, (12.5, 2.0 * t)) for t in times]
-    more += [("sensor_gps", 0, t, (60.0 + 1e-5 * t, 5.0, 10.0, 2.5, 3)) for t in times]
+    more += [("sensor_gps", 0, t, (60.0 + 1e-5 * t, 5.0, 10.0, 2.5, 3, utc_us(t))) for t in times]
     half = np.radians(20.0) / 2
     more += [("vehicle_attitude", 0, t, (np.cos(half), 0.0, 0.0, np.sin(half))) for t in times]
-    rows = open_recording(good(tmp_path / "log.ulg", *more)).table.rows
+    recording = open_recording(good(tmp_path / "log.ulg", *more))
+    assert recording.facts["recorded_utc"] == "2026-01-29T00:00:00.000+00:00"
+    rows = recording.table.rows
     inside = rows.time_s < 29.0
     at = rows.time_s[inside]
     columns = {name: values[inside] for name, values in rows.covariates.items()}

@@ -49,10 +49,11 @@ def lenient_gates() -> dict[str, float]:
     return {**easy, "second_opinion_deg": 180.0, "field_min_gauss": 0.0}
 
 
-def two_units(**options: Any) -> Cable:
+def two_units(rate_hz: float = 20.0, **options: Any) -> Cable:
     """The unit that is judged, and a spare one with another iron."""
     first = Unit(FIRST, IRON, BIAS, **options)
-    return Cable(first, Unit(SPARE, np.array([-0.1, 0.08, 0.02]), -BIAS, uptime_s=1e5, **options))
+    spare = Unit(SPARE, np.array([-0.1, 0.08, 0.02]), -BIAS, uptime_s=1e5, **options)
+    return Cable(first, spare, rate_hz=rate_hz)
 
 
 class CabledRun:

@@ -150,6 +150,10 @@ class Cable:
         self._silent_s = silent_s
         self._half = self._out = b""
 
+    def fall_silent(self, seconds: float) -> None:
+        """Nothing goes either way for a while; the unit stays."""
+        self._silent_s = seconds
+
     def receive(self, data: bytes) -> None:
         """From the host."""
         lines = (self._half + data).split(b"\n")

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-SIZES = {"Q": "Q", "I": "I", "B": "B", "h": "h", "f": "f", "c": "h", "C": "H", "L": "i", "e": "i",
-         "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
+SIZES = {"Q": "Q", "I": "I", "B": "B", "H": "H", "h": "h", "f": "f", "c": "h", "C": "H", "L": "i",
+         "e": "i", "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
 TYPES = {
     "PARM": (1, "QNf", "TimeUS,Name,Value"),
     "MSG": (2, "QZ", "TimeUS,Message"),
     "MAG": (3, "QBhhhhhhhhhBI", "TimeUS,I,MagX,MagY,MagZ,OfsX,OfsY,OfsZ,MOX,MOY,MOZ,Health,S"),
     "IMU": (4, "QBfffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,T"),
     "BAT": (5, "QBff", "TimeUS,Inst,Volt,Curr"),
-    "GPS": (6, "QBBLLef", "TimeUS,I,Status,Lat,Lng,Alt,Spd"),
+    "GPS": (6, "QBBIHLLef", "TimeUS,I,Status,GMS,GWk,Lat,Lng,Alt,Spd"),
     "ATT": (7, "QccC", "TimeUS,Roll,Pitch,Yaw"),
     "MOD": (8, "QB", "TimeUS,Mode"),
 }

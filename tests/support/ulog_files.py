@@ -17,7 +17,7 @@ FORMATS = {
     "sensor_selection": "uint64_t timestamp;uint32_t accel_device_id;uint32_t gyro_device_id",
     "battery_status": "uint64_t timestamp;float voltage_v;float current_a",
     "sensor_gps": "uint64_t timestamp;double latitude_deg;double longitude_deg;"
-    "double altitude_msl_m;float vel_m_s;uint8_t fix_type",
+    "double altitude_msl_m;float vel_m_s;uint8_t fix_type;uint64_t time_utc_usec",
     "vehicle_attitude": "uint64_t timestamp;float[4] q",
 }
 OLD = {

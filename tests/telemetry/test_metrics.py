@@ -31,6 +31,32 @@ STATUS = {
     "write_back": {"state": "TRIAL", "locked": None, "flashes": 3},
     "capture": {"error": ""},
     "viewer": {"dropped": 4},
+    "shares": [
+        {
+            "port": "/run/ahrsd/vn100",
+            "open": True,
+            "send": "",
+            "readers": None,
+            "lost_bytes": 12,
+            "turned_away": 0,
+            "ignored_bytes": 0,
+            "commands": 9,
+            "answered": 6,
+            "refused": 1,
+            "absorbed": 2,
+            "dropped": 0,
+            "unanswered": 0,
+        },
+        {
+            "port": "tcp 127.0.0.1:2101",
+            "open": False,
+            "send": "raw",
+            "readers": 0,
+            "lost_bytes": 0,
+            "turned_away": 3,
+            "ignored_bytes": 77,
+        },
+    ],
 }
 
 
@@ -63,6 +89,13 @@ def test_values_and_labels(scraped):
     assert found["ahrsd_state", ("TRIAL",)] == 1.0
     assert found["ahrsd_state", ("OBSERVING",)] == 0.0
     assert found["ahrsd_flash_writes_total", ()] == 3.0
+    pty, tcp = "/run/ahrsd/vn100", "tcp 127.0.0.1:2101"
+    assert found["ahrsd_share_open", (pty,)] == 1.0
+    assert found["ahrsd_share_commands_total", ("absorbed", pty)] == 2.0
+    assert ("ahrsd_share_commands_total", ("answered", tcp)) not in found
+    assert found["ahrsd_share_readers", (tcp,)] == 0.0
+    assert ("ahrsd_share_readers", (pty,)) not in found
+    assert found["ahrsd_share_turned_away_total", (tcp,)] == 3.0
     assert {name.removesuffix("_total") for name, _ in found} == {row.name for row in METRICS}
 
 

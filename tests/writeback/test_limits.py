@@ -322,6 +322,8 @@ def test_the_gate_itself_asks_everything_again(make_rig):
     assert not safe.allow(save, Purpose.SAVE, now_s)
     rig.do(rig.wb.on_operator("arm", "", now_s))
     assert safe.allow(write, Purpose.STAGE, now_s)
+    assert not safe.allow(save, Purpose.SAVE, now_s)  # no save was decided
+    safe.save_from_s = now_s
     assert safe.allow(save, Purpose.SAVE, now_s)
     assert not safe.allow(write, Purpose.STAGE, now_s + 1.1)
     assert not safe.allow(save, Purpose.SAVE, now_s + 1.1)

@@ -66,6 +66,47 @@ def test_at_every_command_of_the_save(at):
     undone(run)
 
 
+@pytest.mark.parametrize("at", [1, 12, 30])
+def test_a_save_whose_checks_take_long_is_decided_anew(at, monkeypatch):
+    """No sample comes during the checks, so nobody sees whether the vehicle changed."""
+    monkeypatch.setattr("ahrsd.writeback.flow.RETRY_SAVE_S", 12.0)  # not ten minutes
+    run, heard, held_s = CabledRun(two_units(rate_hz=50.0)), [], []
+    run.proven()
+
+    def silence(line: str) -> None:
+        if run.state == "SAVING" and not held_s:
+            heard.append(line)
+            if len(heard) == at:
+                run.cable.fall_silent(0.6)
+                held_s.append(run.now_s)
+
+    run.cable.unit.before = silence
+    run.park(10.0)
+    unit = run.cable.units[FIRST]
+    assert held_s
+    assert unit.saves == []
+    assert run.state == "PROVEN"
+    assert run.told("not saved", "answers were late", "1.1 s are allowed")
+    assert run.until("COMMITTED", 20.0)
+    assert len(unit.saves) == 1
+    assert run.kinds().count("FLASH_SENT") == 2
+
+
+def test_a_line_that_is_slow_by_itself_is_no_reason_not_to_save():
+    """One answer in 50 ms: the checks of a save last two seconds and more."""
+    run, begun_s = CabledRun(two_units()), []
+    run.proven()
+
+    def first(line: str) -> None:
+        if run.state == "SAVING" and not begun_s:
+            begun_s.append(run.now_s)
+
+    run.cable.unit.before = first
+    run.cable.moving, run.safe = False, True
+    assert run.until(lambda: run.cable.units[FIRST].saves, 20.0)
+    assert run.now_s - begun_s[0] > 1.0
+
+
 def test_an_estimate_that_clearly_asks_for_something_else_ends_it():
     run = CabledRun(two_units())
     run.proven()

@@ -21,7 +21,13 @@ from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
 from ahrsd.recording.foreign.dataflash import Log, read_log, refuse_empty
-from ahrsd.recording.foreign.sensors import Choice, Sensors, SensorSeries, positions
+from ahrsd.recording.foreign.sensors import (
+    Choice,
+    Sensors,
+    SensorSeries,
+    positions,
+    recorded_utc,
+)
 from ahrsd.samples import Array
 
 _MAGS = ("MAG", "MAG2", "MAG3")
@@ -32,6 +38,10 @@ _INSTANCES = ("I", "Inst", "Instance")
 _TIMES = (("TimeUS", 1e-6), ("TimeMS", 1e-3))
 _VERSION = re.compile(r"V(\d+)\.(\d+)")
 _LEARNED_MG = 2.0  # offsets that move by more were learned in flight
+#: week and ms of the week since 1980; the second pair in old logs
+_SATELLITES = (("GWk", "GMS"), ("Week", "TimeMS"))
+_GPS_EPOCH_S, _WEEK_S = 315964800.0, 604800.0
+_LEAP_S = 18.0  # since 2017; up to 3 less before
 _SOME = "record MAG and IMU (LOG_BITMASK)"
 
 
@@ -255,7 +265,20 @@ def _covariates(path: Path, log: Log, out: Sensors) -> None:
             at = log.column("GPS", "T")[rows] * 1e-3
         else:
             return
+        if out.mag is not None:
+            out.facts |= _began(log, rows, at, float(out.mag.time_s[0]))
         lat, lon, height = (log.column("GPS", name)[rows] for name in ("Lat", "Lng", "Alt"))
         out.more |= positions(at, lat, lon, height)
         if log.has("GPS", "Spd"):
             out.more["gps_speed_m_s"] = SensorSeries(at, log.column("GPS", "Spd")[rows][:, None])
+
+
+def _began(log: Log, rows: NDArray[np.bool], at: Array, first_s: float) -> dict[str, str]:
+    """When the log's first reading was, by the satellites' time of the fixes."""
+    for week, milliseconds in _SATELLITES:
+        if log.has("GPS", week, milliseconds):
+            weeks = log.column("GPS", week)[rows]
+            seconds = 1e-3 * log.column("GPS", milliseconds)[rows] - _LEAP_S
+            unix_s = np.where(weeks > 0, _GPS_EPOCH_S + _WEEK_S * weeks + seconds, np.nan)
+            return recorded_utc(at, unix_s, first_s)
+    return {}

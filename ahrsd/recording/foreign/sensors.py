@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -28,6 +29,7 @@ _MAG_SIZES = ((0.2, 0.8), (0.05, 3.0))  # of the Earth's field; with much iron a
 _FASTEST_RAD_S = 20.0  # which nothing turns in the median
 _LARGEST = 1e9  # what no sensor reads in any unit
 _EARTH_M = 6371008.8
+_SATELLITES_SINCE_S, _UNTIL_S = 9.5e8, 4.1e9  # 2000 to 2099: a receiver that knows the time
 _SENSORS = {"mag": MAG, "gyro": GYRO, "accel": ACCEL}
 
 
@@ -150,6 +152,20 @@ def positions(
         "position_down_m": height[0] - height,
     }
     return {name: SensorSeries(time_s, values[:, None]) for name, values in columns.items()}
+
+
+def recorded_utc(time_s: Array, unix_s: Array, first_s: float) -> dict[str, str]:
+    """When a recording began, as a fact, by the satellites' time in some of its rows; nothing where
+    no row has one.
+
+    time_s, unix_s (N,): the same moments on the recording's clock and in s since 1970, nan where
+    unknown; first_s: the first sample's time on the recording's clock
+    """
+    began = (unix_s - time_s + first_s)[(unix_s > _SATELLITES_SINCE_S) & (unix_s < _UNTIL_S)]
+    if not len(began):
+        return {}
+    at = datetime.fromtimestamp(float(np.median(began)), UTC)
+    return {"recorded_utc": at.isoformat(timespec="milliseconds")}
 
 
 def _called(what: str, found: Sensors, key: str) -> str:

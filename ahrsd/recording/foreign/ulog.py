@@ -20,7 +20,13 @@ import numpy as np
 from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.printable import printable
-from ahrsd.recording.foreign.sensors import Choice, Sensors, SensorSeries, positions
+from ahrsd.recording.foreign.sensors import (
+    Choice,
+    Sensors,
+    SensorSeries,
+    positions,
+    recorded_utc,
+)
 from ahrsd.samples import Array
 
 _TOPICS = (
@@ -246,6 +252,9 @@ def _fixes(one: _Set, out: Sensors) -> None:
         return
     fixed = data["fix_type"] >= 3
     at = data["timestamp"][fixed] * 1e-6
+    if "time_utc_usec" in data and out.mag is not None:
+        unix_s = data["time_utc_usec"][fixed] * 1e-6
+        out.facts |= recorded_utc(at, unix_s, float(out.mag.time_s[0]))
     if "latitude_deg" in data:  # since 1.14; before that integers of 1e-7 deg and mm
         names, factors = ("latitude_deg", "longitude_deg", "altitude_msl_m"), (1.0, 1.0, 1.0)
     else:

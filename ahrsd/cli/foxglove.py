@@ -1,0 +1,86 @@
+"""`ahrsd foxglove`: the running daemon for Foxglove, in a process of its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import ipaddress
+import signal
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from ahrsd.cli.running_daemon import DaemonPlace, place_options
+from ahrsd.errors import AhrsdError, DeviceError
+
+if TYPE_CHECKING:
+    from ahrsd.viewer.foxglove_server import FoxgloveServer
+
+_AGAIN_S = 1.0
+
+
+@click.command()
+@place_options
+@click.option(
+    "--address",
+    default="127.0.0.1",
+    show_default=True,
+    help="Where to listen. Anybody who reaches another address can read.",
+)
+@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535))
+def command(place: DaemonPlace, address: str, port: int) -> None:
+    """Serve the running daemon to Foxglove: fields, rates, heading, estimate, log, on a WebSocket.
+
+    It only shows. It is a process of its own: whatever happens to it, the daemon does not notice.
+    Exit 75 where the port is taken.
+    """
+    if not importlib.util.find_spec("foxglove"):
+        raise AhrsdError("foxglove-sdk is missing: pip install 'ahrsd[foxglove]'")
+    from ahrsd.viewer.foxglove_server import FoxgloveServer
+
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:
+        raise click.UsageError(f"--address {address}: must be an IP address") from None
+    stopped = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.set())
+    with FoxgloveServer(address, port) as server:
+        shown = f"[{address}]" if found.version == 6 else address
+        click.echo(f"ws://{shown}:{server.port} (in Foxglove: Open connection, Foxglove WebSocket)")
+        if not found.is_loopback:
+            click.echo(f"anybody who reaches {shown}:{server.port} can read it", err=True)
+        _follow(place, server, stopped)
+
+
+def _follow(place: DaemonPlace, server: FoxgloveServer, stopped: threading.Event) -> None:
+    """Show what the daemon says until a signal comes; where it is gone, wait for it."""
+    away = ""
+    while not stopped.is_set():
+        try:
+            _watch(place, server, stopped)
+        except (DeviceError, OSError, ValueError) as error:
+            if str(error) != away:
+                away = str(error)
+                click.echo(f"{away}; waiting for it", err=True)
+            server.away(away)
+            stopped.wait(_AGAIN_S)
+        else:
+            away = ""
+
+
+def _watch(place: DaemonPlace, server: FoxgloveServer, stopped: threading.Event) -> None:
+    from ahrsd.viewer.foxglove_topics import Topics
+
+    with place.connect() as daemon:
+        topics = Topics(time.time() - time.monotonic())
+        server.back()
+        click.echo(f"{daemon.path}: the daemon answers", err=True)
+        for record in daemon.watch(("status", "events", "samples")):
+            if stopped.is_set():
+                return
+            if "error" in record:
+                raise ValueError(str(record["error"]))
+            for message in topics.of(record, time.monotonic()):
+                server.show(message)

@@ -1,0 +1,178 @@
+"""What Foxglove is shown: the records of the daemon's socket as messages on topics; pure.
+
+| topic | holds | how often |
+|---|---|---|
+| /magnetometer/raw, .../corrected | x, y, z, norm [gauss]; by register 23 in force | each sample |
+| /angular_rate | x, y, z [rad/s] | each sample |
+| /field/raw, /field/corrected | a cloud of points [gauss]: a sphere where all is well | 1 s |
+| /attitude | heading now and by the newest estimate, roll, pitch [deg] | 1 s |
+| /estimate | hard iron [gauss], gyro bias [rad/s], heading's sigma [deg] | each estimate |
+| /write_back | state, what holds a write back | each change, 1 s |
+| /log | the daemon's log | each line |
+
+Vectors are in the body frame, that of the device's own outputs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from ahrsd.samples import Array
+
+FRAME: Final = "body"
+RAW, CORRECTED, RATE = "/magnetometer/raw", "/magnetometer/corrected", "/angular_rate"
+CLOUDS: Final = {RAW: "/field/raw", CORRECTED: "/field/corrected"}
+ATTITUDE, ESTIMATE, WRITE_BACK, LOG = "/attitude", "/estimate", "/write_back", "/log"
+_POINTS = 4000  # of a cloud; the oldest goes first
+_APART = 0.02  # of the field, from the last point that was kept
+_CLOUD_S = 1.0
+
+_NUMBER: dict[str, object] = {"type": ["number", "null"]}
+_TEXT: dict[str, object] = {"type": "string"}
+
+
+def _object(**properties: object) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+#: topic: JSON schema of its messages
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+    RAW: {**_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, norm=_NUMBER), "title": "gauss"},
+    CORRECTED: {**_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, norm=_NUMBER), "title": "gauss"},
+    RATE: {**_VECTOR, "title": "rad/s"},
+    ATTITUDE: _object(
+        heading_deg=_NUMBER, heading_would_be_deg=_NUMBER, roll_deg=_NUMBER, pitch_deg=_NUMBER
+    ),
+    ESTIMATE: _object(
+        hard_iron_gauss=_VECTOR,
+        sigma_hard_iron_gauss=_VECTOR,
+        gyro_bias_rad_s=_VECTOR,
+        sigma_gyro_bias_rad_s=_VECTOR,
+        heading_sigma_deg=_NUMBER,
+        converged={"type": "boolean"},
+    ),
+    WRITE_BACK: _object(
+        state=_TEXT,
+        reason=_TEXT,
+        holds={"type": "array", "items": _TEXT},
+        gates_shut=_NUMBER,
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessage:
+    """A message: of a cloud (n, 3) points, of the log (level, text), else a JSON object."""
+
+    topic: str
+    unix_ns: int
+    content: dict[str, Any] | Array | tuple[str, str]
+
+
+@dataclass(slots=True)
+class _Cloud:
+    points: deque[Array] = field(default_factory=lambda: deque(maxlen=_POINTS))
+
+    def take(self, vector: Array) -> None:
+        """Keep it where it differs from the last one; a vehicle at rest fills no cloud."""
+        if not np.isfinite(vector).all():
+            return
+        size = float(np.linalg.norm(vector))
+        if not self.points or np.linalg.norm(vector - self.points[-1]) > _APART * size:
+            self.points.append(vector)
+
+
+class Topics:
+    """The messages of one connection to the daemon."""
+
+    def __init__(self, wall_offset_s: float) -> None:
+        """`wall_offset_s`: what the host's wall clock is ahead of its monotonic one."""
+        self._offset_ns = round(wall_offset_s * 1e9)
+        self._clouds = {topic: _Cloud() for topic in CLOUDS}
+        self._cloud_s = float("-inf")
+
+    def of(self, record: Mapping[str, Any], now_s: float) -> list[TopicMessage]:
+        """What a record says; nothing of kinds that are not shown.
+
+        now_s: the host's monotonic clock, for records that carry no time of their own
+        """
+        at_ns = self._unix_ns(_number(record.get("host_s"), now_s))
+        match record.get("record"):
+            case "samples":
+                return list(self._samples(record))
+            case "status":
+                return list(_status(record, self._unix_ns(now_s)))
+            case "estimate":
+                return [TopicMessage(ESTIMATE, at_ns, _estimate(record))]
+            case "state":
+                told = {"state": record["new"], "reason": record["reason"]}
+                return [TopicMessage(WRITE_BACK, at_ns, told)]
+            case "note":
+                return [TopicMessage(LOG, at_ns, (str(record["level"]), str(record["text"])))]
+            case "gap":
+                text = f"{record['lost']} records are lost: this program read too slowly"
+                return [TopicMessage(LOG, at_ns, ("warning", text))]
+        return []
+
+    def _samples(self, record: Mapping[str, Any]) -> Iterator[TopicMessage]:
+        columns = {
+            RAW: record["raw_b_gauss"],
+            CORRECTED: record["corrected_b_gauss"],
+            RATE: record["gyro_b_rad_s"],
+        }
+        host_s = record["host_s"]
+        for topic, vectors in columns.items():
+            for at_s, vector in zip(host_s, vectors, strict=True):
+                content = _vector(vector)
+                if topic in self._clouds:
+                    known = np.array([np.nan if one is None else one for one in vector])
+                    self._clouds[topic].take(known)
+                    norm = float(np.linalg.norm(known))
+                    content["norm"] = norm if np.isfinite(norm) else None
+                yield TopicMessage(topic, self._unix_ns(at_s), content)
+        if host_s and host_s[-1] - self._cloud_s >= _CLOUD_S:
+            self._cloud_s = host_s[-1]
+            for topic, cloud in self._clouds.items():
+                if cloud.points:
+                    points = np.array(cloud.points)
+                    yield TopicMessage(CLOUDS[topic], self._unix_ns(self._cloud_s), points)
+
+    def _unix_ns(self, host_s: float) -> int:
+        return round(host_s * 1e9) + self._offset_ns
+
+
+def _status(record: Mapping[str, Any], at_ns: int) -> Iterator[TopicMessage]:
+    readings, write_back = record.get("readings"), record.get("write_back")
+    if readings:
+        names = SCHEMAS[ATTITUDE]["properties"]
+        yield TopicMessage(ATTITUDE, at_ns, {name: readings.get(name) for name in names})
+    if write_back:
+        shut = sum(not gate["ok"] for gate in record.get("gates", ()))
+        told = {"state": write_back["state"], "holds": write_back["holds"], "gates_shut": shut}
+        yield TopicMessage(WRITE_BACK, at_ns, told)
+
+
+def _estimate(record: Mapping[str, Any]) -> dict[str, Any]:
+    sigma = record["standard_deviation"]  # soft iron (6,), hard iron (3,), gyro bias (3,)
+    return {
+        "hard_iron_gauss": _vector(record["hard_iron_gauss"]),
+        "sigma_hard_iron_gauss": _vector(sigma[6:9]),
+        "gyro_bias_rad_s": _vector(record["gyro_bias_rad_s"]),
+        "sigma_gyro_bias_rad_s": _vector(sigma[9:12]),
+        "heading_sigma_deg": record["heading_sigma_deg"],
+        "converged": record["converged"],
+    }
+
+
+def _vector(values: Iterable[float | None]) -> dict[str, float | None]:
+    return dict(zip("xyz", values, strict=True))
+
+
+def _number(value: object, otherwise: float) -> float:
+    return float(value) if isinstance(value, int | float) else otherwise
