@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from ahrsd.diagnosis.innovation import Bearings, Filtered, carried_along
+from ahrsd.diagnosis.innovation import Bearings, Filtered, carried_along, foretold
 from ahrsd.diagnosis.recursive import both_ways, gaussian
 from ahrsd.diagnosis.specific_force import without_noise
 from ahrsd.diagnosis.track import Track
@@ -84,7 +84,7 @@ def build_context(track: Track, fit: Fit) -> Context:
     return Context(
         track=track,
         model=done.model,
-        field_b=_foretold(done),
+        field_b=_foretold(done, smooth),
         smooth_b=smooth_b,
         rate_b_rad_s=smooth,
         field_dot_b=np.cross(smooth_b, _at_the_sample(smooth, runs)),
@@ -94,11 +94,11 @@ def build_context(track: Track, fit: Fit) -> Context:
     )
 
 
-def _foretold(done: Filtered | Bearings) -> Array:
-    """(N, 3) the predicted field; where no reading was held against it, the smooth one."""
+def _foretold(done: Filtered | Bearings, rate_b_rad_s: Array) -> Array:
+    """(N, 3) the field as foretold; where no reading was held against it, the smooth one."""
     if isinstance(done, Bearings):
         return done.nominal_b
-    return np.where(done.used[:, None], done.predicted_b, done.nominal_b)
+    return np.where(done.used[:, None], foretold(done, rate_b_rad_s), done.nominal_b)
 
 
 @lru_cache(maxsize=2)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from ahrsd.diagnosis.effects.base import Effect, contribution
+from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.forward import context_along
+from ahrsd.diagnosis.forward import context_along, contribution
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import NullModel, Term
 
@@ -31,8 +29,7 @@ def without(
     if not undone:
         return track, left
     context = context_along(track, model, undone, library)
-    parts = [contribution(library[t.identifier], context, t.value, t.setting) for t in undone]
-    mag, gyro = (np.sum([part[side] for part in parts], axis=0) for side in (0, 1))
+    mag, gyro = contribution(context, undone, library)
     return (
         replace(track, mag_b_gauss=track.mag_b_gauss - mag, gyro_b_rad_s=track.gyro_b_rad_s - gyro),
         left,

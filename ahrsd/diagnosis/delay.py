@@ -1,6 +1,10 @@
-"""The gyro moved in time against the magnetometer, exactly.
+"""A recording without the delay between its magnetometer and its gyro.
 
-A magnetometer that is late by tau shows at t the field of t - tau.  Its columns are linear only for
+A magnetometer that is late by tau shows at t all that it measures as it was at t - tau: the Earth's
+field, that of a current, a place, a joint.  So everything else, whatever it was logged by, is moved
+to where the magnetometer is.  Where the gyro is late, it alone is moved.
+
+The gyro is moved exactly.  Its columns are linear only for
 a lag that is short against the motion, so a lag that has been found is taken out by giving each
 magnetometer sample the rotation between t_(k-1) - tau and t_k - tau.  Between samples the rate is
 straight in time with the mean that the step has and the slope of its neighbours (a constant one
@@ -15,8 +19,27 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
+from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
+
+
+def without_lag(track: Track, lag_s: float) -> Track:
+    """The track with a lag of the magnetometer against all else taken out; negative: the gyro's."""
+    moved = delayed_gyro(track, lag_s)
+    if lag_s <= 0.0:
+        return moved
+    accel = track.accel_b_m_s2
+    return replace(
+        moved,
+        accel_b_m_s2=None if accel is None else earlier(track, accel, lag_s),
+        covariates={name: earlier(track, row, lag_s) for name, row in track.covariates.items()},
+    )
+
+
+def earlier(track: Track, values: Array, ago_s: float) -> Array:
+    """What was logged beside a track's samples, (N,) or (N, k), as it was `ago_s` before."""
+    return series.earlier(values, track.time_s, track.dt_s, ago_s)
 
 
 def delayed_gyro(track: Track, tau_s: float) -> Track:

@@ -110,9 +110,54 @@ class Suspect:
 
 
 @dataclass(frozen=True, slots=True)
+class Component:
+    """One part of what is left, beside what recordings ordinarily leave of it.
+
+    size:    deviation over the recording, in `unit`;  up_to: what ordinary recordings leave
+    heading_deg: deviation of a level vehicle's heading by it; None of the gyro's errors
+    evidence_nats: by which the recording is likelier with it;  there: whether that is enough
+    """
+
+    component: str
+    words: str
+    frame: str
+    size: float
+    up_to: float
+    unit: str
+    heading_deg: float | None
+    evidence_nats: float
+    there: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ordinary:
+    """The size of what is left beside what real recordings ordinarily leave.
+
+    within: whether it is ordinary;  why: in a sentence, if it is not
+    field_gauss, heading_deg, gyro_rad_s: everything together, and what ordinary recordings leave
+    beside_gauss, beside_from_gauss: fields but for the largest, and what real recordings leave
+    recordings: untouched real recordings that this was measured on
+    """
+
+    within: bool
+    why: str | None
+    field_gauss: float
+    field_up_to_gauss: float
+    heading_deg: float
+    heading_up_to_deg: float
+    gyro_rad_s: float
+    gyro_up_to_rad_s: float
+    beside_gauss: float
+    beside_from_gauss: float
+    recordings: int
+    components: tuple[Component, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Unexplained:
     """What the library has no name for: located, with its course in time.
 
+    detected: whether it is there and, where `ordinary` is known, beyond what is ordinary
     course: (time in s, value in `unit`) of one source along `where.direction`, about its mean
     """
 
@@ -125,6 +170,7 @@ class Unexplained:
     follows: tuple[Suspect, ...] = ()
     evidence_nats: float = 0.0
     course: tuple[tuple[float, float], ...] = ()
+    ordinary: Ordinary | None = None
 
 
 @dataclass(frozen=True, slots=True)

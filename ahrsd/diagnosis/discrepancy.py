@@ -74,7 +74,7 @@ class Discrepancy:
 def discrepancy(basis: Base) -> Discrepancy:
     """The random effects that a model needs."""
     cut = locate.segments(basis.context.track.time_s, PIECES)
-    shapes = _shapes(basis.context)
+    shapes = shapes_of(basis.context)
     columns = together(basis, COURSES, cut, shapes)
     widths = [3 * PIECES] * len(COURSES) + [part.width for part, _ in shapes]
     group = np.repeat(np.arange(len(widths)), widths)
@@ -114,7 +114,7 @@ def beyond(
     return worth
 
 
-def _shapes(context: Context) -> list[tuple[Columns, float]]:
+def shapes_of(context: Context) -> list[tuple[Columns, float]]:
     """The random effects that are no courses, and their unit."""
     out = [(by_attitude(context), UNIT_GAUSS), (by_rate(context), UNIT_RAD_S)]
     rests = places(context)

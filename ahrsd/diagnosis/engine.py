@@ -42,6 +42,7 @@ from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import fit_null, unusable
 from ahrsd.diagnosis.omnibus import omnibus
+from ahrsd.diagnosis.ordinary import held_against, is_course_on_sensor
 from ahrsd.diagnosis.own_form import without_trifles
 from ahrsd.diagnosis.passing import without_passing
 from ahrsd.diagnosis.pauses import without_jumps
@@ -49,6 +50,7 @@ from ahrsd.diagnosis.predictive import checks, usual_noise
 from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.quick import Quick, cleaned, quick, without_quick
 from ahrsd.diagnosis.refined import left_alone, refined
+from ahrsd.diagnosis.remainder_sizes import sizes_left
 from ahrsd.diagnosis.resting import resting
 from ahrsd.diagnosis.search import (
     HARDLY_TURNED,
@@ -207,6 +209,7 @@ def _told(
         left = unknown.described(done.left, problem, limits.alone())
     checked, white = _checked(done, fast, terms, library, (*facts, *noise)), _whiteness(done)
     left = unknown.borne_out(left, checked, white)
+    left = _sized(left, done)
     something = bool(found) or left.detected
     steps = rounding(facts)
     lesser = (fact.words for fact in facts if not matters(fact))
@@ -298,6 +301,15 @@ def _left(done: _Searched, problem: Problem, facts: Sequence[Fact], fast: Quick)
     # a turn put together from what is left, and the error of coarse steps, ring by themselves
     itself = any(fact.turned is not None or fact.effect == "mag_quantisation" for fact in facts)
     return Unexplained(False) if itself else heard(done.state, fast)
+
+
+def _sized(left: Unexplained, done: _Searched) -> Unexplained:
+    """What is left beside what recordings ordinarily leave; of bursts and hums nobody knows."""
+    course = left.detected and done.short is None
+    if not course or left.where is None or left.where.band_hz is not None:
+        return left
+    sizes = sizes_left(done.state)
+    return replace(left, ordinary=held_against(sizes, on_sensor=is_course_on_sensor(left)))
 
 
 def _whiteness(done: _Searched) -> dict[str, Whiteness]:

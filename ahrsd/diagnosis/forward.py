@@ -18,7 +18,7 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.diagnosis.context import Given, build_context
 from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.effects.base import Effect, Readings, contribution, readings_of
+from ahrsd.diagnosis.effects.base import Effect, Readings, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation import Filtered, bearings
 from ahrsd.diagnosis.noise import colour_of
@@ -62,9 +62,20 @@ def context_along(
     added = [term for term in terms if library[term.identifier].kind == "mean"]
     if not added:
         return context
-    parts = [contribution(library[t.identifier], context, t.value, t.setting) for t in added]
-    mag, gyro = (np.sum([part[side] for part in parts], axis=0) for side in (0, 1))
+    mag, gyro = contribution(context, added, library)
     return build_context(track, Given(bearings(track, model, mag, gyro), gyro))
+
+
+def contribution(
+    context: Context, terms: Sequence[Term], library: Mapping[str, Effect] = EFFECTS
+) -> tuple[Array, Array]:
+    """What terms of those values add to the magnetometer and the gyro, exactly: (N, 3) each.
+
+    For effects that keep the number of rows, that is all but dropped samples.
+    """
+    clean = readings_of(context)
+    made = simulated(clean, terms, library=library)
+    return made.mag_b_gauss - clean.mag_b_gauss, made.gyro_b_rad_s - clean.gyro_b_rad_s
 
 
 def truth_along(context: Context) -> Readings:
@@ -101,9 +112,11 @@ def simulated(
 ) -> Readings:
     """Readings of a truth with terms and noise on them; the same seed gives the same readings.
 
-    Effects on the finished reading come behind the noise.  KeyError for an unknown effect.
+    Effects on the finished reading come behind the noise, those of all that a sensor measures
+    behind the others.  KeyError for an unknown effect.
     """
     named = [(library[term.identifier], term) for term in terms]
+    named.sort(key=lambda one: one[0].of_whole)
     readings = truth
     for effect, term in named:
         if not effect.after_noise:

@@ -20,7 +20,7 @@ from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.evidence import colour
 from ahrsd.diagnosis.gram import Gram, block_edges, gram
-from ahrsd.diagnosis.innovation import nuisance_columns, run_filter, sensitivities
+from ahrsd.diagnosis.innovation import nuisance_columns, regressing, run_filter, sensitivities
 from ahrsd.diagnosis.regression import CALIBRATION
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.validate import FOLDS, PRIOR, Folds, Gain, heldout, one_by_one
@@ -117,6 +117,7 @@ def _seen(fit: NullFit, walk_rad_s_sqrt_s: float) -> _Seen:
         model = replace(fit.model, gyro_walk_rad_s_sqrt_s=walk_rad_s_sqrt_s)
         track, edges = _cut(fit.filtered.track)
         done = run_filter(track, model, fit.terms_mag, fit.terms_gyro, strength_known=True)
+        done = regressing(done, fit.context().rate_b_rad_s)
         strength = Columns(mag=(done.predicted_b @ model.soft_iron.T)[:, :, None])
         own = [sensitivities(done, part) for part in (nuisance_columns(done), strength)]
         groups = {CALIBRATION: np.concatenate(own, axis=2)}

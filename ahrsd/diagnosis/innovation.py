@@ -17,6 +17,12 @@ gain held the sensitivities are exact (s: deviation of a turn by those of
     T = F H+ - dt [h-]x Jl W_k,   X_k = A T + D_k,   H+ = T - K X_k
 
 Whitened by S = L L^T: under the null L^-1 e = L^-1 X dtheta + white of variance 1.
+
+These are the derivatives of the innovations, which a descent needs.  To regress on (`regressing`)
+they will not do: turns and foretold fields hold the noise of the gyro that the innovations are made
+of (errors in variables), and of 5 mrad/s beside .1 mG that made a field that turns with the heading
+of 440 nats in nothing.  There F, and h- in the calibration's columns, are of the smoothed rate.
+
 A run's first row starts the field from its reading (`used` is false there): h+ = A^-1 (m - b).
 Where that row has no reading the field starts from the nominal one, unsure by half of its size: the
 first reading decides.
@@ -24,7 +30,7 @@ first reading decides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,6 +189,42 @@ def sensitivities(filtered: Filtered, columns: Columns) -> Array:
     if filtered.recursion is None:
         raise ValueError("this run of the filter was made without sensitivities")
     return filtered.recursion.run(columns.gyro, columns.mag)
+
+
+def regressing(filtered: Filtered, rate_b_rad_s: Array) -> Filtered:
+    """The run with sensitivities and foretold fields that hold no noise of the gyro.
+
+    rate_b_rad_s: (N, 3) without bias and without that noise
+    ValueError where the run was not `sensitive`.
+    """
+    if filtered.recursion is None:
+        raise ValueError("this run of the filter was made without sensitivities")
+    turn = _turn(filtered.track, rate_b_rad_s)
+    seen = filtered.model.soft_iron @ turn
+    size, matrix = filtered.recursion.states, filtered.recursion.matrix.copy()
+    root = matrix[:, :3, size + 3 :]  # what a field on the reading is whitened by
+    matrix[:, :3, :3] = root @ seen
+    matrix[:, 3:, :3] = -filtered.gains.gain @ seen
+    matrix[:, 3:6, :3] += turn
+    return replace(
+        filtered,
+        predicted_b=foretold(filtered, rate_b_rad_s),
+        recursion=Recursion(filtered.recursion.layout, matrix),
+    )
+
+
+def foretold(filtered: Filtered, rate_b_rad_s: Array) -> Array:
+    """(N, 3) gauss, the field behind the row before, turned on by these rates (N, 3)."""
+    before = np.roll(filtered.field_b, 1, axis=0)
+    turned = np.einsum("nij,nj->ni", _turn(filtered.track, rate_b_rad_s), before)
+    return np.where(filtered.used[:, None], turned, filtered.predicted_b)
+
+
+def _turn(track: Track, rate_b_rad_s: Array) -> Array:
+    """(N, 3, 3) Exp(-w dt), 0 in the rows with which runs open."""
+    turn = so3.exp(-rate_b_rad_s * np.nan_to_num(track.dt_s, nan=0.0)[:, None])
+    turn[_laid_out(track)[1]] = 0.0
+    return turn
 
 
 def nuisance_columns(filtered: Filtered) -> Columns:

@@ -41,5 +41,12 @@ def in_time(basis: Base, candidate: Candidate) -> Candidate:
     return replace(best, tried=candidate.tried * TRIED, evidence=paid)
 
 
+def on_time(basis: Base, candidate: Candidate) -> Candidate:
+    """The candidate with its cause as it was logged."""
+    setting = {key: value for key, value in candidate.setting.items() if key != "late_s"}
+    logged = replace(candidate, setting=setting, tried=1, alike=1.0)
+    return replace(logged, evidence=evidence_of(basis, logged))
+
+
 def _cost(candidate: Candidate) -> float:
     return candidate.paid + float(np.log(TRIED))

@@ -22,6 +22,7 @@ from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.logger_noise import cleaned
 from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.ordinary import beyond_ordinary
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.search import State, formed_basis_of
 from ahrsd.diagnosis.shown import shown
@@ -35,11 +36,20 @@ MOST_ASKED = 2
 ON_TIME_S = 1.0
 
 
-def diagnose_logged(track: Track, spec: Spec | None = None, *, recording: str = "") -> Diagnosis:
+def diagnose_logged(
+    track: Track, spec: Spec | None = None, *, recording: str = "", simulated: bool = False
+) -> Diagnosis:
     """`diagnose`, with what columns with holes and wrong clocks can still say.
 
+    What is left of a recording that is not known to be simulated is unknown only where it is beyond
+    the ordinary.
     ValueError, one line, where nothing can be fitted.
     """
+    return beyond_ordinary(_with_holes(track, spec, recording), simulated=simulated)
+
+
+def _with_holes(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+    """The diagnosis with columns that have holes, where an effect is named by one."""
     holed = roles.holed(track)
     if holed:
         filled = track.with_columns(

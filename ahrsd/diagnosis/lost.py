@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.delay import delayed_gyro
+from ahrsd.diagnosis.delay import without_lag
 from ahrsd.diagnosis.descent import FittedTerm
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.missing import LONG, UNSEEN, missing_turns
@@ -37,7 +37,7 @@ def lost_beside(whole: Problem, state: State, lost: Sequence[Fact]) -> list[Fact
     """
     fit, terms = state.fit, _without_answers(state, lost)
     if state.problem.recorded is not whole.recorded or len(terms) < len(fit.terms):
-        track = delayed_gyro(whole.recorded, state.problem.lag_s)
+        track = without_lag(whole.recorded, state.problem.lag_s)
         fit = at_model(track, fit.model, terms)
     rate = fit.filtered.track.gyro_b_rad_s - fit.model.gyro_bias_rad_s
     return missing_turns(fit.filtered, rate)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.diagnosis.coning import with_delta_angles
-from ahrsd.diagnosis.delay import delayed_gyro
+from ahrsd.diagnosis.delay import earlier, without_lag
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.null import cold_start
@@ -33,7 +33,8 @@ class Problem:
 
     recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
     lag_s:    lag of the magnetometer that is already taken out of the track
-    riding:   (recorded rows, 3) gauss of named terms that ride with the sensor, None for none
+    riding:   (recorded rows, 3) gauss of named terms that ride with the sensor, without that lag;
+              None for none
     averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
               is read more seldom than the gyro
     notes:    what a person should know of how the rates were read
@@ -63,8 +64,10 @@ class Problem:
 
     def lagging(self, lag_s: float) -> Problem:
         """The same with a lag of the magnetometer taken out."""
-        delayed = delayed_gyro(self.recorded, lag_s)
-        track = thinned(delayed, self.thin, self.cold, self.riding)
+        riding = self.riding
+        if riding is not None and lag_s > 0.0:
+            riding = earlier(self.recorded, riding, lag_s)
+        track = thinned(without_lag(self.recorded, lag_s), self.thin, self.cold, riding)
         return replace(self, track=track, lag_s=lag_s)
 
     def beside(self, riding: Array, model: NullModel) -> Problem:

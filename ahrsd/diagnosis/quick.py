@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ahrsd.diagnosis.delay import delayed_gyro
+from ahrsd.diagnosis.delay import without_lag
 from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.null import at_model
 from ahrsd.diagnosis.problem import Problem, model_at_rate, noise_of_thinned
@@ -90,7 +90,7 @@ def _at_recorded_rate(state: State, whole: Problem) -> State:
     lag_s = state.problem.lag_s
     problem = replace(
         whole,
-        track=delayed_gyro(whole.recorded, lag_s),
+        track=without_lag(whole.recorded, lag_s),
         spec=noise_of_thinned(whole.spec, 1.0 / whole.averaged, 1.0 / whole.thin),
         library=library,
         thin=1,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.evidence import colour
 from ahrsd.diagnosis.gram import Gram, block_edges, gram, slices, solve
-from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, regressing, sensitivities
 from ahrsd.diagnosis.rest import Whitening
 from ahrsd.diagnosis.side_by_side import batches, joined
 from ahrsd.diagnosis.sums import Sums
@@ -134,6 +134,7 @@ def base(
     context: Context, filtered: Filtered, terms: Sequence[tuple[str, Columns]], rate_hz: float
 ) -> Base:
     """Whiten the columns of calibration and named terms (group name, columns)."""
+    filtered = regressing(filtered, context.rate_b_rad_s)
     parts = [(CALIBRATION, sensitivities(filtered, nuisance_columns(filtered)))]
     parts += [(name, sensitivities(filtered, columns)) for name, columns in terms]
     known = np.concatenate([part for _, part in parts], axis=2)

@@ -18,7 +18,7 @@ from ahrsd.diagnosis.context import Given, build_context
 from ahrsd.diagnosis.delays import DELAYS, beyond_the_lag, plain
 from ahrsd.diagnosis.descent import FittedTerm, NullFit
 from ahrsd.diagnosis.innovation import bearings
-from ahrsd.diagnosis.late import in_time
+from ahrsd.diagnosis.late import QUICK_CAUSES, in_time, on_time
 from ahrsd.diagnosis.locate import Frame
 from ahrsd.diagnosis.memory import with_memory
 from ahrsd.diagnosis.moments import as_found, at_one_moment
@@ -225,6 +225,8 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
     with a shorter time constant looks nearly the same.
     """
     at = state.named[number].candidate
+    if at.name in QUICK_CAUSES:  # late as the magnetometer was taken to be when it was named
+        return in_time(left, on_time(left, at))
     key = scale_of(at)
     if key is None and not any(name in at.setting for name in ("onset_s", *FORMS)):
         return None

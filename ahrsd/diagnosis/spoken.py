@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Limit, Unexplained, Value, Where
+from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.shown import shown
 
 _FRAMES = {
@@ -33,6 +34,8 @@ def lines(found: Diagnosis) -> list[str]:
         out += ["", f"{number}. {headline(finding)}", *_finding_lines(finding)]
     if found.unexplained.detected:
         out += ["", "not in the library:", *_unexplained_lines(found.unexplained)]
+    elif ordinary_left(found) is not None:
+        out += ["", "left, and ordinary:", *_unexplained_lines(found.unexplained)]
     if not found.mismatch and found.sensitivity:
         out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
     failed = failed_checks(found)
@@ -63,7 +66,13 @@ def failed_checks(found: Diagnosis) -> list[str]:
 def verdict(found: Diagnosis) -> str:
     """One sentence."""
     names = len(found.findings)
-    failed = failed_checks(found)
+    failed, ordinary = failed_checks(found), ordinary_left(found)
+    said = "" if ordinary is None else in_one_sentence(ordinary)
+    if not found.mismatch and said:
+        return (
+            f"nothing beyond the ordinary: what is left is {said}; it is there "
+            f"(p = {found.p_value:.1g} that nothing is)"
+        )
     if not found.mismatch and failed:
         return f"nothing was found, and yet they differ in: {', '.join(failed)} (see the checks)"
     if not found.mismatch:
@@ -74,7 +83,8 @@ def verdict(found: Diagnosis) -> str:
     if found.unexplained.detected:
         parts.append("something that the library has no name for")
     text = " and ".join(parts) or "recording and simulation differ (see the notes)"
-    return f"MISMATCH: {text} (p = {found.p_value:.1g})"
+    rest = f"; what else is left is {said}" if said else ""
+    return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
 
 
 def headline(finding: Finding) -> str:
@@ -133,6 +143,9 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
     out = [] if left.where is None else [f"   where      {place(left.where)}"]
     if left.size is not None:
         out.append(f"   size       {left.size:.3g} {left.unit}")
+    if left.ordinary is not None:
+        out += [f"   part       {text}" for text in size_lines(left.ordinary)]
+        out += [f"   yardstick  {left.ordinary.why}"] if left.ordinary.why else []
     if left.single_source_share is not None and left.single_source_share > 0.8:
         out.append(
             f"   one source of fixed direction explains {left.single_source_share:.0%} of it"

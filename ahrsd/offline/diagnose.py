@@ -179,8 +179,10 @@ def diagnose_recording(
 
 
 def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
+    simulated = Path(f"{path}.truth.json").exists()  # as `ahrsd simulate` leaves it
     try:
-        return diagnose_logged(track, spec, recording=printable(path.name, 200))
+        name = printable(path.name, 200)
+        return diagnose_logged(track, spec, recording=name, simulated=simulated)
     except np.linalg.LinAlgError:
         raise RecordingError(
             path,

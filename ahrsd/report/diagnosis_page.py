@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.shown import shown
 from ahrsd.diagnosis.spoken import headline, place, sensitivity, value_text, verdict
 from ahrsd.report.template import Picture, number, picture, render
@@ -68,6 +69,7 @@ _BY_FRAME = (
 
 def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
     """Write the page.  OSError where it cannot be written."""
+    ordinary = ordinary_left(found)
     page = render(
         "diagnosis.html",
         title=f"Diagnosis of {found.recording}",
@@ -75,6 +77,7 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
         verdict=verdict(found),
         findings=[_finding(found, one) for one in found.findings],
         unexplained=_unexplained(found),
+        ordinary=None if ordinary is None else in_one_sentence(ordinary),
         how_real=_how_real(found),
         pictures=_pictures(found),
         sensitivity=sensitivity(found.sensitivity),
@@ -131,11 +134,14 @@ def _contribution(found: Diagnosis, one: Finding) -> Picture | None:
 
 def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     left = found.unexplained
-    if not left.detected or left.where is None:
+    if left.where is None or not (left.detected or left.ordinary):
         return []
     rows = [("where", place(left.where))]
     if left.size is not None:
         rows.append(("size", number(left.size, left.unit)))
+    if left.ordinary is not None:
+        rows += [("part", text) for text in size_lines(left.ordinary)]
+        rows += [("yardstick", left.ordinary.why)] if left.ordinary.why else []
     if left.single_source_share is not None:
         rows.append(("one source", f"{left.single_source_share:.0%} of it has one direction"))
     rows += [

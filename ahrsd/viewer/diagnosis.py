@@ -9,6 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn
+from ahrsd.diagnosis.ordinary_text import ordinary_left
 from ahrsd.diagnosis.spoken import headline, lines, place
 from ahrsd.samples import Array
 from ahrsd.viewer.blueprint import X, Y, Z
@@ -72,9 +73,12 @@ def _spans(stream: rr.RecordingStream, found: Diagnosis, drawn: Drawn) -> None:
             stream.set_time(_TIME, duration=float(max(begin, drawn.time_s[0])))
             stream.log("log", rr.TextLog(f"{headline(finding)}: {place(finding.where)}"))
     left = found.unexplained.where
+    told = rr.TextLog("unknown, here", level=rr.TextLogLevel.WARN)
+    if ordinary_left(found) is not None:
+        told = rr.TextLog("left here, and ordinary", level=rr.TextLogLevel.INFO)
     for begin, _ in () if left is None else left.intervals_s:
         stream.set_time(_TIME, duration=float(max(begin, drawn.time_s[0])))
-        stream.log("log", rr.TextLog("unknown, here", level=rr.TextLogLevel.WARN))
+        stream.log("log", told)
 
 
 def _blueprint(effects: list[str], frames: list[str]) -> rrb.Blueprint:

@@ -9,8 +9,11 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.forward import simulated
+from ahrsd.diagnosis.injection import readings_of
 from ahrsd.diagnosis.thin import thinned
 from ahrsd.diagnosis.track import Track
+from ahrsd.diagnosis.values import Noise, Term
 from ahrsd.samples import Array
 
 #: gauss per ampere
@@ -134,3 +137,26 @@ def test_a_rover_s_field_by_its_speed_is_named() -> None:
     assert not found.unexplained.detected
     values = [one.value for one in found.findings[0].parameters]
     np.testing.assert_allclose(values, k, atol=1e-3)
+
+
+def _late(seed: int, shape: str, lag_s: float) -> Track:
+    """A magnetometer that is late with all that it measures, the field of a current as well."""
+    made = experiment("mam", seed=seed, samples=5000)
+    current = SHAPES[shape](made.samples.time_s)
+    truth = readings_of(made, {})
+    lag = Term("mag_time_lag", np.array([lag_s]), np.zeros(1), {})
+    late = SHAPES[shape](made.samples.time_s - lag_s)
+    mag = simulated(truth, [lag], Noise(1e-3, 5e-4), seed).mag_b_gauss + np.outer(late, K)
+    return replace(track_of(made), mag_b_gauss=mag, covariates={"motor_current_a": current})
+
+
+@pytest.mark.parametrize(
+    ("seed", "shape"), [(6, "quick square"), pytest.param(11, "square", marks=pytest.mark.slow)]
+)
+def test_a_late_magnetometer_reads_a_current_late_and_no_change_of_it_is_named(seed, shape):
+    found = diagnose(_late(seed, shape, 0.07))
+    assert {one.effect for one in found.findings} == {"motor_current_field", "mag_time_lag"}
+    assert not found.unexplained.detected
+    (current,) = (one for one in found.findings if one.effect == "motor_current_field")
+    for parameter, truth in zip(current.parameters, K, strict=True):
+        assert parameter.value == pytest.approx(truth, rel=0.02)

@@ -1,4 +1,4 @@
-"""Moving the gyro in time gives the rotation between the moved instants."""
+"""A late sensor is put in time: the gyro exactly, and what was logged beside the magnetometer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from effect_motion import moving
 
 from ahrsd import so3
-from ahrsd.diagnosis.delay import delayed_gyro
+from ahrsd.diagnosis.delay import delayed_gyro, without_lag
 from ahrsd.diagnosis.delays import beyond_the_lag, usual_step
 from ahrsd.diagnosis.track import Track
 
@@ -75,3 +75,41 @@ def test_a_low_pass_does_half_beyond_a_delay_of_what_it_does_to_the_delayed_fiel
     inner = slice(5, -5)
     error = np.abs(found[inner, 0, 0] + 1j * found[inner, 1, 0] - expected[inner])
     assert error.max() < 0.05 * np.abs(expected).max()
+
+
+def logged(t: np.ndarray) -> Track:
+    """A current, a lamp and a specific force beside a gyro, in two runs with a pause in between."""
+    dt = np.diff(t, prepend=np.nan)
+    dt[500] = np.nan
+    t = np.concatenate([t[:500], t[500:] + 7.0])
+    columns = {"motor_current_a": 3 + np.sin(0.8 * t), "lamp_on": (np.sin(0.3 * t) > 0) * 1.0}
+    force = np.column_stack([np.sin(t), np.cos(t), t])
+    runs = (slice(0, 500), slice(500, len(t)))
+    return Track(t, dt, np.zeros((len(t), 3)), rates(t), force, columns, runs)
+
+
+def test_all_that_is_logged_beside_a_late_magnetometer_is_as_late() -> None:
+    track = logged(np.arange(0.0, 20.0, 0.02))
+    moved = without_lag(track, 0.05)
+    t = track.time_s - 0.05
+    inner = np.r_[5:500, 505 : len(t)]
+    np.testing.assert_array_equal(moved.gyro_b_rad_s, delayed_gyro(track, 0.05).gyro_b_rad_s)
+    np.testing.assert_array_equal(moved.mag_b_gauss, track.mag_b_gauss)
+    current = moved.covariates["motor_current_a"]
+    np.testing.assert_allclose(current[inner], 3 + np.sin(0.8 * t[inner]), atol=1e-4)
+    assert moved.accel_b_m_s2 is not None
+    np.testing.assert_allclose(moved.accel_b_m_s2[inner, 2], t[inner], atol=1e-9)
+    # a run's first samples have nothing before them, the run before is none of it
+    assert current[500] == track.covariates["motor_current_a"][500]
+    lamp, before = moved.covariates["lamp_on"], track.covariates["lamp_on"]
+    assert set(lamp) == {0.0, 1.0}
+    late = (np.flatnonzero(np.diff(lamp) > 0) - np.flatnonzero(np.diff(before) > 0)) * 0.02
+    assert late == pytest.approx(0.05, abs=0.0101)
+
+
+def test_beside_a_late_gyro_nothing_else_is_moved() -> None:
+    track = logged(np.arange(0.0, 20.0, 0.02))
+    moved = without_lag(track, -0.05)
+    np.testing.assert_array_equal(moved.gyro_b_rad_s, delayed_gyro(track, -0.05).gyro_b_rad_s)
+    assert moved.covariates is track.covariates
+    assert moved.accel_b_m_s2 is track.accel_b_m_s2

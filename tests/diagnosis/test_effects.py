@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from ahrsd import so3
 from ahrsd.diagnosis import roles
 from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.effects.base import contribution
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.forward import contribution
+from ahrsd.diagnosis.values import Term
 
 CONTRACT = Path(__file__).parents[2] / ".." / "shared" / "reference" / "contract.md"
 MEAN = [name for name, effect in EFFECTS.items() if effect.kind == "mean"]
@@ -57,7 +58,7 @@ def test_every_effect_can_be_computed_where_everything_is_logged(name):
     effect = EFFECTS[name]
     value, setting = effect.example(readings, 1.0)
     assert value == pytest.approx(np.array(effect.typical))
-    added = contribution(effect, context, value, setting)
+    added = contribution(context, [Term(name, np.asarray(value), np.zeros(len(value)), setting)])
     assert max(np.abs(part).max() for part in added) > 1e-6
     for columns in (effect.columns(context, setting),):
         for part in (columns.mag, columns.gyro):

@@ -45,7 +45,7 @@ def test_a_wrong_clock_is_found_beside_a_magnetometer_that_is_late(driven) -> No
     found = diagnose_logged(logged(replace(track, mag_b_gauss=late), "motor_current_a", column))
     assert [one.effect for one in found.findings] == ["mag_time_lag", "motor_current_field"]
     assert found.findings[0].parameters[0].value == pytest.approx(0.1, abs=2e-3)
-    assert found.notes[0].startswith("column motor_current_a runs 2.9 s late against the sensor")
+    assert found.notes[0].startswith("column motor_current_a runs 3 s late against the sensor")
     assert not found.unexplained.detected
 
 

@@ -9,10 +9,10 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.effects.base import contribution
-from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.forward import contribution
 from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.values import Term
 
 
 def test_play_begins_where_it_was_left() -> None:
@@ -27,7 +27,8 @@ def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
     track = made(Trial(5, scenario="wam", samples=6000)).track
     setting = {"radius_gauss": 0.03, "memory": memory}
     value = np.array([2e-3, 2.5e-3, 3e-3])
-    added, _ = contribution(EFFECTS["hysteresis"], fit_null(track).context(), value, setting)
+    term = Term("hysteresis", value, np.zeros(3), setting)
+    added, _ = contribution(fit_null(track).context(), [term])
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert [one.effect for one in found.findings] == ["hysteresis"]
     assert not found.unexplained.detected
@@ -47,8 +48,8 @@ def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
     track = made(Trial(6, scenario="wam", samples=6000)).track
     setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}
     value = np.array([0.02, 0.012, -0.008, 0.004, -0.006, 0.005])
-    context = fit_null(track).context()
-    added, _ = contribution(EFFECTS["viscous_magnetisation"], context, value, setting)
+    term = Term("viscous_magnetisation", value, np.zeros(6), setting)
+    added, _ = contribution(fit_null(track).context(), [term])
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert [one.effect for one in found.findings] == ["viscous_magnetisation"]
     assert not found.unexplained.detected

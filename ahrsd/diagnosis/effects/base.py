@@ -73,6 +73,7 @@ class Effect(ABC):
     size:        what is seen on real vehicles;  source: where that and the equation come from
     kind:        "variance" and "discrete" effects have no columns and no settings
     after_noise: it acts on the finished reading, noise included
+    of_whole:    it acts on all that its sensor measures, whatever other effects put there
     frame:       in which it is told, where that is not the family's name
     rides:       its field stays on the sensor whatever that does, in gauss by what was logged
     unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
@@ -98,6 +99,7 @@ class Effect(ABC):
     source: str
     kind: Kind = "mean"
     after_noise: bool = False
+    of_whole: bool = False
     frame: str | None = None
     rides: bool = False
     unseen: tuple[tuple[float, ...], ...] = ()
@@ -243,7 +245,9 @@ def readings_of(context: Context) -> Readings:
 
 def smooth_readings_of(context: Context) -> Readings:
     """The same with the smooth field: the differences of the foretold one are the gyro's noise."""
-    return replace(readings_of(context), field_b=context.smooth_b)
+    model, smooth = context.model, context.smooth_b
+    mag = smooth @ model.soft_iron.T + model.hard_iron_gauss
+    return replace(readings_of(context), field_b=smooth, mag_b_gauss=mag)
 
 
 def left_over(context: Context) -> Array:
@@ -261,15 +265,3 @@ def added(readings: Readings, terms: Columns, value: Array) -> Readings:
         mag_b_gauss=mag if terms.mag is None else mag + terms.mag @ value,
         gyro_b_rad_s=gyro if terms.gyro is None else gyro + terms.gyro @ value,
     )
-
-
-def contribution(
-    effect: Effect, context: Context, value: Array, setting: Setting
-) -> tuple[Array, Array]:
-    """What the effect of that value adds to the magnetometer and the gyro, exactly: (N, 3) each.
-
-    For effects that keep the number of rows, that is all but dropped samples.
-    """
-    clean = readings_of(context)
-    made = effect.simulate(clean, value, setting)
-    return made.mag_b_gauss - clean.mag_b_gauss, made.gyro_b_rad_s - clean.gyro_b_rad_s

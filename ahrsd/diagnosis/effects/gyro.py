@@ -206,6 +206,7 @@ class GyroTimeLag(Effect):
     identifier = "gyro_time_lag"
     code = "G15"
     family = "gyro"
+    of_whole = True
     words = "the gyro is late, by its latency or its filter"
     equation = "w(t) = true mean rate at t - tau"
     parameters = (Parameter("lag", "s", 0.01, 0.3),)
@@ -229,9 +230,11 @@ class GyroTimeLag(Effect):
         return Columns(gyro=-series.derivative(r.rate_b_rad_s, r.time_s, r.dt_s)[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """The rate of `value` seconds ago in place of the present one."""
-        change = series.delayed_rate(readings, float(value[0])) - readings.rate_b_rad_s
-        return replace(readings, gyro_b_rad_s=readings.gyro_b_rad_s + change)
+        """What the gyro would have read `value` seconds ago in place of the present."""
+        lag_s = float(value[0])
+        others = readings.gyro_b_rad_s - readings.rate_b_rad_s
+        others = series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        return replace(readings, gyro_b_rad_s=series.delayed_rate(readings, lag_s) + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Ten milliseconds."""

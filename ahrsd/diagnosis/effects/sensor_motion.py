@@ -51,11 +51,12 @@ class EddyCurrent(Linear):
 
 
 class MagTimeLag(Effect):
-    """M19.  Exact: the true field, turned back along the steps."""
+    """M19.  Exact: the true field, turned back along the steps, and all else that is read."""
 
     identifier = "mag_time_lag"
     code = "M19"
     family = "sensor"
+    of_whole = True
     words = "the magnetometer trails the gyro"
     equation = "m(t) = A h(t - tau) + b"
     parameters = (Parameter("lag", "s", 0.02, 0.3),)
@@ -83,9 +84,13 @@ class MagTimeLag(Effect):
         return Columns(mag=-change[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """The field of `value` seconds ago in place of the present one."""
-        delay_s = np.full(len(readings.time_s), float(value[0]))
-        return with_field(readings, series.delayed_field(readings, delay_s))
+        """What the magnetometer would have read `value` seconds ago in place of the present."""
+        lag_s = float(value[0])
+        delay_s = np.full(len(readings.time_s), lag_s)
+        field = series.delayed_field(readings, delay_s) @ readings.soft_iron.T
+        others = readings.mag_b_gauss - readings.field_b @ readings.soft_iron.T
+        others = series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        return replace(readings, mag_b_gauss=field + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Twenty milliseconds."""
@@ -98,6 +103,7 @@ class MagLowPass(Linear):
     identifier = "mag_low_pass"
     code = "M20"
     family = "sensor"
+    of_whole = True
     words = "the magnetometer is smoothed by a low-pass"
     equation = "m += (tau / tau0) A (LP_tau0[h] - h); tau = tau0 is the filter itself"
     parameters = (Parameter("time_constant", "s", 0.03, 0.3),)
@@ -125,7 +131,9 @@ class MagLowPass(Linear):
         tau0 = setting["time_constant_s"]
         field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
         change = series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
-        return Columns(mag=np.asarray(change @ readings.soft_iron.T / tau0)[:, :, None])
+        others = readings.mag_b_gauss - field_b @ readings.soft_iron.T
+        change = change @ readings.soft_iron.T + series.low_pass(others, dt_s, tau0) - others
+        return Columns(mag=np.asarray(change / tau0)[:, :, None])
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """The filter itself, of `strength` times 30 ms."""

@@ -80,6 +80,26 @@ def delayed_rate(readings: Readings, delay_s: float) -> Array:
     return out
 
 
+def earlier(values: Array, time_s: Array, dt_s: Array, ago_s: float) -> Array:
+    """(N,) or (N, k) as it was `ago_s` before, straight in between; before a run as at its first.
+
+    What is on or off is so in between, too: as at the nearest sample.
+    """
+    switched = values.ndim == 1 and bool(np.isin(values, (0.0, 1.0)).all())
+    out = np.array(values, dtype=np.float64)
+    for run in runs(dt_s):
+        at_s, then = time_s[run], out[run]
+        if len(at_s) < 2:
+            continue
+        wanted = np.clip(at_s - ago_s, at_s[0], at_s[-1])
+        after = np.clip(np.searchsorted(at_s, wanted), 1, len(at_s) - 1)
+        share = (wanted - at_s[after - 1]) / (at_s[after] - at_s[after - 1])
+        share = np.round(share) if switched else share
+        share = share.reshape(-1, *(1,) * (values.ndim - 1))
+        out[run] = then[after - 1] * (1.0 - share) + then[after] * share
+    return out
+
+
 def low_pass(
     values: Array, dt_s: Array, time_constant_s: float, memory: Sequence[float] | None = None
 ) -> Array:
