@@ -1,6 +1,7 @@
 """What the rows say: DuckDB over Parquet, read-only.
 
-The table is `recordings`: a row's columns, and `device`: the serial number, else the vehicle.
+The table is `recordings`: a row's columns, and `device`: the serial number, else the vehicle, else
+nothing: of recordings of which neither is known nobody can say that they are of one device.
 Where recordings were examined by several versions or options, it has the newest row of each.
 """
 
@@ -37,7 +38,7 @@ _QUANTITIES = [
     for name, unit in (("hard_iron", "gauss"), ("gyro_bias", "rad_s"))
     for axis in AXES
 ]
-_USABLE = "converged and recorded_utc is not null"
+_USABLE = "converged and recorded_utc is not null and device is not null"
 _DEVICES = f"""
     select device, max(vehicle), count(*), min(recorded_utc), max(recorded_utc),
            count(*) filter (recorded_by = 'the file''s date')
@@ -153,6 +154,8 @@ class FleetRows:
             words = line(str(error).strip().partition(chr(10))[0])
             if isinstance(error, duckdb.ParserException):
                 words += "; a question is drift, recurring, failures, or a SELECT over `recordings`"
+            elif isinstance(error, duckdb.CatalogException):
+                words += "; the table is `recordings`"
             raise AhrsdError(f"ask: {words}") from error
 
     def _ask(self, query: str) -> AnswerTable:
@@ -176,7 +179,7 @@ class FleetRows:
         """How many rows of what."""
         names = ("recordings", "devices", "vehicles", "mismatches", "seconds", "newest_utc")
         (numbers,) = self._ask(
-            """select count(*), count(distinct device) filter (device <> 'unknown'),
+            """select count(*), count(distinct device),
                       count(distinct vehicle), count(*) filter (mismatch), sum(seconds),
                       max(finished_utc) from recordings"""
         ).rows
@@ -210,6 +213,12 @@ class FleetRows:
         out.sort(key=lambda row: (row[-1], -row[3], row[0], row[1], str(row[2])))
         columns = ("effect", "by", "which", "found", "of", "share", "share_everywhere", "p")
         return AnswerTable(columns, out)
+
+    def of_no_device(self) -> int:
+        """Calibrations of which neither serial number nor vehicle is known: no part of `drift`."""
+        query = "select count(*) from recordings where converged and device is null"
+        ((count,),) = self._ask(query).rows
+        return int(count)
 
     def drift(self) -> list[DeviceDrift]:
         """Every device with two calibrations or more; the largest heading error first."""
@@ -276,7 +285,7 @@ def _connected(store: Store) -> duckdb.DuckDBPyConnection:
 
 
 def _newest(connection: duckdb.DuckDBPyConnection) -> str:
-    device = "coalesce(serial_number::varchar, vehicle, 'unknown') as device"
+    device = "coalesce(serial_number::varchar, vehicle) as device"
     kinds = connection.execute(
         "select count(*) from (select distinct version, options from every_row)"
     )

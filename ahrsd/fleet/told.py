@@ -42,11 +42,9 @@ def table_lines(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> lis
     ]
 
 
-def drift_lines(found: Sequence[DeviceDrift]) -> list[str]:
-    """Every device, its drift, and below it its steps."""
-    if not found:
-        return ["no device has two calibrations whose time is known"]
-    lines = []
+def drift_lines(found: Sequence[DeviceDrift], of_no_device: int = 0) -> list[str]:
+    """Every device, its drift, and below it its steps; what is of no known device is counted."""
+    lines = [] if found else ["no device has two calibrations whose time is known"]
     for one in found[:_MOST]:
         vehicle = f", {printable(one.vehicle)}" if one.vehicle not in (None, one.device) else ""
         lines.append(
@@ -64,6 +62,11 @@ def drift_lines(found: Sequence[DeviceDrift]) -> list[str]:
             )
     if len(found) > _MOST:
         lines.append(f"... and {len(found) - _MOST} more devices: --json has all")
+    if of_no_device:
+        lines.append(
+            f"left out: {counted(of_no_device, 'calibration', ',')} of no known device: in "
+            "another OUT, --vehicle or --folders say whose they are"
+        )
     return lines
 
 

@@ -463,7 +463,8 @@ PROOF = (
         meaning="heading by an independent fit without gyro, worst heading and tilt",
         advice=f"a fit without the gyro differs by {{v:.1f}} deg (limit {{l:.1f}}): {_MOVE}; "
         f"{_TILT}",
-        missing=f"the data do not form an ellipsoid: {_MOVE}; {_TILT}",
+        missing="too little of the ellipsoid was shown for a fit without the gyro: "
+        f"{_MOVE}; {_TILT}",
     ),
 )
 

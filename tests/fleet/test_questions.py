@@ -47,6 +47,20 @@ def test_drift_of_each_device_worst_first(tmp_path):
     assert text.startswith("2, rov2: 40 calibrations, 2026-01-01 to 2027-01-26")
 
 
+def test_recordings_of_which_nobody_knows_the_device_are_not_one_device(tmp_path):
+    rows = [row(i, day=float(i), serial_number=None, vehicle=None) for i in range(3)]
+    with FleetRows(store_of(tmp_path / "out", rows)) as asked:
+        assert asked.drift() == []
+        assert asked.counts()["devices"] == 0
+        left_out = asked.of_no_device()
+    assert left_out == 3
+    assert told.drift_lines([], left_out) == [
+        "no device has two calibrations whose time is known",
+        "left out: 3 calibrations of no known device: in another OUT, --vehicle or --folders say "
+        "whose they are",
+    ]
+
+
 def test_what_has_not_converged_or_has_no_time_is_no_calibration(tmp_path):
     rows = [row(1, day=0.0), row(2, day=1.0, converged=False), row(3)]
     with FleetRows(store_of(tmp_path / "out", rows)) as asked:

@@ -216,6 +216,9 @@ def test_setups_that_cannot_be_are_explained():
         build(Setup(output="binary", rate_hz=30))
     with pytest.raises(ValueError, match="does not fit"):
         build(Setup(output="binary", rate_hz=200))
+    for rate_hz in (-5, 0, 77):
+        with pytest.raises(ValueError, match="register 7 has 1, 2, 4, 5, 10, 20, 25, 40, 50, 100"):
+            build(Setup(output="ascii", rate_hz=rate_hz))
 
 
 def test_a_clock_that_wraps_begins_again_and_the_device_does_not():

@@ -76,7 +76,8 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
     with FleetRows(Store(output)) as rows:
         if question == "drift":
             found = rows.drift()
-            body, lines = [one.json() for one in found], told.drift_lines(found)
+            body = [one.json() for one in found]
+            lines = told.drift_lines(found, rows.of_no_device())
         else:
             if question == "recurring":
                 answer = rows.recurring()

@@ -14,6 +14,7 @@ from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import Motion, make_motion
 from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, Further, draw_truth
 from drivers.vn100.emulator.streams import fits
+from drivers.vn100.registers import ASYNC_OUTPUT_RATES_HZ
 
 Values = tuple[float | int | str, ...]
 
@@ -143,4 +144,7 @@ def _outputs(setup: Setup) -> Mapping[int, Values]:
     messages = {"ascii": 14, "imu": 19}
     if setup.output not in messages:
         raise ValueError(f"no output {setup.output!r}; there are ascii, imu and binary")
+    if rate not in ASYNC_OUTPUT_RATES_HZ[1:]:
+        there = ", ".join(map(str, ASYNC_OUTPUT_RATES_HZ[1:]))
+        raise ValueError(f"{setup.output} output at {rate} Hz: register 7 has {there} Hz")
     return {5: (setup.baud,), 6: (messages[setup.output],), 7: (rate,)}
