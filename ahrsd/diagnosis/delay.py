@@ -2,7 +2,8 @@
 
 A magnetometer that is late by tau shows at t all that it measures as it was at t - tau: the Earth's
 field, that of a current, a place, a joint.  So everything else, whatever it was logged by, is moved
-to where the magnetometer is.  Where the gyro is late, it alone is moved.
+to where the magnetometer is.  Where the gyro is late, it alone is moved; so it is by half a step,
+by which a gyro's value is early that is the rate at the instant and not the mean over the step.
 
 The gyro is moved exactly.  Its columns are linear only for
 a lag that is short against the motion, so a lag that has been found is taken out by giving each
@@ -23,11 +24,16 @@ from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
+#: steps within this part of the middle one are alike, and so many must be
+ALIKE, ALIKE_SHARE = 0.25, 0.95
+#: a lag is half a step within this share of it
+HALF_A_STEP = 0.1
+
 
 def without_lag(track: Track, lag_s: float) -> Track:
     """The track with a lag of the magnetometer against all else taken out; negative: the gyro's."""
     moved = delayed_gyro(track, lag_s)
-    if lag_s <= 0.0:
+    if not of_magnetometer(track, lag_s):
         return moved
     accel = track.accel_b_m_s2
     return replace(
@@ -35,6 +41,20 @@ def without_lag(track: Track, lag_s: float) -> Track:
         accel_b_m_s2=None if accel is None else earlier(track, accel, lag_s),
         covariates={name: earlier(track, row, lag_s) for name, row in track.covariates.items()},
     )
+
+
+def of_magnetometer(track: Track, lag_s: float) -> bool:
+    """Whether a lag is one of all that the magnetometer measures, and not of the gyro alone."""
+    step_s = usual_step(track.dt_s)
+    half = step_s is not None and abs(lag_s / (step_s / 2) - 1.0) < HALF_A_STEP
+    return lag_s > 0.0 and not half
+
+
+def usual_step(dt_s: Array) -> float | None:
+    """The step that nearly all rows (N,) have, seconds; None where there is none."""
+    middle = float(np.nanmedian(dt_s))
+    alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < ALIKE
+    return middle if np.mean(alike) > ALIKE_SHARE else None
 
 
 def earlier(track: Track, values: Array, ago_s: float) -> Array:

@@ -31,8 +31,6 @@ DELAYS: Mapping[str, float] = {
 }
 #: log prior against the plain lag: rarer, and told only where the data ask for it
 RARER = {"mag_low_pass": -1.0, "gyro_integration": -2.0}
-#: steps within this part of the middle one are alike, and so many must be
-ALIKE, ALIKE_SHARE = 0.25, 0.95
 
 
 def plain(lag_s: float) -> str:
@@ -63,13 +61,6 @@ def weighed(
         )
     found = posterior(evidence, RARER)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
-
-
-def usual_step(dt_s: Array) -> float | None:
-    """The step that nearly all rows (N,) have, seconds; None where there is none."""
-    middle = float(np.nanmedian(dt_s))
-    alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < ALIKE
-    return middle if np.mean(alike) > ALIKE_SHARE else None
 
 
 def time_constant_less_lag(basis: Base, name: str, lag_s: float) -> float:

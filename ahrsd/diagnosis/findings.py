@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ahrsd.diagnosis.confound import separating_manoeuvre
-from ahrsd.diagnosis.delays import DELAYS, time_constant_less_lag, usual_step, weighed
+from ahrsd.diagnosis.delay import usual_step
+from ahrsd.diagnosis.delays import DELAYS, time_constant_less_lag, weighed
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Heldout, Share, Value, Where
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.evidence import SHARPER, posterior

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.diagnosis.coning import with_delta_angles
-from ahrsd.diagnosis.delay import earlier, without_lag
+from ahrsd.diagnosis.delay import earlier, of_magnetometer, without_lag
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.null import cold_start
@@ -65,7 +65,7 @@ class Problem:
     def lagging(self, lag_s: float) -> Problem:
         """The same with a lag of the magnetometer taken out."""
         riding = self.riding
-        if riding is not None and lag_s > 0.0:
+        if riding is not None and of_magnetometer(self.recorded, lag_s):
             riding = earlier(self.recorded, riding, lag_s)
         track = thinned(without_lag(self.recorded, lag_s), self.thin, self.cold, riding)
         return replace(self, track=track, lag_s=lag_s)

@@ -9,8 +9,8 @@ import pytest
 from effect_motion import moving
 
 from ahrsd import so3
-from ahrsd.diagnosis.delay import delayed_gyro, without_lag
-from ahrsd.diagnosis.delays import beyond_the_lag, usual_step
+from ahrsd.diagnosis.delay import delayed_gyro, of_magnetometer, usual_step, without_lag
+from ahrsd.diagnosis.delays import beyond_the_lag
 from ahrsd.diagnosis.track import Track
 
 
@@ -52,6 +52,28 @@ def test_steps_that_are_not_alike_have_no_half():
     assert usual_step(dt) == pytest.approx(0.025)
     kept = np.delete(t, np.arange(3, 4000, 7))
     assert usual_step(np.diff(kept, prepend=np.nan)) is None
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "late"),
+    [(0.07, True), (0.016, True), (0.0125, False), (0.0122, False), (-0.02, False), (0.0, False)],
+)
+def test_half_a_step_is_the_gyros_and_what_is_logged_stays_where_it_is(lag_s, late):
+    """25 ms a step: a gyro that tells the rate at the instant is half of that early."""
+    time_s = np.arange(200) * 0.025
+    zeros = np.zeros((200, 3))
+    track = Track(
+        time_s=time_s,
+        dt_s=np.r_[np.nan, np.diff(time_s)],
+        mag_b_gauss=zeros + [0.2, 0.0, 0.4],
+        gyro_b_rad_s=zeros,
+        accel_b_m_s2=None,
+        covariates={"motor_current_a": np.sin(time_s)},
+    )
+    assert of_magnetometer(track, lag_s) is late
+    moved = without_lag(track, lag_s).covariates["motor_current_a"]
+    wanted = np.sin(time_s - lag_s) if late else np.sin(time_s)
+    np.testing.assert_allclose(moved[10:], wanted[10:], atol=2e-3 if late else 0.0)
 
 
 def test_a_low_pass_does_half_beyond_a_delay_of_what_it_does_to_the_delayed_field():
