@@ -65,7 +65,7 @@ def test_half_a_step_is_the_gyros_and_what_is_logged_stays_where_it_is(lag_s, la
     track = Track(
         time_s=time_s,
         dt_s=np.r_[np.nan, np.diff(time_s)],
-        mag_b_gauss=zeros + [0.2, 0.0, 0.4],
+        mag_b_gauss=np.tile([0.2, 0.0, 0.4], (200, 1)),
         gyro_b_rad_s=zeros,
         accel_b_m_s2=None,
         covariates={"motor_current_a": np.sin(time_s)},
