@@ -12,7 +12,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 
 import bench_seeds
-from seeds import chapter5, dive, norms, page, printed, summary
+from seed_figures import chapter5, dive, norms, page, printed, summary
 
 from ahrsd.simulation import simulate
 

@@ -22,6 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ahrsd.counting import counted
 from ahrsd.samples import Array
 
 FRAME: Final = "body"
@@ -116,7 +117,9 @@ class Topics:
             case "note":
                 return [TopicMessage(LOG, at_ns, (str(record["level"]), str(record["text"])))]
             case "gap":
-                text = f"{record['lost']} records are lost: this program read too slowly"
+                text = (
+                    f"lost {counted(int(record['lost']), 'record')}: this program read too slowly"
+                )
                 return [TopicMessage(LOG, at_ns, ("warning", text))]
         return []
 

@@ -21,7 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from seeds import chapter5, dive, norms, page, summary
+from seed_figures import chapter5, dive, norms, page, summary
 
 PARTS = {"norms": norms.everything, "chapter5": chapter5.everything, "dive": dive.everything}
 

@@ -100,7 +100,7 @@ def test_the_log_and_what_this_program_lost():
     gap = {"record": "gap", "lost": 40, "first_seq": 3, "last_seq": 42}
     ((level, text),) = [one.content for one in topics.of(gap, 9.0)]
     assert level == "warning"
-    assert text.startswith("40 records are lost")
+    assert text == "lost 40 records: this program read too slowly"
     assert topics.of({"record": "of a later version"}, 9.0) == []
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from seeds.chapter5 import Each, Said
+from seed_figures.chapter5 import Each, Said
 
 from ahrsd import so3
 from ahrsd.baselines import MethodData, MethodError, MethodSettings, run

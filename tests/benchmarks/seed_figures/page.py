@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
-from seeds import printed
-from seeds.dive import HARD_IRON_MG
+from seed_figures import printed
+from seed_figures.dive import HARD_IRON_MG
 
 TEMPLATE = Path(__file__).with_name("page.md")
 Said = dict[str, Any]

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from seeds.turning import SENSOR, Turning
+from seed_figures.turning import SENSOR, Turning
 
 from ahrsd import so3
 from ahrsd.baselines import METHODS, MethodSettings, calibrate_with, joined

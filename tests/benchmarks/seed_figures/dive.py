@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq
 from scipy.signal import lfilter
-from seeds.chapter5 import OURS, Answering, Each, Said, published, unguarded
-from seeds.turning import Turning, sensed
+from seed_figures.chapter5 import OURS, Answering, Each, Said, published, unguarded
+from seed_figures.turning import Turning, sensed
 
 from ahrsd import so3
 from ahrsd.calibration import Affine
