@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
-import ipaddress
 import signal
 import threading
 import time
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 import click
 
+from ahrsd.cli.listening import in_url, ip_address
 from ahrsd.cli.running_daemon import DaemonPlace, place_options
 from ahrsd.errors import AhrsdError, DeviceError
 
 if TYPE_CHECKING:
+    from ahrsd.telemetry.client import DaemonConnection
     from ahrsd.viewer.foxglove_server import FoxgloveServer
 
 _AGAIN_S = 1.0
@@ -39,18 +41,15 @@ def command(place: DaemonPlace, address: str, port: int) -> None:
         raise AhrsdError("foxglove-sdk is missing: pip install 'ahrsd[foxglove]'")
     from ahrsd.viewer.foxglove_server import FoxgloveServer
 
-    try:
-        found = ipaddress.ip_address(address)
-    except ValueError:
-        raise click.UsageError(f"--address {address}: must be an IP address") from None
+    found = ip_address(address)
     stopped = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
-    with FoxgloveServer(address, port) as server:
-        shown = f"[{address}]" if found.version == 6 else address
-        click.echo(f"ws://{shown}:{server.port} (in Foxglove: Open connection, Foxglove WebSocket)")
+    with closing(FoxgloveServer(address, port)) as server:
+        where = in_url(found, server.port)
+        click.echo(f"ws://{where} (in Foxglove: Open connection, Foxglove WebSocket)")
         if not found.is_loopback:
-            click.echo(f"anybody who reaches {shown}:{server.port} can read it", err=True)
+            click.echo(f"anybody who reaches {where} can read it", err=True)
         _follow(place, server, stopped)
 
 
@@ -59,28 +58,27 @@ def _follow(place: DaemonPlace, server: FoxgloveServer, stopped: threading.Event
     away = ""
     while not stopped.is_set():
         try:
-            _watch(place, server, stopped)
+            with place.connect() as daemon:
+                away = ""
+                server.back()
+                click.echo(f"{daemon.path}: the daemon answers", err=True)
+                _show(daemon, server, stopped)
         except (DeviceError, OSError, ValueError) as error:
             if str(error) != away:
                 away = str(error)
                 click.echo(f"{away}; waiting for it", err=True)
             server.away(away)
             stopped.wait(_AGAIN_S)
-        else:
-            away = ""
 
 
-def _watch(place: DaemonPlace, server: FoxgloveServer, stopped: threading.Event) -> None:
+def _show(daemon: DaemonConnection, server: FoxgloveServer, stopped: threading.Event) -> None:
     from ahrsd.viewer.foxglove_topics import Topics
 
-    with place.connect() as daemon:
-        topics = Topics(time.time() - time.monotonic())
-        server.back()
-        click.echo(f"{daemon.path}: the daemon answers", err=True)
-        for record in daemon.watch(("status", "events", "samples")):
-            if stopped.is_set():
-                return
-            if "error" in record:
-                raise ValueError(str(record["error"]))
-            for message in topics.of(record, time.monotonic()):
-                server.show(message)
+    topics = Topics(time.time() - time.monotonic())
+    for record in daemon.watch(("status", "events", "samples")):
+        if stopped.is_set():
+            return
+        if "error" in record:
+            raise ValueError(str(record["error"]))
+        for message in topics.of(record, time.monotonic()):
+            server.show(message)

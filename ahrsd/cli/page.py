@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import ipaddress
 import os
 import socket
 import stat
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ahrsd.cli.listening import in_url, ip_address
 from ahrsd.cli.running_daemon import DaemonPlace, place_options
 from ahrsd.errors import EXIT_BUSY, AhrsdError, DeviceError
 from ahrsd.foreign_file import ForeignFileError, read_regular
@@ -114,11 +114,7 @@ def _refuse_unless_private(path: Path) -> None:
 
 
 def _listen(address: str, port: int) -> socket.socket:
-    try:
-        found = ipaddress.ip_address(address)
-    except ValueError:
-        raise click.UsageError(f"--address {address}: must be an IP address") from None
-    kind = socket.AF_INET6 if found.version == 6 else socket.AF_INET
+    kind = socket.AF_INET6 if ip_address(address).version == 6 else socket.AF_INET
     listener = socket.socket(kind, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -133,12 +129,13 @@ def _listen(address: str, port: int) -> socket.socket:
 
 def _say_where(listener: socket.socket, may_approve: bool) -> None:
     address, port = listener.getsockname()[:2]
-    shown = f"[{address}]" if ":" in address else address
+    found = ip_address(address)
+    place = in_url(found, port)
     what = "shows, and approves with the token" if may_approve else "only shows"
-    click.echo(f"http://{shown}:{port}/ ({what})")
-    if not ipaddress.ip_address(address).is_loopback:
+    click.echo(f"http://{place}/ ({what})")
+    if not found.is_loopback:
         more = "; the token goes over the network unencrypted" if may_approve else ""
-        click.echo(f"anybody who reaches {shown}:{port} can read it{more}", err=True)
+        click.echo(f"anybody who reaches {place} can read it{more}", err=True)
 
 
 def _approve(box: OperatorBox, candidate: str) -> tuple[bool, str]:

@@ -44,7 +44,7 @@ from ahrsd.samples import Array
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)
 _FEWEST = 15  # steps that a fit needs
 _SHORTEST_RUN = 8  # samples of a run that the linear start can use
-_STEPS = 60  # most; a fit ends where it has converged, far starts of a loud gyro after some 30
+_STEPS = 60  # most; a fit ends where it has converged
 _REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
 _GOOD = 1.5  # normalised innovation of a start that needs no rival
 _WORTH = 10.0  # by which a further start's cost must be lower

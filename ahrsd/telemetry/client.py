@@ -64,7 +64,7 @@ class DaemonConnection:
 
     def ask(self, what: str) -> dict[str, Any]:
         """One answer."""
-        self._socket.sendall(line_of({"ask": what}))
+        self._say({"ask": what})
         answer = self._line()
         if "error" in answer:
             raise DeviceError(f"{self.path}: {answer['error']}", EXIT_BUSY)
@@ -72,9 +72,15 @@ class DaemonConnection:
 
     def watch(self, streams: tuple[str, ...]) -> Iterator[dict[str, Any]]:
         """Records until the daemon ends; a silence of some seconds is an error."""
-        self._socket.sendall(line_of({"ask": "watch", "of": list(streams)}))
+        self._say({"ask": "watch", "of": list(streams)})
         while True:
             yield self._line()
+
+    def _say(self, request: dict[str, object]) -> None:
+        try:
+            self._socket.sendall(line_of(request))
+        except OSError:  # it closed the connection
+            raise DeviceError(f"{self.path}: the daemon has ended", EXIT_BUSY) from None
 
     def _line(self) -> dict[str, Any]:
         while b"\n" not in self._heard:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-
 import numpy as np
 from foxglove import Channel, Context, start_server
 from foxglove.channels import LogChannel, PointCloudChannel
@@ -35,7 +33,7 @@ _HERE = Pose(position=Vector3(x=0.0, y=0.0, z=0.0), orientation=Quaternion(w=1.0
 
 
 class FoxgloveServer:
-    """Topics of `foxglove_topics` for whoever connects; a context manager."""
+    """Topics of `foxglove_topics` for whoever connects, until `close`."""
 
     def __init__(self, address: str, port: int) -> None:
         """Port 0: any that is free.  DeviceError where it is taken."""
@@ -55,17 +53,6 @@ class FoxgloveServer:
             text = f"{address} port {port}: {reason}; --port and --address choose others"
             raise DeviceError(text, EXIT_BUSY) from None
         self.port: int = self._server.port
-
-    def __enter__(self) -> FoxgloveServer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._server.stop()
 
     def show(self, message: TopicMessage) -> None:
         """To everybody who asked for its topic."""
@@ -87,6 +74,10 @@ class FoxgloveServer:
     def back(self) -> None:
         """A daemon answers."""
         self._server.remove_status([_AWAY])
+
+    def close(self) -> None:
+        """Everybody is let go."""
+        self._server.stop()
 
 
 def _timestamp(unix_ns: int) -> Timestamp:

@@ -202,3 +202,21 @@ def test_an_address_that_is_none():
     done = CliRunner().invoke(group, ["foxglove", "--address", "rov.local"])
     assert done.exit_code == 2
     assert "--address rov.local: must be an IP address" in done.output
+
+
+def test_each_time_that_the_daemon_goes_is_said(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ahrsd", "foxglove", "--port", "0", "--state-directory", tmp_path],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout.readline().startswith("ws://")
+    assert "no daemon answers" in process.stderr.readline()
+    for _ in range(2):
+        server = SocketServer(tmp_path / "socket")
+        assert process.stderr.readline().endswith("the daemon answers\n")
+        server.close()
+        assert process.stderr.readline().endswith("the daemon has ended; waiting for it\n")
+        assert "no daemon answers" in process.stderr.readline()
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=10.0) == ("", "")
+    assert process.returncode == 0
