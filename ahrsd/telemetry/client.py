@@ -88,6 +88,8 @@ class DaemonConnection:
                 data = self._socket.recv(_PIECE)
             except TimeoutError:
                 raise DeviceError(f"{self.path}: silent for {_WAIT_S:.0f} s", EXIT_BUSY) from None
+            except ConnectionError:  # a reset: it closed before it had read what was asked
+                data = b""
             except OSError as error:
                 raise DeviceError(f"{self.path}: {error.strerror}", EXIT_BUSY) from None
             if not data:

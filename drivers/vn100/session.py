@@ -67,7 +67,9 @@ from drivers.vn100.errors import DeviceRefused, DriverError
 from drivers.vn100.sentences import encode
 
 GHOST_LIFE_S = 5.0
-SILENCE_S = 0.1  # without a byte for so long, half a message is no message any more
+# Without a byte for so long, half a message is no message any more: longer than a retransmission
+# of TCP takes (0.2 to 0.4 s), behind which the other half comes.
+SILENCE_S = 0.5
 _BARRIERS = (Read(1), Read(3), Read(4), Read(2))
 _BARRIER_TRIES = 2
 _MOST_FINALLY_BLOCKS = 32  # each of a procedure's may try to send once when the link goes

@@ -21,11 +21,11 @@ from operator import xor
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 
 CASES = Path(__file__).parents[3] / "shared" / "field-cases"
 HARD_IRON_MG, GYRO_BIAS_MRAD_S = (120.0, -80.0, 60.0), (3.5, -4.2, 2.1)
 LISTENED_S = 8.0
-PATIENCE_S = 240.0
 COMMAND = [sys.executable, "-m", "ahrsd"]
 
 pytestmark = [
@@ -247,7 +247,7 @@ def emulated(firmware: int) -> Iterator[Callable[[str], str]]:
 
         def ask(body: str) -> str:
             os.write(fd, f"${body}*{functools.reduce(xor, body.encode()):02X}\r\n".encode())
-            heard, end_s = b"", time.monotonic() + 20.0
+            heard, end_s = b"", time.monotonic() + PATIENCE_S
             reply = re.compile(rb"\$(VN(?:ERR|" + body[2:5].encode() + rb")[^*\r]*)\*[0-9A-F]+\r")
             while not (found := reply.search(heard)):
                 assert time.monotonic() < end_s, heard[-200:]

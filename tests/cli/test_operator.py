@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 from planted_operator import estimate
 
 from ahrsd.core.core import Core
@@ -28,7 +29,7 @@ VERY_LONG_S = 60.0
 
 
 def until(condition):
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.005)
@@ -355,7 +356,7 @@ def test_a_running_daemon_answers(emulated, tmp_path):
         command = [sys.executable, "-m", "ahrsd", "-v", "run", "--config", str(config)]
         process = subprocess.Popen(command, stdout=file, stderr=file, umask=0o077)
         try:
-            end = time.monotonic() + 60.0
+            end = time.monotonic() + PATIENCE_S
             while "OBSERVING" not in log.read_text():
                 assert time.monotonic() < end, log.read_text()
                 time.sleep(0.05)
@@ -367,6 +368,6 @@ def test_a_running_daemon_answers(emulated, tmp_path):
             assert ahrsd("operator", "lock", "crew aboard") == locked
         finally:
             process.terminate()
-            assert process.wait(60.0) == 0
+            assert process.wait(PATIENCE_S) == 0
     (journal,) = tmp_path.glob("journal-*.jsonl")
     assert "crew aboard" in journal.read_text()

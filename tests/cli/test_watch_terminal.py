@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.telemetry.server import SocketServer
 
@@ -37,7 +38,7 @@ def terminal(tmp_path):
     )  # fmt: skip
 
     def drawn(words: str) -> str:
-        text, end_s = "", time.monotonic() + 20.0
+        text, end_s = "", time.monotonic() + PATIENCE_S
         while words not in text:
             assert time.monotonic() < end_s, f"{words!r} was not drawn: {text[-3000:]}"
             status["at_s"] += 1.0
@@ -67,4 +68,4 @@ def test_it_fits_scrolls_and_ends_by_a_key(terminal):
     press(b"\x1b[6~")
     assert "stream: " in drawn(f"-{found} of {found}")
     press(b"q")
-    assert process.wait(5) == 0
+    assert process.wait(PATIENCE_S) == 0

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.config.core_settings import core_settings, terms_text
 from ahrsd.config.loading import Config, check_config
@@ -168,7 +169,7 @@ def test_the_file_is_read_once_and_says_what_is_wrong_with_it(tmp_path):
 
 
 def until(condition):
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.005)

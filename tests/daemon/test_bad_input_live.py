@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.inputs import Received
 from ahrsd.recording.capture import CaptureReader
@@ -230,7 +231,7 @@ def test_a_signal_ends_the_command_in_time_with_everything_put_back(emulated, tm
         before = dict(emulator.memory.ram)
         command = [sys.executable, "-m", "ahrsd", "run", "--config", str(config), "--port", path]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as daemon:
-            end = time.monotonic() + 30.0
+            end = time.monotonic() + PATIENCE_S
             while emulator.memory.get(75)[0] == 0 or emulator.memory.get(6, 1) != (0,):
                 assert time.monotonic() < end
                 time.sleep(0.01)
@@ -262,7 +263,7 @@ def test_a_signal_while_it_still_looks_for_the_rate(emulated, tmp_path):
 
 
 def wait_until_open(pid, path):
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + PATIENCE_S
     target = Path(path).resolve()
     while time.monotonic() < end:
         for descriptor in Path(f"/proc/{pid}/fd").iterdir():

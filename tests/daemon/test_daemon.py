@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S
 from planted_operator import Operator
 
 from ahrsd.config.loading import Config
@@ -235,7 +236,7 @@ def test_samples_go_on_while_the_estimator_is_at_it(live):
 
         def search(_):
             busy.set()
-            free.wait(20.0)
+            free.wait(PATIENCE_S)
 
         daemon.core.calibrator.take = search
         daemon.until(busy.is_set)  # once the device was asked who it is

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from cabled_units import sentence
+from patience import PATIENCE_S
 
 from ahrsd.config.sections import ShareSection
 from ahrsd.daemon.network_shares import MOST_READERS, NetworkShares
@@ -22,7 +23,6 @@ from ahrsd.daemon.shares import Shares
 from ahrsd.errors import ConfigError
 
 TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,+0.1,+0.2,+0.3")
-PATIENCE_S = 20.0
 
 
 def free(kind: socket.SocketKind = socket.SOCK_STREAM) -> str:

@@ -19,13 +19,12 @@ from operator import xor
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.inputs import Received
 from ahrsd.recording.capture import CaptureReader
 from drivers.vn100.emulator.pty import PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup, build
-
-PATIENCE_S = 60.0
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:

@@ -10,6 +10,7 @@ import time
 from dataclasses import asdict
 
 import pytest
+from patience import PATIENCE_S
 from planted_operator import estimate
 
 from ahrsd.config.core_settings import core_settings
@@ -21,8 +22,6 @@ from ahrsd.inputs import LimitsChanged, Samples
 from ahrsd.offline.replay import replay
 from ahrsd.recording import inputs_json
 from ahrsd.recording.capture import CaptureReader
-
-PATIENCE_S = 60.0
 
 
 def until(condition):

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drivers_at_start import ROS2_DAWONN, SDK
+from patience import PATIENCE_S
 
 from ahrsd.config.loading import Config
 from ahrsd.events import SamplesSeen
@@ -29,7 +30,6 @@ from drivers.vn100.sentences import encode
 
 ANSWER = re.compile(rb"\$(VN(?:RRG|WRG|ERR|ASY|WNV|RST)[^*\r]*)\*..\r\n")
 READ = rb"\$VNRRG,\d+(,\d)?\*[0-9A-F]{2}"
-PATIENCE_S = 60.0
 
 
 class Running:

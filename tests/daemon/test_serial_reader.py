@@ -8,6 +8,8 @@ import pty
 import threading
 from pathlib import Path
 
+from patience import PATIENCE_S
+
 from ahrsd.daemon.serial_link import Bytes, Inbox, Lost, SerialLink, SerialReader
 from ahrsd.inputs import LinkLost, Received
 from ahrsd.recording.capture import CaptureReader
@@ -32,7 +34,7 @@ class Endless:
 
 
 def ended(reader):
-    reader._thread.join(5.0)
+    reader._thread.join(PATIENCE_S)
     return not reader._thread.is_alive()
 
 

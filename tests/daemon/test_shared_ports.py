@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from cabled_units import sentence
+from patience import PATIENCE_S
 
 from ahrsd.config.sections import ShareSection
 from ahrsd.daemon.shared_ports import SharedPorts
@@ -23,7 +24,6 @@ from ahrsd.events import SendToClient
 from ahrsd.inputs import ClientLeft, ClientSent
 
 TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,+0.1,+0.2,+0.3")
-PATIENCE_S = 20.0
 
 
 class Program:

@@ -9,14 +9,13 @@ import time
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.config.loading import Config
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader
 from ahrsd.telemetry.client import DaemonConnection, default_socket_path
-
-PATIENCE_S = 120.0
 
 
 def constant(field):

@@ -10,12 +10,11 @@ import threading
 import time
 
 import pytest
+from patience import PATIENCE_S
 from planted_operator import Operator
 
 from ahrsd.daemon.interlock import InterlockFile
 from ahrsd.foreign_file import Contents
-
-PATIENCE_S = 60.0
 
 
 class HangingDisk:

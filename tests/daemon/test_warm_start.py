@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cabled_run import estimate, lenient_gates
+from patience import PATIENCE_S
 from recorded_run import LIMIT_S, RecordedRun
 
 from ahrsd import events, inputs
@@ -418,7 +419,7 @@ def test_the_thread_that_reads_never_ends_a_run():
         raise RuntimeError("no such thing")
 
     recall = Recall(broken)
-    recall._thread.join(30.0)
+    recall._thread.join(PATIENCE_S)
     item = recall.take(5)
     assert item.host_ns == 5
     assert item.why == "RuntimeError: no such thing"

@@ -11,6 +11,7 @@ import sys
 import time
 
 from cabled_run import lenient_gates
+from patience import PATIENCE_S
 
 from ahrsd.config.loading import check_config
 from ahrsd.config.text import print_config
@@ -21,7 +22,6 @@ from drivers.vn100.emulator.process import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 
 SPEED = 8.0
-PATIENCE_S = 240.0
 AGAIN_S = 7.0  # within it the device is read once more, which every used sample needs
 MOTION = (("static", 12.0), ("tumble", 5000.0))
 SCENE = Setup("rov", seed=2, output="binary", rate_hz=50, baud=115200, motion=MOTION)

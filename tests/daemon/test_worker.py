@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from patience import PATIENCE_S
 from planted_calibrator import PlantedCalibrator
 from virtual_run import VirtualRun
 
@@ -111,7 +112,7 @@ def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch
         public.notifier.feed = lambda: fed.append(time.monotonic())
         daemon.daemon._public = public
         daemon.until(lambda: len(fed) > 20)
-        daemon.core.calibrator.take = lambda _: gate.wait(30.0)
+        daemon.core.calibrator.take = lambda _: gate.wait(PATIENCE_S)
         daemon.until(lambda: daemon.shell.worker.stuck)
         daemon.flowing()  # a turn that had begun before may end
         count = len(fed)

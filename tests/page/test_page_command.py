@@ -19,6 +19,7 @@ import pytest
 from browser import BROWSER
 from click.testing import CliRunner
 from live_browser import LiveBrowser
+from patience import PATIENCE_S
 
 from ahrsd.__main__ import group
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorBox, OperatorInbox
@@ -211,7 +212,7 @@ def test_a_page_without_a_token_has_no_form(daemon, tmp_path):
 
 def events(address, count):
     """The first events that a browser gets, as dictionaries."""
-    asked = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    asked = http.client.HTTPConnection(urlsplit(address).netloc, timeout=PATIENCE_S)
     asked.request("GET", "/events")
     answer = asked.getresponse()
     found = []
@@ -259,7 +260,7 @@ def test_it_ends_when_it_is_asked_to_with_browsers_open(daemon, tmp_path):
             open_one.sendall(f"GET /events HTTP/1.1\r\nHost: {place.netloc}\r\n\r\n".encode())
             assert open_one.recv(100).startswith(b"HTTP/1.1 200")
             process.send_signal(signal.SIGTERM)
-            assert process.wait(10) in (0, -signal.SIGTERM)
+            assert process.wait(PATIENCE_S) in (0, -signal.SIGTERM)
 
 
 def test_without_a_daemon_it_says_so_and_waits(tmp_path):
@@ -323,7 +324,7 @@ def test_addresses_and_ports():
 def test_a_name_is_one_whatever_its_port(daemon, tmp_path):
     assert "must be a name such as rov.local" in refused("--host", "http://rov.local/")[0]
     with page_of(tmp_path, "--host", "ROV.local:9191") as (address, _):
-        asked = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+        asked = http.client.HTTPConnection(urlsplit(address).netloc, timeout=PATIENCE_S)
         codes = []
         for name in ("rov.local", "other.local"):
             asked.request("GET", "/", headers={"Host": name})

@@ -8,6 +8,7 @@ import threading
 import time
 
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.config.loading import load_config
 from ahrsd.daemon.columns_file import ColumnsFile
@@ -25,7 +26,7 @@ from ahrsd.foreign_file import (
 
 
 def until(condition):
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.005)
@@ -137,7 +138,7 @@ class Host:
         self.looks = 0
 
     def read(self, _path, _most):
-        self.reading.wait(60.0)
+        self.reading.wait(PATIENCE_S)
         self.looks += 1
         return self.file
 

@@ -11,6 +11,7 @@ from typing import Self
 
 import serial
 import serial.rfc2217
+from patience import PATIENCE_S
 
 
 class DeviceServer:
@@ -48,7 +49,7 @@ class DeviceServer:
     ) -> None:
         self._stopping = True
         self.drop()
-        self._thread.join(10.0)
+        self._thread.join(PATIENCE_S)
         self._listener.close()
 
     def _serve(self) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from browser import BROWSER
+from patience import PATIENCE_S
 
 _LONG_S = 30.0
 
@@ -54,7 +55,7 @@ class LiveBrowser:
     def __exit__(self, *_: object) -> None:
         self._session = None
         self.tell("Browser.close")
-        self._process.wait(10)
+        self._process.wait(PATIENCE_S)
         os.close(self._in)
         os.close(self._out)
 

@@ -15,6 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from patience import PATIENCE_S
+
 _MASKED = """
 systemd-binfmt systemd-firstboot systemd-logind systemd-machine-id-commit systemd-modules-load
 systemd-networkd systemd-pcrphase systemd-random-seed systemd-remount-fs systemd-resolved
@@ -113,7 +115,7 @@ class RealSystemd:
         return self
 
     def _wait_for_boot(self) -> None:
-        until = time.monotonic() + 30.0
+        until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             if self._process is None or self._process.poll() is not None:
                 break
@@ -158,7 +160,7 @@ class RealSystemd:
                 os.kill(self._init, signal.SIGKILL)  # PID 1 of the namespace: all in it ends
         if self._process is not None:
             self._process.kill()
-            self._process.wait(10)
+            self._process.wait(PATIENCE_S)
         subprocess.run(
             ["umount", "-l", str(self._folder / "tmpfs")], capture_output=True, check=False
         )

@@ -15,12 +15,12 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
+from patience import PATIENCE_S
 from scripted_vn100 import Cable, Iron, Motion, Served, Unit, Vehicle
 from write_observer import Observer
 
 SUPPORT = Path(__file__).parent
 PROJECT = SUPPORT.parent.parent
-PATIENCE_S = 90.0
 SERIAL = 100130608
 OUTPUT = {
     "binary": {6: "0", 7: "40", 75: "1,20,06,0001,083F"},

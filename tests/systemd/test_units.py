@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE_S
 from real_systemd import RealSystemd, why_not
 
 PROJECT = Path(__file__).parents[2]
@@ -170,7 +171,7 @@ def emulate(machine):
 def unplug(machine, device):
     """The emulator ends at once, and its pty with it; nsenter ends with its child."""
     machine.run("pkill", "-KILL", "-f", "ahrsd emulate", check=False)
-    device.wait(10)
+    device.wait(PATIENCE_S)
     device.stdout.close()
 
 

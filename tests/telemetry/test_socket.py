@@ -2,15 +2,18 @@
 
 import json
 import socket
+import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 
 import pytest
+from patience import PATIENCE_S
 
 from ahrsd.errors import DeviceError
 from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.lines import status_lines
+from ahrsd.telemetry.protocol import SCHEMA, line_of
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.server import MOST_CLIENTS, SocketServer
 
@@ -135,7 +138,7 @@ def test_a_slow_reader_gets_a_gap_record(tmp_path):
             for number in range(600):
                 server.status({"number": number, "fill": "x" * 2000})
                 time.sleep(0.0005)
-            until = time.monotonic() + 5.0
+            until = time.monotonic() + PATIENCE_S
             while server.dropped == 0 and time.monotonic() < until:
                 time.sleep(0.01)
             seqs, gaps = [], []
@@ -166,3 +169,23 @@ def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
             assert asked.ask("status") == {"number": 399}
     finally:
         server.close()
+
+
+def test_a_daemon_that_ends_before_it_read_the_question_has_ended(tmp_path):
+    """The kernel tells that end of a connection as a reset."""
+    with closing(socket.socket(socket.AF_UNIX)) as listening:
+        listening.bind(str(tmp_path / "socket"))
+        listening.listen()
+
+        def greet_and_end():
+            connection, _ = listening.accept()
+            connection.sendall(line_of({"schema": SCHEMA}))
+            assert connection.recv(1, socket.MSG_PEEK)  # asked, and never read
+            connection.close()
+
+        daemon = threading.Thread(target=greet_and_end)
+        daemon.start()
+        has_ended = pytest.raises(DeviceError, match=r"socket: the daemon has ended$")
+        with DaemonConnection(tmp_path / "socket") as asking, has_ended:
+            next(asking.watch(("status",)))
+        daemon.join()

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from cabled_run import IRON, estimate
 from click.testing import CliRunner
+from patience import PATIENCE_S
 from websockets.sync.client import connect
 
 from ahrsd import events
@@ -142,7 +143,7 @@ def test_a_foxglove_reads_every_topic_and_can_write_to_none(shown):
     process, place = shown
     with connect(place, subprotocols=["foxglove.sdk.v1"], max_size=None) as client:
         told, topics = {}, {}
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + PATIENCE_S
         while len(topics) < len(SCHEMAS) + len(CLOUDS) + 1 and time.monotonic() < deadline:
             message = json.loads(client.recv(30.0))
             told[message["op"]] = message
@@ -171,7 +172,7 @@ def test_a_foxglove_reads_every_topic_and_can_write_to_none(shown):
         assert base64.b64decode(topics["/log"]["schema"])  # a Foxglove knows what it is
     assert process.stderr.readline().endswith("socket: the daemon answers\n")
     process.send_signal(signal.SIGTERM)
-    assert process.wait(10.0) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 def test_without_a_daemon_it_says_so_once_and_waits(tmp_path):
@@ -185,7 +186,7 @@ def test_without_a_daemon_it_says_so_once_and_waits(tmp_path):
     assert line.endswith("waiting for it\n")
     time.sleep(2.5)
     process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=10.0) == ("", "")
+    assert process.communicate(timeout=PATIENCE_S) == ("", "")
     assert process.returncode == 0
 
 
@@ -218,5 +219,5 @@ def test_each_time_that_the_daemon_goes_is_said(tmp_path):
         assert process.stderr.readline().endswith("the daemon has ended; waiting for it\n")
         assert "no daemon answers" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
-    assert process.communicate(timeout=10.0) == ("", "")
+    assert process.communicate(timeout=PATIENCE_S) == ("", "")
     assert process.returncode == 0

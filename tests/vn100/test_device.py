@@ -9,6 +9,7 @@ import time
 import tty
 
 import pytest
+from patience import PATIENCE_S
 
 from drivers.serial_port import PortLost, SerialPort
 from drivers.vn100.commands import NoReply, NotPermitted, Pause, Word, Write
@@ -145,7 +146,7 @@ def test_ctrl_c_resumes_the_output_before_it_goes_on(scripted):
     with Device(SerialPort(scripted.path, 115200), everything, on_event=press) as device:
         with pytest.raises(KeyboardInterrupt):
             device.run(quiet(read(23)))
-        until_s = time.monotonic() + 5.0  # the other end reads in a thread of its own
+        until_s = time.monotonic() + PATIENCE_S  # the other end reads in a thread of its own
         while scripted.heard[-1] != b"$VNASY,1*4E" and time.monotonic() < until_s:
             time.sleep(0.01)
         assert scripted.heard[-1] == b"$VNASY,1*4E"

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import serial
+from patience import PATIENCE_S
 
 from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import make_motion
@@ -246,7 +247,7 @@ def test_command_prints_the_path_serves_and_ends_cleanly(tmp_path, stop):
             host.write(b"$VNRRG,04*77\r\n")
             assert host.read_until(b"\n").startswith(b"$VNRRG,04,2.1.0.0*")
         process.send_signal(stop)
-        _, said = process.communicate(timeout=10)
+        _, said = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 0
@@ -266,7 +267,7 @@ def test_command_prints_the_path_serves_and_ends_cleanly(tmp_path, stop):
 )
 def test_bad_usage_is_one_line_and_exit_2(arguments, complaint):
     process = command_line(*arguments)
-    out, said = process.communicate(timeout=20)
+    out, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert out == ""
     assert complaint in said and said.count("\n") == 1
@@ -274,7 +275,7 @@ def test_bad_usage_is_one_line_and_exit_2(arguments, complaint):
 
 def test_list_names_scenarios_and_faults():
     process = command_line("--list")
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert "\n  rov " in out and "\n  torn_flash " in out
 

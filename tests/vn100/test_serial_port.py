@@ -17,6 +17,7 @@ import tty
 
 import psutil
 import pytest
+from patience import PATIENCE_S
 
 from drivers import serial_port
 from drivers.port_holders import holders
@@ -202,7 +203,7 @@ def test_writing_waits_for_a_slow_reader_and_not_for_ever(pty):
         reader = threading.Thread(target=slow_reader)
         reader.start()
         port.write(data, timeout_s=20.0)
-        reader.join(20.0)
+        reader.join(PATIENCE_S)
         assert bytes(taken) == data
         begin_s = time.monotonic()
         with pytest.raises(PortLost, match="of 200000 bytes"):

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 from cabled_run import FIRST, SPARE, two_units
+from patience import PATIENCE_S
 
-PATIENCE_S = 90.0
 CONFIG = """state_directory = "{folder}"
 mode = "commit"
 [device]

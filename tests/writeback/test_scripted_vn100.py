@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import write_observer
+from patience import PATIENCE_S
 from quiet_device import bodies
 from scripted_vn100 import Cable, Iron, Motion, Served, Unit, Vehicle
 from scripted_vn100.memory import TABLE, printed, stored
@@ -221,7 +222,7 @@ def test_it_is_served_on_a_pty_in_real_time():
         port = os.open(served.path, os.O_RDWR | os.O_NOCTTY)
         try:
             os.write(port, sentence("VNRRG,3"))
-            heard, end = b"", time.monotonic() + 20.0
+            heard, end = b"", time.monotonic() + PATIENCE_S
             while (b"VNRRG,03" not in heard or b"VNIMU" not in heard) and time.monotonic() < end:
                 heard += os.read(port, 4096)
         finally:

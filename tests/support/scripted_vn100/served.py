@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
+from patience import PATIENCE_S
+
 from scripted_vn100.cable import Cable
 
 TURN_S = 0.004
@@ -55,7 +57,7 @@ class Served:
         trace: TracebackType | None,
     ) -> None:
         self._stop.set()
-        self._thread.join(10.0)
+        self._thread.join(PATIENCE_S)
         os.close(self._master)
         os.close(self._slave)
         if self.error is not None and error is None:
