@@ -254,6 +254,8 @@ class Soak:
         return rows[:count]
 
     def _row(self, cpu_s: float, estimator_s: float) -> tuple[float, ...]:
+        while self.shell.capture.status.queued_bytes:  # what the disk has not got yet is no growth
+            time.sleep(0.001)
         gc.collect()
         core = self.shell.core
         return (
