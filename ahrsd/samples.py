@@ -7,11 +7,17 @@ says whether the first row follows the last row of the previous block.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+REGULAR: Final = 0.1  # of the period: steps that near a multiple of it are made of whole ones
+PERIOD_PERCENTILE: Final = 10.0  # of the steps, where no more than nine of ten have samples missing
+WINDOW_STEPS: Final = 20  # that last equally long where nothing is missing ...
+WINDOW_PERIODS: Final = 1.5  # ... but for one tick of the clock at either end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,3 +61,24 @@ class SampleBlock:
             epoch=self.epoch,
             gap_before=gap_before,
         )
+
+
+def in_periods(step_s: Array) -> Array | None:
+    """N positive steps of a regular clock in periods of it (near 2: a sample is missing), or None.
+
+    None where nine of ten steps are no multiples of a period, and where the stamps are rounded to
+    ticks nearly as long as a period: those are multiples of the tick, but nothing is missing, so
+    the same number of steps lasts equally long everywhere.
+    """
+    if not len(step_s):
+        return None
+    ratio = step_s / np.percentile(step_s, PERIOD_PERCENTILE)
+    whole = np.maximum(np.rint(ratio), 1.0)
+    if np.quantile(np.abs(ratio - whole), 0.9) > REGULAR:
+        return None
+    if len(step_s) > WINDOW_STEPS:
+        ends = np.concatenate([[0.0], np.cumsum(whole)])
+        lasts = ends[WINDOW_STEPS:] - ends[:-WINDOW_STEPS]
+        if whole.max() > 1.0 and np.ptp(lasts) <= WINDOW_PERIODS:
+            return None
+    return np.asarray(ratio)

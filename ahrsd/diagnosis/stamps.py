@@ -14,9 +14,8 @@ from ahrsd.counting import counted
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.track import Track
-from ahrsd.samples import Array
+from ahrsd.samples import Array, in_periods
 
-_REGULAR = 0.1  # scatter of the steps over the step, below which multiples can be told
 _MISSING_SHARE = 1e-3
 _JITTER = 0.03  # of the step
 _PIECE = 30  # rows over which a host's clock is straight
@@ -50,16 +49,14 @@ def _backwards(track: Track) -> list[Fact]:
 def _missing(track: Track) -> list[Fact]:
     """Steps that are whole multiples of the usual one."""
     steps = np.diff(track.time_s)
-    usual = float(np.median(steps))
-    if usual <= 0 or len(steps) < 50:
+    if len(steps) < 50 or np.any(steps <= 0):
         return []
-    ratio = steps / usual
-    scatter = float(np.quantile(np.abs(ratio - 1), 0.9))
-    if scatter > _REGULAR:
+    periods = in_periods(steps)
+    if periods is None:
         return []
-    times = np.round(ratio)
-    long = (times >= 2) & (np.abs(ratio - times) < 0.25 + 0.02 * times)
-    lost = int(np.sum(times[long] - 1))
+    whole = np.rint(periods)
+    long = (whole >= 2) & (np.abs(periods - whole) < 0.25 + 0.02 * whole)
+    lost = int(np.sum(whole[long] - 1))
     share = lost / (lost + len(track))
     if share < _MISSING_SHARE or np.count_nonzero(long) < 2:
         return []

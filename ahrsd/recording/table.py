@@ -54,7 +54,7 @@ from ahrsd.recording.limits import (
     TABLE_ROWS,
     refuse_beyond,
 )
-from ahrsd.samples import Array, SampleBlock
+from ahrsd.samples import Array, SampleBlock, in_periods
 
 PARQUET = b"PAR1"  # how such a file begins
 NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
@@ -374,7 +374,7 @@ class _TableRows:
             dt_s=dt_s,
             host_s=time_s,
             raw_b_gauss=self.vectors(MAG),
-            gyro_b_rad_s=self.vectors(GYRO),
+            gyro_b_rad_s=_over_steps(self.vectors(GYRO), dt_s),
             accel_b_m_s2=accel,
             covariates=self.covariates,
         )
@@ -667,6 +667,25 @@ def _steps(time_s: Array, known: tuple[int, ...] = ()) -> tuple[Array, tuple[int
     gap[[row - 1 for row in known if row > 0]] = True
     dt_s = np.concatenate([[np.nan], np.where(gap, np.nan, step_s)])
     return dt_s, (0, *(np.flatnonzero(gap) + 1).tolist())
+
+
+def _over_steps(gyro_b_rad_s: Array, dt_s: Array) -> Array:
+    """Rates (N, 3) as means over their steps: a row tells the rate of one period only.
+
+    Where rows are missing within a step, their rates are taken from both sides, linearly. Taken as
+    the rate of the whole step, that of its last period comes early, which looks like a lag.
+    """
+    known = np.isfinite(dt_s)
+    periods = in_periods(dt_s[known])
+    if periods is None:
+        return gyro_b_rad_s
+    count = np.ones(len(dt_s))
+    count[known] = np.rint(periods)
+    long = np.flatnonzero(count > 1.0)
+    share = (1.0 - 1.0 / count[long, None]) / 2.0
+    out = gyro_b_rad_s.copy()
+    out[long] += share * (gyro_b_rad_s[long - 1] - gyro_b_rad_s[long])
+    return out
 
 
 TABLE_SUFFIXES = (".csv", ".csv.gz", ".parquet")

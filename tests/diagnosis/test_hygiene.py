@@ -327,8 +327,9 @@ def _without(track: Track, keep: np.ndarray, *, restamp: bool) -> Track:
     )
 
 
-def test_missing_samples_by_their_stamps(track: Track) -> None:
-    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.02)
+@pytest.mark.parametrize("missing", [0.02, 0.3])
+def test_missing_samples_by_their_stamps(track: Track, missing: float) -> None:
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > missing)
     fact = _only(hygiene(_without(track, keep, restamp=False)))
     assert fact.effect == "dropped_samples"
     assert abs(_value(fact) - (1 - len(keep) / len(track))) < 1e-3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,20 @@ def test_two_alternating_steps_are_no_gaps_and_one_lost_sample_is(tmp_path):
     values = columns()
     values["time_s"] = [f"{t:.4f}" for t in np.cumsum(steps)]
     assert read_table(save(tmp_path / "t.csv", values)).starts == (0, 20)
+
+
+def test_a_rate_over_missing_rows_is_the_mean_of_the_step(tmp_path):
+    """A rate that grows evenly: the mean is that of the rows that were there."""
+    values, whole = columns(), 0.01 * 6 * (np.arange(ROWS) + 1)
+    missing = np.zeros(ROWS, bool)
+    missing[4:40:5] = missing[21] = True
+    kept = np.flatnonzero(~missing)
+    some = {name: [column[k] for k in kept] for name, column in values.items()}
+    table = read_table(save(tmp_path / "t.csv", some))
+    assert table.starts == (0,)
+    means = [whole[a + 1 : b + 1].mean() for a, b in pairwise(kept.tolist())]
+    np.testing.assert_allclose(table.rows.gyro_b_rad_s[1:, 1], means, atol=1e-12)
+    np.testing.assert_allclose(table.rows.raw_b_gauss[:, 0], 0.02 * (kept + 1))
 
 
 def test_without_acceleration_it_is_nan_and_covariates_may_have_holes(tmp_path):
