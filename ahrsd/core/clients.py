@@ -97,6 +97,8 @@ class Clients:
             return effects
         if done.asked.kind is Kind.RESET and (isinstance(result, Reply) or _silent(error)):
             effects.reset_by = done.client
+        elif done.asked.kind is Kind.SAVE and not isinstance(result, Reply):
+            effects.actions = self._writeback.on_client_save_failed(str(error), host_s)
         elif isinstance(result, Reply):
             self._changed(done, registers, host_s, effects)
         return effects

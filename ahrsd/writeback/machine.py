@@ -112,6 +112,8 @@ class WriteBack:
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
         deadlines = [self._flow.deadline_s, self._outbox.journal_again_s, self._recheck.due_s]
+        if (aside := self._flow.aside) is not None and not aside.settled(self._outbox.host_s):
+            deadlines.append(aside.settled_s)
         if self._flow.watches_interlock:
             deadlines.append(self._outbox.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
@@ -138,6 +140,8 @@ class WriteBack:
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
         now = (self.history, self._outbox.host_s, self._outbox.now)
+        if self.state is State.SET_ASIDE:
+            return self._flow.aside_holds()
         if self.state is State.PROVEN:
             return self._safe.save_holds(*now)
         reasons = self._safe.write_holds(*now)
@@ -284,6 +288,8 @@ class WriteBack:
             self._restarts.answered(self._recheck.asked_s, host_s)
             self._safe.asking_took(host_s - self._recheck.asked_s)
             flow.proven_to_s = self._sampled_to_s if flow.passed else None
+            if flow.aside is not None:
+                flow.aside.confirmed_s = self._recheck.asked_s
         return self._answer()
 
     def on_waiting(self, span_s: float, host_s: float) -> list[Action]:
@@ -350,6 +356,8 @@ class WriteBack:
             self._flow.consider(estimate, gyro_is_raw)
         elif self.state in LIVED_WITH:
             self._flow.compare(estimate, gyro_is_raw)
+        elif self.state is State.SET_ASIDE:
+            self._flow.judge_aside(estimate, gyro_is_raw)
         return self._answer()
 
     def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
@@ -435,7 +443,13 @@ class WriteBack:
     def on_client_wants_save(self, client: str, host_s: float) -> list[Action]:
         """All of RAM is to be saved for a client: what is on trial is undone first."""
         self._outbox.host_s = host_s
-        self._flow.roll_back("client", f"{client} saves, and nothing unproven is saved along")
+        self._flow.set_aside(client)
+        return self._answer()
+
+    def on_client_save_failed(self, why: str, host_s: float) -> list[Action]:
+        """The device refused it, or nobody knows whether it was carried out."""
+        self._outbox.host_s = host_s
+        self._flow.client_save_ended(why)
         return self._answer()
 
     def on_client_saved(
@@ -453,6 +467,7 @@ class WriteBack:
             self._outbox.record(
                 RecordKind.CLIENT_SAVED, client=client, serial=self._flow.identity.serial
             )
+        self._flow.client_save_ended()
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:

@@ -119,8 +119,10 @@ class Safeguards:
             return ""
         return self.interlock_holds(host_s)
 
-    def write_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
-        """Why no write may begin now, but for the approval."""
+    def write_holds(
+        self, history: JournalHistory, host_s: float, now: Now, *, again: bool = False
+    ) -> list[str]:
+        """Why no write may begin now, but for the approval. `again`: see `policy.ram_budget`."""
         reasons = list(self._limits)
         if self.policy.mode < Mode.STAGE:
             reasons.append(
@@ -133,8 +135,17 @@ class Safeguards:
             reasons.append("no gate has judged yet")
         if self._hsi_applied:
             reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
-        reasons += ram_budget(self.policy, history, now)
+        reasons += ram_budget(self.policy, history, now, again=again)
         return reasons + self._always(host_s)
+
+    def again_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+        """Why what was set aside may not be written again now: its approval must still hold."""
+        reasons = [word for word in (self.void, self.disagrees) if word]
+        if not self.armed:
+            reasons.append(NOT_ARMED)
+        reasons += self._old_verdict(host_s)
+        more = self.write_holds(history, host_s, now, again=True)
+        return list(dict.fromkeys([*reasons, *more]))
 
     def save_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
         """Why the flash may not be written now."""
@@ -162,9 +173,11 @@ class Safeguards:
                 f"somebody else changed register {which} in this run, and a save would make it "
                 "permanent; once it is right, switch the device off and on"
             )
-        if host_s - self.judged_s > VERDICT_AGE_S:
-            reasons.append(f"the newest verdict is {host_s - self.judged_s:.0f} s old")
-        return reasons + self.unexamined()
+        return reasons + self._old_verdict(host_s) + self.unexamined()
+
+    def _old_verdict(self, host_s: float) -> list[str]:
+        old_s = host_s - self.judged_s
+        return [f"the newest verdict is {old_s:.0f} s old"] if old_s > VERDICT_AGE_S else []
 
     def asking_took(self, took_s: float) -> None:
         """The device was asked who it is and what it holds, and answered as it ought to."""
