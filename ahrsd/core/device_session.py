@@ -445,10 +445,12 @@ class DeviceSession:
             return []
         return self._digest(self.session.cancel(now_s), now_s)
 
-    def serve(self, command: Speech, now_s: float) -> list[Event]:
+    def serve(
+        self, command: Speech, now_s: float, purpose: Purpose = Purpose.CLIENT
+    ) -> list[Event]:
         """Send a client's command, beside the running output; only while `idle`."""
         self.phase, self._serving = Phase.SERVING, command
-        return self._digest(self._start(asked(command), Purpose.CLIENT, now_s), now_s)
+        return self._digest(self._start(asked(command), purpose, now_s), now_s)
 
     def cancel(self, name: str, now_s: float) -> list[Event]:
         """End the procedure of this name, if it runs; it may still send what puts things back."""

@@ -12,6 +12,7 @@ from functools import partial
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.action_outbox import ActionOutbox
 from ahrsd.writeback.actions import CalibrateAnew, IdentifyAgain, SetUpStream
+from ahrsd.writeback.client_write import ClientWrite
 from ahrsd.writeback.composition import (
     GYRO,
     MAG,
@@ -65,6 +66,7 @@ class Flow:
         self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
         self.waits_for_look = False  # all that is lacking is that the device is asked again
         self.aside: SetAside | None = None  # what is undone for a client's save
+        self.client_write: ClientWrite | None = None  # of what calibrates
         self._cause = "device"
         self._left: dict[int, Values] = {}  # by register, what the device made of ours
         self._from_fault = self._resumed = False
@@ -118,8 +120,9 @@ class Flow:
         """Take the step that waits for nothing but a condition, if it holds now."""
         now = (self.outbox.history, self.outbox.host_s, self.outbox.now)
         self.waits_for_look = False
-        if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
-            self.signal(Signal.APPROVED, f"approved: {self.approver}")
+        if self.state is State.QUALIFIED and self.approver:
+            if self.client_write is None and not self.safe.write_holds(*now):
+                self.signal(Signal.APPROVED, f"approved: {self.approver}")
         elif self.watches_interlock and (
             word := self.safe.interlock_broken(self.outbox.host_s, self._since_s)
         ):
@@ -344,6 +347,52 @@ class Flow:
         self.waits_for_look = self.aside.waits_for_look(self.safe.doubt_s, self.outbox.host_s)
         if not self.aside_holds():
             self.signal(Signal.GO_ON, f"{self.aside.client} has saved; what was on trial is again")
+
+    # -- a client writes what calibrates -----------------------------------------------------------
+
+    def no_client_write(self, number: int) -> str | None:
+        """Why a client may not write this register now; "" where it may; None: not yet."""
+        if self.safe.mode < Mode.STAGE:
+            why = f"the mode is {self.policy.mode.name.lower()}"
+            return why if self.policy.mode < Mode.STAGE else "the device or its journal is in doubt"
+        if self.outbox.history.locked is not None:
+            return f"locked: {self.outbox.history.locked}"
+        if self.outbox.history.open is not None or self.state is State.SET_ASIDE:
+            return (
+                f"a calibration of ahrsd's is {self.state.value}, and what calibrates is nobody "
+                "else's until that has ended"
+            )
+        if self.state not in WITHOUT_TRANSACTION:
+            return None if self.state is State.RECONCILING else f"the state is {self.state.value}"
+        if self.approver:
+            return "a calibration is approved and about to be written"
+        if not self.safe.journal_ok:
+            return "the journal cannot be written"
+        return "" if number in self.registers else f"register {number} could not be read"
+
+    def announce(self, client: str, number: int, values: Values) -> None:
+        """The journal is told of a client's write, with what the register holds until now."""
+        self.client_write = ClientWrite(client, number, values)
+        self.outbox.record(
+            RecordKind.CLIENT_WRITES,
+            client=client,
+            serial=self._the_identity().serial,
+            old={str(number): list(self.registers[number])},
+            new={str(number): list(values)},
+        )
+
+    def announced(self, journaled: bool) -> None:
+        """That record is on the disk, or is not; then nothing is sent."""
+        if self.client_write is not None and not journaled:
+            self.client_write = None
+        elif self.client_write is not None:
+            self.client_write.journaled = True
+
+    def client_wrote(self) -> None:
+        """The client's write was answered, refused or lost: the device is read again."""
+        write, self.client_write = self.client_write, None
+        if write is not None and self.state is not State.RECONCILING:
+            self.look_closer(f"{write.client} wrote register {write.number}")
 
     # -- locks -------------------------------------------------------------------------------------
 

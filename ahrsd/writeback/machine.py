@@ -452,6 +452,32 @@ class WriteBack:
         self._flow.client_save_ended(why)
         return self._answer()
 
+    def may_client_write(self, number: int) -> str | None:
+        """Why a client may not write this register now; "" where it may; None: not yet."""
+        return self._flow.no_client_write(number)
+
+    def on_client_writes(
+        self, client: str, number: int, values: Values, host_s: float
+    ) -> tuple[list[Action], bool]:
+        """A client's write of what calibrates is next: what must happen, and whether it may go.
+
+        Asked again until the journal has it; from then on nobody knows what the device applies,
+        until `on_client_wrote`.
+        """
+        self._outbox.host_s, write = host_s, self._flow.client_write
+        if write is None or not write.is_of(client, number, values):
+            self._flow.announce(client, number, values)
+        elif write.journaled:
+            self._outbox.in_force(None)
+            return self._answer(), True
+        return self._answer(), False
+
+    def on_client_wrote(self, host_s: float) -> list[Action]:
+        """That write was carried out, refused, or nobody knows."""
+        self._outbox.host_s = host_s
+        self._flow.client_wrote()
+        return self._answer()
+
     def on_client_saved(
         self,
         client: str,
@@ -463,7 +489,9 @@ class WriteBack:
         self._outbox.host_s, self._flow.session_keys = host_s, session_keys
         self._safe.client_registers = frozenset()
         self._flow.registers = {**self._flow.registers, **saved}
+        self._safe.theirs = frozenset()  # whoever changed what: it is permanent by now
         if self._flow.identity is not None:
+            self._theirs.pop(self._flow.identity.serial, None)
             self._outbox.record(
                 RecordKind.CLIENT_SAVED, client=client, serial=self._flow.identity.serial
             )
@@ -482,6 +510,8 @@ class WriteBack:
         """The record is on the disk."""
         self._outbox.host_s = host_s
         self._safe.journal_ok = self._outbox.journaled(kind)
+        if kind is RecordKind.CLIENT_WRITES:
+            self._flow.announced(True)
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNALLED, f"{kind.value} is in the journal")
         return self._answer()
@@ -490,6 +520,8 @@ class WriteBack:
         """The record is not on the disk. What waited for it does not happen."""
         self._outbox.host_s, self._safe.journal_ok = host_s, False
         self._outbox.not_journaled(kind)
+        if kind is RecordKind.CLIENT_WRITES:
+            self._flow.announced(False)
         self._outbox.note("error", f"{kind.value} could not be journalled: {error}")
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNAL_FAILED, error)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from cabled_run import FIRST, IRON, SPARE, CabledRun, estimate, two_units
 from planted_calibrator import PlantedCalibrator
@@ -203,7 +204,7 @@ def test_a_client_that_is_gone_before_its_save_leaves_the_old_values():
 def test_what_speaks_against_the_values_is_not_forgotten_by_a_save():
     """A trial that a figure speaks against when the client comes is over."""
     run, heard = on_trial(), []
-    moved = IRON + [0.03, 0.0, 0.0]
+    moved = IRON + np.array([0.03, 0.0, 0.0])
     run.core.calibrator = PlantedCalibrator(
         run.core.calibrator.anew(), estimate(hard_iron_gauss=moved)
     )

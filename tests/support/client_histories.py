@@ -4,7 +4,10 @@ Clients read, set, save, reset, try what is not theirs, send garbage, go away an
 random moments of a write-back that is approved again and again. What must not be, counted:
 
 wrong answers  an answer to something that this client did not ask, or an error it cannot have
-calibration    registers 23 or 84 in RAM with values that are neither the user's nor the candidate's
+calibration    registers 23 or 84 in RAM with values that are neither the user's nor the candidate's;
+               with `passes`, where the owner may write what calibrates, nor what it was let write
+overwritten    with `passes`: a value of the owner's replaced by anything but a transaction that has
+               it as its old value, the owner itself, or a restart
 flash          the candidate in flash although the daemon did not save it, or anything foreign
 hangs          at the end a client is not answered, or the device does not stream
 """
@@ -12,9 +15,10 @@ hangs          at the end a client is not answered, or the device does not strea
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
-from cabled_run import CabledRun, two_units
+from cabled_run import FIRST, CabledRun, two_units
 from cabled_units import printed
 
 from ahrsd import inputs
@@ -31,13 +35,21 @@ NOT_THEIRS = [f"VNWRG,{n},{THEIRS}" for n in (23, 25, 84)] + ["VNRFS", "VNTAR", 
 GARBAGE = ["$", "\x00\xff", "$VNRRG,01*00\r\n", "$VNRRG,", "x" * 300, "\r\n", "$VNWRG,23,1"]
 
 
+def _printed(values: list[float]) -> str:
+    return printed(",".join(repr(float(v)) for v in values))
+
+
 class ClientHistory:
     """One history. `wrong`: what was seen that must not be; `asked`: commands of clients."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, *, passes: bool = False) -> None:
         self._rng = np.random.default_rng(seed)
         cable = two_units(binary=bool(seed % 2))
-        self.run = CabledRun(cable, shares=SHARES, min_interval_s=0.0, cooldown_s=0.0)
+        shares = (replace(SHARES[0], calibration_writes="pass"), SHARES[1]) if passes else SHARES
+        self.run = CabledRun(cable, shares=shares, min_interval_s=0.0, cooldown_s=0.0)
+        self._passes, self._watched = passes, 0
+        self._ram = dict.fromkeys(NEW, ONE)
+        self.let_through = 0  # writes of what calibrates that the device was sent for the owner
         self.wrong: Counter[str] = Counter()
         self.asked = 0
         self._open: dict[str, list[str]] = {"owner": [], "log": []}
@@ -85,15 +97,32 @@ class ClientHistory:
     def _judge(self) -> None:
         run = self.run
         self._committed |= "COMMITTED" in run.states
+        self._judge_writes()
         for name in self._open:
             self._answers(name)
         for number, allowed in ((23, NEW[23]), (84, NEW[84])):
             ram, flash = (printed(run.cable.unit.__dict__[m][number]) for m in ("ram", "flash"))
-            if ram not in (ONE, allowed):
+            theirs = (THEIRS,) if self._passes else ()
+            if ram not in (ONE, allowed, *theirs):
                 self.wrong["calibration"] += 1
             saved = self._committed or run.state == "SAVING"
-            if flash not in ((ONE, allowed) if saved else (ONE,)):
+            if flash not in ((ONE, allowed, *theirs) if saved else (ONE, *theirs)):
                 self.wrong["flash"] += 1
+
+    def _judge_writes(self) -> None:
+        """Who wrote register 23 or 84, by the journal: a client's record or a transaction."""
+        unit, journal = self.run.cable.unit, self.run.journal.get(FIRST, [])
+        fresh, self._watched = unit.writes[self._watched :], len(unit.writes)
+        for number, text in [(n, text) for n, text in fresh if n in NEW]:
+            before, self._ram[number] = self._ram[number], text
+            if text == THEIRS and journal[-1]["kind"] == "CLIENT_WRITES":
+                self.let_through += 1
+                continue
+            open_ = next(r["facts"] for r in reversed(journal) if r["kind"] == "PREPARED")
+            old = _printed(open_["old"][str(number)])
+            if THEIRS in (before, text) and old != THEIRS:
+                self.wrong["overwritten"] += 1
+        self._ram = {n: printed(unit.ram[n]) for n in NEW}
 
     def _answers(self, name: str) -> None:
         for answer in self.run.answers(name):
