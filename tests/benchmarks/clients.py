@@ -2,7 +2,8 @@
 
     python tests/benchmarks/clients.py [--histories N] [--first SEED] [--passes] [--json FILE]
 
-Some 375 commands of clients each; `--passes`: the owner may write what calibrates. Exit code 1 where anything was seen that must not be.
+Some 375 commands of clients each; with `--passes` the owner may write what calibrates. Exit code 1
+where anything was seen that must not be.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
     """The owner may write in the middle of a trial, which is then undone over it."""
     undo = flow.roll_back
     monkeypatch.setattr(WriteBack, "may_client_write", lambda self, number: "")
-    monkeypatch.setattr(WriteBack, "on_client_wrote", lambda self, host_s: [])
+    monkeypatch.setattr(flow.Flow, "client_wrote", lambda self: setattr(self, "client_write", None))
     monkeypatch.setattr(flow, "roll_back", lambda what, **_: undo(what, only_ours=False))
     wrong = sum((played(seed, passes=True).wrong for seed in range(4)), Counter())
     assert wrong["overwritten"] > 0

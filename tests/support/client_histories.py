@@ -4,10 +4,10 @@ Clients read, set, save, reset, try what is not theirs, send garbage, go away an
 random moments of a write-back that is approved again and again. What must not be, counted:
 
 wrong answers  an answer to something that this client did not ask, or an error it cannot have
-calibration    registers 23 or 84 in RAM with values that are neither the user's nor the candidate's;
-               with `passes`, where the owner may write what calibrates, nor what it was let write
-overwritten    with `passes`: a value of the owner's replaced by anything but a transaction that has
-               it as its old value, the owner itself, or a restart
+calibration    registers 23 or 84 in RAM with values that are neither the user's nor the candidate's
+               (nor, with `passes`, what the owner was let write)
+overwritten    a value of the owner's replaced by anything but a transaction that has it as its old
+               value, the owner itself, or a restart
 flash          the candidate in flash although the daemon did not save it, or anything foreign
 hangs          at the end a client is not answered, or the device does not stream
 """
@@ -118,8 +118,8 @@ class ClientHistory:
             if text == THEIRS and journal[-1]["kind"] == "CLIENT_WRITES":
                 self.let_through += 1
                 continue
-            open_ = next(r["facts"] for r in reversed(journal) if r["kind"] == "PREPARED")
-            old = _printed(open_["old"][str(number)])
+            prepared = [r["facts"] for r in journal if r["kind"] == "PREPARED"]
+            old = _printed(prepared[-1]["old"][str(number)]) if prepared else ""
             if THEIRS in (before, text) and old != THEIRS:
                 self.wrong["overwritten"] += 1
         self._ram = {n: printed(unit.ram[n]) for n in NEW}
