@@ -32,10 +32,15 @@ def test_nothing_that_must_not_be_where_the_owner_may_write_what_calibrates(seed
 
 
 def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
-    """The owner may write in the middle of a trial, which is then undone over it."""
+    """The owner may write in the middle of a trial, and then that is undone, over it."""
     undo = flow.roll_back
+
+    def end_the_trial(self):
+        self.client_write = None
+        self.roll_back("client", "a client wrote")
+
     monkeypatch.setattr(WriteBack, "may_client_write", lambda self, number: "")
-    monkeypatch.setattr(flow.Flow, "client_wrote", lambda self: setattr(self, "client_write", None))
+    monkeypatch.setattr(flow.Flow, "client_wrote", end_the_trial)
     monkeypatch.setattr(flow, "roll_back", lambda what, **_: undo(what, only_ours=False))
     wrong = sum((played(seed, passes=True).wrong for seed in range(4)), Counter())
     assert wrong["overwritten"] > 0

@@ -18,8 +18,9 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from cabled_run import FIRST, CabledRun, two_units
+from cabled_run import FIRST, CabledRun, estimate, two_units
 from cabled_units import printed
+from planted_calibrator import PlantedCalibrator
 
 from ahrsd import inputs
 from ahrsd.sharing.client_commands import SharePolicy
@@ -31,7 +32,9 @@ THEIRS = "2,0,0,0,1,0,0,0,1,0.1,0.1,0.1"
 READS = [f"VNRRG,{n:02d}" for n in (1, 2, 3, 4, 5, 6, 7, 23, 30, 44, 75, 84, 85)]
 SETS = ["VNWRG,06,0", "VNWRG,06,19", "VNWRG,07,20", "VNWRG,07,40", "VNWRG,05,921600"]
 SETS += ["VNWRG,85,0,8,8,8,8,0,3,3,3,0", "VNASY,0", "VNASY,1"]
+PASSED = "1,0,0,0,1,0,0,0,1,0.1,0.1,0.1"  # what an owner writes that may
 NOT_THEIRS = [f"VNWRG,{n},{THEIRS}" for n in (23, 25, 84)] + ["VNRFS", "VNTAR", "VNSGB", "VNXYZ"]
+PASSING = [f"VNWRG,{n},{PASSED}" for n in (23, 84)] + ["VNRFS", "VNTAR", "VNSGB"]
 GARBAGE = ["$", "\x00\xff", "$VNRRG,01*00\r\n", "$VNRRG,", "x" * 300, "\r\n", "$VNWRG,23,1"]
 
 
@@ -69,6 +72,8 @@ class ClientHistory:
             if rng.random() < 0.005:
                 run.cable.moving = not run.cable.moving
             run.step()
+            if not isinstance(run.core.calibrator, PlantedCalibrator):  # begun anew: it still knows
+                run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
             self._judge()
         self._end()
 
@@ -78,7 +83,8 @@ class ClientHistory:
             ["read", "set", "save", "reset", "theirs", "garbage", "leave"],
             p=[0.55, 0.2, 0.04, 0.01, 0.1, 0.07, 0.03],
         )
-        pool = {"read": READS, "set": SETS, "theirs": NOT_THEIRS}
+        theirs = PASSING if self._passes and name == "owner" else NOT_THEIRS
+        pool = {"read": READS, "set": SETS, "theirs": theirs}
         pool |= {"save": ["VNWNV"], "reset": ["VNRST"]}
         if kind == "garbage":
             text = GARBAGE[rng.integers(0, len(GARBAGE))]
@@ -102,7 +108,7 @@ class ClientHistory:
             self._answers(name)
         for number, allowed in ((23, NEW[23]), (84, NEW[84])):
             ram, flash = (printed(run.cable.unit.__dict__[m][number]) for m in ("ram", "flash"))
-            theirs = (THEIRS,) if self._passes else ()
+            theirs = (PASSED,) if self._passes else ()
             if ram not in (ONE, allowed, *theirs):
                 self.wrong["calibration"] += 1
             saved = self._committed or run.state == "SAVING"
@@ -115,12 +121,12 @@ class ClientHistory:
         fresh, self._watched = unit.writes[self._watched :], len(unit.writes)
         for number, text in [(n, text) for n, text in fresh if n in NEW]:
             before, self._ram[number] = self._ram[number], text
-            if text == THEIRS and journal[-1]["kind"] == "CLIENT_WRITES":
+            if text == PASSED and journal[-1]["kind"] == "CLIENT_WRITES":
                 self.let_through += 1
                 continue
             prepared = [r["facts"] for r in journal if r["kind"] == "PREPARED"]
             old = _printed(prepared[-1]["old"][str(number)]) if prepared else ""
-            if THEIRS in (before, text) and old != THEIRS:
+            if PASSED in (before, text) and old != PASSED:
                 self.wrong["overwritten"] += 1
         self._ram = {n: printed(unit.ram[n]) for n in NEW}
 
