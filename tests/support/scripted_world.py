@@ -123,7 +123,7 @@ class World:
         self.notes: list[tuple[float, str]] = []
         self.finished = False
         self.kills = 0
-        shares = (SharePolicy(CLIENT, owner=True),)
+        shares = (SharePolicy(CLIENT, owner=True, calibration_writes="pass"),)
         settings = core_settings(self.config, policy=self.policy)
         self.settings = replace(settings, keep=16, shares=shares)
         self.answered: list[tuple[float, str]] = []
@@ -206,6 +206,7 @@ class World:
     def say(self, body: str) -> None:
         """The program on the owner's port writes this line, if it has a port."""
         if self.core is not None:
+            self.observer.asked_by_client(body)
             self.feed(inputs.ClientSent(self._ns(), CLIENT, sentence(body).decode()))
 
     def later(self, seconds: float, act: Callable[[], None]) -> None:

@@ -288,11 +288,22 @@ def client_sets_and_saves(world: World, draw: Dice) -> None:
     world.later(0.05, lambda: world.say("VNWNV"))
 
 
+def client_calibrates(world: World, draw: Dice) -> None:
+    """The driver writes what calibrates, as its share allows; half the time it saves then."""
+    values = users_values(draw)
+    for k, number in enumerate(((23,), (84,), (23, 84))[int(draw.integers(3))]):
+        line = f"VNWRG,{number},{values[number]}"
+        world.later(0.001 + 0.2 * k, lambda line=line: world.say(line))
+    if draw.random() < 0.5:
+        world.later(float(draw.uniform(0.3, 2.0)), lambda: world.say("VNWNV"))
+
+
 CLIENT_EVENTS: dict[str, Act] = {
     "client saves": client_saves,
     "client saves again": client_saves_again,
     "client saves and resets": client_saves_and_resets,
     "client sets and saves": client_sets_and_saves,
+    "client calibrates": client_calibrates,
 }
 EVENTS: dict[str, tuple[Act, float]] = {
     "swap": (swap, 3.0),

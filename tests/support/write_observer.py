@@ -76,6 +76,7 @@ class Observer:
         self.counts: Counter[str] = Counter()
         self.newest_prepared: int | None = None
         self.begun_s = 0.0
+        self.clients_values: set[tuple[int, str]] = set()
         self.attached_s: dict[int, list[float]] = defaultdict(list)
 
     # -- what it is told ---------------------------------------------------------------------------
@@ -91,6 +92,11 @@ class Observer:
             while seen.noted < len(unit.log) and unit.log[seen.noted].at_s <= at_s:
                 seen.noted += 1
                 self._change(unit, seen, unit.log[seen.noted - 1])
+
+    def asked_by_client(self, body: str) -> None:
+        """A program on the owner's port sends this line; what it writes is its own."""
+        if match := _LINE.search(f"${body}*"):
+            self.clients_values.add((int(match[1]), stored(int(match[1]), match[2].split(","))))
 
     def announced(self, text: str, at_s: float) -> None:
         """A line of the daemon's log; candidates are named in it with the lines to send."""
@@ -146,11 +152,15 @@ class Observer:
 
     def _change(self, unit: Unit, seen: Seen, change: Change) -> None:
         if change.what == "write" and change.register in _REGISTERS:
-            if change.who == "other":
+            who = change.who
+            if (change.register, change.asked) in self.clients_values:
+                who = "other"  # whoever it is: not the daemon
+                self.counts["client writes"] += 1
+            if who == "other":
                 seen.own[change.register].add(change.after)
             else:
                 self._written(unit, seen, change)
-            seen.author[change.register] = (change.who, change.at_s)
+            seen.author[change.register] = (who, change.at_s)
             seen.changed_s = change.at_s
         elif change.what == "save":
             if change.who == "host" and seen.announced:
