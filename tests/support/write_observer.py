@@ -42,6 +42,7 @@ KINDS = (
 )  # fmt: skip
 _LINE = re.compile(r"\$VNWRG,0?(23|84),([^*]*)\*")
 _REGISTERS = (23, 84)
+_OF_NO_WRITE = ("LOCKED", "UNLOCKED", "CLIENT_SAVED", "CLIENT_WRITES")
 
 
 @dataclass
@@ -122,7 +123,8 @@ class Observer:
             return
         unit = self.cable.units[serial]
         seen = self.seen(unit)
-        seen.announced = kind == "FLASH_SENT"
+        if kind not in _OF_NO_WRITE:
+            seen.announced = kind == "FLASH_SENT"
         if kind == "PREPARED":
             seen.prepared, self.newest_prepared = dict(facts), serial
             seen.prepared_s, seen.sent_s = at_s, -1e9
