@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from ahrsd import inputs
-from ahrsd.core.device_session import DeviceSession
+from ahrsd.core.device_session import DeviceSession, NotAsKnown
 from ahrsd.events import SendToClient
 from ahrsd.sharing.arbiter import COUNTED, Arbiter, Waiting
 from ahrsd.sharing.client_commands import (
@@ -25,8 +25,9 @@ from ahrsd.sharing.client_commands import (
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import PASSABLE, Mode
-from drivers.vn100.commands import NoReply, Write
+from drivers.vn100.commands import NoReply, TooLate, Write
 from drivers.vn100.decode import Reply
+from drivers.vn100.procedures import Seen
 from drivers.vn100.registers import Values
 
 _UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"
@@ -39,6 +40,14 @@ class ServedEffects:
     wrote: dict[int, Values] = field(default_factory=dict)
     actions: list[Action] = field(default_factory=list)
     reset_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ClientTurn:
+    """A client's command for the wire; `known`: only for this unit while it holds these values."""
+
+    asked: ClientCommand
+    known: Seen | None = None
 
 
 class Clients:
@@ -83,7 +92,7 @@ class Clients:
         """How many commands this client sent, and what became of them."""
         return {what: self.arbiter.counts[client, what] for what in COUNTED}
 
-    def next(self, host_s: float, *, free: bool) -> tuple[list[Action], ClientCommand | None]:
+    def next(self, host_s: float, *, free: bool) -> tuple[list[Action], ClientTurn | None]:
         """The next command for the wire, where it is free, and what must happen before it."""
         waiting = self.arbiter.first(host_s)
         if waiting is None or not free or not self._session.idle:
@@ -95,11 +104,13 @@ class Clients:
             return [], None
         if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
             return self._calibrate(waiting.client, waiting.asked.command, host_s)
-        return [], self.arbiter.begin().asked
+        lasts = waiting.asked.kind is Kind.SAVE
+        known = self._writeback.known if lasts else None
+        return [], ClientTurn(self.arbiter.begin().asked, known)
 
     def _calibrate(
         self, client: str, command: Write, host_s: float
-    ) -> tuple[list[Action], ClientCommand | None]:
+    ) -> tuple[list[Action], ClientTurn | None]:
         """A write of what calibrates: refused with the same code as where none passes, or next."""
         why = self._writeback.may_client_write(command.register)
         if why is None:
@@ -110,7 +121,9 @@ class Clients:
             return [], None
         wanted = (client, command.register, command.values)
         actions, ready = self._writeback.on_client_writes(*wanted, host_s)
-        return actions, self.arbiter.begin().asked if ready else None
+        if not ready:
+            return actions, None
+        return actions, ClientTurn(self.arbiter.begin().asked, self._writeback.known)
 
     def served(
         self,
@@ -120,8 +133,13 @@ class Clients:
         host_s: float,
     ) -> ServedEffects:
         """The command on the wire ended. `registers`: what the device held before it."""
-        effects, done = ServedEffects(), self.arbiter.ended(result, error)
-        if done is None:
+        effects = ServedEffects()
+        if isinstance(error, NotAsKnown | TooLate):  # nothing was sent
+            self.arbiter.again()
+            reason = "" if isinstance(error, TooLate) else str(error)
+            effects.actions = self._writeback.on_client_waits(reason, host_s)
+            return effects
+        if (done := self.arbiter.ended(result, error)) is None:
             return effects
         if done.asked.kind is Kind.RESET and (isinstance(result, Reply) or _silent(error)):
             effects.reset_by = done.client

@@ -391,6 +391,8 @@ class Flow:
     def client_wrote(self) -> None:
         """The client's write was answered, refused or lost: the device is read again."""
         write, self.client_write = self.client_write, None
+        if write is not None:
+            self.safe.client_writes(write.number, self.registers[write.number])
         if write is not None and self.state is not State.RECONCILING:
             self.look_closer(f"{write.client} wrote register {write.number}")
 

@@ -30,7 +30,6 @@ from ahrsd.writeback.policy import WriteBackPolicy, margin
 from ahrsd.writeback.recheck import Recheck
 from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.restarts import RestartWatch
-from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     LIVED_WITH,
@@ -192,7 +191,10 @@ class WriteBack:
         self._recheck.begin(host_s)
         self._outbox.bind(identity.serial, journal)
         restarted = self._restarts.bind(identity.serial, read_from_s)
-        self._safe.theirs = self._changed_by_others(identity, registers, session_keys, restarted)
+        theirs = self._changed_by_others(identity, registers, session_keys, restarted)
+        if flow.identity is None or flow.identity.serial != identity.serial:
+            self._safe.client_wrote = {}
+        self._theirs[identity.serial] = self._safe.read_again(theirs, registers)
         self._safe.bind(identity, registers, journal is not None)
         self._safe.client_registers = clients
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
@@ -452,6 +454,24 @@ class WriteBack:
         self._flow.client_save_ended(why)
         return self._answer()
 
+    @property
+    def known(self) -> Seen | None:
+        """Who is there and what it must hold for anything that lasts; None: nobody was asked."""
+        flow = self._flow
+        if flow.identity is None:
+            return None
+        return Seen(
+            flow.identity.unit, {n: v for n, v in flow.registers.items() if n in COMPENSATING}
+        )
+
+    def on_client_waits(self, reason: str, host_s: float) -> list[Action]:
+        """A client's save or write was held back: why the device is not as known, if that is so."""
+        self._outbox.host_s, self._flow.client_write = host_s, None
+        if reason and self.state is not State.RECONCILING:
+            self._outbox.note("warning", f"held back for a client: {reason}")
+            self._flow.look_closer(reason)
+        return self._answer()
+
     def may_client_write(self, number: int) -> str | None:
         """Why a client may not write this register now; "" where it may; None: not yet."""
         return self._flow.no_client_write(number)
@@ -490,6 +510,7 @@ class WriteBack:
         self._safe.client_registers = frozenset()
         self._flow.registers = {**self._flow.registers, **saved}
         self._safe.theirs = frozenset()  # whoever changed what: it is permanent by now
+        self._safe.client_wrote = {}
         if self._flow.identity is not None:
             self._theirs.pop(self._flow.identity.serial, None)
             self._outbox.record(
@@ -567,7 +588,6 @@ class WriteBack:
             written = set() if self.history.open is None else set(self.history.open.new)
             compared = known.keys() & registers.keys() - session_keys - written - {HSI_RESULT}
             theirs |= {n for n in compared if not same(n, known[n], registers[n])}
-        self._theirs[identity.serial] = theirs
         return theirs
 
     def _ask_again(self) -> None:
@@ -585,8 +605,7 @@ class WriteBack:
 
     def _arm(self, armed: bool) -> Answer:
         """Whether this run may begin a write or a save; what is under way is not undone."""
-        self._safe.armed = armed
-        text = "armed: this run may write" if armed else NOT_ARMED
+        text = self._safe.arm(armed)
         self._outbox.note("info", text)
         if armed and self.policy.mode < Mode.STAGE:
             return False, f"{self._flow.mode_forbids}"

@@ -17,7 +17,7 @@ from ahrsd.writeback.policy import VERDICT_AGE_S, WriteBackPolicy, flash_budget,
 from ahrsd.writeback.stillness import Stillness
 from drivers.vn100.commands import Command, Word, Write
 from drivers.vn100.procedures import Identity
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
 UNEXAMINED_S = 2.0  # samples that the estimate has not seen yet may hold a step
@@ -48,6 +48,7 @@ class Safeguards:
         self._asking_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
         self.save_from_s = float("-inf")  # when the save was decided
         self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
+        self.client_wrote: dict[int, Values] = {}  # and held before a client wrote and did not save
         self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
@@ -86,6 +87,25 @@ class Safeguards:
             self._limits.append(f"registers {missing} could not be read")
         if not journal_readable:
             self._limits.append("the journal cannot be read; see its error")
+
+    def arm(self, armed: bool) -> str:
+        """Whether this run may begin a write or a save; in words."""
+        self.armed = armed
+        return "armed: this run may write" if armed else NOT_ARMED
+
+    def client_writes(self, number: int, before: Values) -> None:
+        """A client wrote this register; what it held before is its own as long as nobody knows."""
+        self.client_wrote.setdefault(number, before)
+
+    def read_again(self, theirs: frozenset[int], registers: Mapping[int, Values]) -> frozenset[int]:
+        """Registers that others changed, without those that hold what they held before a client."""
+        returned = {
+            n for n, before in self.client_wrote.items() if same(n, before, registers.get(n, ()))
+        }
+        self.theirs = theirs - returned
+        left = self.client_wrote.keys() & self.theirs
+        self.client_wrote = {n: self.client_wrote[n] for n in left}
+        return self.theirs
 
     def doubt(self, host_s: float) -> None:
         """What was judged of samples until now is of before a doubt: nothing is saved by it."""
@@ -135,6 +155,11 @@ class Safeguards:
             reasons.append("no gate has judged yet")
         if self._hsi_applied:
             reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
+        if unsaved := sorted(self.client_wrote.keys() & {MAG, GYRO}):
+            reasons.append(
+                f"register {', '.join(map(str, unsaved))} holds what a program on a shared port "
+                "wrote and did not save: let it save that, or switch the device off and on"
+            )
         reasons += ram_budget(self.policy, history, now, again=again)
         return reasons + self._always(host_s)
 

@@ -6,7 +6,7 @@ Judged by what the units hold and were sent (`cabled_units`).
 from __future__ import annotations
 
 import pytest
-from cabled_run import BIAS, FIRST, IRON, CabledRun, estimate, two_units
+from cabled_run import BIAS, FIRST, IRON, SPARE, CabledRun, estimate, two_units
 from planted_calibrator import PlantedCalibrator
 
 from ahrsd import inputs
@@ -155,13 +155,58 @@ def test_what_was_approved_is_not_written_over_the_owners_value():
 def test_a_rollback_puts_back_what_the_owner_wrote():
     run = shared()
     assert say(run, f"VNWRG,23,{THEIRS}") == f"VNWRG,23,{THEIRS}"
-    run.run(2.0)
+    assert say(run, "VNWNV") == "VNWNV"
     run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
     run.approve()
     assert run.until("TRIAL", 30.0), run.notes
     run.feed(inputs.Operator(run.now_ns, "rollback", ""))
     run.run(5.0)
     assert run.cable.unit.held() == (THEIRS, ONE)
+
+
+@pytest.mark.parametrize("ends", ["saved", "restart"])
+def test_nothing_is_written_over_what_the_owner_did_not_save(ends):
+    """A restart in that trial would bring values that are neither old nor new."""
+    run = shared()
+    say(run, f"VNWRG,84,{THEIRS}")
+    run.run(2.0)
+    run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
+    run.approve()
+    run.run(20.0)
+    assert run.state == "QUALIFIED"
+    assert any("register 84 holds what a program" in r for r in run.core.writeback.holds())
+    assert run.cable.unit.held() == (ONE, THEIRS)
+    if ends == "saved":
+        assert say(run, "VNWNV") == "VNWNV"
+    else:
+        run.cable.unit.restart()
+        run.run(3.0)
+        run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
+        run.approve()
+    assert run.until("TRIAL", 40.0), run.core.writeback.holds()
+    assert run.cable.unit.held() != (ONE, THEIRS)
+
+
+@pytest.mark.parametrize("number", [23, 84])
+@pytest.mark.parametrize("at", range(1, 16))
+def test_another_unit_at_any_command_of_the_owners_write_is_not_written(number, at):
+    run, heard = shared(planted=False), []
+    first, spare = run.cable.units[FIRST], run.cable.units[SPARE]
+
+    def hear(line: str) -> None:
+        heard.append(line)
+        if len(heard) == at:
+            run.cable.swap(SPARE, silent_s=0.1)
+
+    for unit in (first, spare):
+        unit.before = hear
+    run.say("owner", f"VNWRG,{number},{THEIRS}")
+    run.run(12.0)
+    assert len(heard) >= at
+    known = {number: THEIRS} if spare.writes else {}
+    assert spare.writes == list(known.items())
+    if spare.writes:  # once it was identified and read: by its own journal
+        assert "CLIENT_WRITES" in run.kinds(SPARE)
 
 
 @pytest.mark.parametrize("saves", [True, False])
@@ -226,6 +271,7 @@ def test_whatever_was_answered_the_device_is_read_again(answered):
     unit.answer = other
     run.say("owner", f"VNWRG,23,{THEIRS}")
     if answered == "link":
+        assert run.until(lambda: unit.writes, 2.0)
         run.feed(inputs.LinkLost(run.now_ns, "unplugged"))
         run.feed(inputs.LinkOpened(run.now_ns, "cable", 115200))
     run.run(8.0)

@@ -173,6 +173,25 @@ def test_another_program_that_writes_in_between_is_not_written_over():
     assert "PREPARING" not in run.states[run.states.index("SET_ASIDE") :]
 
 
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_unit_that_comes_back_with_values_on_trial_is_not_saved_for_a_client(asked):
+    """It kept its power while another one had the cable, and nobody has asked who is there now."""
+    run = on_trial()
+    first, spare = run.cable.units[FIRST], run.cable.units[SPARE]
+    run.cable.unit = spare
+    assert run.until(lambda: run.told("another device, VN-100T-CR serial 555"), 40.0)
+    assert run.until("OBSERVING", 5.0)
+    assert first.held() == NEW
+    run.cable.unit = first
+    if asked:
+        run.run(1.0)
+    run.say("owner", "VNWNV")
+    run.run(20.0)
+    assert [held(one) for one in first.saves] in ([], [ONE])
+    assert first.held("flash") == ONE
+    assert spare.saves == []
+
+
 def test_a_save_that_the_device_refuses_ends_the_trial():
     run = on_trial()
     unit, answer = run.cable.unit, run.cable.unit.answer
