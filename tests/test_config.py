@@ -244,6 +244,14 @@ def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp
         ('tcp = "127.0.0.1:2101"\nowner = true', "owner is for pty; this share is tcp"),
         ('udp = "127.0.0.1:2101"\ngroup = "x"', "group is for pty; this share is udp"),
         ('pty = "/x"\nsend = "nmea"', "send is for tcp and udp; this share is pty"),
+        (
+            'pty = "/x"\ncalibration_writes = "pass"',
+            'calibration_writes = "pass" is for the share with owner = true',
+        ),
+        (
+            'udp = "127.0.0.1:2101"\ncalibration_writes = "pass"',
+            "calibration_writes is for pty; this share is udp",
+        ),
         ('pty = "/x"\nownr = true', "share.0.ownr = True: unknown key; did you mean owner?"),
     ],
 )
@@ -257,11 +265,12 @@ def test_a_share_that_cannot_be_is_one_line(tmp_path, share, words):
 def test_shares_of_every_kind_come_back_from_their_text(tmp_path):
     config = load(
         tmp_path,
-        '[[share]]\npty = "/x"\nowner = true\n'
+        '[[share]]\npty = "/x"\nowner = true\ncalibration_writes = "pass"\n'
         '[[share]]\ntcp = "[::1]:2101"\nsend = "corrected"\ncalibration = "registers"\n'
         '[[share]]\nudp = "192.168.1.255:10110"\nsend = "nmea"\nother_hosts = true\n',
     )
     names = [share.name for share in config.share]
     assert names == ["/x", "tcp [::1]:2101", "udp 192.168.1.255:10110"]
     assert load(tmp_path, print_config(config)) == config
-    assert [policy.name for policy in core_settings(config).shares] == ["/x"]
+    (policy,) = core_settings(config).shares
+    assert (policy.name, policy.owner, policy.calibration_writes) == ("/x", True, "pass")

@@ -22,7 +22,7 @@ Baud = Literal["auto", 9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800
 
 _PLACES: Final = ("pty", "tcp", "udp")  # of a share, exactly one
 _KEYS_OF: Final = {  # which of them a key of a share is for
-    **dict.fromkeys(("owner", "save", "reset", "group"), ("pty",)),
+    **dict.fromkeys(("owner", "save", "reset", "calibration_writes", "group"), ("pty",)),
     **dict.fromkeys(
         ("send", "other_hosts", "calibration", "max_heading_sigma_deg"), ("tcp", "udp")
     ),
@@ -87,12 +87,16 @@ class ShareSection(Section):
     of corrected and nmea. [deg]"""
     owner: bool = False
     """The program on the pty may set outputs and other settings of the device, in RAM; at most one
-    may. The others read and listen. Nobody writes what calibrates."""
+    may. The others read and listen. Nobody writes what calibrates (but see calibration_writes)."""
     save: Literal["refuse", "clean"] = "clean"
     """What becomes of VNWNV of the owner; clean: sent once nothing unproven is in the device's RAM
-    (a calibration on trial is undone first)."""
+    (a calibration on trial is undone first and written again behind it)."""
     reset: Literal["refuse", "announce"] = "announce"
     """What becomes of VNRST of the owner."""
+    calibration_writes: Literal["guard", "pass"] = "guard"
+    """What becomes of the owner's writes of registers 23, 25, 26, 43, 44, 74 and 84; guard: VNERR
+    09; pass: journaled and sent, in mode stage and commit, while no calibration of ahrsd's is under
+    way."""
     group: str | None = None
     """Group that may open the pty; default: the daemon's."""
 
@@ -106,6 +110,8 @@ class ShareSection(Section):
             set_ = getattr(self, key) != type(self).model_fields[key].get_default()
             if set_ and given[0] not in kind:
                 raise ValueError(f"{key} is for {' and '.join(kind)}; this share is {given[0]}")
+        if self.calibration_writes == "pass" and not self.owner:
+            raise ValueError('calibration_writes = "pass" is for the share with owner = true')
         if self.pty is None:
             self.address.check(self.kind, other_hosts=self.other_hosts)
         return self

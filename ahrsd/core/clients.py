@@ -2,7 +2,8 @@
 
 `sharing.arbiter` knows whose command is next and to whom an answer goes; here is what it means for
 the device session and the write-back: a save waits until nothing unproven is in the device's RAM,
-a write changes what is the user's, a reset is a restart that is known of.
+a write changes what is the user's, a reset is a restart that is known of, and a write of what
+calibrates, where the share lets it pass, is somebody's change that is journaled before it is sent.
 """
 
 from __future__ import annotations
@@ -11,14 +12,22 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from ahrsd import inputs
-from ahrsd.core.device_session import DeviceSession
+from ahrsd.core.device_session import DeviceSession, NotAsKnown
 from ahrsd.events import SendToClient
 from ahrsd.sharing.arbiter import COUNTED, Arbiter, Waiting
-from ahrsd.sharing.client_commands import UNAUTHORIZED, Kind, Refusal, SharePolicy
+from ahrsd.sharing.client_commands import (
+    UNAUTHORIZED,
+    ClientCommand,
+    Kind,
+    Refusal,
+    SharePolicy,
+)
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
-from drivers.vn100.commands import NoReply, Speech, Write
+from ahrsd.writeback.permissions import PASSABLE, Mode
+from drivers.vn100.commands import NoReply, TooLate, Write
 from drivers.vn100.decode import Reply
+from drivers.vn100.procedures import Seen
 from drivers.vn100.registers import Values
 
 _UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"
@@ -33,14 +42,24 @@ class ServedEffects:
     reset_by: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class ClientTurn:
+    """A client's command for the wire; `known`: only for this unit while it holds these values."""
+
+    asked: ClientCommand
+    known: Seen | None = None
+
+
 class Clients:
     """See the module."""
 
     def __init__(
         self, policies: Iterable[SharePolicy], session: DeviceSession, writeback: WriteBack
     ) -> None:
-        self.arbiter = Arbiter(policies)
+        shares = tuple(policies)
+        self.arbiter = Arbiter(shares)
         self._session, self._writeback = session, writeback
+        self._notes = [_passing(s.name, writeback) for s in shares if any(map(s.passes, PASSABLE))]
 
     @property
     def deadline_s(self) -> float | None:
@@ -66,13 +85,14 @@ class Clients:
 
     def take_notes(self) -> list[str]:
         """What a person should know of."""
-        return self.arbiter.take_notes()
+        notes, self._notes = self._notes, []
+        return notes + self.arbiter.take_notes()
 
     def counts(self, client: str) -> dict[str, int]:
         """How many commands this client sent, and what became of them."""
         return {what: self.arbiter.counts[client, what] for what in COUNTED}
 
-    def next(self, host_s: float, *, free: bool) -> tuple[list[Action], Speech | None]:
+    def next(self, host_s: float, *, free: bool) -> tuple[list[Action], ClientTurn | None]:
         """The next command for the wire, where it is free, and what must happen before it."""
         waiting = self.arbiter.first(host_s)
         if waiting is None or not free or not self._session.idle:
@@ -82,7 +102,28 @@ class Clients:
                 return self._writeback.on_client_wants_save(waiting.client, host_s), None
             self.arbiter.refuse_first(Refusal(UNAUTHORIZED, _UNKNOWN))
             return [], None
-        return [], self.arbiter.begin().asked.command
+        if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
+            return self._calibrate(waiting.client, waiting.asked.command, host_s)
+        lasts = waiting.asked.kind is Kind.SAVE
+        known = self._writeback.known if lasts else None
+        return [], ClientTurn(self.arbiter.begin().asked, known)
+
+    def _calibrate(
+        self, client: str, command: Write, host_s: float
+    ) -> tuple[list[Action], ClientTurn | None]:
+        """A write of what calibrates: refused with the same code as where none passes, or next."""
+        why = self._writeback.may_client_write(command.register)
+        if why is None:
+            return [], None
+        if why:
+            told = f"register {command.register} was not written for it: {why}"
+            self.arbiter.refuse_first(Refusal(UNAUTHORIZED, told))
+            return [], None
+        wanted = (client, command.register, command.values)
+        actions, ready = self._writeback.on_client_writes(*wanted, host_s)
+        if not ready:
+            return actions, None
+        return actions, ClientTurn(self.arbiter.begin().asked, self._writeback.known)
 
     def served(
         self,
@@ -92,11 +133,20 @@ class Clients:
         host_s: float,
     ) -> ServedEffects:
         """The command on the wire ended. `registers`: what the device held before it."""
-        effects, done = ServedEffects(), self.arbiter.ended(result, error)
-        if done is None:
+        effects = ServedEffects()
+        if isinstance(error, NotAsKnown | TooLate):  # nothing was sent
+            self.arbiter.again()
+            reason = "" if isinstance(error, TooLate) else str(error)
+            effects.actions = self._writeback.on_client_waits(reason, host_s)
+            return effects
+        if (done := self.arbiter.ended(result, error)) is None:
             return effects
         if done.asked.kind is Kind.RESET and (isinstance(result, Reply) or _silent(error)):
             effects.reset_by = done.client
+        elif done.asked.kind is Kind.CALIBRATE:
+            effects.actions = self._writeback.on_client_wrote(host_s)
+        elif done.asked.kind is Kind.SAVE and not isinstance(result, Reply):
+            effects.actions = self._writeback.on_client_save_failed(str(error), host_s)
         elif isinstance(result, Reply):
             self._changed(done, registers, host_s, effects)
         return effects
@@ -121,6 +171,16 @@ class Clients:
             settings.forget()
             keys = self._session.session_keys
             effects.actions = self._writeback.on_client_saved(done.client, saved, keys, host_s)
+
+
+def _passing(name: str, writeback: WriteBack) -> str:
+    mode = writeback.policy.mode
+    if mode < Mode.STAGE:
+        return (
+            f'{name}: calibration_writes = "pass" lets nothing pass in mode {mode.name.lower()}: '
+            "what calibrates is refused"
+        )
+    return f'{name} may write what calibrates (calibration_writes = "pass")'
 
 
 def _silent(error: Exception | None) -> bool:

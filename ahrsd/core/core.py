@@ -398,11 +398,14 @@ class Core:
     def _serve_clients(self) -> bool:
         """Let a client's command have the wire; returns whether anything was done."""
         free = not (self._action_queue.wants_the_wire or self._stopping)
-        actions, command = self.clients.next(self._host_s, free=free)
+        actions, turn = self.clients.next(self._host_s, free=free)
         self._action_queue.add(actions)
-        if command is not None:
-            self.take(self.device_session.serve(command, self._host_s))
-        return bool(actions) or command is not None
+        if turn is not None:
+            asked = turn.asked
+            self.take(
+                self.device_session.serve(asked.command, self._host_s, asked.purpose, turn.known)
+            )
+        return bool(actions) or turn is not None
 
     def _client_served(self, result: object, error: Exception | None) -> None:
         """What a client's command changed in the device."""

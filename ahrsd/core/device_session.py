@@ -18,7 +18,7 @@ identity, so nothing can be written to it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from ahrsd.core.client_settings import ClientSettings
@@ -37,18 +37,24 @@ from drivers.vn100.commands import (
     RESUME,
     Command,
     LinkGone,
+    NoReply,
     Pause,
     Procedure,
     Read,
     SessionError,
     Speech,
+    TooLate,
+    Word,
+    Write,
 )
 from drivers.vn100.decode import Measurement, Reply
+from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
     Seen,
     Unit,
+    differences,
     identify,
     look,
     quiet,
@@ -67,6 +73,7 @@ ECHOES = (
 )
 ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
 RESTORE_AGAIN_S = 0.1
+BEHIND_TRIES = 5  # to have the answers and the command right behind them
 _FOREIGN = 20  # messages without one of the session's own output: it is gone
 FIRST_S, LONGEST_S = 2.0, 5.0  # outputs have 1 Hz at least, so 2 s without one is a silence
 # First and longest wait: after the journal refused the user's outputs; where they could not be put
@@ -173,6 +180,10 @@ class WrongDevice(SessionError):
 
 class Unsteady(SessionError):
     """A register does not read the same twice."""
+
+
+class NotAsKnown(SessionError):
+    """Another device answers than the one that was read, or it holds something else."""
 
 
 class OutOfTime(SessionError):
@@ -445,10 +456,20 @@ class DeviceSession:
             return []
         return self._digest(self.session.cancel(now_s), now_s)
 
-    def serve(self, command: Speech, now_s: float) -> list[Event]:
-        """Send a client's command, beside the running output; only while `idle`."""
+    def serve(
+        self,
+        command: Speech,
+        now_s: float,
+        purpose: Purpose = Purpose.CLIENT,
+        known: Seen | None = None,
+    ) -> list[Event]:
+        """Send a client's command, beside the running output; only while `idle`.
+
+        known: send it only to this unit while it holds these values; else NotAsKnown
+        """
         self.phase, self._serving = Phase.SERVING, command
-        return self._digest(self._start(asked(command), Purpose.CLIENT, now_s), now_s)
+        procedure = asked(command) if known is None else asked_of(known, command)
+        return self._digest(self._start(procedure, purpose, now_s), now_s)
 
     def cancel(self, name: str, now_s: float) -> list[Event]:
         """End the procedure of this name, if it runs; it may still send what puts things back."""
@@ -682,6 +703,32 @@ def again_after(error: Exception) -> tuple[float, float] | None:
 def asked(command: Speech) -> Procedure[Reply]:
     """One command and its reply."""
     return (yield command)
+
+
+def asked_of(known: Seen, command: Speech) -> Procedure[Reply]:
+    """The same, once it is sure who answers and what it holds, and right behind that answer.
+
+    Raises NotAsKnown, where nothing was sent, and TooLate on a line that answers too slowly.
+    """
+    if isinstance(command, Write):
+        command = replace(command, once=True)
+    elif isinstance(command, Word):
+        command = replace(command, behind=True)
+    for left in reversed(range(BEHIND_TRIES)):
+        try:
+            seen = yield from look(known.unit, known.values)
+        except (NoReply, DeviceRefused) as error:
+            raise NotAsKnown(f"the device does not say what it holds: {error}") from error
+        if seen.unit != known.unit:
+            raise NotAsKnown(f"another device answers: {seen.unit}")
+        if changed := differences(known.values, seen.values):
+            raise NotAsKnown(f"registers {', '.join(map(str, sorted(changed)))} changed")
+        try:
+            return (yield command)
+        except TooLate:
+            if not left:
+                raise
+    raise AssertionError("no try is left")
 
 
 def identify_in(seconds: float) -> Procedure[Identity]:

@@ -185,6 +185,12 @@ class Arbiter:
             self.counts[done.client, "unanswered"] += 1
         return done
 
+    def again(self) -> None:
+        """What is on the wire was not sent after all: it is the first one again."""
+        held, self._under_way = self._under_way, None
+        if held is not None and not held.gone:
+            self._queue.appendleft(held)
+
     def refuse_first(self, refusal: Refusal) -> None:
         """The first one is not to be sent, for this reason."""
         if self._queue:

@@ -10,6 +10,7 @@ read like the device reads them, so what goes out on its behalf is always a comm
 | VNASY | by the port: only this client's stream stops and goes on |
 | register 5 (baud rate) | as if it had worked; the line to the device stays as it is |
 | registers 23, 25, 26, 43, 44, 74, 84 and the words that change them | VNERR 09: they are ahrsd's |
+| the same registers, for an owner with `calibration_writes = "pass"` | the device's |
 | VNWNV, VNRST | as the share's policy says |
 | VNRFS and the words of vendor tools | VNERR 09 |
 | any other read | the device's |
@@ -25,7 +26,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Literal
 
-from ahrsd.writeback.permissions import GUARDED
+from ahrsd.writeback.permissions import GUARDED, PASSABLE, Purpose
 from drivers.vn100.commands import Read, Speech, Word, Write
 from drivers.vn100.registers import REGISTERS, RegisterValueError, parse
 
@@ -45,6 +46,7 @@ class Kind(Enum):
     RESET = "reset"
     READ = "read"
     WRITE = "write"
+    CALIBRATE = "write what calibrates"
     REFUSE = "refuse"
 
 
@@ -68,12 +70,19 @@ class SharePolicy:
     owner: its output registers are the device's; at most one share is
     save:  what becomes of VNWNV: refused, or sent once nothing unproven is in the device's RAM
     reset: what becomes of VNRST: refused, or sent and told
+    calibration_writes: what becomes of the owner's writes of what calibrates: refused, or journaled
+           and sent
     """
 
     name: str
     owner: bool = False
     save: Literal["refuse", "clean"] = "clean"
     reset: Literal["refuse", "announce"] = "announce"
+    calibration_writes: Literal["guard", "pass"] = "guard"
+
+    def passes(self, number: int) -> bool:
+        """Whether a write of this register, which calibrates, is the owner's to make."""
+        return self.owner and self.calibration_writes == "pass" and number in PASSABLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +96,12 @@ class ClientCommand:
     kind: Kind
     body: str
     command: Speech
+
+    @property
+    def purpose(self) -> Purpose:
+        """What the gate in front of the device is asked for."""
+        calibrates = self.kind is Kind.CALIBRATE
+        return Purpose.CLIENT_CALIBRATION if calibrates else Purpose.CLIENT
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +145,8 @@ def _register(
         return Refusal(BAD_REGISTER)
     if word == "VNRRG":
         return _read(number, tokens[1:], body)
-    if number in GUARDED and number != LINE_RATE:
+    passes = policy.passes(number)
+    if number in GUARDED and number != LINE_RATE and not passes:
         why = f"register {number} was not written for a client: what calibrates is ahrsd's"
         return Refusal(UNAUTHORIZED, why)
     if not REGISTERS[number].writable:
@@ -143,7 +159,7 @@ def _register(
         return ClientCommand(Kind.RATE, body, command)
     if not policy.owner:
         return Refusal(UNAUTHORIZED, f"writes of register {number} are for the share with owner")
-    return ClientCommand(Kind.WRITE, body, command)
+    return ClientCommand(Kind.CALIBRATE if passes else Kind.WRITE, body, command)
 
 
 def _read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:

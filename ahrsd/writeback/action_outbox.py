@@ -29,6 +29,7 @@ _ANNOUNCED = (
     RecordKind.PREPARED,
     RecordKind.RAM_VERIFIED,
     RecordKind.FLASH_SENT,
+    RecordKind.CLIENT_WRITES,
 )  # not on the disk: not done
 
 

@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.action_outbox import ActionOutbox
 from ahrsd.writeback.actions import CalibrateAnew, IdentifyAgain, SetUpStream
+from ahrsd.writeback.client_write import ClientWrite
 from ahrsd.writeback.composition import (
     GYRO,
     MAG,
@@ -25,6 +27,7 @@ from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
 from ahrsd.writeback.reconcile import RecordKind, found
 from ahrsd.writeback.safeguards import Safeguards
+from ahrsd.writeback.set_aside import SetAside
 from ahrsd.writeback.states import (
     LIVED_WITH,
     ON_TIMEOUT,
@@ -41,6 +44,7 @@ from drivers.vn100.registers import Values, same
 RETRY_SAVE_S = 600.0  # after a save that was not sent
 Answer = tuple[bool, str]  # to a person: whether it is accepted, and what follows or why not
 COUNTED = frozenset({"trial", "interlock", "operator"})  # rollbacks that speak against the values
+_ASIDE = (State.ROLLING_BACK, State.SET_ASIDE, State.PREPARING)  # states that remember what was
 
 
 class Flow:
@@ -60,7 +64,9 @@ class Flow:
         self.trial = Trial(policy.trial, 0.0)
         self.passed = ""  # why the trial is passed, until the device was asked again
         self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
-        self.waits_for_look = False  # all that a save lacks is that the device is asked again
+        self.waits_for_look = False  # all that is lacking is that the device is asked again
+        self.aside: SetAside | None = None  # what is undone for a client's save
+        self.client_write: ClientWrite | None = None  # of what calibrates
         self._cause = "device"
         self._left: dict[int, Values] = {}  # by register, what the device made of ours
         self._from_fault = self._resumed = False
@@ -100,6 +106,7 @@ class Flow:
     def enter(self, state: State, reason: str) -> None:
         """Arrive in a state. A procedure of the old one ends."""
         self.outbox.stop_running()
+        self.aside = self.aside if state in _ASIDE else None
         old, self.state = self.state, state
         self._from_fault, self._resumed = old is State.FAULT, old is State.RECONCILING
         self._since_s = self.outbox.host_s
@@ -113,12 +120,15 @@ class Flow:
         """Take the step that waits for nothing but a condition, if it holds now."""
         now = (self.outbox.history, self.outbox.host_s, self.outbox.now)
         self.waits_for_look = False
-        if self.state is State.QUALIFIED and self.approver and not self.safe.write_holds(*now):
-            self.signal(Signal.APPROVED, f"approved: {self.approver}")
+        if self.state is State.QUALIFIED and self.approver:
+            if self.client_write is None and not self.safe.write_holds(*now):
+                self.signal(Signal.APPROVED, f"approved: {self.approver}")
         elif self.watches_interlock and (
             word := self.safe.interlock_broken(self.outbox.host_s, self._since_s)
         ):
             self.roll_back("interlock", word)
+        elif self.state is State.SET_ASIDE:
+            self._write_again()
         elif self.state is State.TRIAL and self.proven_to_s is not None:
             if self.safe.examined(self.proven_to_s) and not self.safe.disagrees:
                 self.safe.proof_waits = ""
@@ -134,7 +144,8 @@ class Flow:
     @property
     def watches_interlock(self) -> bool:
         """Whether the vehicle's word is needed all the time now."""
-        return self.policy.trial.interlock and self.state in (State.STAGED, State.TRIAL)
+        on_trial = (State.STAGED, State.TRIAL, State.SET_ASIDE)
+        return self.policy.trial.interlock and self.state in on_trial
 
     def on_timeout(self) -> None:
         """What was waited for did not come."""
@@ -146,7 +157,8 @@ class Flow:
         self._cause = "device"
         if self.state is State.STAGING:
             self.outbox.record(RecordKind.RAM_FAILED, reason="no end")
-        self.signal(Signal.TIMEOUT, "nothing came in time")
+        holds = self.aside_holds() if self.state is State.SET_ASIDE else []
+        self.signal(Signal.TIMEOUT, "; ".join(holds) or "nothing came in time")
 
     def roll_back(self, cause: str, reason: str) -> None:
         """Back to the old values, where the state allows it at all; out of FAULT only by hand."""
@@ -157,6 +169,14 @@ class Flow:
 
     def roll_back_by_hand(self) -> Answer:
         """An operator wants the old values back."""
+        if self.aside is not None:  # they are, or will be at once; now for good
+            why, txn, self.aside = "an operator asked for it", self.aside.transaction.id, None
+            self.outbox.record(
+                RecordKind.ROLLBACK, txn=txn, reason=why, cause="operator", counts=True
+            )
+            self._lock_after_rollbacks()
+            self.signal_if(Signal.ROLL_BACK, why)
+            return True, "the old values stay"
         if Signal.ROLL_BACK not in TABLE[self.state]:
             return False, (
                 f"nothing to roll back in {self.state.value}; for values that are in flash use "
@@ -173,7 +193,7 @@ class Flow:
         What qualified is kept as it was, so that a person approves what will be written, until the
         estimate has moved away from it by the smallest change that is worth a write.
         """
-        fresh = self._compose(estimate, gyro_is_raw)
+        fresh = self._compose(estimate, gyro_is_raw, self.registers)
         if fresh is None or not worth_writing(self.policy, self.outbox.history, fresh):
             self.signal_if(Signal.NOT_WORTH_WRITING, "the registers are right as they are")
             return
@@ -215,11 +235,13 @@ class Flow:
         """Why nothing can be written in this run at all."""
         return f"the mode is {self.policy.mode.name.lower()}: nothing is written in this run"
 
-    def _compose(self, estimate: Estimate, gyro_is_raw: bool) -> Proposal | None:
+    def _compose(
+        self, estimate: Estimate, gyro_is_raw: bool, registers: Mapping[int, Values]
+    ) -> Proposal | None:
         if not estimate.converged:
             return None
         try:
-            return compose(estimate, self.registers, gyro_is_raw=gyro_is_raw)
+            return compose(estimate, registers, gyro_is_raw=gyro_is_raw)
         except UnwritableError as error:
             self.outbox.note("warning", f"this estimate cannot be written: {error}")
             return None
@@ -232,24 +254,30 @@ class Flow:
         The smallest disagreement holds the pass of a trial and a save; one that is clear and lasts
         as long as a bad figure may ends them.
         """
-        reason = clear = ""
-        if red := [gate.gate for gate in self.safe.gates if not gate.ok]:
-            reason = clear = f"gates not met: {', '.join(red)}"
-        elif (fresh := self._compose(estimate, gyro_is_raw)) is None:
-            reason = "there is no present estimate to compare with what was written"
-        elif worth_writing(self.policy, self.outbox.history, fresh):
-            reason = (
-                f"the present estimate asks for another {fresh.heading_change_deg:.1f} deg and "
-                f"{fresh.gyro_change_rad_s:.4f} rad/s"
-            )
-            clear = reason if contradicts(self.policy, fresh, estimate) else ""
-        self.safe.disagrees = reason
+        self.safe.disagrees, clear = self._disagreement(estimate, gyro_is_raw, self.registers)
         if not clear:
             self._against_since_s = None
         elif self._against_since_s is None:
             self._against_since_s = self.outbox.host_s
         elif self.outbox.host_s - self._against_since_s >= self.policy.trial.worse_for_s:
             self.void(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
+
+    def _disagreement(
+        self, estimate: Estimate, gyro_is_raw: bool, registers: Mapping[int, Values]
+    ) -> tuple[str, str]:
+        """How the present estimate or its gates speak against these registers; and how clearly."""
+        if red := [gate.gate for gate in self.safe.gates if not gate.ok]:
+            reason = f"gates not met: {', '.join(red)}"
+            return reason, reason
+        if (fresh := self._compose(estimate, gyro_is_raw, registers)) is None:
+            return "there is no present estimate to compare with what was written", ""
+        if not worth_writing(self.policy, self.outbox.history, fresh):
+            return "", ""
+        reason = (
+            f"the present estimate asks for another {fresh.heading_change_deg:.1f} deg and "
+            f"{fresh.gyro_change_rad_s:.4f} rad/s"
+        )
+        return reason, reason if contradicts(self.policy, fresh, estimate) else ""
 
     def void(self, reason: str) -> None:
         """The calibration holds no more: what is not saved yet never will be."""
@@ -265,6 +293,8 @@ class Flow:
             self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
             self.passed, self.proven_to_s = "", None
             self.safe.proof_waits = f"{reason}: what is in force is on trial again"
+        elif self.state is State.SET_ASIDE:
+            self.roll_back("client", f"{reason}: what was set aside is not written again")
 
     def judge_proof(self, finding: TrialVerdict, reason: str) -> None:
         """What is proven goes on being judged until it is saved."""
@@ -272,6 +302,99 @@ class Flow:
             self.roll_back("trial", reason)
         elif finding is TrialVerdict.PASSED:
             self.safe.proof_waits = ""
+
+    # -- a client saves ----------------------------------------------------------------------------
+
+    def set_aside(self, client: str) -> None:
+        """A client saves all of RAM: what is on trial is undone first.
+
+        It is written again behind the save, unless something speaks against it already.
+        """
+        against = self.safe.void or self.safe.disagrees or self.trial.in_question
+        if self.state in (State.TRIAL, State.PROVEN) and not against:
+            self.aside = SetAside(self.transaction(), client)
+        self.roll_back("client", f"{client} saves, and nothing unproven is saved along")
+
+    def client_save_ended(self, why_not: str = "") -> None:
+        """The device acknowledged it, or why it did not."""
+        if self.aside is None or self.state is not State.SET_ASIDE:
+            return
+        if why_not:
+            self.roll_back("client", f"the save of {self.aside.client} failed: {why_not}")
+        else:
+            self.aside.saved_s = self.outbox.host_s
+
+    def judge_aside(self, estimate: Estimate, gyro_is_raw: bool) -> None:
+        """Does the present estimate still ask for what was set aside?"""
+        if self.aside is None:
+            return
+        registers = {**self.registers, **self.aside.transaction.new}
+        if against := self._disagreement(estimate, gyro_is_raw, registers)[0]:
+            self.roll_back("client", against)
+
+    def aside_holds(self) -> list[str]:
+        """Why what was set aside is not written again now; while the trial lasts it may be."""
+        if self.aside is None or self.aside.saved_s is None:
+            return ["the client's save is not acknowledged"]
+        if not self.aside.confirmed(self.safe.doubt_s):
+            return ["the device did not say again what it holds"]
+        return self.safe.again_holds(self.outbox.history, self.outbox.host_s, self.outbox.now)
+
+    def _write_again(self) -> None:
+        """The trial goes on as soon as nothing speaks against it."""
+        if self.aside is None:
+            return
+        self.waits_for_look = self.aside.waits_for_look(self.safe.doubt_s, self.outbox.host_s)
+        if not self.aside_holds():
+            self.signal(Signal.GO_ON, f"{self.aside.client} has saved; what was on trial is again")
+
+    # -- a client writes what calibrates -----------------------------------------------------------
+
+    def no_client_write(self, number: int) -> str | None:
+        """Why a client may not write this register now; "" where it may; None: not yet."""
+        if self.safe.mode < Mode.STAGE:
+            why = f"the mode is {self.policy.mode.name.lower()}"
+            return why if self.policy.mode < Mode.STAGE else "the device or its journal is in doubt"
+        if self.outbox.history.locked is not None:
+            return f"locked: {self.outbox.history.locked}"
+        if self.outbox.history.open is not None or self.state is State.SET_ASIDE:
+            return (
+                f"a calibration of ahrsd's is {self.state.value}, and what calibrates is nobody "
+                "else's until that has ended"
+            )
+        if self.state not in WITHOUT_TRANSACTION:
+            return None if self.state is State.RECONCILING else f"the state is {self.state.value}"
+        if self.approver:
+            return "a calibration is approved and about to be written"
+        if not self.safe.journal_ok:
+            return "the journal cannot be written"
+        return "" if number in self.registers else f"register {number} could not be read"
+
+    def announce(self, client: str, number: int, values: Values) -> None:
+        """The journal is told of a client's write, with what the register holds until now."""
+        self.client_write = ClientWrite(client, number, values)
+        self.outbox.record(
+            RecordKind.CLIENT_WRITES,
+            client=client,
+            serial=self._the_identity().serial,
+            old={str(number): list(self.registers[number])},
+            new={str(number): list(values)},
+        )
+
+    def announced(self, journaled: bool) -> None:
+        """That record is on the disk, or is not; then nothing is sent."""
+        if self.client_write is not None and not journaled:
+            self.client_write = None
+        elif self.client_write is not None:
+            self.client_write.journaled = True
+
+    def client_wrote(self) -> None:
+        """The client's write was answered, refused or lost: the device is read again."""
+        write, self.client_write = self.client_write, None
+        if write is not None:
+            self.safe.client_writes(write.number, self.registers[write.number])
+        if write is not None and self.state is not State.RECONCILING:
+            self.look_closer(f"{write.client} wrote register {write.number}")
 
     # -- locks -------------------------------------------------------------------------------------
 
@@ -322,9 +445,22 @@ class Flow:
     def _enter_preparing(self, reason: str) -> None:
         self.safe.void = self.safe.disagrees = self.safe.proof_waits = ""
         self._against_since_s = None
+        gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
+        facts: dict[str, object] = {"gates": gates, "interlock": "safe"}
+        wall = f"{self.outbox.wall_s:.0f}"
+        if self.aside is None:
+            transaction = self._new_transaction(wall)
+        else:
+            before, self.aside = self.aside.transaction, None
+            facts["again"] = before.id
+            name = f"{before.id.partition('-')[0]}-{wall}"
+            transaction = replace(before, id=name, snapshot=self.registers)
+        self.outbox.record(RecordKind.PREPARED, **facts, **transaction.facts())
+
+    def _new_transaction(self, wall: str) -> Transaction:
         proposal, identity = self._the_proposal(), self._the_identity()
-        transaction = Transaction(
-            id=f"{proposal.id}-{self.outbox.wall_s:.0f}",
+        return Transaction(
+            id=f"{proposal.id}-{wall}",
             serial=identity.serial,
             firmware=identity.firmware,
             old=proposal.old,
@@ -333,10 +469,6 @@ class Flow:
             heading_change_deg=proposal.heading_change_deg,
             approver=self.approver,
             model=identity.model,
-        )
-        gates = [[gate.gate, gate.value, gate.limit] for gate in self.safe.gates]
-        self.outbox.record(
-            RecordKind.PREPARED, gates=gates, interlock="safe", **transaction.facts()
         )
 
     def _enter_checking(self, reason: str) -> None:
@@ -501,10 +633,16 @@ class Flow:
         self._now_in_force(transaction.old)
         self.outbox.written(transaction.new, transaction.old, "undone")
         self.outbox.record(RecordKind.ROLLED_BACK, serial=transaction.serial)
+        self._lock_after_rollbacks()
+        if self.aside is None:
+            self.signal(Signal.DONE, "the old values were read back")
+        else:
+            self.signal(Signal.SET_ASIDE, "the old values were read back, for the save alone")
+
+    def _lock_after_rollbacks(self) -> None:
         history = self.outbox.history
         if history.rollbacks >= self.policy.rollbacks_to_lock and history.locked is None:
             self.outbox.record(RecordKind.LOCKED, reason=f"{history.rollbacks} rollbacks in a row")
-        self.signal(Signal.DONE, "the old values were read back")
 
     # -- after an interruption ---------------------------------------------------------------------
 

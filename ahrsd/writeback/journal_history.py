@@ -98,6 +98,8 @@ class JournalHistory:
             return self
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
+        if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
+            return now._with_values(facts)._not_sure_of(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
@@ -125,6 +127,11 @@ class JournalHistory:
         except (KeyError, TypeError, ValueError, AttributeError):
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
+
+    def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
+        written = {str(number) for number in facts.get("new", ())}
+        left = {n: v for n, v in (self.holds or {}).items() if str(n) not in written}
+        return replace(self, holds=left or None)
 
     def _counted(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
         """Budgets and rollbacks."""

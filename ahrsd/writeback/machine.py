@@ -30,7 +30,6 @@ from ahrsd.writeback.policy import WriteBackPolicy, margin
 from ahrsd.writeback.recheck import Recheck
 from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.restarts import RestartWatch
-from ahrsd.writeback.safeguards import NOT_ARMED
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     LIVED_WITH,
@@ -112,6 +111,8 @@ class WriteBack:
     def deadline_s(self) -> float | None:
         """When `tick` must be called at the latest."""
         deadlines = [self._flow.deadline_s, self._outbox.journal_again_s, self._recheck.due_s]
+        if (aside := self._flow.aside) is not None and not aside.settled(self._outbox.host_s):
+            deadlines.append(aside.settled_s)
         if self._flow.watches_interlock:
             deadlines.append(self._outbox.host_s + self.policy.interlock_max_age_s)
         return min((d for d in deadlines if d is not None), default=None)
@@ -138,6 +139,8 @@ class WriteBack:
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
         now = (self.history, self._outbox.host_s, self._outbox.now)
+        if self.state is State.SET_ASIDE:
+            return self._flow.aside_holds()
         if self.state is State.PROVEN:
             return self._safe.save_holds(*now)
         reasons = self._safe.write_holds(*now)
@@ -188,7 +191,10 @@ class WriteBack:
         self._recheck.begin(host_s)
         self._outbox.bind(identity.serial, journal)
         restarted = self._restarts.bind(identity.serial, read_from_s)
-        self._safe.theirs = self._changed_by_others(identity, registers, session_keys, restarted)
+        theirs = self._changed_by_others(identity, registers, session_keys, restarted)
+        if flow.identity is None or flow.identity.serial != identity.serial:
+            self._safe.client_wrote = {}
+        self._theirs[identity.serial] = self._safe.read_again(theirs, registers)
         self._safe.bind(identity, registers, journal is not None)
         self._safe.client_registers = clients
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
@@ -284,6 +290,8 @@ class WriteBack:
             self._restarts.answered(self._recheck.asked_s, host_s)
             self._safe.asking_took(host_s - self._recheck.asked_s)
             flow.proven_to_s = self._sampled_to_s if flow.passed else None
+            if flow.aside is not None:
+                flow.aside.confirmed_s = self._recheck.asked_s
         return self._answer()
 
     def on_waiting(self, span_s: float, host_s: float) -> list[Action]:
@@ -350,6 +358,8 @@ class WriteBack:
             self._flow.consider(estimate, gyro_is_raw)
         elif self.state in LIVED_WITH:
             self._flow.compare(estimate, gyro_is_raw)
+        elif self.state is State.SET_ASIDE:
+            self._flow.judge_aside(estimate, gyro_is_raw)
         return self._answer()
 
     def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
@@ -435,7 +445,57 @@ class WriteBack:
     def on_client_wants_save(self, client: str, host_s: float) -> list[Action]:
         """All of RAM is to be saved for a client: what is on trial is undone first."""
         self._outbox.host_s = host_s
-        self._flow.roll_back("client", f"{client} saves, and nothing unproven is saved along")
+        self._flow.set_aside(client)
+        return self._answer()
+
+    def on_client_save_failed(self, why: str, host_s: float) -> list[Action]:
+        """The device refused it, or nobody knows whether it was carried out."""
+        self._outbox.host_s = host_s
+        self._flow.client_save_ended(why)
+        return self._answer()
+
+    @property
+    def known(self) -> Seen | None:
+        """Who is there and what it must hold for anything that lasts; None: nobody was asked."""
+        flow = self._flow
+        if flow.identity is None:
+            return None
+        return Seen(
+            flow.identity.unit, {n: v for n, v in flow.registers.items() if n in COMPENSATING}
+        )
+
+    def on_client_waits(self, reason: str, host_s: float) -> list[Action]:
+        """A client's save or write was held back: why the device is not as known, if that is so."""
+        self._outbox.host_s, self._flow.client_write = host_s, None
+        if reason and self.state is not State.RECONCILING:
+            self._outbox.note("warning", f"held back for a client: {reason}")
+            self._flow.look_closer(reason)
+        return self._answer()
+
+    def may_client_write(self, number: int) -> str | None:
+        """Why a client may not write this register now; "" where it may; None: not yet."""
+        return self._flow.no_client_write(number)
+
+    def on_client_writes(
+        self, client: str, number: int, values: Values, host_s: float
+    ) -> tuple[list[Action], bool]:
+        """A client's write of what calibrates is next: what must happen, and whether it may go.
+
+        Asked again until the journal has it; from then on nobody knows what the device applies,
+        until `on_client_wrote`.
+        """
+        self._outbox.host_s, write = host_s, self._flow.client_write
+        if write is None or not write.is_of(client, number, values):
+            self._flow.announce(client, number, values)
+        elif write.journaled:
+            self._outbox.in_force(None)
+            return self._answer(), True
+        return self._answer(), False
+
+    def on_client_wrote(self, host_s: float) -> list[Action]:
+        """That write was carried out, refused, or nobody knows."""
+        self._outbox.host_s = host_s
+        self._flow.client_wrote()
         return self._answer()
 
     def on_client_saved(
@@ -449,10 +509,14 @@ class WriteBack:
         self._outbox.host_s, self._flow.session_keys = host_s, session_keys
         self._safe.client_registers = frozenset()
         self._flow.registers = {**self._flow.registers, **saved}
+        self._safe.theirs = frozenset()  # whoever changed what: it is permanent by now
+        self._safe.client_wrote = {}
         if self._flow.identity is not None:
+            self._theirs.pop(self._flow.identity.serial, None)
             self._outbox.record(
                 RecordKind.CLIENT_SAVED, client=client, serial=self._flow.identity.serial
             )
+        self._flow.client_save_ended()
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:
@@ -467,6 +531,8 @@ class WriteBack:
         """The record is on the disk."""
         self._outbox.host_s = host_s
         self._safe.journal_ok = self._outbox.journaled(kind)
+        if kind is RecordKind.CLIENT_WRITES:
+            self._flow.announced(True)
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNALLED, f"{kind.value} is in the journal")
         return self._answer()
@@ -475,6 +541,8 @@ class WriteBack:
         """The record is not on the disk. What waited for it does not happen."""
         self._outbox.host_s, self._safe.journal_ok = host_s, False
         self._outbox.not_journaled(kind)
+        if kind is RecordKind.CLIENT_WRITES:
+            self._flow.announced(False)
         self._outbox.note("error", f"{kind.value} could not be journalled: {error}")
         if _AWAITED.get(self.state) is kind:
             self._flow.signal(Signal.JOURNAL_FAILED, error)
@@ -520,7 +588,6 @@ class WriteBack:
             written = set() if self.history.open is None else set(self.history.open.new)
             compared = known.keys() & registers.keys() - session_keys - written - {HSI_RESULT}
             theirs |= {n for n in compared if not same(n, known[n], registers[n])}
-        self._theirs[identity.serial] = theirs
         return theirs
 
     def _ask_again(self) -> None:
@@ -538,8 +605,7 @@ class WriteBack:
 
     def _arm(self, armed: bool) -> Answer:
         """Whether this run may begin a write or a save; what is under way is not undone."""
-        self._safe.armed = armed
-        text = "armed: this run may write" if armed else NOT_ARMED
+        text = self._safe.arm(armed)
         self._outbox.note("info", text)
         if armed and self.policy.mode < Mode.STAGE:
             return False, f"{self._flow.mode_forbids}"

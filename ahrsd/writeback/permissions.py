@@ -8,6 +8,7 @@
 | ROLL_BACK | a transaction puts them back | stage |
 | SAVE | session settings put back (with `configure_stream`), then VNWNV | commit |
 | CLIENT | what a program on a shared port asked for (`sharing.client_commands`) | passive |
+| CLIENT_CALIBRATION | the same, of the owner with `calibration_writes = "pass"` | stage |
 
 A client's settings, in RAM for its session, are put back for a save like the daemon's own.
 
@@ -27,6 +28,7 @@ from drivers.vn100.registers import REGISTERS
 
 CALIBRATION: Final = (23, 84)
 GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # for no client: line rate and calibration
+PASSABLE: Final = tuple(n for n in GUARDED if n != 5)  # but for one whose share says so
 
 
 class Mode(IntEnum):
@@ -47,6 +49,7 @@ class Purpose(Enum):
     ROLL_BACK = "roll back"
     SAVE = "save"
     CLIENT = "client"
+    CLIENT_CALIBRATION = "client's calibration"
 
 
 NEEDS: Final[dict[Purpose, Mode]] = {
@@ -56,6 +59,7 @@ NEEDS: Final[dict[Purpose, Mode]] = {
     Purpose.ROLL_BACK: Mode.STAGE,
     Purpose.SAVE: Mode.COMMIT,
     Purpose.CLIENT: Mode.PASSIVE,
+    Purpose.CLIENT_CALIBRATION: Mode.STAGE,
 }
 WRITES: Final[dict[Purpose, tuple[int, ...]]] = {
     Purpose.READ: (),
@@ -64,6 +68,7 @@ WRITES: Final[dict[Purpose, tuple[int, ...]]] = {
     Purpose.ROLL_BACK: CALIBRATION,
     Purpose.SAVE: (),
     Purpose.CLIENT: tuple(n for n, row in REGISTERS.items() if row.writable and n not in GUARDED),
+    Purpose.CLIENT_CALIBRATION: PASSABLE,
 }
 WORDS: Final[dict[Purpose, tuple[str, ...]]] = {
     Purpose.READ: (),
@@ -72,6 +77,7 @@ WORDS: Final[dict[Purpose, tuple[str, ...]]] = {
     Purpose.ROLL_BACK: ("VNASY",),
     Purpose.SAVE: ("VNASY", "VNWNV"),
     Purpose.CLIENT: ("VNWNV", "VNRST", "VNKMD", "VNKAD"),
+    Purpose.CLIENT_CALIBRATION: (),
 }
 
 

@@ -131,9 +131,14 @@ def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate)
     return proposal.heading_change_deg > heading_deg or proposal.gyro_change_rad_s > gyro_rad_s
 
 
-def ram_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> list[str]:
+def ram_budget(
+    policy: WriteBackPolicy, history: JournalHistory, now: Now, *, again: bool = False
+) -> list[str]:
     """Why RAM must not be written now; empty where it may. Times as `clocks.passed_s` reads them:
     no clock that was wrong, or was set, makes one longer.
+
+    again: the values were in RAM just now and were undone for a client's save, so the pause between
+           two writes is not waited for; the write counts in the day's number all the same
     """
     reasons: list[str] = []
     if history.locked is not None:
@@ -141,7 +146,7 @@ def ram_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> li
     if history.broken is not None:
         reasons.append(f"the journal's {history.broken} record cannot be understood")
     *writes_s, _ = passed_s((*history.ram_writes_at, history.newest_at), now)
-    if writes_s and writes_s[-1] < policy.min_interval_s:
+    if writes_s and not again and writes_s[-1] < policy.min_interval_s:
         reasons.append(
             f"the last write was {writes_s[-1]:.0f} s ago, wait for {policy.min_interval_s:.0f} s"
         )

@@ -47,6 +47,7 @@ class RecordKind(StrEnum):
     OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
     OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
     CLIENT_SAVED = "CLIENT_SAVED"  # a program on a shared port saved all of RAM
+    CLIENT_WRITES = "CLIENT_WRITES"  # one is about to write what calibrates, in RAM
 
 
 OPEN: Final = (

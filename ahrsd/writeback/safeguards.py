@@ -17,7 +17,7 @@ from ahrsd.writeback.policy import VERDICT_AGE_S, WriteBackPolicy, flash_budget,
 from ahrsd.writeback.stillness import Stillness
 from drivers.vn100.commands import Command, Word, Write
 from drivers.vn100.procedures import Identity
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
 UNEXAMINED_S = 2.0  # samples that the estimate has not seen yet may hold a step
@@ -48,6 +48,7 @@ class Safeguards:
         self._asking_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
         self.save_from_s = float("-inf")  # when the save was decided
         self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
+        self.client_wrote: dict[int, Values] = {}  # and held before a client wrote and did not save
         self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
@@ -87,6 +88,25 @@ class Safeguards:
         if not journal_readable:
             self._limits.append("the journal cannot be read; see its error")
 
+    def arm(self, armed: bool) -> str:
+        """Whether this run may begin a write or a save; in words."""
+        self.armed = armed
+        return "armed: this run may write" if armed else NOT_ARMED
+
+    def client_writes(self, number: int, before: Values) -> None:
+        """A client wrote this register; what it held before is its own as long as nobody knows."""
+        self.client_wrote.setdefault(number, before)
+
+    def read_again(self, theirs: frozenset[int], registers: Mapping[int, Values]) -> frozenset[int]:
+        """Registers that others changed, without those that hold what they held before a client."""
+        returned = {
+            n for n, before in self.client_wrote.items() if same(n, before, registers.get(n, ()))
+        }
+        self.theirs = theirs - returned
+        left = self.client_wrote.keys() & self.theirs
+        self.client_wrote = {n: self.client_wrote[n] for n in left}
+        return self.theirs
+
     def doubt(self, host_s: float) -> None:
         """What was judged of samples until now is of before a doubt: nothing is saved by it."""
         if self.examined_s is not None:
@@ -119,8 +139,10 @@ class Safeguards:
             return ""
         return self.interlock_holds(host_s)
 
-    def write_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
-        """Why no write may begin now, but for the approval."""
+    def write_holds(
+        self, history: JournalHistory, host_s: float, now: Now, *, again: bool = False
+    ) -> list[str]:
+        """Why no write may begin now, but for the approval. `again`: see `policy.ram_budget`."""
         reasons = list(self._limits)
         if self.policy.mode < Mode.STAGE:
             reasons.append(
@@ -133,8 +155,22 @@ class Safeguards:
             reasons.append("no gate has judged yet")
         if self._hsi_applied:
             reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
-        reasons += ram_budget(self.policy, history, now)
+        if unsaved := sorted(self.client_wrote.keys() & {MAG, GYRO}):
+            reasons.append(
+                f"register {', '.join(map(str, unsaved))} holds what a program on a shared port "
+                "wrote and did not save: let it save that, or switch the device off and on"
+            )
+        reasons += ram_budget(self.policy, history, now, again=again)
         return reasons + self._always(host_s)
+
+    def again_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+        """Why what was set aside may not be written again now: its approval must still hold."""
+        reasons = [word for word in (self.void, self.disagrees) if word]
+        if not self.armed:
+            reasons.append(NOT_ARMED)
+        reasons += self._old_verdict(host_s)
+        more = self.write_holds(history, host_s, now, again=True)
+        return list(dict.fromkeys([*reasons, *more]))
 
     def save_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
         """Why the flash may not be written now."""
@@ -162,9 +198,11 @@ class Safeguards:
                 f"somebody else changed register {which} in this run, and a save would make it "
                 "permanent; once it is right, switch the device off and on"
             )
-        if host_s - self.judged_s > VERDICT_AGE_S:
-            reasons.append(f"the newest verdict is {host_s - self.judged_s:.0f} s old")
-        return reasons + self.unexamined()
+        return reasons + self._old_verdict(host_s) + self.unexamined()
+
+    def _old_verdict(self, host_s: float) -> list[str]:
+        old_s = host_s - self.judged_s
+        return [f"the newest verdict is {old_s:.0f} s old"] if old_s > VERDICT_AGE_S else []
 
     def asking_took(self, took_s: float) -> None:
         """The device was asked who it is and what it holds, and answered as it ought to."""

@@ -16,6 +16,7 @@ before the device does: nothing is sent until the record of what the device held
     SAVE_PREPARING waits for the journal to say that the flash is about to be written
     SAVING        session settings put back, every register compared, then VNWNV: one procedure
     COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
+    SET_ASIDE     what was on trial is undone for a client's save, and is written again behind it
 
 "verified", "proven", "committed" and "confirmed" are different words on purpose.
 
@@ -55,6 +56,7 @@ class State(StrEnum):
     CONFIRMED = "CONFIRMED"
     ROLLING_BACK = "ROLLING_BACK"
     ROLLED_BACK = "ROLLED_BACK"
+    SET_ASIDE = "SET_ASIDE"
     FAULT = "FAULT"
     FLASH_TORN = "FLASH_TORN"
     LOCKED = "LOCKED"
@@ -78,6 +80,8 @@ class Signal(StrEnum):
     TRIAL_FAILED = "trial failed"
     SAVE_DUE = "save due"
     ROLL_BACK = "roll back"
+    SET_ASIDE = "set aside"
+    GO_ON = "trial goes on"
     TIMEOUT = "timeout"
     LINK_LOST = "link lost"
     DEVICE_RESET = "device reset"
@@ -196,10 +200,17 @@ TABLE: Final[dict[State, dict[Signal, State]]] = {
     S.ROLLING_BACK: {
         **_AWAY,
         E.DONE: S.ROLLED_BACK,
+        E.SET_ASIDE: S.SET_ASIDE,
         E.FAILED: S.FAULT,
         E.TIMEOUT: S.FAULT,
     },
     S.ROLLED_BACK: _WATCHING,
+    S.SET_ASIDE: {
+        **_AWAY,
+        E.GO_ON: S.PREPARING,
+        E.ROLL_BACK: S.ROLLED_BACK,  # the old values are in RAM already: the trial is over
+        E.TIMEOUT: S.ROLLED_BACK,
+    },
     S.FAULT: {**_AWAY, E.ROLL_BACK: S.ROLLING_BACK, E.UNLOCK: S.RECONCILING},
     S.FLASH_TORN: {**_AWAY, E.UNLOCK: S.OBSERVING},
     S.LOCKED: {**_AWAY, E.UNLOCK: S.OBSERVING},
@@ -219,6 +230,7 @@ ON_TIMEOUT: Final[dict[State, tuple[float, State]]] = {
     S.SAVE_PREPARING: (5.0, S.PROVEN),  # VNWNV was not sent
     S.SAVING: (30.0, S.FAULT),  # it may have been carried out: only a reset tells
     S.ROLLING_BACK: (30.0, S.FAULT),
+    S.SET_ASIDE: (30.0, S.ROLLED_BACK),  # a later write would be a new one, with a new approval
 }
 
 # The device's RAM may hold values of a transaction, not yet in flash: the vehicle runs on them.

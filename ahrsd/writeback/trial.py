@@ -70,6 +70,11 @@ class Trial:
         self._predicted_deg = predicted_jump_deg
         self._worse_since_s: float | None = None
 
+    @property
+    def in_question(self) -> bool:
+        """Whether the newest figures speak against the new registers."""
+        return self._worse_since_s is not None
+
     def judge(self, metrics: TrialMetrics) -> tuple[TrialVerdict, str]:
         """The finding and its reason. Metrics that are not finite say nothing."""
         if not metrics.finite:

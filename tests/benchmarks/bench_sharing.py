@@ -1,13 +1,16 @@
 """What a shared port costs a driver: the time from the device's port to the driver's, and bytes.
 
-    python tests/benchmarks/bench_sharing.py [--rate HZ] [--seconds S] [--way NAME] [--json FILE]
+    python tests/benchmarks/bench_sharing.py [--rate HZ] [--seconds S] [--way NAME] [--wire socket]
 
 A writer puts binary packets with the host's time into a pty, a reader stamps each when it is whole:
 directly, through `ahrsd run` (mode passive) with a shared port or with a raw share over tcp, and
 through socat where that is installed. `crowd`: over tcp with 15 readers more, one of which never
 reads; the losses are those of all that read. Median and 99 % of the delay in ms, messages lost, and
 the daemon's share of a core.
-Run it on a quiet machine: the figures are those of the scheduler otherwise.
+Run it on a quiet machine: the figures are those of the scheduler otherwise. A busy one can be made
+quiet for a while, `chrt -r 20 python tests/benchmarks/bench_sharing.py --wire socket` (root): the
+kernel hands the bytes of a pty over in threads of ordinary priority, those of a socket it does not.
+Then the device is a server on this machine, and only what a network reader gets is measured.
 """
 
 from __future__ import annotations
@@ -54,11 +57,25 @@ class Way:
 Opened = Callable[[str, Path], contextlib.AbstractContextManager[Way]]
 
 
-def packet(number: int) -> bytes:
+def packet(number: int, moved: tuple[float, ...] = (0.0,) * 6) -> bytes:
     """Group 1 with TimeStartup (the host's), YawPitchRoll (yaw: a number), AngularRate, MagPres."""
     data = struct.pack("<Q", time.monotonic_ns())
-    data += struct.pack("<3f3f3f2f", number, 0.1, 0.1, *([0.01] * 3), 0.2, 0.0, 0.4, 25.0, 101.3)
+    data += struct.pack("<3f3f3f2f", number, 0.1, 0.1, *moved, 25.0, 101.3)
     return HEAD + data + struct.pack(">H", crc16((HEAD + data)[1:]))
+
+
+def motion(rate_hz: float, seconds: float) -> list[tuple[float, ...]]:
+    """Rate of turn and field of a vehicle that turns all the time, so that there is an estimate."""
+    draw, attitude, rows = np.random.default_rng(1), np.eye(3), []
+    for t in np.arange(0.0, seconds, 1.0 / rate_hz).tolist():
+        rate = np.array([0.5 * np.sin(0.7 * t), 0.6 * np.cos(0.45 * t), 0.7])
+        x, y, z = rate / rate_hz
+        step = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        attitude = attitude @ (np.eye(3) + step + step @ step / 2)
+        field = attitude.T @ [0.2, 0.0, 0.42] + [0.05, -0.03, 0.04]
+        noise = 1e-3 * draw.normal(size=6)
+        rows.append(tuple(float(v) for v in np.concatenate([rate, field]) + noise))
+    return rows
 
 
 SIZE = len(packet(0))
@@ -71,14 +88,61 @@ def pair() -> tuple[int, int, str]:
     return master, slave, os.ttyname(slave)
 
 
-def write(master: int, rate_hz: float, stop: threading.Event, count: list[int]) -> None:
-    """Packets at their times until `stop`."""
-    begun_s = time.monotonic()
+class Pty:
+    """A device on a pty."""
+
+    def __init__(self) -> None:
+        self._master, self._slave, self.name = pair()
+
+    def taken(self) -> None:
+        """Another process is to have it."""
+        os.close(self._slave)
+
+    def write(self, data: bytes) -> None:
+        os.write(self._master, data)
+
+    def close(self) -> None:
+        os.close(self._master)
+
+
+class Server:
+    """A device on a device server: whoever connects last has it."""
+
+    def __init__(self) -> None:
+        self._place = socket.create_server(("127.0.0.1", 0))
+        self._place.settimeout(0.2)
+        self.name = f"socket://127.0.0.1:{self._place.getsockname()[1]}"
+        self._taker: socket.socket | None = None
+
+    def taken(self) -> None:
+        """Nothing is to be done."""
+
+    def write(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            if self._taker is None:
+                self._taker = self._place.accept()[0]
+                self._taker.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            try:
+                self._taker.sendall(data)
+            except OSError:  # it was only looked at
+                self._taker.close()
+                self._taker = None
+
+    def close(self) -> None:
+        if self._taker is not None:
+            self._taker.close()
+        self._place.close()
+
+
+def write(wire: Pty | Server, rate_hz: float, stop: threading.Event, count: list[int]) -> None:
+    """Packets at their times until `stop`; after a break it is not caught up."""
+    rows = motion(rate_hz, 60.0)
+    due_s = time.monotonic()
     while not stop.is_set():
-        due_s = begun_s + count[0] / rate_hz
+        due_s = max(due_s + 1.0 / rate_hz, time.monotonic() - 0.1)
         if (wait_s := due_s - time.monotonic()) > 0.0:
             time.sleep(wait_s)
-        os.write(master, packet(count[0]))
+        wire.write(packet(count[0], rows[count[0] % len(rows)]))
         count[0] += 1
 
 
@@ -105,7 +169,10 @@ def read(reader: int, seconds: float) -> tuple[np.ndarray, int]:
 @contextlib.contextmanager
 def direct(device: str, _folder: Path) -> Iterator[Way]:
     """The device's own port."""
-    yield Way(os.open(device, os.O_RDWR | os.O_NOCTTY))
+    if device.startswith("socket://"):
+        yield Way(connected(int(device.rpartition(":")[2])).detach())
+    else:
+        yield Way(os.open(device, os.O_RDWR | os.O_NOCTTY))
 
 
 @contextlib.contextmanager
@@ -191,6 +258,12 @@ def drain(place: int) -> None:
 @contextlib.contextmanager
 def socat(device: str, folder: Path) -> Iterator[Way]:
     """socat between the two."""
+    if device.startswith("socket://"):
+        place, host = free_place(), device.removeprefix("socket://")
+        to = f"tcp-listen:{place},bind=127.0.0.1,nodelay"
+        with running(["socat", to, f"tcp:{host}"]) as pid:
+            yield Way(connected(place).detach(), pid)
+        return
     port = folder / "socat"
     with running(["socat", f"{device},raw,echo=0", f"pty,raw,echo=0,link={port}"]) as pid:
         yield Way(opened(port), pid)
@@ -231,16 +304,18 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measured(way: Opened, rate_hz: float, seconds: float) -> dict[str, float]:
+def measured(
+    way: Opened, rate_hz: float, seconds: float, kind: type[Pty | Server] = Pty
+) -> dict[str, float]:
     """One way at one rate."""
-    master, slave, device = pair()
+    wire = kind()
     stop, count = threading.Event(), [0]
-    writer = threading.Thread(target=write, args=(master, rate_hz, stop, count), daemon=True)
+    writer = threading.Thread(target=write, args=(wire, rate_hz, stop, count), daemon=True)
     with tempfile.TemporaryDirectory() as folder:
         if way is not direct:
-            os.close(slave)
+            wire.taken()
         writer.start()
-        with way(device, Path(folder)) as there:
+        with way(wire.name, Path(folder)) as there:
             time.sleep(1.0)
             pid = there.pid
             used_s, begun_s = cpu_s(pid) if pid else 0.0, time.monotonic()
@@ -249,11 +324,12 @@ def measured(way: Opened, rate_hz: float, seconds: float) -> dict[str, float]:
             stop.set()
             writer.join()
             os.close(there.reader)
-    os.close(master)
+    wire.close()
     return {
         "packets": len(delays),
         "median_ms": round(float(np.median(delays)), 3),
         "p99_ms": round(float(np.percentile(delays, 99)), 3),
+        "worst_ms": round(float(delays.max()), 1),
         "lost": lost + there.others_lost,
         "core_percent": round(100.0 * share, 1),
     }
@@ -265,6 +341,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, action="append", help="Hz; default 200 and 800")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--way", action="append", help="direct, shared, tcp, crowd, socat; all")
+    parser.add_argument("--wire", choices=["pty", "socket"], default="pty", help="of the device")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--drain", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -274,12 +351,16 @@ def main() -> None:
     ways: dict[str, Opened] = {"direct": direct, "shared": shared, "tcp": tcp, "crowd": crowd}
     if shutil.which("socat"):
         ways["socat"] = socat
+    if options.wire == "socket":
+        del ways["shared"]  # a pty again
     found = {}
     for rate_hz in options.rate or (200.0, 800.0):
         for name, way in ways.items():
             if options.way and name not in options.way:
                 continue
-            found[f"{name} {rate_hz:.0f} Hz"] = row = measured(way, rate_hz, options.seconds)
+            found[f"{name} {rate_hz:.0f} Hz"] = row = measured(
+                way, rate_hz, options.seconds, Server if options.wire == "socket" else Pty
+            )
             print(f"{name:8} {rate_hz:4.0f} Hz", row, flush=True)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

@@ -3,7 +3,9 @@
     python tests/benchmarks/histories.py --histories 100000 --seed 1 --json FILE
 
 Parts: `histories` (tests/support/write_histories.py), `moments` (every event at every moment of an
-ordinary history, with --moments) and `real` (whole histories with the estimator itself, --real N).
+ordinary history, with --moments), `clients` (a driver that saves all of RAM, --clients N), `aside`
+(every event at every moment of what follows from such a save in a trial, with --aside) and `real`
+(whole histories with the estimator itself, --real N).
 Done in chunks: the file is written after each, and a later call with the same seed and file goes on
 where this one ended (`--seconds` ends each part). Exit code 1 where a violation was seen; each is
 named with its seed and number, and `--only NUMBER` tells that history's story.
@@ -31,25 +33,33 @@ MOST_NAMED = 200
 
 def histories_chunk(chunk: range, seed: int) -> Tally:
     """Random histories with the fitted sphere."""
-    import write_histories
-    from scripted_world import fitted
-
-    tally = write_histories.HistoriesTally()
-    with fitted():
-        for number in chunk:
-            write_histories.run_one(number, seed, tally)
-    return dict(vars(tally))
+    return played("run_one", chunk, seed)
 
 
 def moments_chunk(chunk: range, seed: int) -> Tally:
     """Every event at every moment; the number counts through events, moments and streams."""
+    return played("run_moment", chunk, seed)
+
+
+def clients_chunk(chunk: range, seed: int) -> Tally:
+    """Random histories with a driver on a shared port that saves."""
+    return played("run_with_client", chunk, seed)
+
+
+def aside_chunk(chunk: range, seed: int) -> Tally:
+    """Every event at every moment behind a client's save in a trial."""
+    return played("run_aside", chunk, seed)
+
+
+def played(how: str, chunk: range, seed: int) -> Tally:
+    """These histories with the fitted sphere."""
     import write_histories
     from scripted_world import fitted
 
     tally = write_histories.HistoriesTally()
     with fitted():
         for number in chunk:
-            write_histories.run_moment(number, seed, tally)
+            getattr(write_histories, how)(number, seed, tally)
     return dict(vars(tally))
 
 
@@ -66,6 +76,8 @@ def real_chunk(chunk: range, seed: int) -> Tally:
 PARTS: dict[str, tuple[int, Callable[[range, int], Tally]]] = {
     "histories": (100, histories_chunk),
     "moments": (50, moments_chunk),
+    "clients": (100, clients_chunk),
+    "aside": (50, aside_chunk),
     "real": (1, real_chunk),
 }
 
@@ -135,6 +147,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--histories", type=int, default=100_000)
     parser.add_argument("--moments", type=int, default=0, help="-1: all there are")
+    parser.add_argument("--clients", type=int, default=0)
+    parser.add_argument("--aside", type=int, default=0, help="-1: all there are")
     parser.add_argument("--real", type=int, default=0, help="with the estimator itself")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1, choices=[1, 2])
@@ -155,10 +169,12 @@ def main() -> int:
         if options.json is not None:
             options.json.write_text(json.dumps(result, indent=1) + "\n")
 
-    if options.moments < 0:
+    if options.moments < 0 or options.aside < 0:
         import write_histories
 
-        options.moments = write_histories.moments()
+        every = {"moments": write_histories.moments(), "aside": write_histories.aside_moments()}
+        for name, most in every.items():
+            setattr(options, name, most if getattr(options, name) < 0 else getattr(options, name))
     for name in PARTS:
         if wanted := getattr(options, name):
             run_part(name, wanted, options, result["parts"].setdefault(name, {}), keep)

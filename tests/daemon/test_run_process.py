@@ -93,9 +93,19 @@ def captured(folder: Path) -> Path:
 
 
 def grown(path: Path, by: int):
-    """A condition: the file has grown by so many bytes."""
-    start = path.stat().st_size
-    return lambda: path.stat().st_size > start + by
+    """A condition: the file has its head, and so many bytes more than when that was seen first.
+
+    The head of a capture is larger than what a device sends in seconds.
+    """
+    seen: list[int] = []
+
+    def condition() -> bool:
+        size = path.stat().st_size
+        if not seen and size:
+            seen.append(size)
+        return bool(seen) and size > seen[0] + by
+
+    return condition
 
 
 def test_passive_sends_not_one_byte(program, tmp_path):

@@ -33,6 +33,34 @@ def test_what_calibrates_is_written_for_nobody(policy, number):
         assert not permitted(Write(number, values), mode, True, Purpose.CLIENT)
 
 
+@pytest.mark.parametrize("number", [23, 25, 26, 43, 44, 74, 84])
+def test_what_calibrates_passes_for_an_owner_whose_share_says_so_from_mode_stage_on(number):
+    values = next(iter(REGISTERS[number].defaults.values()))
+    body = f"VNWRG,{format_reply(number, values)}"
+    passing = SharePolicy("/a", owner=True, calibration_writes="pass")
+    answer = understand(body, passing)
+    assert answer == ClientCommand(Kind.CALIBRATE, body, Write(number, values))
+    allowed = [m for m in Mode if permitted(answer.command, m, False, answer.purpose)]
+    assert allowed == [Mode.STAGE, Mode.COMMIT]
+    assert answer.purpose is Purpose.CLIENT_CALIBRATION
+    nobody = SharePolicy("/b", calibration_writes="pass")
+    assert understand(body, nobody).code == 0x09
+
+
+def test_nothing_else_becomes_possible_by_it():
+    passing = SharePolicy("/a", owner=True, calibration_writes="pass")
+    for number in REGISTERS:
+        for values in REGISTERS[number].defaults.values():
+            body = f"VNWRG,{format_reply(number, values)}"
+            if number == 5 or number not in GUARDED:
+                assert understand(body, passing) == understand(body, OWNER)
+    for word in FOR_NOBODY:
+        assert understand(word, passing) == understand(word, OWNER)
+    for word, arguments in (("VNWNV", ()), ("VNRST", ()), ("VNRFS", ()), ("VNTAR", ())):
+        command = Word(word, arguments)
+        assert not permitted(command, Mode.COMMIT, True, Purpose.CLIENT_CALIBRATION)
+
+
 @pytest.mark.parametrize("number", sorted(REGISTERS))
 def test_each_register_has_one_answer(number):
     """Reads are for everybody, writes for the owner, and nothing guarded goes out."""

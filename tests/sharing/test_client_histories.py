@@ -10,6 +10,7 @@ from client_histories import SHARES, ClientHistory
 
 from ahrsd.sharing import client_commands
 from ahrsd.sharing.arbiter import Arbiter
+from ahrsd.writeback import flow
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import WRITES, Purpose
 
@@ -20,6 +21,29 @@ def test_nothing_that_must_not_be(seed):
     assert history.wrong == {}, history.run.notes[-10:]
     assert history.asked > 200
     assert "TRIAL" in history.run.states
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_that_must_not_be_where_the_owner_may_write_what_calibrates(seed):
+    history = ClientHistory(seed, passes=True)
+    history.play()
+    assert history.wrong == {}, history.run.notes[-10:]
+    assert history.let_through > 0
+
+
+def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
+    """The owner may write in the middle of a trial, and then that is undone, over it."""
+    undo = flow.roll_back
+
+    def end_the_trial(self):
+        self.client_write = None
+        self.roll_back("client", "a client wrote")
+
+    monkeypatch.setattr(WriteBack, "may_client_write", lambda self, number: "")
+    monkeypatch.setattr(flow.Flow, "client_wrote", end_the_trial)
+    monkeypatch.setattr(flow, "roll_back", lambda what, **_: undo(what, only_ours=False))
+    wrong = sum((played(seed, passes=True).wrong for seed in range(4)), Counter())
+    assert wrong["overwritten"] > 0
 
 
 def test_a_save_in_the_middle_of_a_trial_would_be_seen(monkeypatch):
@@ -49,7 +73,7 @@ def test_an_answer_to_the_wrong_client_would_be_seen():
     assert history.wrong["wrong answers"] > 0
 
 
-def played(seed):
-    history = ClientHistory(seed)
+def played(seed, **options):
+    history = ClientHistory(seed, **options)
     history.play()
     return history

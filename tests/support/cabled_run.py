@@ -60,8 +60,9 @@ class CabledRun:
     """See the module."""
 
     def __init__(
-        self, cable: Cable, *, planted: bool = True, shares: tuple[Any, ...] = (), **policy: Any
-    ) -> None:
+        self, cable: Cable, *, planted: bool = True, shares: tuple[Any, ...] = (),
+        journal: dict[int, list[dict[str, Any]]] | None = None, **policy: Any,
+    ) -> None:  # fmt: skip
         given: dict[str, Any] = {
             "mode": Mode.COMMIT, "trial": TRIAL, "still": StillPolicy(gyro_rad_s=0.02),
             **policy,
@@ -71,7 +72,7 @@ class CabledRun:
         self.core = Core(replace(settings, shares=shares))
         self.heard: dict[str, bytes] = {share.name: b"" for share in shares}
         self.safe = True
-        self.journal: dict[int, list[dict[str, Any]]] = {}
+        self.journal = {} if journal is None else journal  # of a run before, by serial number
         self.notes: list[tuple[str, str]] = []
         self.states: list[str] = []
         self.taken: list[inputs.Input] = []

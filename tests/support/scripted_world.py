@@ -21,6 +21,7 @@ from typing import Any
 
 from fitting_calibrator import FittingCalibrator
 from scripted_vn100 import Cable, Unit
+from scripted_vn100.wire import sentence
 from write_observer import Observer
 
 from ahrsd import events, inputs
@@ -29,6 +30,7 @@ from ahrsd.config.loading import Config
 from ahrsd.core import core as core_module
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
+from ahrsd.sharing.client_commands import SharePolicy
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
 
@@ -39,6 +41,7 @@ POLICY = WriteBackPolicy(
     flash_writes_per_day=10**6, flash_writes_lifetime=10**6, rollbacks_to_lock=10**6, recheck_s=3.0,
     trial=TrialPolicy(duration_s=2.0, turns=100.0), still=StillPolicy(duration_s=1.0),
 )  # fmt: skip
+CLIENT = "owner"  # of a shared port; says nothing unless a script makes it
 _CANDIDATE = re.compile(r"candidate ([0-9a-f]{8}),")
 
 
@@ -120,7 +123,10 @@ class World:
         self.notes: list[tuple[float, str]] = []
         self.finished = False
         self.kills = 0
-        self.settings = replace(core_settings(self.config, policy=self.policy), keep=16)
+        shares = (SharePolicy(CLIENT, owner=True, calibration_writes="pass"),)
+        settings = core_settings(self.config, policy=self.policy)
+        self.settings = replace(settings, keep=16, shares=shares)
+        self.answered: list[tuple[float, str]] = []
         self.core: Core | None = None
         self._shell: Shell | None = None
         self._serial = 0
@@ -196,6 +202,12 @@ class World:
         """A person's word, if somebody is there to hear it."""
         if self.core is not None:
             self.feed(inputs.Operator(self._ns(), verb, argument))
+
+    def say(self, body: str) -> None:
+        """The program on the owner's port writes this line, if it has a port."""
+        if self.core is not None:
+            self.observer.asked_by_client(body)
+            self.feed(inputs.ClientSent(self._ns(), CLIENT, sentence(body).decode()))
 
     def later(self, seconds: float, act: Callable[[], None]) -> None:
         """Do it after a while."""
@@ -277,6 +289,8 @@ class World:
                 self.states.append((self.now_s, new, f"{old}: {reason}"))
             case events.OpenJournal(serial=serial):
                 self._serial = serial
+            case events.SendToClient(data=data):
+                self.answered.append((self.now_s, data.decode("latin-1").strip()))
             case events.Finished():
                 self.finished = True
 

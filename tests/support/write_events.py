@@ -264,6 +264,47 @@ def bad_line(world: World, draw: Dice) -> None:
     faults.lost, faults.doubled, faults.late = (float(v) for v in draw.uniform(0.0, 0.12, 3))
 
 
+def client_saves(world: World, draw: Dice) -> None:
+    """The vehicle's driver, on its shared port, saves all of RAM."""
+    world.later(0.001, lambda: world.say("VNWNV"))
+
+
+def client_saves_again(world: World, draw: Dice) -> None:
+    """And once more a while later."""
+    client_saves(world, draw)
+    world.later(float(draw.uniform(0.2, 6.0)), lambda: world.say("VNWNV"))
+
+
+def client_saves_and_resets(world: World, draw: Dice) -> None:
+    """As one driver does at every start."""
+    client_saves(world, draw)
+    world.later(float(draw.choice([0.1, 1.0, 3.0])), lambda: world.say("VNRST"))
+
+
+def client_sets_and_saves(world: World, draw: Dice) -> None:
+    """A setting of its own that is to last."""
+    rate = int(draw.choice([5, 10, 20]))
+    world.later(0.001, lambda: world.say(f"VNWRG,07,{rate}"))
+    world.later(0.05, lambda: world.say("VNWNV"))
+
+
+def client_calibrates(world: World, draw: Dice) -> None:
+    """The driver writes what calibrates, as its share allows; half the time it saves then."""
+    values = users_values(draw)
+    for k, number in enumerate(((23,), (84,), (23, 84))[int(draw.integers(3))]):
+        line = f"VNWRG,{number},{values[number]}"
+        world.later(0.001 + 0.2 * k, lambda line=line: world.say(line))
+    if draw.random() < 0.5:
+        world.later(float(draw.uniform(0.3, 2.0)), lambda: world.say("VNWNV"))
+
+
+CLIENT_EVENTS: dict[str, Act] = {
+    "client saves": client_saves,
+    "client saves again": client_saves_again,
+    "client saves and resets": client_saves_and_resets,
+    "client sets and saves": client_sets_and_saves,
+    "client calibrates": client_calibrates,
+}
 EVENTS: dict[str, tuple[Act, float]] = {
     "swap": (swap, 3.0),
     "swap and back": (swap_and_back, 1.5),

@@ -23,7 +23,14 @@ from typing import Any
 import numpy as np
 from scripted_vn100 import Cable, Iron, Motion, Unit, Vehicle
 from scripted_world import POLICY, HostClocks, World
-from write_events import EVENTS, ORIGIN_SERIAL, Act, random_iron, users_values
+from write_events import (
+    CLIENT_EVENTS,
+    EVENTS,
+    ORIGIN_SERIAL,
+    Act,
+    random_iron,
+    users_values,
+)
 from write_observer import KINDS
 
 from ahrsd.config.loading import Config
@@ -191,6 +198,63 @@ def run_one(number: int, seed: int, tally: HistoriesTally) -> World:
         names = plan(world, draw, tally)
         error = attempt(world)
         judge(world, f"history {number} of seed {seed} ({', '.join(names)})", tally, error)
+    return world
+
+
+def run_with_client(number: int, seed: int, tally: HistoriesTally) -> World:
+    """The same with a driver on the owner's port that saves, mostly in the middle of a trial."""
+    draw = np.random.default_rng([seed, number, 2])
+    with folder() as at:
+        world = random_world(at, draw)
+        names = plan(world, draw, tally, length_s=LONG_S) if draw.random() < 0.7 else []
+        for _ in range(1 + int(draw.integers(3))):
+            name = str(draw.choice(list(CLIENT_EVENTS)))
+            names.append(name)
+            _client_comes(world, draw, CLIENT_EVENTS[name])
+            tally.events[name] += 1
+        error = attempt(world, LONG_S)
+        judge(world, f"client history {number} of seed {seed} ({', '.join(names)})", tally, error)
+    return world
+
+
+def _client_comes(world: World, draw: np.random.Generator, act: Act) -> None:
+    def now() -> None:
+        world.later(float(draw.uniform(0.0, 2.2)), lambda: act(world, draw))
+
+    if draw.random() < 0.3:
+        world.at(float(draw.uniform(1.0, LONG_S)), now)
+    else:
+        label = str(draw.choice(["PREPARED", "RAM_VERIFIED", "PROVEN", "ROLLED_BACK"]))
+        world.at_label(f"after {label}", now, 1 + int(draw.integers(3)))
+
+
+ASIDE_MOMENTS = 240  # from the record of the rollback to the second RAM_VERIFIED, and some more
+
+
+def aside_moments() -> int:
+    """How many there are of `run_aside`."""
+    return (len(NAMES) + len(CLIENT_EVENTS)) * ASIDE_MOMENTS
+
+
+def run_aside(number: int, seed: int, tally: HistoriesTally) -> World:
+    """A client's save in a trial, and an event at one moment of what follows from it."""
+    acts = {**{name: act for name, (act, _) in EVENTS.items()}, **CLIENT_EVENTS}
+    after, event = divmod(number, len(acts))
+    name, draw = list(acts)[event], np.random.default_rng([seed, number, 3])
+    with folder() as at:
+        stream = STREAMS[number % 2]
+        world = make_world(at, draw, stream=stream, users=bool(draw.random() < 0.5))
+        world.clocks.wall_ahead_s = WALLS_S[number % len(WALLS_S)]
+
+        def begin() -> None:
+            where = len(world.moments) + after
+            world.at_moment(where, lambda: acts[name](world, draw))
+
+        world.at_label("after RAM_VERIFIED", lambda: world.later(0.7, lambda: world.say("VNWNV")))
+        world.at_label("before ROLLBACK", begin)
+        error = attempt(world, LONG_S)
+        judge(world, f"{name} {after} moments on, seed {seed}, number {number}", tally, error)
+        tally.events[name] += 1
     return world
 
 

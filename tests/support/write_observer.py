@@ -15,6 +15,9 @@ half_save          a save while the device does not hold all of the transaction'
                    samples to find, and that lasts two seconds in these histories
 foreign_replaced   a write over another program's value that the journal knows nothing of
 proven_not_held    PROVEN of values that the device, when asked, does not show
+unproven_saved     a save for a client (no FLASH_SENT announced it) of a value that came from the
+                   daemon and that no save of its own has made permanent; but for a unit that
+                   shows the old value in every reading and applies the new one
 false_confirmed    CONFIRMED although that unit did not restart with the values in its flash
 """
 
@@ -35,10 +38,11 @@ RACE_S = 1.5  # in which another program's write may slip between a look and an 
 HARD_GAUSS, SOFT, BIAS_RAD_S = 0.012, 0.03, 0.004
 KINDS = (
     "not_judged_here", "other_journal", "void_save", "foreign_save", "half_save",
-    "foreign_replaced", "proven_not_held", "false_confirmed",
+    "foreign_replaced", "proven_not_held", "unproven_saved", "false_confirmed",
 )  # fmt: skip
 _LINE = re.compile(r"\$VNWRG,0?(23|84),([^*]*)\*")
 _REGISTERS = (23, 84)
+_OF_NO_WRITE = ("LOCKED", "UNLOCKED", "CLIENT_SAVED", "CLIENT_WRITES")
 
 
 @dataclass
@@ -58,6 +62,8 @@ class Seen:
     prepared: dict[str, Any] | None = None
     prepared_s: float = -1e9
     sent_s: float = -1e9
+    announced: bool = False  # a save of the daemon's own, by its journal
+    kept: dict[int, set[str]] = field(default_factory=lambda: {23: set(), 84: set()})
     noted: int = 0
 
 
@@ -71,6 +77,7 @@ class Observer:
         self.counts: Counter[str] = Counter()
         self.newest_prepared: int | None = None
         self.begun_s = 0.0
+        self.clients_values: set[tuple[int, str]] = set()
         self.attached_s: dict[int, list[float]] = defaultdict(list)
 
     # -- what it is told ---------------------------------------------------------------------------
@@ -86,6 +93,11 @@ class Observer:
             while seen.noted < len(unit.log) and unit.log[seen.noted].at_s <= at_s:
                 seen.noted += 1
                 self._change(unit, seen, unit.log[seen.noted - 1])
+
+    def asked_by_client(self, body: str) -> None:
+        """A program on the owner's port sends this line; what it writes is its own."""
+        if match := _LINE.search(f"${body}*"):
+            self.clients_values.add((int(match[1]), stored(int(match[1]), match[2].split(","))))
 
     def announced(self, text: str, at_s: float) -> None:
         """A line of the daemon's log; candidates are named in it with the lines to send."""
@@ -111,6 +123,8 @@ class Observer:
             return
         unit = self.cable.units[serial]
         seen = self.seen(unit)
+        if kind not in _OF_NO_WRITE:
+            seen.announced = kind == "FLASH_SENT"
         if kind == "PREPARED":
             seen.prepared, self.newest_prepared = dict(facts), serial
             seen.prepared_s, seen.sent_s = at_s, -1e9
@@ -140,15 +154,22 @@ class Observer:
 
     def _change(self, unit: Unit, seen: Seen, change: Change) -> None:
         if change.what == "write" and change.register in _REGISTERS:
-            if change.who == "other":
+            who = change.who
+            if (change.register, change.asked) in self.clients_values:
+                who = "other"  # whoever it is: not the daemon
+                self.counts["client writes"] += 1
+            if who == "other":
                 seen.own[change.register].add(change.after)
             else:
                 self._written(unit, seen, change)
-            seen.author[change.register] = (change.who, change.at_s)
+            seen.author[change.register] = (who, change.at_s)
             seen.changed_s = change.at_s
         elif change.what == "save":
-            if change.who == "host":
+            if change.who == "host" and seen.announced:
                 self._saved(unit, seen, change)
+                seen.announced = False
+            elif change.who == "host":
+                self._saved_for_a_client(unit, seen, change)
             elif change.who == "other":  # whoever saves it makes it the user's
                 for number, text in zip(_REGISTERS, change.pair, strict=True):
                     seen.own[number].add(text)
@@ -184,6 +205,7 @@ class Observer:
         new = self._new(seen)
         for number in _REGISTERS:
             text = ram[number]
+            seen.kept[number].add(text)
             who, since_s = seen.author[number]
             theirs = who == "other" and seen.flash_author[number] != (who, since_s)
             theirs &= since_s > max(self._first_read_s(unit, number), self.begun_s + RACE_S)
@@ -195,6 +217,13 @@ class Observer:
             ours = who == "host" and text not in seen.own[number]
             if ours and self._shown_s(unit, number, text, at_s) >= GRACE_S:
                 self._wrong("void_save", at_s, f"unit {unit.serial} register {number}: {text}")
+
+    def _saved_for_a_client(self, unit: Unit, seen: Seen, change: Change) -> None:
+        self.counts["client saves"] += 1
+        for number, text in zip(_REGISTERS, change.pair, strict=True):
+            if not {text, unit.shown(number)} & (seen.own[number] | seen.kept[number]):
+                where = f"unit {unit.serial} register {number}: {text}"
+                self._wrong("unproven_saved", change.at_s, where)
 
     def _shown_s(self, unit: Unit, number: int, text: str, until_s: float) -> float:
         """For how long readings have shown that this value is wrong, since it was right last."""

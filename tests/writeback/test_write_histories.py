@@ -5,7 +5,7 @@ from __future__ import annotations
 import write_histories
 from scripted_world import fitted
 
-HISTORIES, REAL = 100, 1
+HISTORIES, CLIENTS, REAL = 100, 40, 1
 
 
 def test_random_histories_write_nothing_wrong():
@@ -17,6 +17,17 @@ def test_random_histories_write_nothing_wrong():
     assert tally.seen["writes"] > HISTORIES
     assert tally.seen["saves"] > HISTORIES / 10
     assert tally.seen["CONFIRMED"] > HISTORIES / 30
+
+
+def test_histories_with_a_driver_that_saves_and_writes_are_as_right():
+    tally = write_histories.HistoriesTally()
+    with fitted():
+        for number in range(CLIENTS):
+            write_histories.run_with_client(number, 1, tally)
+    assert tally.wrong == []
+    assert tally.seen["client saves"] > CLIENTS / 2
+    assert tally.seen["client writes"] > 0
+    assert tally.seen["CONFIRMED"] > 0
 
 
 def test_a_history_with_the_estimator_itself_writes_nothing_wrong():

@@ -65,9 +65,12 @@ class Story:
         self.prepare()
         self.write()
         self.record("PROVEN")
+        self.save()
+        self.record("FLASH_ACKED")
+
+    def save(self) -> None:
         self.record("FLASH_SENT")
         self.say("VNWNV")
-        self.record("FLASH_ACKED")
 
     @property
     def kinds(self) -> list[str]:
@@ -122,7 +125,7 @@ def test_a_save_of_what_the_iron_made_wrong_a_while_ago():
     story.write()
     story.unit.vehicle.move_iron(np.array([0.05, 0.0, 0.0]), story.now_s)
     story.now_s += 10.0
-    story.say("VNWNV")
+    story.save()
     assert story.kinds == ["void_save"]
 
 
@@ -132,7 +135,7 @@ def test_a_save_just_after_the_iron_changed_is_nobodys_fault():
     story.prepare()
     story.write()
     story.unit.vehicle.move_iron(np.array([0.05, 0.0, 0.0]), story.now_s - 0.1)
-    story.say("VNWNV")
+    story.save()
     assert story.kinds == []
 
 
@@ -148,10 +151,10 @@ def test_iron_that_leaves_the_fields_length_as_it_is_shows_in_no_reading_at_rest
     turned = np.cos(0.1) * field + np.sin(0.1) * across
     story.unit.vehicle.move_iron(turned - field, story.now_s)
     story.now_s += 10.0
-    story.say("VNWNV")
+    story.save()
     assert story.kinds == []
     story.unit.vehicle.motion = Motion()  # had it turned, it would have shown
-    story.say("VNWNV")
+    story.save()
     assert story.kinds == ["void_save"]
 
 
@@ -161,7 +164,7 @@ def test_a_save_of_half_and_of_somebodys_values():
     story.prepare()
     story.write({23: GOOD[23]})
     story.now_s += 5.0
-    story.say("VNWNV")
+    story.save()
     assert story.kinds == ["half_save"]
     for saved_by_them in (False, True):
         story = Story()
@@ -173,7 +176,7 @@ def test_a_save_of_half_and_of_somebodys_values():
         if saved_by_them:
             story.cable.other_master("VNWNV", story.now_s)
         story.now_s += 5.0
-        story.say("VNWNV")
+        story.save()
         assert sorted(story.kinds) == ["foreign_save"] * (not saved_by_them) + ["half_save"]
 
 
@@ -185,7 +188,7 @@ def test_what_was_there_before_anybody_listened_is_the_units_own():
     story.announce({23: GOOD[23]})
     story.prepare(values={23: GOOD[23]})
     story.write({23: GOOD[23]})
-    story.say("VNWNV")
+    story.save()
     assert story.kinds == []
 
 
@@ -198,6 +201,28 @@ def test_somebodys_values_are_not_replaced_unseen():
     story.now_s += 5.0
     story.write({23: GOOD[23]})
     assert story.kinds == ["foreign_replaced"]
+
+
+def test_a_save_that_no_record_announced_may_hold_nothing_of_the_daemons():
+    story = Story()
+    story.say("VNWNV")  # a client's, of what the unit had
+    assert story.kinds == []
+    story.announce()
+    story.prepare()
+    story.write({23: GOOD[23]})
+    story.say("VNWNV")
+    assert story.kinds == ["unproven_saved"]
+
+
+def test_what_a_client_wrote_and_saved_is_its_own():
+    story = Story()
+    story.observer.asked_by_client(f"VNWRG,23,{FOREIGN}")
+    story.write({23: FOREIGN})
+    story.say("VNWNV")
+    assert story.kinds == []
+    assert story.observer.counts["client writes"] == 1
+    story.write({23: GOOD[23]})  # over it, and no record knows of it
+    assert "foreign_replaced" in story.kinds
 
 
 def test_proven_without_both_values_in_the_device():

@@ -90,7 +90,10 @@ def test_only_an_approval_leads_into_a_transaction() -> None:
         for signal, target in row.items()
         if target is State.PREPARING
     }
-    assert into == {(State.QUALIFIED, Signal.APPROVED)}
+    assert into == {(State.QUALIFIED, Signal.APPROVED), (State.SET_ASIDE, Signal.GO_ON)}
+    # and what is set aside had one, for values that the device held and that were undone
+    aside = {s for s, row in TABLE.items() if State.SET_ASIDE in row.values()}
+    assert aside == {State.ROLLING_BACK}
 
 
 @pytest.mark.parametrize("state", [State.FAULT, State.FLASH_TORN, State.LOCKED])
