@@ -52,11 +52,8 @@ SHELL = (
     "ahrsd.telemetry.sd_notify",
     "ahrsd.telemetry.server",
     "ahrsd.viewer",
-    "drivers.port_holders",
     "drivers.serial_port",
-    "drivers.usb",
     "drivers.vn100.device",
-    "drivers.vn100.emulator.process",
     "drivers.vn100.emulator.pty",
 )
 
@@ -70,7 +67,8 @@ MOST_IMPORTS = 15  # other modules of the project that one module imports
 IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.core.core": 29,
     "ahrsd.daemon.service": 23,
-    "ahrsd.daemon.daemon": 18,
+    "ahrsd.recording.earlier_run": 16,
+    "ahrsd.daemon.daemon": 17,
     "ahrsd.writeback.machine": 18,
 }
 LONGEST_CHAIN = 21  # modules, each of which imports the next; the aim is 12

@@ -22,8 +22,7 @@ from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
 from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
 from ahrsd.recording.capture import CaptureStatus, CaptureWriter, Sent
 from drivers import serial_port
-from drivers.serial_port import SerialPort
-from drivers.usb import latency_timer_ms
+from drivers.serial_port import SerialPort, latency_timer_ms
 from drivers.vn100.deframer import Deframer, Sentence
 from drivers.vn100.device import Device
 

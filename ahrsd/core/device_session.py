@@ -43,7 +43,7 @@ from drivers.vn100.commands import (
     SessionError,
     Speech,
 )
-from drivers.vn100.decode import Measurement, Reply
+from drivers.vn100.decode import Measurement
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -59,6 +59,7 @@ from drivers.vn100.procedures import (
     resume,
 )
 from drivers.vn100.registers import Values, format_command, same
+from drivers.vn100.sentences import Reply
 from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
 ECHOES = (

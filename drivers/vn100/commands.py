@@ -12,7 +12,6 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from drivers.vn100.decode import Reply
 from drivers.vn100.errors import ERRORS, DriverError, Remedy
 from drivers.vn100.registers import (
     REGISTERS,
@@ -22,6 +21,7 @@ from drivers.vn100.registers import (
     parse,
     same,
 )
+from drivers.vn100.sentences import Reply
 
 WORDS: dict[str, tuple[tuple[int, ...], ...]] = {  # word: the arguments that it takes
     "VNWNV": ((),),

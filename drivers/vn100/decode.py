@@ -18,6 +18,7 @@ from drivers.vn100.sentences import (
     COMMAND_WORDS,
     MESSAGES,
     REGISTER_WORDS,
+    Reply,
     sentence_layout,
 )
 
@@ -38,15 +39,6 @@ class Measurement:
     layout: Layout
     values: tuple[float, ...]
     offset: int
-
-
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """The device's answer to a command: its word, the register if it has one, and the rest."""
-
-    word: str
-    register: int | None
-    tokens: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

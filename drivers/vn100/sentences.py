@@ -150,3 +150,12 @@ def encode_sentence(
     if status is not None:
         tokens.append(f"S{status:04X}")
     return encode(",".join(tokens), crc=check == "crc")
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The device's answer to a command: its word, the register if it has one, and the rest."""
+
+    word: str
+    register: int | None
+    tokens: tuple[str, ...]

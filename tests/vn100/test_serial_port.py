@@ -19,7 +19,6 @@ import psutil
 import pytest
 
 from drivers import serial_port
-from drivers.port_holders import holders
 from drivers.serial_port import (
     BaudNotFound,
     PortAbsent,
@@ -29,8 +28,9 @@ from drivers.serial_port import (
     PortUnusable,
     SerialPort,
     detect_baud,
+    holders,
+    latency_timer_ms,
 )
-from drivers.usb import latency_timer_ms
 
 YMR = (
     b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"
