@@ -67,7 +67,6 @@ MOST_IMPORTS = 15  # other modules of the project that one module imports
 IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.core.core": 29,
     "ahrsd.daemon.service": 23,
-    "ahrsd.recording.earlier_run": 16,
     "ahrsd.daemon.daemon": 17,
     "ahrsd.writeback.machine": 18,
 }

@@ -5,8 +5,7 @@
     samples ─▶ segments (every 4th held out; attitude by gyro and gravity, no compass)
                  ├─▶ heading    held-out error
                  ├─▶ coverage   attitudes shown
-                 ├─▶ refits     halves, second opinion
-                 ├─▶ stillness  gyro bias at rest
+                 ├─▶ second_opinions  refits of halves and of the field's size, gyro bias at rest
                  └─▶ comparison size, dip and drift of its field; against the calibration in force
 
 `EvidenceCollector` runs it all; `values` is what it finds, and what `ahrsd.gates` judges.

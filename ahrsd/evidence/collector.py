@@ -13,6 +13,7 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.evidence import comparison
 from ahrsd.evidence.coverage import coverage
 from ahrsd.evidence.heading import field_0, gyro_heading_rad, prove
+from ahrsd.evidence.second_opinions import rest
 from ahrsd.evidence.segments import (
     AttitudeTrack,
     HistoryParameters,
@@ -22,7 +23,6 @@ from ahrsd.evidence.segments import (
     nodes_at,
     track,
 )
-from ahrsd.evidence.stillness import rest
 from ahrsd.evidence.values import (
     NO_PROOF,
     UNKNOWN_FIELD,

@@ -8,9 +8,8 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.evidence.refits import gyro_fit, size_fit
+from ahrsd.evidence.second_opinions import Rest, gyro_fit, size_fit
 from ahrsd.evidence.segments import Nodes
-from ahrsd.evidence.stillness import Rest
 from ahrsd.evidence.values import (
     Bools,
     ChangeFacts,

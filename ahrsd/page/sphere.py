@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ahrsd.evidence.directions import CELLS, cells_of, centres
+from ahrsd.evidence.coverage import CELLS, cells_of, centres
 from ahrsd.evidence.values import Bools
 from ahrsd.samples import Array
 from ahrsd.telemetry.driving import Shown

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.evidence.directions import CELLS, centres
+from ahrsd.evidence.coverage import CELLS, centres
 from ahrsd.evidence.values import Bools
 from ahrsd.samples import Array
 

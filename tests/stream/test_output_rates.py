@@ -7,7 +7,12 @@ import pytest
 
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.stream.output_rates import RateWatch, offered_rate, rate_by_registers, rate_of_arrivals
+from ahrsd.stream.streams_without_time import (
+    RateWatch,
+    offered_rate,
+    rate_by_registers,
+    rate_of_arrivals,
+)
 from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.sentences import sentence_layout
