@@ -17,8 +17,8 @@ from ahrsd.cli.running_daemon import DaemonPlace, place_options
 from ahrsd.cli.watch_screen import Scroll, screen
 from ahrsd.counting import counted
 from ahrsd.printable import line
+from ahrsd.telemetry.driving import Pace
 from ahrsd.telemetry.lines import status_lines
-from ahrsd.telemetry.pace import Pace
 
 _EVENTS = 6  # lines of what happened
 

@@ -14,10 +14,9 @@ from rich.text import Text
 from ahrsd.counting import counted
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import line
-from ahrsd.telemetry.driving import drive_next, shown_of
+from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, drive_next, shown_of
 from ahrsd.telemetry.explain import explain_json, holding
 from ahrsd.telemetry.lines import heading_line, reading_lines, status_lines
-from ahrsd.telemetry.pace import LEVEL, TILTED, Pace, about
 
 Status = Mapping[str, Any]
 

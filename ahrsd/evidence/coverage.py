@@ -4,7 +4,8 @@ Directions are those of the field in the sensor's own frame, as cells of a spher
 rings of 10 degrees from the sensor's z axis, each ring into sectors of about 10 degrees of arc, so
 that all cells are about equally large. A vehicle that turns level shows one ring; where it tilts,
 it shows what lies beside that ring. Numbers of cells run ring by ring from +z, in a ring from +x to
-+y."""
++y.
+"""
 
 from __future__ import annotations
 

@@ -18,7 +18,8 @@ Rest, the plainest second opinion there is. What is contiguous is cut in bins of
 whatever segments it lies in. At rest the force is steady, the rate is small and steady, and the
 field stays where it is (a slow steady turn has the first two). No bias is assumed. Runs of three
 such bins and more count, between two more. The scatter of the bins gives the sigma of the mean; the
-Earth's rotation (0.07 mrad/s) and a bias that wanders are a floor under it."""
+Earth's rotation (0.07 mrad/s) and a bias that wanders are a floor under it.
+"""
 
 from __future__ import annotations
 

@@ -11,8 +11,7 @@ from typing import Any
 from ahrsd.page import sphere, view
 from ahrsd.page.feed import Heard
 from ahrsd.report.template import render
-from ahrsd.telemetry.driving import circle_is_wanted, shown_of, tilt_is_wanted
-from ahrsd.telemetry.pace import Pace
+from ahrsd.telemetry.driving import Pace, circle_is_wanted, shown_of, tilt_is_wanted
 
 TEMPLATES = Path(__file__).with_name("templates")
 #: sections in the order of the page; each is an element of this id

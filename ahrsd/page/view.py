@@ -13,6 +13,10 @@ from ahrsd.gates.table import GATES
 from ahrsd.printable import line
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.telemetry.driving import (
+    LEVEL,
+    TILTED,
+    Pace,
+    about,
     circle_is_wanted,
     drive_next,
     shown_of,
@@ -20,7 +24,6 @@ from ahrsd.telemetry.driving import (
 )
 from ahrsd.telemetry.explain import STATES, explain_json, holding
 from ahrsd.telemetry.lines import old_reading, turned_deg
-from ahrsd.telemetry.pace import LEVEL, TILTED, Pace, about
 
 Status = Mapping[str, Any]
 NONE = "–"

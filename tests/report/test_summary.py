@@ -24,7 +24,7 @@ from ahrsd.report.summary import (
     summary_lines,
     warnings_of,
 )
-from ahrsd.telemetry.pace import Pace
+from ahrsd.telemetry.driving import Pace
 from ahrsd.viewer.recorder import gate_table
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy

@@ -7,7 +7,7 @@ import numpy as np
 from ahrsd.calibration import Affine
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.telemetry.records import Newest, samples_record
+from ahrsd.telemetry.protocol import Newest, samples_record
 from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.sentences import MESSAGES

@@ -7,8 +7,8 @@ from shown_status import cells, level_ring, motion
 
 from ahrsd.cli.watch import event_line
 from ahrsd.cli.watch_screen import Scroll, countdown, screen
+from ahrsd.telemetry.driving import Pace
 from ahrsd.telemetry.lines import motion_line
-from ahrsd.telemetry.pace import Pace
 
 
 def gate(name, ok=False):
