@@ -42,8 +42,6 @@ SHELL = (
     "ahrsd.montecarlo.runs",
     "ahrsd.offline",
     "ahrsd.page.app",
-    "ahrsd.page.board",
-    "ahrsd.page.feed",
     "ahrsd.recording",
     "ahrsd.report",
     "ahrsd.telemetry.client",

@@ -59,8 +59,7 @@ def command(
         are = "is" if len(needed) == 1 else "are"
         raise AhrsdError(f"{' and '.join(needed)} {are} missing: pip install 'ahrsd[page]'")
     from ahrsd.daemon.operator_inbox import OperatorBox
-    from ahrsd.page.app import Site, make_app, serve
-    from ahrsd.page.feed import DaemonFeed
+    from ahrsd.page.app import DaemonFeed, Site, make_app, serve
 
     token = None if token_file is None else _token(token_file)
     box = OperatorBox(place.state)

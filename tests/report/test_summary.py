@@ -25,7 +25,7 @@ from ahrsd.report.summary import (
     warnings_of,
 )
 from ahrsd.telemetry.driving import Pace
-from ahrsd.viewer.recorder import gate_table
+from ahrsd.viewer.process import gate_table
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.emulator.scenarios import Setup, build
