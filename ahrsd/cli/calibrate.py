@@ -166,7 +166,7 @@ def _published(
 
 
 def _draw(path: Path, name: str, rows: list[ComparisonRow]) -> None:
-    from ahrsd.report.methods_figure import write_methods_figure
+    from ahrsd.report.accuracy_figures import write_methods_figure
 
     try:
         write_methods_figure(path, f"All methods on {name}", rows)

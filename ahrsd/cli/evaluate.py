@@ -91,7 +91,7 @@ def _into(
 
 
 def _draw(path: Path, found: Evaluation) -> None:
-    from ahrsd.report.evaluation_figure import write_evaluation_figure
+    from ahrsd.report.accuracy_figures import write_evaluation_figure
 
     try:
         write_evaluation_figure(path, found)

@@ -199,7 +199,7 @@ def _json(sets: list[tuple[Plan, list[SummaryRow]]], seed: int, runs: int) -> di
 
 
 def _draw(path: Path, sets: list[tuple[Plan, list[SummaryRow]]]) -> None:
-    from ahrsd.report.montecarlo_figure import write_montecarlo_figure
+    from ahrsd.report.accuracy_figures import write_montecarlo_figure
 
     try:
         write_montecarlo_figure(path, [(plan.name, rows) for plan, rows in sets])

@@ -45,7 +45,7 @@ from ahrsd.events import (
     StateChanged,
 )
 from ahrsd.gates import guards_a_write
-from ahrsd.report.run_time import RunTime
+from ahrsd.report.contents import RunTime
 from ahrsd.samples import Array
 from ahrsd.viewer import blueprint as names
 from ahrsd.viewer.blueprint import blueprint
