@@ -15,7 +15,7 @@ from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 
 if TYPE_CHECKING:
-    from ahrsd.baselines.comparison import ComparisonRow
+    from ahrsd.baselines.registry import ComparisonRow
     from ahrsd.offline.calibrate import BatchResult
     from ahrsd.recording.column_names import ColumnMap
 

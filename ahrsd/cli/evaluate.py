@@ -62,7 +62,7 @@ def command(
     refuse_unwritable(figure_path)
     if folder is not None:
         json_path, figure_path = _into(folder, json_path, figure_path)
-    from ahrsd.evaluation import text
+    from ahrsd.evaluation import judging
     from ahrsd.offline.evaluate import evaluate
 
     with byte_progress(recording) as progress:
@@ -71,13 +71,17 @@ def command(
     if json_path is not None:
         write_json(
             json_path,
-            text.comparison_json(found, without) if several else text.evaluation_json(found[0]),
+            judging.comparison_json(found, without)
+            if several
+            else judging.evaluation_json(found[0]),
         )
     if figure_path is not None:
         _draw(figure_path, found[0])
     if json_path != "-":
         lines = (
-            text.comparison_lines(found, without) if several else text.evaluation_lines(found[0])
+            judging.comparison_lines(found, without)
+            if several
+            else judging.evaluation_lines(found[0])
         )
         click.echo("\n".join(lines))
     raise SystemExit(EXIT_DONE if found[0].better else EXIT_NO)

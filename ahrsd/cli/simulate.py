@@ -98,7 +98,7 @@ class _Options:
 def _simulate_scenario(wanted: _Options) -> None:
     """Write a scenario's experiment, its effects in it, and its truth beside it."""
     from ahrsd.offline.simulate import with_effects, write_experiment
-    from ahrsd.simulation.tabular import truth_json
+    from ahrsd.simulation.scenarios import truth_json
 
     experiment, made_from = _experiment(wanted)
     truth: dict[str, object] = {}
@@ -113,8 +113,7 @@ def _simulate_scenario(wanted: _Options) -> None:
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
     """The scenario's experiment, and what makes the same one again."""
     from ahrsd.simulation import Iron, ScenarioSettings, simulate
-    from ahrsd.simulation.scenarios import Disturbances
-    from ahrsd.simulation.tabular import settings_json
+    from ahrsd.simulation.scenarios import Disturbances, settings_json
 
     if wanted.scenario is None:
         raise AhrsdError("name a scenario (wam, mam, lam, recorded), or give --model and --along")

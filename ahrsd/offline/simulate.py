@@ -16,7 +16,7 @@ from ahrsd.offline.diagnose import load_track
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.table import TABLE_SUFFIXES, is_table, write_table
 from ahrsd.samples import Array
-from ahrsd.simulation import Experiment, tabular
+from ahrsd.simulation import Experiment, scenarios
 
 STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
 
@@ -66,7 +66,7 @@ def write_experiment(path: Path, experiment: Experiment) -> None:
     """A table, or a byte stream of VNYMR sentences, as the name says.  AhrsdError otherwise."""
     further = experiment.samples.covariates
     if is_table(path):
-        write_columns(path, {**tabular.columns(experiment), **further})
+        write_columns(path, {**scenarios.columns(experiment), **further})
         return
     if not path.name.endswith(STREAM_SUFFIXES):
         known = ", ".join((*TABLE_SUFFIXES, *STREAM_SUFFIXES))
@@ -75,7 +75,7 @@ def write_experiment(path: Path, experiment: Experiment) -> None:
         raise AhrsdError(
             f"{path}: a byte stream has no place for {', '.join(further)}; write a table"
         )
-    content = b"".join(tabular.sentences(experiment))
+    content = b"".join(scenarios.sentences(experiment))
     try:
         path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
     except OSError as error:

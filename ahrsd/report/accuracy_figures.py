@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ahrsd.baselines.comparison import ComparisonRow
+from ahrsd.baselines.registry import ComparisonRow
 from ahrsd.evaluation.judging import Evaluation, HeadingJudged, Reckoned
 from ahrsd.montecarlo.summary import BOUNDED, SummaryRow
 from ahrsd.printable import drawn

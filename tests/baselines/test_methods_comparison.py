@@ -10,7 +10,7 @@ import pytest
 from simulation import HARD_IRON, UNIT_SOFT_IRON, blocks, simulate
 
 from ahrsd.baselines import calibrate_with
-from ahrsd.baselines.comparison import PIECES, ComparisonRow, halves, spread_of
+from ahrsd.baselines.registry import PIECES, ComparisonRow, halves, spread_of
 from ahrsd.report.accuracy_figures import write_methods_figure
 
 
