@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 
 from ahrsd.cli.device_access import PORT, describe, driver_errors, open_port, read_all
-from ahrsd.cli.output_files import refuse_unwritable, write_json
+from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.counting import counted
 from ahrsd.daemon import host_clock
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError

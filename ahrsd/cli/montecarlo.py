@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable, write_json
+from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.cli.progress import count_progress
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable, write_json
-from ahrsd.cli.recording_options import columns_option
+from ahrsd.cli.files import columns_option, refuse_unwritable, write_json
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, AhrsdError
 

@@ -21,7 +21,7 @@ from typing import TypeVar
 import click
 
 from ahrsd.cli.device_access import PORT, describe, open_device
-from ahrsd.cli.output_files import refuse_unwritable, write_text
+from ahrsd.cli.files import refuse_unwritable, write_text
 from ahrsd.cli.registers import locks
 from ahrsd.cli.registers.changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.cli.registers.sources import Sources, calibrated, find, journals, newest_in_force
