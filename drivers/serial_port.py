@@ -55,7 +55,10 @@ import serial
 from drivers.vn100.decode import decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.errors import NO_CHECKSUM, DriverError
-from drivers.vn100.sentences import Reply, encode
+from drivers.vn100.messages import Reply, encode
+
+# -- Who else has it open --------------------------------------------------------------------------
+
 
 _PTMX = os.makedev(5, 2)
 _PTY_SLAVE_MAJORS = range(136, 144)  # Linux, Documentation/admin-guide/devices.txt
@@ -156,6 +159,9 @@ def _command(process: Path) -> str:
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
+# -- Latency timer of a USB adapter ----------------------------------------------------------------
+
+
 SYSFS = Path("/sys")
 
 
@@ -170,6 +176,9 @@ def latency_timer_ms(path: str | Path, sysfs: Path = SYSFS) -> int | None:
 
 def _file(path: str | Path, sysfs: Path) -> Path:
     return sysfs / "class" / "tty" / Path(path).resolve().name / "device" / "latency_timer"
+
+
+# -- The port --------------------------------------------------------------------------------------
 
 
 READ_BYTES = 65536

@@ -52,6 +52,9 @@ from ahrsd.baselines.soft_iron import answer
 from ahrsd.estimator.chain import upper_triangle
 from ahrsd.samples import Array
 
+# -- Ellipsoid fit ---------------------------------------------------------------------------------
+
+
 _RANK = 1e-9  # smallest eigenvalue over the largest that still counts as not zero
 _MANY = "the readings fit many quadrics: turn about more axes"
 
@@ -116,6 +119,9 @@ def estimate_ellipsoid(data: MethodData, settings: MethodSettings) -> MethodFit:
     C = vectors @ np.diag(np.sqrt(values)) @ vectors.T
     A, _ = answer(upper_triangle(C), np.zeros(3))
     return MethodFit(A, middle - size * np.linalg.solve(Q, n), None, 1)
+
+
+# -- TWOSTEP ---------------------------------------------------------------------------------------
 
 
 _TWOSTEP_MAX_ITERATIONS = 200
@@ -219,6 +225,9 @@ def _fit(theta: Array, count: int) -> MethodFit:
     answer(upper_triangle(root), np.zeros(3))  # refuses what no sensor is
     A = np.asarray(np.linalg.inv(root), dtype=np.float64)
     return MethodFit(A, A @ np.asarray(np.linalg.solve(root, theta[:3])), None, count)
+
+
+# -- The norm-preserving methods -------------------------------------------------------------------
 
 
 ResidualOfCentre = Callable[[Array], tuple[Array, Array]]

@@ -13,6 +13,9 @@ from ahrsd import so3
 from ahrsd.counting import counted
 from ahrsd.samples import Array
 
+# -- What a method takes and gives -----------------------------------------------------------------
+
+
 Derivative = Literal["median", "savgol"]
 Constraint = Literal["trace", "fang"]
 
@@ -161,6 +164,9 @@ def corrected(raw_b_gauss: Array, soft_iron: Array | None, hard_iron_gauss: Arra
     if soft_iron is None:
         return centred
     return np.asarray(np.linalg.solve(soft_iron, centred.T).T, dtype=np.float64)
+
+
+# -- What none can use -----------------------------------------------------------------------------
 
 
 MINIMUM_SAMPLES = 20

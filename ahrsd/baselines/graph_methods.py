@@ -50,6 +50,9 @@ from ahrsd.baselines.soft_iron import answer, cholesky, positive, rescaled, tria
 from ahrsd.estimator.chain import symmetric, symmetric_columns, upper_triangle
 from ahrsd.samples import Array
 
+# -- The kinematic residual ------------------------------------------------------------------------
+
+
 MINIMUM_WINDOWS = 12  # three equations each, twelve unknowns, and something left to judge by
 
 
@@ -179,6 +182,9 @@ class Model:
 
 
 _COUNTED = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])  # how often each term stands in the matrix
+
+
+# -- Factor graphs on GTSAM ------------------------------------------------------------------------
 
 
 Residual = Callable[[Array], tuple[Array, Array]]
@@ -522,6 +528,9 @@ def estimate_magyc_ifg(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A, b and w_b.  MethodError as `incremental`."""
     threshold = GTSAM_THRESHOLD if settings.relinearize is None else settings.relinearize
     return incremental(cholesky_model(), windowed(data, settings), settings, threshold)
+
+
+# -- MagFactor3 ------------------------------------------------------------------------------------
 
 
 MAGFACTOR3_NODES = (1, 3)

@@ -27,6 +27,9 @@ from ahrsd.baselines.data import (
 )
 from ahrsd.samples import Array, SampleBlock
 
+# -- Methods beside each other ---------------------------------------------------------------------
+
+
 PIECES = 10
 Halves = tuple[list[SampleBlock], list[SampleBlock]]
 
@@ -91,6 +94,9 @@ def spread_of(
         size = np.linalg.norm(corrected(raw, soft_iron, hard_iron), axis=1)
         sizes.append(size / size.mean())
     return float(np.std(np.concatenate(sizes)))
+
+
+# -- The methods -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,9 @@ import click
 
 from ahrsd.errors import AhrsdError
 
+# -- Recordings that it reads ----------------------------------------------------------------------
+
+
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
@@ -38,6 +41,9 @@ def columns_option(command: _Command) -> _Command:
         help="Names and units of a foreign table: mag_x=MagX:uT,gyro_x=GyrX:deg/s,time=t:ms; a "
         "minus before COLUMN turns its sign (docs/guide/recordings.md).",
     )(command)
+
+
+# -- Files that it writes --------------------------------------------------------------------------
 
 
 def refuse_unwritable(target: str | Path | None) -> None:

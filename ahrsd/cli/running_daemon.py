@@ -1,6 +1,6 @@
 """Commands that talk with the running daemon, and how it is found: `ahrsd status`, `explain`,
-`operator`, `bundle`. `watch` is in a module of its own, for what it draws with. Also where a command
-that serves listens: the address that was given, and how it stands in a URL.
+`operator`, `bundle`. `watch` is in a module of its own, for what it draws with. Also where a
+command that serves listens: the address that was given, and how it stands in a URL.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, AhrsdError, DeviceError
 from ahrsd.printable import line
 from ahrsd.telemetry.client import DaemonConnection, find_socket
 
+# -- Where a command listens -----------------------------------------------------------------------
+
+
 IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
@@ -37,6 +40,9 @@ def ip_address(text: str) -> IpAddress:
 def in_url(address: IpAddress, port: int) -> str:
     """`127.0.0.1:9191`, `[::1]:9191`."""
     return f"[{address}]:{port}" if address.version == 6 else f"{address}:{port}"
+
+
+# -- The running daemon ----------------------------------------------------------------------------
 
 
 _PLACE = click.Path(path_type=Path)

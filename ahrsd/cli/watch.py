@@ -34,6 +34,9 @@ from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, drive_next, show
 from ahrsd.telemetry.explain import explain_json, holding
 from ahrsd.telemetry.lines import heading_line, reading_lines, status_lines
 
+# -- Keys of a terminal ----------------------------------------------------------------------------
+
+
 _NAMES = {
     "\x1b[A": "up",
     "\x1b[B": "down",
@@ -76,6 +79,9 @@ def _read(terminal: int, pressed: Callable[[str], None], ended: threading.Event)
             return
         for key in [_NAMES[text]] if text in _NAMES else text:
             pressed(key)
+
+
+# -- The screen ------------------------------------------------------------------------------------
 
 
 Status = Mapping[str, Any]
@@ -179,6 +185,9 @@ class Scroll:
         for one in lines[self.top : self.top + rows]:
             shown += [*one, Segment.line()]
         return Segments([*shown, Segment(text)])
+
+
+# -- The command -----------------------------------------------------------------------------------
 
 
 _EVENTS = 6  # lines of what happened

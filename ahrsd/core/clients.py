@@ -18,8 +18,8 @@ from ahrsd.sharing.client_commands import UNAUTHORIZED, Kind, Refusal, SharePoli
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
 from drivers.vn100.commands import NoReply, Speech, Write
+from drivers.vn100.messages import Reply
 from drivers.vn100.registers import Values
-from drivers.vn100.sentences import Reply
 
 _UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"
 

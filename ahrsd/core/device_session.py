@@ -44,6 +44,7 @@ from drivers.vn100.commands import (
     Speech,
 )
 from drivers.vn100.decode import Measurement
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,
@@ -59,7 +60,6 @@ from drivers.vn100.procedures import (
     resume,
 )
 from drivers.vn100.registers import Values, format_command, same
-from drivers.vn100.sentences import Reply
 from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
 ECHOES = (

@@ -36,6 +36,9 @@ from ahrsd.samples import Array, SampleBlock
 # % at 4 rad/s and 25 ms.
 
 
+# -- From samples to epochs ------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
     """N consecutive steps; the rotation of row k leads from step k-1 to step k.
@@ -472,6 +475,9 @@ def with_border(data: chain.EpochData, before: chain.EpochData) -> chain.EpochDa
 # A field that changes while the sensor rests (a lift, a magnet, drift) would be taken for a strange
 # calibration. So both sensors must have seen a rotation. How much of a steady rate is the gyro's
 # bias is not known well: where the field swept far, any turn that the gyro saw will do.
+
+# -- Before they are linearised --------------------------------------------------------------------
+
 
 _SWEPT = 0.10  # spread of the field over its size: a turn, if the gyro saw any
 _SEEN = 0.3  # spread of the integrated rate, less the bias as known, over that: it saw any

@@ -35,6 +35,9 @@ from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.estimator.window import Window, search
 from ahrsd.samples import Array, SampleBlock
 
+# -- What an estimate is worth ---------------------------------------------------------------------
+
+
 _NAMES = (
     *(f"soft iron {i}" for i in ("xx", "xy", "xz", "yy", "yz", "zz")),
     *(f"hard iron {i}" for i in "xyz"),
@@ -164,6 +167,9 @@ def _blind_names(vectors: Array) -> tuple[str, ...]:
         names.append(" + ".join(_NAMES[i] for i in [lead, *others[:2]]))
         P = P - np.outer(v, v)
     return tuple(names)
+
+
+# -- The estimator ---------------------------------------------------------------------------------
 
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more

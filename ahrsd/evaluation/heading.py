@@ -18,6 +18,9 @@ from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.samples import Array
 
+# -- References ------------------------------------------------------------------------------------
+
+
 _EARTH_M = 6_371_000.0
 _UNBROKEN = 1.6  # times the usual distance of fixes; more is a gap that is not bridged
 _LEAST_FIXES = 10
@@ -177,6 +180,9 @@ def column(track: EvaluationTrack, name: str) -> HeadingReference:
     return HeadingReference(
         f"column {name}", not device, track.time_s[known], values[known], detail=detail
     )
+
+
+# -- Errors against a reference --------------------------------------------------------------------
 
 
 FOLDS = 5

@@ -37,6 +37,9 @@ from ahrsd.world_field import WorldField
 # is not known the mean of |h| stands for |H|, and the error is then about that.
 
 
+# -- Figures ---------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFigures:
     """Of one calibration. constraint_*: of |h| - |H|, |H| the mean of |h| unless it was given."""
@@ -245,6 +248,9 @@ def _with_caveats(found: Evaluation) -> Evaluation:
 def _stem(name: str) -> str:
     """A recording's name without what says how it is stored."""
     return name.split(".", 1)[0]
+
+
+# -- As JSON and as lines --------------------------------------------------------------------------
 
 
 SCHEMA = "ahrsd.evaluation/1"

@@ -18,6 +18,9 @@ from ahrsd.evidence.segments import Nodes
 from ahrsd.evidence.values import SECTOR_DEG, SECTORS, Bools, Coverage, Regime
 from ahrsd.samples import Array
 
+# -- Directions ------------------------------------------------------------------------------------
+
+
 CELL_DEG = 10.0
 _RINGS = round(180.0 / CELL_DEG)
 _MIDDLE_RAD = np.radians((np.arange(_RINGS) + 0.5) * CELL_DEG)
@@ -53,6 +56,9 @@ def centres() -> Array:
     return np.column_stack(
         [level * np.cos(angle), level * np.sin(angle), np.cos(_MIDDLE_RAD)[ring]]
     )
+
+
+# -- Attitudes -------------------------------------------------------------------------------------
 
 
 PLANAR_DEG = 5.0

@@ -33,6 +33,9 @@ from ahrsd.calibration import Affine
 from ahrsd.evidence.segments import Nodes, Segment
 from ahrsd.samples import Array
 
+# -- Two fits --------------------------------------------------------------------------------------
+
+
 _PRIOR_MATRIX = 0.3
 _PRIOR_GAUSS = 0.5
 _DRIFT_RAD = 2e-3  # error of the gyro's attitude within a segment: 0.1 mrad/s for half a minute
@@ -165,6 +168,9 @@ def _calibration(C: Array, c: Array, present: Affine) -> Affine | None:
         return None
     scale = np.cbrt(np.linalg.det(present.matrix) / np.linalg.det(C))
     return Affine(scale * C, np.asarray(np.linalg.solve(C, c), dtype=float))
+
+
+# -- Rest ------------------------------------------------------------------------------------------
 
 
 STILL_GYRO_RAD_S = 0.01

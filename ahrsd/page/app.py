@@ -47,6 +47,9 @@ from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.driving import Pace, circle_is_wanted, shown_of, tilt_is_wanted
 from ahrsd.telemetry.protocol import STATUS_SCHEMA
 
+# -- The newest status -----------------------------------------------------------------------------
+
+
 _AGAIN_S = 1.0
 _STALE_S = 3.5  # a status comes every second
 
@@ -111,6 +114,9 @@ class DaemonFeed:
         if status.get("schema") != STATUS_SCHEMA:
             raise ValueError(f"the daemon tells {status.get('schema')}, not {STATUS_SCHEMA}")
         self.heard = Heard(status, time.monotonic())
+
+
+# -- Sections as HTML ------------------------------------------------------------------------------
 
 
 TEMPLATES = Path(__file__).with_name("templates")
@@ -200,6 +206,9 @@ def _field(status: Mapping[str, Any]) -> list[float | None]:
         return [None] * 3
     new: list[float | None] = seen["would_be_b_gauss"]
     return seen["corrected_b_gauss"] if None in new else new
+
+
+# -- The application -------------------------------------------------------------------------------
 
 
 MOST_BROWSERS = 32

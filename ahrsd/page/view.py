@@ -36,6 +36,9 @@ from ahrsd.telemetry.driving import (
 from ahrsd.telemetry.explain import STATES, explain_json, holding
 from ahrsd.telemetry.lines import old_reading, turned_deg
 
+# -- Words and numbers -----------------------------------------------------------------------------
+
+
 Status = Mapping[str, Any]
 NONE = "–"
 _ALARMING = frozenset({"FAULT", "FLASH_TORN", "LOCKED"})
@@ -362,6 +365,9 @@ def _axes(
 def _size(vector: Sequence[float | None]) -> float | None:
     known = [value for value in vector if value is not None]
     return math.hypot(*known) if len(known) == len(vector) else None
+
+
+# -- The sphere ------------------------------------------------------------------------------------
 
 
 WIDTH, HEIGHT = 360, 196

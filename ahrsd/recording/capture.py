@@ -68,6 +68,9 @@ from ahrsd.samples import SampleBlock
 from ahrsd.writeback.journal_history import StoredRecord
 from ahrsd.writeback.reconcile import RecordKind
 
+# -- Inputs as JSON --------------------------------------------------------------------------------
+
+
 _TYPES = {
     kind.__name__: kind
     for kind in (
@@ -225,6 +228,9 @@ def _is(value: object, hint: object) -> bool:
         whole = isinstance(value, int) and not isinstance(value, bool) and -_MOST < value < _MOST
         return whole or (hint is float and isinstance(value, float))
     return hint is object or not isinstance(hint, type) or isinstance(value, hint)
+
+
+# -- The file --------------------------------------------------------------------------------------
 
 
 SCHEMA = "ahrsd.capture/1"

@@ -21,6 +21,9 @@ from ahrsd.montecarlo.summary import BOUNDED, SummaryRow
 from ahrsd.printable import drawn
 from ahrsd.report.figures import AFTER, BEFORE, GREY, MAX_POINTS, SERIES, TRUTH, save_png
 
+# -- An evaluation ---------------------------------------------------------------------------------
+
+
 _EVALUATION_PANEL_PX, _EVALUATION_ROW_PX = 560, 360
 
 
@@ -111,6 +114,9 @@ def _thin(count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.unique(np.linspace(0, count - 1, min(count, 2 * MAX_POINTS)).astype(np.int64))
 
 
+# -- All methods -----------------------------------------------------------------------------------
+
+
 _METHODS_WIDTH_PX, _METHODS_ROW_PX = 1500, 52
 _AXES = "xyz"
 _WORDS = 150
@@ -180,6 +186,9 @@ def _reach(lengths: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
     if not lengths.size:
         return 1.0
     return float(min(np.max(lengths), _WORST_SHOWN * np.median(lengths))) or 1.0
+
+
+# -- A Monte Carlo ---------------------------------------------------------------------------------
 
 
 _TITLES = {

@@ -27,6 +27,9 @@ from ahrsd.events import (
 )
 from ahrsd.samples import Array
 
+# -- Time of a run ---------------------------------------------------------------------------------
+
+
 _LATE_S = 60.0  # an estimate is not told later than this; what is older is from after a restart
 _PAUSE_S = 1.0  # between the last sample before a restart and the first one behind it
 
@@ -69,6 +72,9 @@ class RunTime:
     def newest_s(self) -> float:
         """Of the newest sample; nan before the first."""
         return float(self._newest_s + self._offset_s) if np.isfinite(self._newest_s) else np.nan
+
+
+# -- Contents --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,9 @@ from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_a
 from ahrsd.report.template import Picture, number, picture, render
 from ahrsd.samples import Array
 
+# -- Pictures --------------------------------------------------------------------------------------
+
+
 _BINS = 300  # of time
 _REGIMES = 10  # quantities in the map
 _AXES = "xyz"
@@ -232,6 +235,9 @@ def _power(time_s: Array, values: Array) -> tuple[Array, Array]:
 def _log_log(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
+
+
+# -- The page --------------------------------------------------------------------------------------
 
 
 _MG = 1e3

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ahrsd import so3
 from ahrsd.samples import Array
 from ahrsd.simulation.experiment import Experiment, Iron, Truth, measured
-from drivers.vn100.sentences import encode_sentence
+from drivers.vn100.messages import encode_sentence
 
 # -- How the sensor turns --------------------------------------------------------------------------
 #
@@ -278,6 +278,9 @@ def simulate_recorded(
         (noise_mag_gauss, noise_gyro_rad_s),
         (generator(seed, 1), generator(seed, 2)),
     )
+
+
+# -- As a recording --------------------------------------------------------------------------------
 
 
 def columns(experiment: Experiment) -> dict[str, Array]:

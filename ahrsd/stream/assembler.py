@@ -41,9 +41,9 @@ from ahrsd.stream.streams_without_time import (
     rate_by_registers,
     rate_of_arrivals,
 )
-from drivers.vn100.binary import BinaryLayout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
+from drivers.vn100.messages import BinaryLayout
 
 
 @dataclass(slots=True)

@@ -29,12 +29,13 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.samples import Array
-from drivers.vn100.binary import BinaryLayout, binary_layout
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.fields import Layout
+from drivers.vn100.messages import MESSAGES, BinaryLayout, Layout, binary_layout
 from drivers.vn100.registers import ASYNC_OUTPUT_RATES_HZ, BINARY_OUTPUTS, SAMPLE_RATE_HZ
-from drivers.vn100.sentences import MESSAGES
+
+# -- Rates by registers and arrivals ---------------------------------------------------------------
+
 
 RegisterValues = Mapping[int, tuple[float | int | str, ...]]
 
@@ -144,6 +145,9 @@ class RateWatch:
         mean_hz = sum(self._differing) / _WINDOWS
         self._differing.clear()
         return mean_hz
+
+
+# -- Time from the attitude ------------------------------------------------------------------------
 
 
 _SOURCE = "from the device's attitude against its rate"

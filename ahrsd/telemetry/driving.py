@@ -20,6 +20,9 @@ from ahrsd.evidence.segments import HistoryParameters
 from ahrsd.evidence.values import Bools
 from ahrsd.samples import Array
 
+# -- Which way to turn -----------------------------------------------------------------------------
+
+
 REACH_DEG = 30.0  # how far a vehicle is asked to lean over
 _LEVEL_DEG = 7.5  # half width of the ring of a level circle
 _CIRCLE_DEG = 360.0
@@ -157,6 +160,9 @@ def _level_frame(down_b: Array) -> Array:
 def _share(seen: Bools, of: Bools) -> float:
     total = int(np.count_nonzero(of))
     return int(np.count_nonzero(seen & of)) / total if total else 0.0
+
+
+# -- How long it takes -----------------------------------------------------------------------------
 
 
 _WINDOW_S = 150.0  # the present: a verdict comes every few seconds, a segment lasts 30

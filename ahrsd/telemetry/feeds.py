@@ -33,6 +33,9 @@ from ahrsd.writeback.composition import GYRO, MAG, Proposal, correction, heading
 from ahrsd.writeback.states import State
 from drivers.vn100.registers import Values
 
+# -- By which calibration --------------------------------------------------------------------------
+
+
 REGISTERS, QUALIFIED = "registers", "qualified"
 _COMPENSATING = (23, 25, 26, 84)
 _AGAINST = frozenset({State.ROLLED_BACK, State.LOCKED, State.FAULT, State.FLASH_TORN})
@@ -161,6 +164,9 @@ def _affine(values: Values) -> Affine:
     return Affine.from_register(tuple(float(value) for value in values))
 
 
+# -- Records of send = "corrected" -----------------------------------------------------------------
+
+
 SCHEMA: Final = "ahrsd.corrected/1"
 ALARMS: Final = ("FAULT", "FLASH_TORN", "LOCKED")  # states of the write-back that need a person
 _DIGITS = 7
@@ -245,6 +251,9 @@ def alarms(status: Mapping[str, Any]) -> list[str]:
     if trouble := estimator_trouble(status):
         found.append(f"estimator {trouble}")
     return [text for text in found if text]
+
+
+# -- The feed of a share ---------------------------------------------------------------------------
 
 
 _NMEA_S = 0.1  # a heading so often

@@ -27,6 +27,9 @@ from ahrsd import events
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
 
+# -- Lines -----------------------------------------------------------------------------------------
+
+
 SCHEMA: Final = "ahrsd.socket/1"
 STATUS_SCHEMA: Final = "ahrsd.status/1"
 STREAMS: Final = ("status", "events", "samples")
@@ -85,6 +88,9 @@ def plain(value: object) -> object:
     if isinstance(value, Sequence):
         return [plain(one) for one in value]
     raise TypeError(f"{type(value).__name__} does not go into JSON")
+
+
+# -- Records of events -----------------------------------------------------------------------------
 
 
 Record = dict[str, object]
@@ -176,6 +182,9 @@ class Newest:
 
 def _at(kind: str, at_s: float, host_s: float) -> Record:
     return {"record": kind, "at_s": at_s, "host_s": host_s}
+
+
+# -- What waits for a client -----------------------------------------------------------------------
 
 
 LIMIT_BYTES = 1 << 20

@@ -16,6 +16,8 @@ from ahrsd.samples import Array
 from ahrsd.sharing.share_facts import ShareFacts
 from ahrsd.telemetry.protocol import STATUS_SCHEMA
 
+# -- Readings of now -------------------------------------------------------------------------------
+
 
 def readings(seen: SamplesSeen, now_s: float) -> dict[str, object]:
     """Means over the newest block of samples; `now_s` is the host's monotonic clock.
@@ -49,6 +51,9 @@ def readings(seen: SamplesSeen, now_s: float) -> dict[str, object]:
 def _heading_deg(field_b: Array, force_b: Array) -> float:
     heading_rad = tilt_compensated_heading(field_b[None, :], force_b[None, :])
     return float(np.degrees(heading_rad[0]) % 360.0)
+
+
+# -- The status ------------------------------------------------------------------------------------
 
 
 _RATE_S = 1.0  # rates are means over at least so long

@@ -42,6 +42,9 @@ from ahrsd.counting import counted
 from ahrsd.errors import EXIT_BUSY, DeviceError
 from ahrsd.samples import Array
 
+# -- Topics ----------------------------------------------------------------------------------------
+
+
 FRAME: Final = "body"
 RAW, CORRECTED, RATE = "/magnetometer/raw", "/magnetometer/corrected", "/angular_rate"
 CLOUDS: Final = {RAW: "/field/raw", CORRECTED: "/field/corrected"}
@@ -196,6 +199,9 @@ def _vector(values: Iterable[float | None]) -> dict[str, float | None]:
 
 def _number(value: object, otherwise: float) -> float:
     return float(value) if isinstance(value, int | float) else otherwise
+
+
+# -- The server ------------------------------------------------------------------------------------
 
 
 _LEVELS = {

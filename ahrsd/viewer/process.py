@@ -51,6 +51,9 @@ from ahrsd.viewer import blueprint as names
 from ahrsd.viewer.blueprint import blueprint
 from ahrsd.viewer.sink import BATCH_ROWS, HEADER, REMEMBERED, Item, ProcessSettings
 
+# -- Which event becomes which entity --------------------------------------------------------------
+
+
 Indices = NDArray[np.signedinteger]
 
 APPLICATION = "ahrsd"
@@ -387,6 +390,9 @@ def record(events: Iterable[Event], path: Path) -> None:
     except RuntimeError as error:
         raise OSError(f"{path}: {error}") from error
     stream.disconnect()
+
+
+# -- The process -----------------------------------------------------------------------------------
 
 
 READ_BYTES = 1 << 18

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from drivers.vn100.errors import ERRORS, DriverError, Remedy
+from drivers.vn100.messages import Reply
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,
@@ -21,7 +22,6 @@ from drivers.vn100.registers import (
     parse,
     same,
 )
-from drivers.vn100.sentences import Reply
 
 WORDS: dict[str, tuple[tuple[int, ...], ...]] = {  # word: the arguments that it takes
     "VNWNV": ((),),

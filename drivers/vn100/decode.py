@@ -13,11 +13,11 @@ from operator import truediv
 
 from drivers.vn100.deframer import Packet, Sentence
 from drivers.vn100.errors import code_of
-from drivers.vn100.fields import Layout
-from drivers.vn100.sentences import (
+from drivers.vn100.messages import (
     COMMAND_WORDS,
     MESSAGES,
     REGISTER_WORDS,
+    Layout,
     Reply,
     sentence_layout,
 )

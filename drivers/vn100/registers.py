@@ -15,7 +15,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from drivers.vn100.binary import SYNC, packet_size
+from drivers.vn100.messages import SYNC, packet_size
 from drivers.vn100.register_codec import (
     OUT_OF_RANGE,
     TOO_FEW,
@@ -31,6 +31,29 @@ from drivers.vn100.register_codec import (
     reply_text,
     same_values,
 )
+
+__all__ = [
+    "ASYNC_OUTPUT_RATES_HZ",
+    "BINARY_OUTPUTS",
+    "BINARY_OUTPUT_OFF",
+    "COMPENSATING",
+    "REGISTERS",
+    "SAMPLE_RATE_HZ",
+    "SUPPORTED_BAUD",
+    "Register",
+    "RegisterField",
+    "RegisterValueError",
+    "Values",
+    "as_stored",
+    "check",
+    "format_command",
+    "format_reply",
+    "parse",
+    "same",
+]
+
+# -- Words that the rows are written in ------------------------------------------------------------
+
 
 ANGLE, QUATERNION = "%+08.3f", "%+09.6f"
 MAG, ACCEL, GYRO = "%+08.4f", "%+07.3f", "%+010.6f"
@@ -107,6 +130,9 @@ def opaque(
         keep_off=why,
         unconfirmed="fields and values",
     )
+
+
+# -- Rows of the system module and of the measurements ---------------------------------------------
 
 
 SAMPLE_RATE_HZ = 800  # what the rate divisor of registers 75 to 77 divides
@@ -362,25 +388,8 @@ MEASUREMENT_ROWS = (
 )
 
 
-__all__ = [
-    "ASYNC_OUTPUT_RATES_HZ",
-    "BINARY_OUTPUTS",
-    "BINARY_OUTPUT_OFF",
-    "COMPENSATING",
-    "REGISTERS",
-    "SAMPLE_RATE_HZ",
-    "SUPPORTED_BAUD",
-    "Register",
-    "RegisterField",
-    "RegisterValueError",
-    "Values",
-    "as_stored",
-    "check",
-    "format_command",
-    "format_reply",
-    "parse",
-    "same",
-]
+# -- The other rows, and the map -------------------------------------------------------------------
+
 
 ORTHONORMAL_WITHIN = 1e-5  # register 26: what the device still accepts
 

@@ -58,7 +58,10 @@ from drivers.vn100.commands import (
 from drivers.vn100.decode import ErrorReply, Measurement, Undecodable, Unused, decode
 from drivers.vn100.deframer import Deframer, Frame, Sentence
 from drivers.vn100.errors import DeviceRefused, DriverError
-from drivers.vn100.sentences import Reply, encode
+from drivers.vn100.messages import Reply, encode
+
+# -- Echoes ----------------------------------------------------------------------------------------
+
 
 _MOST_WAITING = 16  # commands whose echo may be under way
 # A read whose answer has values; that of an empty user tag has none, and one with a port parameter
@@ -92,6 +95,9 @@ class Echo:
         """The link is gone; the next one may be another adapter."""
         self.echoes = False
         self._waiting.clear()
+
+
+# -- The session -----------------------------------------------------------------------------------
 
 
 GHOST_LIFE_S = 5.0

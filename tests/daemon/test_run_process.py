@@ -25,7 +25,7 @@ from drivers_at_start import ROS2_DAWONN, SDK
 from ahrsd.config.loading import Config
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import encode
 
 ANSWER = re.compile(rb"\$(VN(?:RRG|WRG|ERR|ASY|WNV|RST)[^*\r]*)\*..\r\n")
 READ = rb"\$VNRRG,\d+(,\d)?\*[0-9A-F]{2}"

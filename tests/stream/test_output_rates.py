@@ -13,9 +13,8 @@ from ahrsd.stream.streams_without_time import (
     rate_by_registers,
     rate_of_arrivals,
 )
-from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement
-from drivers.vn100.sentences import sentence_layout
+from drivers.vn100.messages import binary_layout, sentence_layout
 
 AUTOPILOT = binary_layout(0x14, (0x073E, 0x0004))
 OTHER = binary_layout(0x01, (0x0538,))

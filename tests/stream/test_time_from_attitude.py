@@ -16,11 +16,10 @@ from ahrsd.stream.streams_without_time import (
     rate_from_attitude,
     rate_of,
 )
-from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.sentences import MESSAGES
+from drivers.vn100.messages import MESSAGES, binary_layout
 
 FOLDER = Path(__file__).parents[2] / "fixtures" / "replays"
 

@@ -21,8 +21,8 @@ from drivers.vn100.commands import (
 )
 from drivers.vn100.decode import Measurement
 from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import quiet, read, save_settings, write_verified
-from drivers.vn100.sentences import Reply
 from drivers.vn100.session import DeviceFault, ProcedureFinished, Session, Stray
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

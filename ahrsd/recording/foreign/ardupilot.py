@@ -37,6 +37,9 @@ from ahrsd.recording.foreign.sensors import (
 from ahrsd.recording.limits import TABLE_CELLS, refuse_beyond
 from ahrsd.samples import Array
 
+# -- The file (DataFlash) --------------------------------------------------------------------------
+
+
 _HEADER = b"\xa3\x95"
 _FMT, _FMT_BYTES = 128, 89
 _CODES: dict[str, str] = {
@@ -162,6 +165,9 @@ def refuse_empty(path: Path, log: Log) -> None:
         raise RecordingError(
             path, "is an ArduPilot log without a measurement", "arm, or set LOG_DISARMED, and log"
         )
+
+
+# -- Its sensors -----------------------------------------------------------------------------------
 
 
 _MAGS = ("MAG", "MAG2", "MAG3")

@@ -44,6 +44,9 @@ from drivers.vn100.emulator.physics import (
     SensorBlock,
 )
 
+# -- Real-time hard and soft iron ------------------------------------------------------------------
+
+
 FADING_S = {1: 90.0, 2: 70.0, 3: 50.0, 4: 30.0, 5: 18.0}  # by ConvergeRate
 SAMPLE_TICKS = 40  # one sample in so many ticks is used
 _PULL = 1e-4  # of the weight of the data
@@ -107,6 +110,9 @@ class OnBoardHsi:
         root = (axes * np.sqrt(eigenvalues)) @ axes.T
         self.matrix = np.asarray(root / np.linalg.det(root) ** (1 / 3))
         self.offset = -np.linalg.solve(Q, found[6:]) * _UNIT_GAUSS
+
+
+# -- The chain -------------------------------------------------------------------------------------
 
 
 LARGEST = 1e9  # whatever a host writes into a matrix: every value still fits an f32

@@ -39,9 +39,11 @@ from drivers.vn100.emulator.motion import Motion
 from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, EmulatedWorld, Further
 from drivers.vn100.emulator.sensor import Sensor
 from drivers.vn100.emulator.streams import OutputStream, Transmitter, streams
+from drivers.vn100.messages import encode
 from drivers.vn100.register_codec import RegisterValueError, Values
 from drivers.vn100.registers import REGISTERS, format_reply
-from drivers.vn100.sentences import encode
+
+# -- What happens to it once -----------------------------------------------------------------------
 
 
 class EventTarget(Protocol):
@@ -192,6 +194,9 @@ def nudged(memory: Memory, register: int) -> Values:
     if row is None or row.access == "R" or not values or row.fields[-1].kind != "f32":
         raise ValueError(f"nobody else writes register {register}; try 23, 25, 84 or 44")
     return memory.stored(register, (*values[:-1], float(values[-1]) + 0.01))
+
+
+# -- The device ------------------------------------------------------------------------------------
 
 
 BOOT_S = 0.5

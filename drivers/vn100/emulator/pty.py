@@ -320,6 +320,9 @@ class PtyEmulator:
         self._backlog = waiting  # no reader sees it longer than it may be
 
 
+# -- In a process of its own -----------------------------------------------------------------------
+
+
 START_S = 30.0
 OFF_S = 1.0  # device time without power in a `power_cycle`
 

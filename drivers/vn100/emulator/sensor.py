@@ -19,8 +19,10 @@ from drivers.vn100.emulator.chain import SAMPLE_TICKS, FilterState, OnBoardHsi, 
 from drivers.vn100.emulator.memory import Memory
 from drivers.vn100.emulator.motion import Array
 from drivers.vn100.emulator.physics import BLOCK_TICKS, HISTORY_TICKS, TICK_HZ, EmulatedWorld
-from drivers.vn100.fields import Columns
-from drivers.vn100.sentences import MESSAGES
+from drivers.vn100.messages import MESSAGES, Columns
+
+# -- Quantities of a message -----------------------------------------------------------------------
+
 
 KNOWN_MAGNETIC, KNOWN_ACCELERATION = 0x0800, 0x1000  # VpeStatus, after VNKMD and VNKAD
 GYRO_FULL, MAG_FULL = 0x0004, 0x0040
@@ -129,7 +131,7 @@ def _dcm(of: OutputReadings) -> Array:
     return of.outputs.R_nu.reshape(BLOCK_TICKS, 9)  # row by row, as recordings show
 
 
-# By the name of the quantity's first column (`fields`); SI, angles in rad.
+# By the name of the quantity's first column (`messages`); SI, angles in rad.
 QUANTITIES: dict[str, Callable[[OutputReadings], Array]] = {
     "time_startup_s": _time_startup,
     "time_sync_in_s": _time_startup,  # no SyncIn event ever came: since the start
@@ -166,6 +168,9 @@ QUANTITIES: dict[str, Callable[[OutputReadings], Array]] = {
 def quantities_of(columns: Columns) -> tuple[str, ...]:
     """The quantities that fill a message's columns, in their order."""
     return tuple(column.name for column in columns if column.name in QUANTITIES)
+
+
+# -- The sensor ------------------------------------------------------------------------------------
 
 
 Row = list[float]

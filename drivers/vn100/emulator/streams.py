@@ -14,13 +14,22 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.vn100.binary import BinaryLayout, binary_layout, encode_packet
 from drivers.vn100.emulator.faults import FaultPlan
 from drivers.vn100.emulator.memory import PER_PORT, PORTS, Memory
 from drivers.vn100.emulator.physics import TICK_HZ
 from drivers.vn100.emulator.sensor import Sensor, quantities_of
+from drivers.vn100.messages import (
+    MESSAGES,
+    BinaryLayout,
+    Message,
+    binary_layout,
+    encode_packet,
+    encode_sentence,
+)
 from drivers.vn100.register_codec import Values
-from drivers.vn100.sentences import MESSAGES, Message, encode_sentence
+
+# -- The transmitter -------------------------------------------------------------------------------
+
 
 QUEUE_BYTES = 2048
 BITS_PER_BYTE = 10  # 8N1
@@ -89,6 +98,9 @@ class Transmitter:
         self._released_s = max(self._released_s, self._plan.release_s(self._free_s))
         if self.connected:
             self._queue.append((self._released_s, self._free_s, self.baud, message))
+
+
+# -- Which messages --------------------------------------------------------------------------------
 
 
 BINARY_OUTPUTS = (75, 76, 77)
