@@ -17,8 +17,7 @@ import numpy as np
 from ahrsd.counting import counted
 from ahrsd.evidence.coverage import CELLS, cells_of, centres
 from ahrsd.evidence.values import Bools
-from ahrsd.gates import guards_a_write
-from ahrsd.gates.table import GATES
+from ahrsd.gates import GATES, guards_a_write
 from ahrsd.printable import line
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.samples import Array
