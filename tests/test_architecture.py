@@ -68,7 +68,7 @@ IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.daemon.daemon": 17,
     "ahrsd.writeback.machine": 18,
 }
-LONGEST_CHAIN = 21  # modules, each of which imports the next; the aim is 12
+LONGEST_CHAIN = 19  # modules, each of which imports the next; the aim is 12
 
 
 @cache

@@ -168,7 +168,7 @@ def _recorded(path: Path, wanted: _Options, disturbances: Disturbances) -> Exper
 def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None:
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
     from ahrsd.diagnosis.injection import terms_json
-    from ahrsd.offline.diagnose import load_model
+    from ahrsd.offline.diagnose import load_model, load_track
     from ahrsd.offline.simulate import along, write_columns
     from ahrsd.recording.table import TABLE_SUFFIXES, is_table
 
@@ -176,8 +176,9 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     if not is_table(output):
         raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
     model = load_model(model_path)
-    columns, notes = along(model, recording, seed, wanted.columns)
-    for note in notes:
+    read, notes = load_track(recording, columns=wanted.columns)
+    columns, refused = along(model, recording, read, seed)
+    for note in [*notes, *refused]:
         click.echo(f"{recording}: {note}", err=True)
     write_columns(output, columns)
     truth = {
