@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.counting import counted
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 # -- What a method takes and gives -----------------------------------------------------------------

@@ -10,8 +10,8 @@ import click
 from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
 from ahrsd.cli.progress import byte_progress
 from ahrsd.config.loading import Config, load_config
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.baselines.registry import ComparisonRow

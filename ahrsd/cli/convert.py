@@ -9,8 +9,8 @@ import click
 
 from ahrsd.cli.files import columns_option, refuse_unwritable
 from ahrsd.cli.progress import byte_progress
-from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap

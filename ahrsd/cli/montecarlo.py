@@ -10,8 +10,8 @@ import click
 
 from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.cli.progress import count_progress
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.montecarlo.runs import Plan

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from ahrsd.cli.files import columns_option, refuse_unwritable, write_json
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, AhrsdError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap

@@ -27,9 +27,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ahrsd.cli.running_daemon import DaemonPlace, place_options
-from ahrsd.counting import counted
 from ahrsd.gates import guards_a_write
-from ahrsd.printable import line
+from ahrsd.printable import counted, line
 from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, drive_next, shown_of
 from ahrsd.telemetry.explain import explain_json, holding
 from ahrsd.telemetry.lines import heading_line, reading_lines, status_lines

@@ -35,8 +35,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ahrsd.counting import counted
 from ahrsd.errors import JournalError
+from ahrsd.printable import counted
 from drivers.vn100.messages import encode
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_command
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.track import Track
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 _REGULAR = 0.1  # scatter of the steps over the step, below which multiples can be told

@@ -13,7 +13,6 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from ahrsd.baselines.data import field_spread
-from ahrsd.counting import counted
 from ahrsd.evaluation import dead_reckoning
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.heading import (
@@ -26,6 +25,7 @@ from ahrsd.evaluation.heading import (
 )
 from ahrsd.evaluation.stored import StoredCalibration
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 from ahrsd.world_field import WorldField
 

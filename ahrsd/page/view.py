@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.evidence.coverage import CELLS, cells_of, centres
 from ahrsd.evidence.values import Bools
 from ahrsd.gates import GATES, guards_a_write
-from ahrsd.printable import line
+from ahrsd.printable import counted, line
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.samples import Array
 from ahrsd.telemetry.driving import (

@@ -36,7 +36,6 @@ from typing import Any
 import numpy as np
 
 from ahrsd import __version__
-from ahrsd.counting import counted
 from ahrsd.errors import CaptureError, RecordingError
 from ahrsd.inputs import (
     ClientLeft,
@@ -61,6 +60,7 @@ from ahrsd.inputs import (
     Tick,
     WallClock,
 )
+from ahrsd.printable import counted
 from ahrsd.recording import blocks
 from ahrsd.recording.blocks import SEQUENCES, Damage, Entry
 from ahrsd.recording.retention import prune

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.evidence.values import HealthFacts
+from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.decompensation import (
     Extracted,

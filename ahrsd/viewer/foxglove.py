@@ -38,8 +38,8 @@ from foxglove.messages import (
 )
 from foxglove.websocket import StatusLevel
 
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_BUSY, DeviceError
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 # -- Topics ----------------------------------------------------------------------------------------

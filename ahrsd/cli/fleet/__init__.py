@@ -12,10 +12,10 @@ import click
 from ahrsd.cli.files import columns_option, make_folder
 from ahrsd.cli.fleet import answers
 from ahrsd.cli.progress import fleet_progress
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.fleet.row import Calibrated
 from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.diagnosis.diagnosis import Diagnosis

@@ -24,9 +24,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.recording.foreign.sensors import (
     Choice,
     Sensors,

@@ -11,8 +11,8 @@ import click
 
 from ahrsd.cli.files import refuse_unwritable
 from ahrsd.cli.progress import count_progress
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO
+from ahrsd.printable import counted
 
 _RINGS = (
     "full",
