@@ -1,4 +1,7 @@
-"""Foreign text where a person sees it: no control characters, not longer than it may be."""
+"""Text where a person sees it: foreign text made printable, and counts in English.
+
+Foreign text gets no control characters, and is not longer than it may be.
+"""
 
 from __future__ import annotations
 
@@ -37,3 +40,11 @@ def _escape(char: str) -> str:
     if code < 0x100:
         return char.encode("unicode_escape").decode()
     return f"\\u{code:04x}" if code < 2**16 else "?"
+
+
+def counted(number: int, thing: str, form: str = "") -> str:
+    """`1 sample`, `2 samples`; of a thing whose plural is its name with an s.
+
+    form: how the number is written, as in a format specification
+    """
+    return f"{number:{form}} {thing}" if number == 1 else f"{number:{form}} {thing}s"

@@ -42,8 +42,6 @@ SHELL = (
     "ahrsd.montecarlo.runs",
     "ahrsd.offline",
     "ahrsd.page.app",
-    "ahrsd.page.board",
-    "ahrsd.page.feed",
     "ahrsd.recording",
     "ahrsd.report",
     "ahrsd.telemetry.client",
@@ -52,11 +50,8 @@ SHELL = (
     "ahrsd.telemetry.sd_notify",
     "ahrsd.telemetry.server",
     "ahrsd.viewer",
-    "drivers.port_holders",
     "drivers.serial_port",
-    "drivers.usb",
     "drivers.vn100.device",
-    "drivers.vn100.emulator.process",
     "drivers.vn100.emulator.pty",
 )
 
@@ -73,7 +68,7 @@ IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.daemon.daemon": 18,
     "ahrsd.writeback.machine": 17,
 }
-LONGEST_CHAIN = 21  # modules, each of which imports the next; the aim is 12
+LONGEST_CHAIN = 19  # modules, each of which imports the next; the aim is 12
 
 
 @cache

@@ -16,7 +16,7 @@ from ahrsd.config.loading import Config
 from ahrsd.demo import FILES, demo_config, emulated, lines, run_demo
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay
-from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import EmulatorProcess
 
 SEEDS = range(5)
 # Half a minute where nothing else runs; a busy machine makes it slow, and is no reason to fail.

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
+from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
 from ahrsd.cli.progress import byte_progress
-from ahrsd.cli.recording_options import columns_option
 from ahrsd.config.loading import Config, load_config
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
-    from ahrsd.baselines.comparison import ComparisonRow
+    from ahrsd.baselines.registry import ComparisonRow
     from ahrsd.offline.calibrate import BatchResult
     from ahrsd.recording.column_names import ColumnMap
 
@@ -166,7 +165,7 @@ def _published(
 
 
 def _draw(path: Path, name: str, rows: list[ComparisonRow]) -> None:
-    from ahrsd.report.methods_figure import write_methods_figure
+    from ahrsd.report.accuracy_figures import write_methods_figure
 
     try:
         write_methods_figure(path, f"All methods on {name}", rows)

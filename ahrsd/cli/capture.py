@@ -15,15 +15,14 @@ from pathlib import Path
 import click
 
 from ahrsd.cli.device_access import PORT, describe, driver_errors, open_port, read_all
-from ahrsd.cli.output_files import refuse_unwritable, write_json
-from ahrsd.counting import counted
+from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.daemon import host_clock
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError
 from ahrsd.inputs import Input, LinkLost, LinkOpened, Received, RegistersKnown, Stop, WallClock
+from ahrsd.printable import counted
 from ahrsd.recording.capture import CaptureStatus, CaptureWriter, Sent
 from drivers import serial_port
-from drivers.serial_port import SerialPort
-from drivers.usb import latency_timer_ms
+from drivers.serial_port import SerialPort, latency_timer_ms
 from drivers.vn100.deframer import Deframer, Sentence
 from drivers.vn100.device import Device
 

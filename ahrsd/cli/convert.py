@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable
+from ahrsd.cli.files import columns_option, refuse_unwritable
 from ahrsd.cli.progress import byte_progress
-from ahrsd.cli.recording_options import columns_option
-from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap

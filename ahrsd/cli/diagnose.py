@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
+from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
 from ahrsd.cli.progress import byte_progress
-from ahrsd.cli.recording_options import columns_option
 from ahrsd.daemon.heap import keep_heap
 from ahrsd.errors import AhrsdError
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
+from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
 from ahrsd.cli.progress import byte_progress
-from ahrsd.cli.recording_options import columns_option
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ def command(
     refuse_unwritable(figure_path)
     if folder is not None:
         json_path, figure_path = _into(folder, json_path, figure_path)
-    from ahrsd.evaluation import text
+    from ahrsd.evaluation import judging
     from ahrsd.offline.evaluate import evaluate
 
     with byte_progress(recording) as progress:
@@ -71,13 +70,17 @@ def command(
     if json_path is not None:
         write_json(
             json_path,
-            text.comparison_json(found, without) if several else text.evaluation_json(found[0]),
+            judging.comparison_json(found, without)
+            if several
+            else judging.evaluation_json(found[0]),
         )
     if figure_path is not None:
         _draw(figure_path, found[0])
     if json_path != "-":
         lines = (
-            text.comparison_lines(found, without) if several else text.evaluation_lines(found[0])
+            judging.comparison_lines(found, without)
+            if several
+            else judging.evaluation_lines(found[0])
         )
         click.echo("\n".join(lines))
     raise SystemExit(EXIT_DONE if found[0].better else EXIT_NO)
@@ -91,7 +94,7 @@ def _into(
 
 
 def _draw(path: Path, found: Evaluation) -> None:
-    from ahrsd.report.evaluation_figure import write_evaluation_figure
+    from ahrsd.report.accuracy_figures import write_evaluation_figure
 
     try:
         write_evaluation_figure(path, found)

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.listening import in_url, ip_address
-from ahrsd.cli.running_daemon import DaemonPlace, place_options
+from ahrsd.cli.running_daemon import DaemonPlace, in_url, ip_address, place_options
 from ahrsd.errors import AhrsdError, DeviceError
 
 if TYPE_CHECKING:
     from ahrsd.telemetry.client import DaemonConnection
-    from ahrsd.viewer.foxglove_server import FoxgloveServer
+    from ahrsd.viewer.foxglove import FoxgloveServer
 
 _AGAIN_S = 1.0
 
@@ -39,7 +38,7 @@ def command(place: DaemonPlace, address: str, port: int) -> None:
     """
     if not importlib.util.find_spec("foxglove"):
         raise AhrsdError("foxglove-sdk is missing: pip install 'ahrsd[foxglove]'")
-    from ahrsd.viewer.foxglove_server import FoxgloveServer
+    from ahrsd.viewer.foxglove import FoxgloveServer
 
     found = ip_address(address)
     stopped = threading.Event()
@@ -72,7 +71,7 @@ def _follow(place: DaemonPlace, server: FoxgloveServer, stopped: threading.Event
 
 
 def _show(daemon: DaemonConnection, server: FoxgloveServer, stopped: threading.Event) -> None:
-    from ahrsd.viewer.foxglove_topics import Topics
+    from ahrsd.viewer.foxglove import Topics
 
     topics = Topics(time.time() - time.monotonic())
     for record in daemon.watch(("status", "events", "samples")):

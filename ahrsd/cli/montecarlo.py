@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable, write_json
+from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.cli.progress import count_progress
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.montecarlo.runs import Plan
@@ -199,7 +199,7 @@ def _json(sets: list[tuple[Plan, list[SummaryRow]]], seed: int, runs: int) -> di
 
 
 def _draw(path: Path, sets: list[tuple[Plan, list[SummaryRow]]]) -> None:
-    from ahrsd.report.montecarlo_figure import write_montecarlo_figure
+    from ahrsd.report.accuracy_figures import write_montecarlo_figure
 
     try:
         write_montecarlo_figure(path, [(plan.name, rows) for plan, rows in sets])

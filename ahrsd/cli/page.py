@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.listening import in_url, ip_address
-from ahrsd.cli.running_daemon import DaemonPlace, place_options
+from ahrsd.cli.running_daemon import DaemonPlace, in_url, ip_address, place_options
 from ahrsd.errors import EXIT_BUSY, AhrsdError, DeviceError
 from ahrsd.foreign_file import ForeignFileError, read_regular
 from ahrsd.printable import line
@@ -59,8 +58,7 @@ def command(
         are = "is" if len(needed) == 1 else "are"
         raise AhrsdError(f"{' and '.join(needed)} {are} missing: pip install 'ahrsd[page]'")
     from ahrsd.daemon.operator_inbox import OperatorBox
-    from ahrsd.page.app import Site, make_app, serve
-    from ahrsd.page.feed import DaemonFeed
+    from ahrsd.page.app import DaemonFeed, Site, make_app, serve
 
     token = None if token_file is None else _token(token_file)
     box = OperatorBox(place.state)

@@ -1,9 +1,12 @@
 """Commands that talk with the running daemon, and how it is found: `ahrsd status`, `explain`,
-`operator`, `bundle`. `watch` is in a module of its own, for what it draws with."""
+`operator`, `bundle`. `watch` is in a module of its own, for what it draws with. Also where a
+command that serves listens: the address that was given, and how it stands in a URL.
+"""
 
 from __future__ import annotations
 
 import functools
+import ipaddress
 import re
 import shlex
 from collections.abc import Callable
@@ -13,12 +16,34 @@ from typing import Any
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable, write_json
+from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.config.loading import Config, load_config
 from ahrsd.daemon.operator_inbox import VERBS
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, AhrsdError, DeviceError
 from ahrsd.printable import line
 from ahrsd.telemetry.client import DaemonConnection, find_socket
+
+# -- Where a command listens -----------------------------------------------------------------------
+
+
+IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+def ip_address(text: str) -> IpAddress:
+    """The address of --address.  click.UsageError where it is none."""
+    try:
+        return ipaddress.ip_address(text)
+    except ValueError:
+        raise click.UsageError(f"--address {text}: must be an IP address") from None
+
+
+def in_url(address: IpAddress, port: int) -> str:
+    """`127.0.0.1:9191`, `[::1]:9191`."""
+    return f"[{address}]:{port}" if address.version == 6 else f"{address}:{port}"
+
+
+# -- The running daemon ----------------------------------------------------------------------------
+
 
 _PLACE = click.Path(path_type=Path)
 _SOCKET = click.option("--socket", "socket_path", type=_PLACE, help="The daemon's socket.")

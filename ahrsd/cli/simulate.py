@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable, write_json
-from ahrsd.cli.recording_options import columns_option
-from ahrsd.counting import counted
+from ahrsd.cli.files import columns_option, refuse_unwritable, write_json
 from ahrsd.errors import EXIT_DONE, AhrsdError
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.recording.column_names import ColumnMap
@@ -98,7 +97,7 @@ class _Options:
 def _simulate_scenario(wanted: _Options) -> None:
     """Write a scenario's experiment, its effects in it, and its truth beside it."""
     from ahrsd.offline.simulate import with_effects, write_experiment
-    from ahrsd.simulation.tabular import truth_json
+    from ahrsd.simulation.scenarios import truth_json
 
     experiment, made_from = _experiment(wanted)
     truth: dict[str, object] = {}
@@ -113,8 +112,7 @@ def _simulate_scenario(wanted: _Options) -> None:
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
     """The scenario's experiment, and what makes the same one again."""
     from ahrsd.simulation import Iron, ScenarioSettings, simulate
-    from ahrsd.simulation.scenarios import Disturbances
-    from ahrsd.simulation.tabular import settings_json
+    from ahrsd.simulation.scenarios import Disturbances, settings_json
 
     if wanted.scenario is None:
         raise AhrsdError("name a scenario (wam, mam, lam, recorded), or give --model and --along")
@@ -170,7 +168,7 @@ def _recorded(path: Path, wanted: _Options, disturbances: Disturbances) -> Exper
 def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None:
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
     from ahrsd.diagnosis.injection import terms_json
-    from ahrsd.offline.diagnose import load_model
+    from ahrsd.offline.diagnose import load_model, load_track
     from ahrsd.offline.simulate import along, write_columns
     from ahrsd.recording.table import TABLE_SUFFIXES, is_table
 
@@ -178,8 +176,9 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     if not is_table(output):
         raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
     model = load_model(model_path)
-    columns, notes = along(model, recording, seed, wanted.columns)
-    for note in notes:
+    read, notes = load_track(recording, columns=wanted.columns)
+    columns, refused = along(model, recording, read, seed)
+    for note in [*notes, *refused]:
         click.echo(f"{recording}: {note}", err=True)
     write_columns(output, columns)
     truth = {

@@ -11,12 +11,12 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator.model_checks import change_message
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.step_detector import Step, StepDetector
 from ahrsd.events import GateResult, Noted
 from ahrsd.evidence.collector import EvidenceCollector
 from ahrsd.evidence.segments import Role
 from ahrsd.evidence.values import BasisFacts, Evidence, HealthFacts
 from ahrsd.gates import GateLimits, judge
-from ahrsd.monitoring.step_detector import Step, StepDetector
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.world_field import WorldField
 

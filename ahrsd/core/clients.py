@@ -26,7 +26,7 @@ from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import PASSABLE, Mode
 from drivers.vn100.commands import NoReply, TooLate, Write
-from drivers.vn100.decode import Reply
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import Seen
 from drivers.vn100.registers import Values
 

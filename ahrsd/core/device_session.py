@@ -47,8 +47,9 @@ from drivers.vn100.commands import (
     Word,
     Write,
 )
-from drivers.vn100.decode import Measurement, Reply
+from drivers.vn100.decode import Measurement
 from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import (
     SESSION_SETTINGS,
     Identity,

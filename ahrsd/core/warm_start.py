@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.counting import counted
 from ahrsd.inputs import EarlierRun, EarlierSamples, WallClock
+from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.clocks import Stamp, plausible, same_boot_s
 from drivers.vn100.procedures import Unit

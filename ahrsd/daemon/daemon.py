@@ -30,8 +30,7 @@ from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink, find_device
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
 from ahrsd.viewer.sink import RerunSink
-from drivers.serial_port import PortError, PortLost, spelled
-from drivers.usb import latency_timer_ms
+from drivers.serial_port import PortError, PortLost, latency_timer_ms, spelled
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
 

@@ -10,7 +10,7 @@ import logging
 from dataclasses import dataclass, field
 
 from ahrsd.core.core import Core
-from ahrsd.counting import counted
+from ahrsd.printable import counted
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 
 STATUS_S = 60.0

@@ -35,10 +35,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ahrsd.counting import counted
 from ahrsd.errors import JournalError
+from ahrsd.printable import counted
+from drivers.vn100.messages import encode
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_command
-from drivers.vn100.sentences import encode
 
 _OWN_KEYS = ("seq", "time", "kind", "crc")
 _MOST_BYTES = 64 * 1024 * 1024  # tens of thousands of writes; no journal is as long

@@ -24,7 +24,7 @@ from ahrsd.config.addresses import Address
 from ahrsd.config.sections import ShareSection
 from ahrsd.errors import ConfigError
 from ahrsd.sharing.share_facts import ShareFacts
-from ahrsd.telemetry.outbox import Outbox
+from ahrsd.telemetry.protocol import Outbox
 
 log = logging.getLogger("ahrsd")
 

@@ -13,7 +13,7 @@ from ahrsd.daemon.daemon import Daemon, HostClock
 from ahrsd.errors import EXIT_BUSY, DeviceError
 from drivers.serial_port import PortError, SerialPort
 from drivers.vn100.device import Device
-from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 from drivers.vn100.errors import DriverError
 from drivers.vn100.procedures import read_registers

@@ -27,7 +27,7 @@ from ahrsd.gates import Level, for_level, guards_a_write
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.report import EventCollector
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
-from ahrsd.report.run_time import RunTime
+from ahrsd.report.contents import RunTime
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.composition import Proposal
 from ahrsd.writeback.states import State

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from ahrsd.counting import counted
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.innovation import Filtered, run_filter
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.turns import QUARTER, Turns, recovered, some_lost
 from ahrsd.diagnosis.values import NullModel
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 #: samples before and after a jump, and how many deviations of a mean a step's turn must have: over

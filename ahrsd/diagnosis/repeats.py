@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.counting import counted
 from ahrsd.diagnosis.clipping import step_of
 from ahrsd.diagnosis.coarse import noise_of
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact, spans_of
 from ahrsd.diagnosis.prior import sphere_centre
 from ahrsd.diagnosis.track import Track
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 _AXES = ("x", "y", "z")

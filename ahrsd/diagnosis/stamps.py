@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.track import Track
+from ahrsd.printable import counted
 from ahrsd.samples import Array, in_periods
 
 _MISSING_SHARE = 1e-3

@@ -35,9 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.counting import counted
 from ahrsd.estimator import chain
 from ahrsd.estimator.chain import Noise
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 __all__ = ["Epoch", "EpochKeys", "EpochSummary", "Noise", "Point", "epoch_factor", "summarise"]

@@ -1,14 +1,14 @@
 """What a calibration is worth on a recording: before and after, judged by what can be known.
 
-`track` is the recording as arrays, with which way is up; `stored` the calibration, `references`
-what the heading is compared with; `heading` and `dead_reckoning` are figures, `judging` has those
-of the field and all of them together, `text` says them as JSON and as a table.
+`track` is the recording as arrays, with which way is up; `stored` the calibration; `heading`
+compares with references, `dead_reckoning` with fixes; `judging` has the figures of the field and
+all of them together, as JSON and as a table.
 
 Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """
 
+from ahrsd.evaluation.heading import Fixes, HeadingReference
 from ahrsd.evaluation.judging import Evaluation, judge
-from ahrsd.evaluation.references import Fixes, HeadingReference
 from ahrsd.evaluation.stored import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, tracked
 

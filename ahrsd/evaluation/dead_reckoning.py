@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ahrsd.evaluation.references import Fixes
+from ahrsd.evaluation.heading import Fixes
 from ahrsd.evaluation.track import EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array

@@ -1,4 +1,10 @@
-"""Heading errors against a reference, one constant removed."""
+"""Heading errors against a reference, one constant removed.
+
+The reference is the course of fixes, an optical attitude, or another heading. Course at fix k is
+the direction from fix k-1 to fix k+1; it stands for the mean heading between them. Its frame is
+true north, that of an optical system has any yaw; the mount of the sensor has one, too. So one
+constant is removed from every comparison, and reported.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +12,178 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from ahrsd.evaluation.references import HeadingReference
-from ahrsd.evaluation.track import EvaluationError
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.samples import Array
+
+# -- References ------------------------------------------------------------------------------------
+
+
+_EARTH_M = 6_371_000.0
+_UNBROKEN = 1.6  # times the usual distance of fixes; more is a gap that is not bridged
+_LEAST_FIXES = 10
+_LEAST_FORCE_M_S2 = 1.0  # of the mean in the world, below which it is no gravity
+_LEAST_INSTANTS = 10
+_OPINION = "its own filter's opinion, not the truth"
+QUATERNION = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
+POSITION = ("position_north_m", "position_east_m")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """M positions on the recording's clock, in metres north and east of the first one."""
+
+    time_s: Array
+    north_m: Array
+    east_m: Array
+    source: str
+
+    def velocity(self) -> tuple[Array, Array, float]:
+        """Instants (K,), velocity north + i east (K,) in m/s, and half of the time it spans in s.
+
+        Central differences over two steps; none across a gap.
+        """
+        span_s = self.time_s[2:] - self.time_s[:-2]
+        usual_s = float(np.median(span_s))
+        position = self.north_m + 1j * self.east_m
+        whole = span_s < _UNBROKEN * usual_s
+        velocity = ((position[2:] - position[:-2]) / span_s)[whole]
+        return self.time_s[1:-1][whole], velocity, usual_s / 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadingReference:
+    """Headings to compare with.
+
+    name, detail: for titles; what else a reader must know
+    truth:        false where it is only another opinion, such as the device's own
+    time_s:       (M,) instants; each stands for the mean over time_s -+ half_width_s
+    heading_rad:  (M,) from any fixed direction, positive to the east
+    up_b:         (N, 3) the vertical in the sensor frame at the track's samples, or None
+    """
+
+    name: str
+    truth: bool
+    time_s: Array
+    heading_rad: Array
+    half_width_s: float = 0.0
+    up_b: Array | None = None
+    detail: str = ""
+
+
+def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: str) -> Fixes:
+    """Fixes of a receiver.  EvaluationError, naming `source`, where they cannot be that."""
+    known = np.isfinite(time_s) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    time_s, lat_deg, lon_deg = time_s[known], lat_deg[known], lon_deg[known]
+    if len(time_s) < _LEAST_FIXES:
+        raise EvaluationError(
+            f"{source}: {len(time_s)} fixes with time and position; {_LEAST_FIXES} are needed"
+        )
+    if np.max(np.abs(lat_deg)) > 90.0 or np.max(np.abs(lon_deg)) > 360.0:
+        raise EvaluationError(f"{source}: positions are no degrees; lat_deg, lon_deg are needed")
+    if not np.all(np.diff(time_s) > 0):
+        row = int(np.argmin(np.diff(time_s) > 0)) + 1
+        raise EvaluationError(f"{source}: time does not go forward at fix {row}; sort by time")
+    north = np.radians(lat_deg - lat_deg[0]) * _EARTH_M
+    east = np.unwrap(np.radians(lon_deg))
+    east_m = (east - east[0]) * _EARTH_M * np.cos(np.radians(lat_deg[0]))
+    return Fixes(time_s, north, east_m, "GPS")
+
+
+def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
+    """Positions that the recording holds itself; None without."""
+    if not all(name in track.covariates for name in POSITION):
+        return None
+    north, east = (track.covariates[name] for name in POSITION)
+    known = np.isfinite(north) & np.isfinite(east)
+    if np.count_nonzero(known) < _LEAST_FIXES:
+        return None
+    time_s, north, east = track.time_s[known], north[known], east[known]
+    first = np.flatnonzero(np.r_[True, np.diff(np.floor(time_s)) > 0])  # one a second, as GPS
+    if len(first) < _LEAST_FIXES:
+        return None
+    north, east = north[first] - north[0], east[first] - east[0]
+    return Fixes(time_s[first], north, east, "position")
+
+
+def course(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
+    """Course over ground where it is faster than that.  EvaluationError where it hardly ever is."""
+    time_s, velocity, half_width_s = fixes.velocity()
+    fast = np.abs(velocity) > least_speed_m_s
+    if np.count_nonzero(fast) < _LEAST_INSTANTS:
+        raise EvaluationError(
+            f"{fixes.source}: {np.count_nonzero(fast)} fixes faster than {least_speed_m_s:g} m/s, "
+            f"{_LEAST_INSTANTS} are needed: no course to compare with (--min-speed sets it)"
+        )
+    heading = np.angle(velocity[fast])
+    detail = f"speed > {least_speed_m_s:g} m/s"
+    return HeadingReference(
+        f"{fixes.source} course", True, time_s[fast], heading, half_width_s, detail=detail
+    )
+
+
+def optical(track: EvaluationTrack) -> HeadingReference | None:
+    """The attitude columns ref_q*, sensor to world, scalar first; None without.
+
+    Which way is up in that world is measured: the mean specific force, or its z axis without one.
+    """
+    if not all(name in track.covariates for name in QUATERNION):
+        return None
+    q = np.column_stack([track.covariates[name] for name in QUATERNION])
+    norms = np.linalg.norm(q, axis=1)
+    known = np.isfinite(norms) & (norms > 0.5)
+    if np.count_nonzero(known) < _LEAST_INSTANTS:
+        return None
+    R_wb = Rotation.from_quat(q[known], scalar_first=True).as_matrix()
+    up_w = np.array([0.0, 0.0, 1.0])
+    if track.has_accel:
+        force_w = np.mean(np.einsum("kij,kj->ki", R_wb, track.accel_b_m_s2[known]), axis=0)
+        if (size := float(np.linalg.norm(force_w))) > _LEAST_FORCE_M_S2:
+            up_w = force_w / size
+    x_w = R_wb[:, :, 0]
+    side = np.array([1.0, 0.0, 0.0]) if abs(up_w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    ahead = side - up_w * (side @ up_w)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(-up_w, ahead)
+    up_b = np.full((len(track), 3), np.nan)
+    up_b[known] = np.einsum("kji,j->ki", R_wb, up_w)
+    heading = np.arctan2(x_w @ right, x_w @ ahead)
+    return HeadingReference("optical attitude", True, track.time_s[known], heading, up_b=up_b)
+
+
+def device_heading(track: EvaluationTrack) -> HeadingReference | None:
+    """The device's own yaw, which is no truth; None without."""
+    attitude = track.device_attitude()
+    if attitude is None:
+        return None
+    known = np.isfinite(attitude[0])
+    return HeadingReference(
+        "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_OPINION
+    )
+
+
+def column(track: EvaluationTrack, name: str) -> HeadingReference:
+    """A heading column in deg or rad, by its name's end.  EvaluationError where there is none."""
+    if name not in track.covariates:
+        others = ", ".join(sorted(track.covariates)) or "none"
+        raise EvaluationError(f"the recording has no column {name}; further columns: {others}")
+    if not name.endswith(("_deg", "_rad")):
+        raise EvaluationError(f"column {name}: its name must end in _deg or _rad")
+    values = track.covariates[name] * (np.pi / 180.0 if name.endswith("_deg") else 1.0)
+    known = np.isfinite(values)
+    if np.count_nonzero(known) < _LEAST_INSTANTS:
+        raise EvaluationError(f"column {name} holds {np.count_nonzero(known)} numbers only")
+    device = name in ("vn_yaw_deg", "yaw_rad")
+    detail = _OPINION if device else ""
+    return HeadingReference(
+        f"column {name}", not device, track.time_s[known], values[known], detail=detail
+    )
+
+
+# -- Errors against a reference --------------------------------------------------------------------
+
 
 FOLDS = 5
 _LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.calibration import Affine
-from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError
+from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
 
 MINIMUM_SAMPLES = 20

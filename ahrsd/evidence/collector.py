@@ -3,16 +3,21 @@
 The protocol with the core: cut a block with `parts`; `add` each part here, and give it to the
 estimator only where its role is "train". A block that lies within one slot may be passed whole,
 under `role(block)`.
+
+The candidate against the calibration in force, the world, refits and rest, as facts.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from ahrsd import so3
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.evidence import comparison
 from ahrsd.evidence.coverage import coverage
 from ahrsd.evidence.heading import field_0, gyro_heading_rad, prove
+from ahrsd.evidence.second_opinions import Rest, gyro_fit, rest, size_fit
 from ahrsd.evidence.segments import (
     AttitudeTrack,
     HistoryParameters,
@@ -22,18 +27,246 @@ from ahrsd.evidence.segments import (
     nodes_at,
     track,
 )
-from ahrsd.evidence.stillness import rest
 from ahrsd.evidence.values import (
     NO_PROOF,
     UNKNOWN_FIELD,
     UNKNOWN_MOTION,
     BasisFacts,
+    Bools,
+    ChangeFacts,
+    Coverage,
     EstimateFacts,
     Evidence,
+    FieldFacts,
+    GyroFacts,
     HealthFacts,
+    RefitFacts,
+    WorldFacts,
 )
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.world_field import WorldField
+
+# -- Heading that one calibration would show where another is the truth ----------------------------
+#
+# Heading that one calibration would show where another is the truth, over all headings and tilts.
+#
+# With the truth (C, b), attitude R_nb and field f_n the sensor reads m = C^-1 R_nb^T f_n + b. The
+# judged calibration makes a field of it; seen in n its horizontal direction is off by the error.
+
+
+HEADINGS = 36
+_LEAST_TILT_DEG = 5.0  # no vehicle is level for ever: judge at least so far
+_MOST_TILT_DEG = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """Where heading is predicted: a field (magnetic north-east-down) and half-ranges of tilt."""
+
+    total_gauss: float
+    inclination_rad: float
+    roll_deg: float
+    pitch_deg: float
+
+    @property
+    def field_n_gauss(self) -> Array:
+        """(3,) the field in magnetic north, east, down."""
+        level, down = np.cos(self.inclination_rad), np.sin(self.inclination_rad)
+        return self.total_gauss * np.array([level, 0.0, down])
+
+    def tilts_rad(self) -> Array:
+        """(9, 2) roll and pitch: level, and the edges of what was driven (at least 5 degrees)."""
+        roll, pitch = np.clip([self.roll_deg, self.pitch_deg], _LEAST_TILT_DEG, _MOST_TILT_DEG)
+        grid = np.array([(r, p) for r in (-roll, 0, roll) for p in (-pitch, 0, pitch)])
+        return np.asarray(np.radians(grid))
+
+
+def heading_error_curve(
+    judged: Affine,
+    truth: Affine,
+    field_n_gauss: Array,
+    *,
+    roll_rad: float = 0.0,
+    pitch_rad: float = 0.0,
+    headings: int = HEADINGS,
+) -> Array:
+    """(headings,) heading shown by `judged` minus true heading in degrees, at 0, 10, 20, ... deg.
+
+    `field_n_gauss` (3,) is in the units that `truth` produces.
+    """
+    heading = np.linspace(0, 2 * np.pi, headings, endpoint=False)
+    pitch, roll = np.full(headings, pitch_rad), np.full(headings, roll_rad)
+    R_nb = so3.from_yaw_pitch_roll(heading, pitch, roll)
+    raw_b_gauss = truth.undo(np.einsum("kji,j->ki", R_nb, field_n_gauss))
+    seen_n = np.einsum("kij,kj->ki", R_nb, judged.apply(raw_b_gauss))
+    off = np.arctan2(seen_n[:, 1], seen_n[:, 0]) - np.arctan2(field_n_gauss[1], field_n_gauss[0])
+    return np.asarray(-np.degrees(np.arctan2(np.sin(off), np.cos(off))))
+
+
+def worst_difference_deg(judged: Affine, truth: Affine, envelope: Envelope) -> float:
+    """Largest |heading difference| over all headings and the envelope's tilts; nan if unknown."""
+    curves = [
+        heading_error_curve(judged, truth, envelope.field_n_gauss, roll_rad=roll, pitch_rad=pitch)
+        for roll, pitch in envelope.tilts_rad().tolist()
+    ]
+    return float(np.max(np.abs(curves)))
+
+
+# -- The candidate beside the calibration in force -------------------------------------------------
+
+_NAN = float("nan")
+_VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move
+_BIAS_FLOOR_RAD_S = 3e-4  # a smaller change of the bias needs no better rest than this one
+_MOST_BIAS_SIGMA_RAD_S = 3e-4  # an estimate that knows less must not agree with everything
+_LEAST_NOISE_GAUSS = 2e-4
+_FACTORY = 1e-6
+_ROUGH_M_S2 = 0.5  # rms of |force| - gravity above which a segment's dip is not compared
+
+
+def envelope_of(motion: Coverage, field: FieldFacts, world: WorldField | None) -> Envelope:
+    """Where heading is predicted: the field measured (the dip from the model where there is one)
+    and the tilts driven."""
+    dip = np.radians(field.inclination_deg) if world is None else world.inclination_rad
+    return Envelope(field.mean_gauss, float(dip), motion.roll_deg, motion.pitch_deg)
+
+
+def field_facts(nodes: Nodes, correction: Affine) -> FieldFacts:
+    """Facts about the field that `correction` makes of all segments."""
+    h_b = correction.apply(nodes.raw_b_gauss)
+    size = np.linalg.norm(h_b, axis=1)
+    sine = np.sum(h_b * nodes.down_b, axis=1) / size
+    dip_deg = nodes.mean(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
+    calm = dip_deg[nodes.rough_m_s2 < _ROUGH_M_S2]
+    temperatures = np.array([t.segment.temperature_c for t in nodes.tracks])
+    return FieldFacts(
+        mean_gauss=float(np.mean(size)),
+        min_gauss=float(np.min(size)),
+        max_gauss=float(np.max(size)),
+        spread=float(np.std(size) / np.mean(size)),
+        inclination_deg=float(np.median(calm)) if len(calm) else float("nan"),
+        wander_gauss=_wander(nodes.mean(size)),
+        inclination_wander_deg=_wander(calm),
+        temperature_range_c=float(np.ptp(temperatures)),
+    )
+
+
+def _wander(values: Array) -> float:
+    return float(np.max(np.abs(values - np.median(values)))) if len(values) else float("nan")
+
+
+def in_scale_of(model: Affine, correction: Affine) -> Affine:
+    """`correction` with the determinant of `model`: the same headings, the other's field units."""
+    scale = np.cbrt(np.linalg.det(model.matrix) / np.linalg.det(correction.matrix))
+    return Affine(scale * correction.matrix, correction.offset)
+
+
+def proposed_by(estimate: Estimate, present: Affine) -> Affine:
+    """The estimate's correction; in the scale of `present` where the field is not known."""
+    if estimate.field_known:
+        return estimate.correction
+    return in_scale_of(present, estimate.correction)
+
+
+def against_world(field: FieldFacts, world: WorldField | None) -> WorldFacts | None:
+    """Magnitude and dip against the model; None without a position."""
+    if world is None:
+        return None
+    return WorldFacts(
+        magnitude_error=abs(field.mean_gauss / world.total_gauss - 1.0),
+        inclination_error_deg=abs(field.inclination_deg - float(np.degrees(world.inclination_rad))),
+    )
+
+
+def refits(
+    nodes: Nodes | None,
+    judged: Affine,
+    present: Affine,
+    estimate: Estimate,
+    *,
+    where: Envelope,
+    halves: tuple[Affine, Affine] | None,
+) -> RefitFacts:
+    """Two halves against each other, and the size fit against the candidate."""
+    if nodes is None:
+        return RefitFacts(_NAN, _NAN, _NAN)
+    averaged = nodes.tracks[0].segment.averaged
+    sigma_gauss = max(estimate.noise_mag_gauss / np.sqrt(averaged), _LEAST_NOISE_GAUSS)
+    opinion = size_fit(nodes, present, sigma_gauss)
+    a, b = halves or _half_fits(nodes, present, sigma_gauss)
+    second = _NAN if opinion is None else worst_difference_deg(opinion, judged, where)
+    if a is None or b is None:
+        return RefitFacts(_NAN, _NAN, second)
+    apart = a.offset - b.offset
+    down = _mean_down(nodes)
+    return RefitFacts(
+        hard_iron_gauss=float(np.linalg.norm(apart - (apart @ down) * down)),
+        halves_deg=worst_difference_deg(in_scale_of(judged, a), in_scale_of(judged, b), where),
+        second_opinion_deg=second,
+    )
+
+
+def change(
+    nodes: Nodes | None,
+    judged: Affine,
+    present: Affine,
+    motion: Coverage,
+    *,
+    where: Envelope,
+    world: WorldField | None,
+) -> ChangeFacts:
+    """The proposed numbers by themselves, and what they would change."""
+    C = judged.matrix
+    ratio = np.cbrt(np.linalg.det(C) / np.linalg.det(present.matrix))
+    moved = _NAN
+    if nodes is not None and np.isfinite(motion.roll_deg):
+        flat = max(motion.roll_deg, motion.pitch_deg) < _VERTICAL_SEEN_DEG
+        moved = abs(float((judged.offset - present.offset) @ _mean_down(nodes))) if flat else 0.0
+    factory = np.allclose(present.matrix, np.eye(3), atol=_FACTORY) and np.allclose(
+        present.offset, 0.0, atol=_FACTORY
+    )
+    return ChangeFacts(
+        first_calibration=bool(factory),
+        eigenvalue_min=float(np.linalg.eigvalsh((C + C.T) / 2)[0]),
+        condition=float(np.linalg.cond(C)),
+        diagonal_min=float(np.min(np.diag(C))),
+        diagonal_max=float(np.max(np.diag(C))),
+        offset_gauss=float(np.linalg.norm(judged.offset)),
+        scale_change=float(abs(ratio - 1.0)) if world is None else 0.0,
+        moved_unseen_gauss=moved,
+        step_deg=worst_difference_deg(present, judged, where),
+    )
+
+
+def gyro(estimate: Estimate, present_b_rad_s: Array, still: Rest) -> GyroFacts:
+    """The estimate's gyro bias against rest."""
+    bias = estimate.gyro_bias_rad_s
+    written = max(float(np.linalg.norm(bias - present_b_rad_s)), _BIAS_FLOOR_RAD_S)
+    own = np.minimum(estimate.sigma[9:12], _MOST_BIAS_SIGMA_RAD_S)
+    sigma = np.hypot(own, still.sigma_rad_s)
+    return GyroFacts(
+        bias_rad_s=float(np.linalg.norm(bias)),
+        rest_s=still.duration_s,
+        sigma_share=still.sigma_rad_s / written,
+        disagreement=float(np.max(np.abs(bias - still.rate_b_rad_s) / sigma)),
+    )
+
+
+def _half_fits(
+    nodes: Nodes, present: Affine, sigma_gauss: float
+) -> tuple[Affine | None, Affine | None]:
+    """Earlier and later half, cut where half of all turning was done: what drifts, shows."""
+    turned = np.cumsum([t.segment.turned_rad for t in nodes.tracks])
+    early: Bools = turned <= turned[-1] / 2
+    first, second = nodes.only(early), nodes.only(~early)
+    if first is None or second is None:
+        return None, None
+    return gyro_fit(first, present, sigma_gauss), gyro_fit(second, present, sigma_gauss)
+
+
+def _mean_down(nodes: Nodes) -> Array:
+    mean = np.mean(nodes.down_b, axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
 
 _LEAST_TURN_DEG = 60.0  # a held-out segment that turned less cannot show a heading error
 
@@ -83,15 +316,15 @@ class EvidenceCollector:
         `halves`: corrections from two disjoint halves of the data; without them they are fitted
         here. `present_gyro_bias_rad_s` (3,) is what register 84 takes off now.
         """
-        judged = proposed or comparison.proposed_by(estimate, present)
+        judged = proposed or proposed_by(estimate, present)
         nodes = self._nodes(estimate.gyro_bias_rad_s)
         motion, field, proof = UNKNOWN_MOTION, UNKNOWN_FIELD, NO_PROOF
         if nodes is not None:
             heading_rad = gyro_heading_rad(nodes, field_0(nodes, judged))
             motion = coverage(nodes, heading_rad, judged)
-            field = comparison.field_facts(nodes, judged)
+            field = field_facts(nodes, judged)
             proof = prove(nodes, heading_rad, judged, present, _LEAST_TURN_DEG)
-        envelope = comparison.envelope(motion, field, world)
+        envelope = envelope_of(motion, field, world)
         still = rest(self._history.segments)
         return Evidence(
             health=health,
@@ -99,13 +332,11 @@ class EvidenceCollector:
             estimate=_facts(estimate),
             motion=motion,
             field=field,
-            world=comparison.against_world(field, world),
+            world=against_world(field, world),
             proof=proof,
-            refits=comparison.refits(
-                nodes, judged, present, estimate, where=envelope, halves=halves
-            ),
-            change=comparison.change(nodes, judged, present, motion, where=envelope, world=world),
-            gyro=comparison.gyro(estimate, present_gyro_bias_rad_s, still),
+            refits=refits(nodes, judged, present, estimate, where=envelope, halves=halves),
+            change=change(nodes, judged, present, motion, where=envelope, world=world),
+            gyro=gyro(estimate, present_gyro_bias_rad_s, still),
         )
 
     def _nodes(self, bias_b_rad_s: Array) -> Nodes | None:

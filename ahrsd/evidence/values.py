@@ -63,7 +63,7 @@ class Coverage:
     regime: 3D (tilts by 30 deg and more), 2D (within 5 deg of its mean tilt), partial (between),
     none (turned less than 45 deg), unknown (no accelerometer)
     turn: what is missing, e.g. "turn left about 120 deg more"; empty where nothing is
-    directions: cells of `evidence.directions` in which the corrected field was seen, none: unknown
+    directions: cells of `evidence.coverage` in which the corrected field was seen, none: unknown
     down_b: mean direction of down in the sensor frame, nan where unknown
     """
 

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import told
 from ahrsd.fleet.questions import DeviceDrift, FleetRows
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.trend import Trend
-from ahrsd.printable import LINE, printable
+from ahrsd.printable import LINE, counted, printable
 from ahrsd.report.fleet_page import (
     DeviceLine,
     Drawing,

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.fleet.questions import AnswerTable, DeviceDrift
 from ahrsd.fleet.trend import StepChange, Trend
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.samples import Array
 
 _MILLI = 1e3

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS, MethodResult, calibrate_with
-from ahrsd.baselines.checks import stuck
-from ahrsd.baselines.comparison import ComparisonRow, halves, spread_of
+from ahrsd.baselines.data import stuck
+from ahrsd.baselines.registry import ComparisonRow, halves, spread_of
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.calibrate import BatchResult

@@ -27,7 +27,7 @@ from ahrsd.evaluation import (
     parse_calibrations,
     tracked,
 )
-from ahrsd.evaluation.references import (
+from ahrsd.evaluation.heading import (
     Fixes,
     column,
     course,

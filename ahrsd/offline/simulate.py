@@ -11,12 +11,11 @@ from ahrsd.diagnosis import forward, roles
 from ahrsd.diagnosis.effects import profiles, request
 from ahrsd.diagnosis.injection import injected, readings_of, terms_json
 from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
-from ahrsd.offline.diagnose import load_track
-from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.table import TABLE_SUFFIXES, is_table, write_table
 from ahrsd.samples import Array
-from ahrsd.simulation import Experiment, tabular
+from ahrsd.simulation import Experiment, scenarios
 
 STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
 
@@ -38,13 +37,12 @@ def with_effects(
 
 
 def along(
-    model: RepairedModel, recording: Path, seed: int, columns: ColumnMap = NO_MAP
+    model: RepairedModel, recording: Path, read: Track, seed: int
 ) -> tuple[dict[str, Array], list[str]]:
     """A table's columns: what the repaired model reads along the motion of a recording.
 
-    RecordingError as `diagnose`; AhrsdError where a term needs a column that there is not.
+    `read` is the recording's own track. AhrsdError where a term needs a column that there is not.
     """
-    read, notes = load_track(recording, columns=columns)
     track, refused = roles.prepared(read)
     try:
         context = forward.context_along(track, model.calibration, model.terms)
@@ -59,14 +57,14 @@ def along(
         sensors.append(("accel", "m_s2", done.accel_b_m_s2))
     for name, unit, values in sensors:
         written |= {f"{name}_{axis}_{unit}": values[:, i] for i, axis in enumerate("xyz")}
-    return written | done.covariates, [*notes, *refused]
+    return written | done.covariates, [*refused]
 
 
 def write_experiment(path: Path, experiment: Experiment) -> None:
     """A table, or a byte stream of VNYMR sentences, as the name says.  AhrsdError otherwise."""
     further = experiment.samples.covariates
     if is_table(path):
-        write_columns(path, {**tabular.columns(experiment), **further})
+        write_columns(path, {**scenarios.columns(experiment), **further})
         return
     if not path.name.endswith(STREAM_SUFFIXES):
         known = ", ".join((*TABLE_SUFFIXES, *STREAM_SUFFIXES))
@@ -75,7 +73,7 @@ def write_experiment(path: Path, experiment: Experiment) -> None:
         raise AhrsdError(
             f"{path}: a byte stream has no place for {', '.join(further)}; write a table"
         )
-    content = b"".join(tabular.sentences(experiment))
+    content = b"".join(scenarios.sentences(experiment))
     try:
         path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
     except OSError as error:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.diagnosis.correction import without
 from ahrsd.diagnosis.dead import dead_axes, possible
 from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
@@ -26,6 +25,7 @@ from ahrsd.diagnosis.roles import prepared
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
 from ahrsd.events import Event, SamplesSeen
+from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
 
 _FEW_MISSING = 0.02  # of the rows, whose acceleration is filled from their neighbours

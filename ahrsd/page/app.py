@@ -1,17 +1,25 @@
-"""The page as a web application. The only importer of starlette and uvicorn."""
+"""The page as a web application. The only importer of starlette and uvicorn.
+
+The newest status comes from one connection to the daemon (`DaemonFeed`), however many browsers look
+at the page; its sections are made as HTML once for all of them (`Board`), and each changes by
+itself.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import json
+import math
 import re
 import secrets
 import socket
+import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -31,10 +39,177 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import ahrsd
+from ahrsd.errors import DeviceError
+from ahrsd.page import view
 from ahrsd.page.access import Token, comes_from_here, form_mark, host_is_known, is_form_mark
-from ahrsd.page.board import TEMPLATES, Board
-from ahrsd.page.feed import DaemonFeed
 from ahrsd.report.template import render
+from ahrsd.telemetry.client import DaemonConnection
+from ahrsd.telemetry.driving import Pace, circle_is_wanted, shown_of, tilt_is_wanted
+from ahrsd.telemetry.protocol import STATUS_SCHEMA
+
+# -- The newest status -----------------------------------------------------------------------------
+
+
+_AGAIN_S = 1.0
+_STALE_S = 3.5  # a status comes every second
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """The newest status and when it came (monotonic); `fault`: why none comes, empty if one may."""
+
+    status: dict[str, Any] | None = None
+    at_s: float = 0.0
+    fault: str = ""
+
+    def away(self, now_s: float) -> str:
+        """Why the status says nothing of now; empty where it does."""
+        if self.fault:
+            return self.fault
+        if self.status is None:
+            return "the daemon has not told its status yet"
+        if now_s - self.at_s > _STALE_S:
+            return "the daemon is silent"
+        return ""
+
+
+class DaemonFeed:
+    """Watches the daemon in a thread of its own; connects again by itself."""
+
+    def __init__(self, connect: Callable[[], DaemonConnection]) -> None:
+        self._connect = connect
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
+        self.heard = Heard(at_s=time.monotonic())
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End with the next status; the thread does not keep the process."""
+        self._stopped.set()
+
+    def _run(self) -> None:
+        while not self._stopped.is_set():
+            try:
+                with self._connect() as daemon:
+                    self._watch(daemon)
+            except (DeviceError, OSError, ValueError) as error:
+                self.heard = Heard(self.heard.status, self.heard.at_s, str(error))
+            self._stopped.wait(_AGAIN_S)
+
+    def _watch(self, daemon: DaemonConnection) -> None:
+        """The newest status at once, then each one as it comes."""
+        self._take(daemon.ask("status"))
+        for record in daemon.watch(("status",)):
+            if self._stopped.is_set():
+                return
+            if record.get("record") == "status":
+                self._take(record)
+            elif "error" in record:
+                raise ValueError(str(record["error"]))
+
+    def _take(self, status: dict[str, Any]) -> None:
+        if status.get("schema") != STATUS_SCHEMA:
+            raise ValueError(f"the daemon tells {status.get('schema')}, not {STATUS_SCHEMA}")
+        self.heard = Heard(status, time.monotonic())
+
+
+# -- Sections as HTML ------------------------------------------------------------------------------
+
+
+TEMPLATES = Path(__file__).with_name("templates")
+#: sections in the order of the page; each is an element of this id
+SECTIONS = (
+    "head",
+    "alarms",
+    "todo",
+    "sphere",
+    "marker",
+    "drive",
+    "heading",
+    "gates",
+    "candidate",
+    "estimate",
+    "readings",
+)
+#: what a status of another version may cause
+_OTHER_VERSION = (KeyError, TypeError, ValueError, AttributeError, IndexError)
+LOOK_ELSEWHERE = "the page does not understand this daemon, it may be another version"
+
+
+class Board:
+    """See the module. `may_approve`: whether this page was given an operator's token."""
+
+    def __init__(self, *, may_approve: bool) -> None:
+        self.may_approve = may_approve
+        self._pace, self._fresh = Pace(), view.Fresh()
+        self._taken_s = -math.inf
+
+    def take(self, heard: Heard) -> None:
+        """Follow what moves; once for each status."""
+        if heard.status is None or heard.at_s == self._taken_s:
+            return
+        self._taken_s = heard.at_s
+        try:
+            self._pace.take(heard.status)
+            self._fresh.take(_field(heard.status), float(heard.status["at_s"] or 0.0))
+        except _OTHER_VERSION:
+            return  # `sections` says so
+
+    def sections(self, heard: Heard, now_s: float) -> dict[str, str]:
+        """Every section by its id, at `now_s` of the monotonic clock."""
+        if why := heard.away(now_s):
+            return self._away(why, now_s - heard.at_s, heard.status is not None)
+        try:
+            return self._present(heard.status or {})
+        except _OTHER_VERSION as error:
+            return self._away(f"{LOOK_ELSEWHERE}: {error!r}", now_s - heard.at_s, seen=False)
+
+    def _away(self, why: str, for_s: float, seen: bool) -> dict[str, str]:
+        """No figure at all: an old one must not be taken for one of now."""
+        since = time.strftime("%H:%M:%S", time.localtime(time.time() - for_s))
+        text = render(
+            "away.html", TEMPLATES, why=why, since=since, for_=view.span(for_s), seen=seen
+        )
+        return dict.fromkeys(SECTIONS, "") | {"alarms": text}
+
+    def _present(self, status: Mapping[str, Any]) -> dict[str, str]:
+        state, meaning, mode = view.state_words(status)
+        shown, fresh_s = shown_of(status), float(status["at_s"] or 0.0)
+        circle, tilts = circle_is_wanted(status), tilt_is_wanted(status)
+        dots, marker = None, None
+        if shown is not None:
+            fresh = self._fresh.cells(fresh_s)
+            dots = view.dots(shown, fresh, circle=circle, tilts=tilts)
+            if view.has_readings(status):
+                marker = view.marker(_field(status), shown.frame_b)
+        values: dict[str, object] = {
+            "view": view,
+            "status": status,
+            "pace": self._pace,
+            "may_approve": self.may_approve,
+            "state": state,
+            "meaning": meaning,
+            "mode": mode,
+            "dots": dots,
+            "marker": marker,
+        }
+        return {name: render(f"{name}.html", TEMPLATES, **values) for name in SECTIONS}
+
+
+def _field(status: Mapping[str, Any]) -> list[float | None]:
+    """The field now by the best calibration that is known."""
+    seen = status["readings"]
+    if seen is None:
+        return [None] * 3
+    new: list[float | None] = seen["would_be_b_gauss"]
+    return seen["corrected_b_gauss"] if None in new else new
+
+
+# -- The application -------------------------------------------------------------------------------
+
 
 MOST_BROWSERS = 32
 _MOST_REQUESTS = 64

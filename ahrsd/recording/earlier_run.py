@@ -22,7 +22,7 @@ import numpy as np
 
 from ahrsd.core.warm_start import MOST_ROWS, too_old
 from ahrsd.errors import RecordingError
-from ahrsd.estimator.epoch_builder import StepAverager, samples_per_step
+from ahrsd.estimator.epoch_data import StepAverager, samples_per_step
 from ahrsd.inputs import (
     EarlierRun,
     EarlierSamples,
@@ -32,15 +32,16 @@ from ahrsd.inputs import (
     Received,
     WallClock,
 )
-from ahrsd.recording import inputs_json
+from ahrsd.recording import capture
 from ahrsd.recording.blocks import SEQUENCES, Damage, Entry, read_entries, read_head
 from ahrsd.recording.capture import part_path
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
 from ahrsd.writeback.clocks import Stamp
-from drivers.vn100.decode import Measurement, Reply, Undecodable, decode
+from drivers.vn100.decode import Measurement, Undecodable, decode
 from drivers.vn100.deframer import Deframer
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import COMPENSATING, Values, parse, same
 
@@ -120,7 +121,7 @@ class Reading:
         elif entry.topic == "tx":
             self._sent(entry.data.decode("ascii", "replace"))
         elif entry.topic == "input" and entry.data.startswith(_INPUTS):
-            self._input(inputs_json.decode(entry.data))
+            self._input(capture.input_from_json(entry.data))
 
     def skipped(self) -> None:
         """Part of the file was not read."""

@@ -107,7 +107,7 @@ class Recording:
 
     def told_rate(self) -> tuple[float, str] | None:
         """Rate in Hz that a byte stream itself tells, and by what; None: it tells none."""
-        from ahrsd.stream.time_from_attitude import rate_of
+        from ahrsd.stream.streams_without_time import rate_of
 
         return rate_of(read_stream(self.path))
 

@@ -28,9 +28,8 @@ import pyarrow.parquet
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.recording.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
 from ahrsd.recording.column_names import (
     ACCEL,

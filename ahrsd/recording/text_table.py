@@ -15,9 +15,8 @@ from pathlib import Path
 import pyarrow
 import pyarrow.csv
 
-from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.recording.bytestream import read_chunks, utf16_of
 from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.limits import (

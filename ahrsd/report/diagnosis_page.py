@@ -1,15 +1,244 @@
-"""The report of a diagnosis: one HTML file with its pictures inside."""
+"""The report of a diagnosis: one HTML file with its pictures inside.
+
+Orange is before, blue is after, as everywhere in the project.
+"""
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
 
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn, Finding, RegimeMap, Validation
 from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.shown import shown
 from ahrsd.diagnosis.spoken import headline, place, sensitivity, value_text, verdict
+from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.report.template import Picture, number, picture, render
+from ahrsd.samples import Array
+
+# -- Pictures --------------------------------------------------------------------------------------
+
+
+_BINS = 300  # of time
+_REGIMES = 10  # quantities in the map
+_AXES = "xyz"
+_WORSE = 1.05  # times the mean distance of the spectrum from 1, in logarithms
+
+
+def _figure(height_in: float, rows: int = 1) -> Figure:
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    figure.subplots(rows, 1, sharex=rows > 1)
+    return figure
+
+
+def _binned(time_s: Array, values: Array) -> tuple[Array, Array]:
+    """Means of `values` in at most _BINS spans of time; empty ones are left out."""
+    edges = np.linspace(time_s[0], time_s[-1], min(_BINS, max(len(time_s) // 8, 2)) + 1)
+    index = np.clip(np.searchsorted(edges, time_s, "right") - 1, 0, len(edges) - 2)
+    count = np.bincount(index, minlength=len(edges) - 1)
+    total = np.bincount(index, weights=values, minlength=len(edges) - 1)
+    kept = count > 0
+    return 0.5 * (edges[1:] + edges[:-1])[kept], total[kept] / count[kept]
+
+
+def _both(before: Array, after: Array) -> tuple[tuple[Array, str, str], ...]:
+    if np.array_equal(before, after):  # nothing was named: one would hide the other
+        return ((before, BEFORE, "nothing named"),)
+    return (before, BEFORE, "before"), (after, AFTER, "after")
+
+
+def residual(found: Diagnosis, drawn: Drawn) -> Figure:
+    """Readings less what was expected over time, before and after, located spans shaded."""
+    figure = _figure(4.6, 3)
+    spans = [span for finding in found.findings for span in finding.where.intervals_s]
+    if found.unexplained.where is not None:
+        spans += found.unexplained.where.intervals_s
+    whole = drawn.time_s[-1] - drawn.time_s[0]
+    for k, axes in enumerate(figure.axes):
+        for begin, end in spans:
+            if end - begin < 0.95 * whole:
+                axes.axvspan(begin, end, color=GREY, alpha=0.15, lw=0)
+        for values, color, name in _both(drawn.before_gauss, drawn.after_gauss):
+            series = _binned(drawn.time_s, values[:, k] * 1e3)
+            axes.plot(*series, color=color, lw=1.0, label=name)
+        axes.set_ylabel(f"{_AXES[k]}, mG")
+    legend_above(figure)
+    figure.axes[-1].set_xlabel("time, s")
+    return figure
+
+
+def evidence(found: Diagnosis, drawn: Drawn) -> Figure:
+    """Nats of every candidate in the first round, the strongest on top; named ones in blue."""
+    named = {finding.effect for finding in found.findings}
+    ranked = sorted(drawn.evidence.items(), key=lambda item: -item[1])[:14]
+    figure = _figure(0.5 + 0.24 * max(len(ranked), 2))
+    axes = figure.axes[0]
+    values = [max(nats, 0.1) for _, nats in ranked]
+    colors = [AFTER if name in named else GREY for name, _ in ranked]
+    axes.barh(range(len(ranked)), values, color=colors)
+    axes.set_yticks(range(len(ranked)), [name for name, _ in ranked], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.axvline(3.0, color=BEFORE, lw=1.0)
+    axes.set_xlabel("evidence, nats")
+    return figure
+
+
+def contribution(one: Contribution) -> Figure:
+    """What a named effect adds to the readings over time."""
+    figure = _figure(2.0)
+    axes = figure.axes[0]
+    for k in range(3):
+        series = _binned(one.time_s, one.added[:, k] * 1e3)
+        axes.plot(*series, color=SERIES[k], lw=1.0, label=_AXES[k])
+    axes.set_xlabel("time, s")
+    axes.set_ylabel({"gauss": "mG", "rad/s": "mrad/s"}[one.unit])
+    legend_above(figure)
+    return figure
+
+
+def validation(found: Validation) -> Figure:
+    """Gain of whole models over the calibration alone on parts that were not fitted."""
+    bars = {
+        "calibration alone": (0.0, GREY),
+        "moved in time": (found.placebo, BEFORE),
+        "named": (found.named, AFTER),
+        "named, rest drawn freely": (found.named + found.free, SERIES[1]),
+    }
+    figure = _figure(1.7)
+    axes = figure.axes[0]
+    values = [value for value, _ in bars.values()]
+    drawn = axes.barh(range(len(bars)), values, color=[color for _, color in bars.values()])
+    axes.bar_label(drawn, [f" {value:+.4f}" for value in values], fontsize=8)
+    axes.set_yticks(range(len(bars)), list(bars), fontsize=8)
+    axes.margins(x=0.2)
+    axes.axvline(0.0, color=GREY, lw=0.8)
+    axes.invert_yaxis()
+    axes.set_xlabel("gain, nats per sample")
+    return figure
+
+
+def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
+    """What is left by condition: a row a quantity, low values left, before and after."""
+    rows = maps[:_REGIMES]
+    highest = max(max(one.before + one.after) for one in rows)
+    colours = LogNorm(1.0, max(highest, 10.0), clip=True)
+    figure = _figure(1.2 + 0.72 * len(rows), 2)
+    for axes, side in zip(figure.axes, ("before", "after"), strict=True):
+        for row, one in enumerate(rows):
+            nats = np.array([getattr(one, side)])
+            edges = np.linspace(0.0, 1.0, nats.shape[1] + 1)
+            drawn = axes.pcolormesh(
+                edges, [row - 0.45, row + 0.45], nats, cmap="YlOrRd", norm=colours, edgecolor="w"
+            )
+        labels = [
+            f"{_plain(one.quantity)}\n{one.edges[0]:.3g} to {one.edges[-1]:.3g}" for one in rows
+        ]
+        axes.set_yticks(range(len(rows)), labels, fontsize=7)
+        axes.set_xticks([])
+        axes.invert_yaxis()
+        axes.set_title(side)
+        axes.grid(visible=False)
+        figure.colorbar(drawn, ax=axes, label="nats")
+    figure.axes[1].set_xlabel("low to high, as many samples in every bin")
+    return figure
+
+
+def _plain(name: str) -> str:
+    """A column's name in a picture: a dollar sign begins no formula."""
+    return shown(name).replace("$", r"\$")
+
+
+def courses(drawn: Drawn) -> Figure:
+    """What is left after the named effects, in the three frames, by segments of time."""
+    shown = [one for one in drawn.courses if len(one.course)]
+    figure = _figure(0.4 + 1.5 * max(len(shown), 1), max(len(shown), 1))
+    for axes, one in zip(figure.axes, shown, strict=False):
+        middle = 0.5 * (np.asarray(one.cut.edges_s[1:]) + np.asarray(one.cut.edges_s[:-1]))
+        for k in range(3):
+            axes.plot(middle, one.course[:, k] * 1e3, color=SERIES[k], lw=1.2, label=_AXES[k])
+        axes.fill_between(
+            middle, -2e3 * one.deviation, 2e3 * one.deviation, color=GREY, alpha=0.15, lw=0
+        )
+        unit = "mrad/s" if one.frame == "gyro" else "mG"
+        axes.set_title(f"{one.frame} frame, evidence {max(one.evidence, 0.0):.0f} nats")
+        axes.set_ylabel(unit)
+    figure.axes[-1].set_xlabel("time, s")
+    legend_above(figure)
+    return figure
+
+
+def spectrum(drawn: Drawn) -> Figure:
+    """Power of the whitened innovations by frequency, all axes: 1 where nothing is left."""
+    figure = _figure(2.4)
+    axes = figure.axes[0]
+    for values, color, name in _both(drawn.before, drawn.after):
+        frequency, power = _power(drawn.time_s, values)
+        axes.plot(frequency, power, color=color, lw=1.0, label=name)
+    axes.axhline(1.0, color=GREY, lw=0.8)
+    _log_log(axes)
+    axes.set_xlabel("frequency, Hz")
+    axes.set_ylabel("power, 1 = as expected")
+    if spectrum_is_worse(drawn):
+        axes.set_title("Farther from 1 after than before")
+    legend_above(figure)
+    return figure
+
+
+def spectrum_is_worse(drawn: Drawn) -> bool:
+    """Whether the innovations after the named effects are farther from 1 than those before."""
+    if np.array_equal(drawn.before, drawn.after):
+        return False
+    before, after = (
+        float(np.mean(np.abs(np.log(np.maximum(_power(drawn.time_s, values)[1], 1e-12)))))
+        for values in (drawn.before, drawn.after)
+    )
+    return after > _WORSE * before
+
+
+def stands_out(drawn: Drawn) -> bool:
+    """Whether the freely drawn course of any frame leaves its own band of two deviations."""
+    return any(
+        bool(np.any(np.abs(one.course) > 2.0 * np.reshape(one.deviation, (-1, 1))))
+        for one in drawn.courses
+        if len(one.course)
+    )
+
+
+def grey_ones_are_longer(found: Diagnosis, drawn: Drawn) -> bool:
+    """Whether an effect that was not named explains more alone than one that was."""
+    named = {finding.effect for finding in found.findings}
+    blue = [nats for name, nats in drawn.evidence.items() if name in named]
+    grey = [nats for name, nats in drawn.evidence.items() if name not in named]
+    return bool(blue) and bool(grey) and max(grey) > min(blue)
+
+
+def _power(time_s: Array, values: Array) -> tuple[Array, Array]:
+    """Averaged periodogram on a logarithmic grid of frequencies; 1 for white innovations."""
+    step_s = float(np.median(np.diff(time_s)))
+    clean = np.nan_to_num(values - np.nanmean(values, axis=0))
+    power = np.mean(np.abs(np.fft.rfft(clean, axis=0)) ** 2, axis=1) / len(clean)
+    frequency = np.fft.rfftfreq(len(clean), step_s)
+    edges = np.geomspace(frequency[1], frequency[-1] * 1.001, 50)
+    index = np.searchsorted(edges, frequency[1:], "right") - 1
+    count = np.bincount(index, minlength=len(edges))[: len(edges) - 1]
+    total = np.bincount(index, weights=power[1:], minlength=len(edges))[: len(edges) - 1]
+    kept = count > 0
+    return np.sqrt(edges[1:] * edges[:-1])[kept], total[kept] / count[kept]
+
+
+def _log_log(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+
+
+# -- The page --------------------------------------------------------------------------------------
+
 
 _MG = 1e3
 #: what each picture is called, and what is said below it
@@ -125,10 +354,9 @@ def _finding(found: Diagnosis, one: Finding) -> dict[str, object]:
 def _contribution(found: Diagnosis, one: Finding) -> Picture | None:
     if found.drawn is None or one.term is None:
         return None
-    from ahrsd.report import diagnosis_figures as figures
 
     added = found.drawn.contributions[one.term]
-    draw = partial(figures.contribution, added)
+    draw = partial(contribution, added)
     return picture(draw, f"{one.effect} over time", "What it adds to the readings.")
 
 
@@ -156,7 +384,6 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
 
 def _how_real(found: Diagnosis) -> str:
     """Only what the pictures below show."""
-    from ahrsd.report.diagnosis_figures import stands_out
 
     if found.drawn is not None and found.drawn.courses and not stands_out(found.drawn):
         return (
@@ -186,22 +413,21 @@ def _pictures(found: Diagnosis) -> list[Picture]:
     drawn = found.drawn
     if drawn is None:
         return []
-    from ahrsd.report import diagnosis_figures as figures
 
-    worse = figures.spectrum_is_worse(drawn)
+    worse = spectrum_is_worse(drawn)
     shots = [
-        (partial(figures.residual, found, drawn), *_OVER_TIME),
-        (partial(figures.spectrum, drawn), *_longer(_BY_FREQUENCY, worse, _WORSE_SPECTRUM)),
+        (partial(residual, found, drawn), *_OVER_TIME),
+        (partial(spectrum, drawn), *_longer(_BY_FREQUENCY, worse, _WORSE_SPECTRUM)),
     ]
     if drawn.evidence:
-        longer = figures.grey_ones_are_longer(found, drawn)
-        shots.append((partial(figures.evidence, found, drawn), *_longer(_BY_NAME, longer, _LOST)))
+        longer = grey_ones_are_longer(found, drawn)
+        shots.append((partial(evidence, found, drawn), *_longer(_BY_NAME, longer, _LOST)))
     if found.regime_map:
-        shots.append((partial(figures.regime_map, found.regime_map), *_BY_CONDITION))
+        shots.append((partial(regime_map, found.regime_map), *_BY_CONDITION))
     if found.validation is not None and found.findings:
-        shots.append((partial(figures.validation, found.validation), *_NOT_FITTED))
+        shots.append((partial(validation, found.validation), *_NOT_FITTED))
     if drawn.courses:
-        shots.append((partial(figures.courses, drawn), *_BY_FRAME))
+        shots.append((partial(courses, drawn), *_BY_FRAME))
     return [picture(*shot) for shot in shots]
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from ahrsd.calibration import Estimate
 from ahrsd.core.core import Core
-from ahrsd.counting import counted
 from ahrsd.events import GateResult
 from ahrsd.gates import Level, guards_a_write
+from ahrsd.printable import counted
 from ahrsd.report.calibration_json import (
     HeadingErrors,
     calibration_json,

@@ -26,12 +26,11 @@ from ahrsd.sharing.client_commands import (
     understand,
 )
 from drivers.vn100.commands import Read, Write
-from drivers.vn100.decode import Reply
 from drivers.vn100.deframer import Cause, Deframer
 from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.messages import Reply, encode
 from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values, format_reply
-from drivers.vn100.sentences import encode
 
 PATIENCE_S = 2.5  # the longest that a known driver waits for an answer
 MOST_WAITING = 16  # commands of one client

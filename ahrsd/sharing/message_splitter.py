@@ -9,7 +9,7 @@ whoever asked.
 from __future__ import annotations
 
 from drivers.vn100.deframer import Deframer, Sentence, Skipped
-from drivers.vn100.sentences import COMMAND_WORDS, REGISTER_WORDS
+from drivers.vn100.messages import COMMAND_WORDS, REGISTER_WORDS
 
 _REPLIES = REGISTER_WORDS | COMMAND_WORDS | {"VNERR"}
 

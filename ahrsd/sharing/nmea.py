@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import encode
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,10 @@ so that the blocks do not depend on how the bytes were cut), then turned into ar
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
 the rate. Damaged messages, steps over which the device turned further than its rate can explain
-(`rate.TurnWatch`), and a pause in the arrivals count as lost messages then, so that nothing
-is bridged. The rate of such a stream is what the caller says, else what the register of this very
-output says (`output_rates`), else what the arrival times say, else the factory's 40 Hz. Where
-messages come at another rate than a register says, time after time, the arrivals are right.
+(`TurnWatch`), and a pause in the arrivals count as lost messages then, so that nothing is bridged.
+The rate of such a stream is what the caller says, else what the register of this very output says
+(`streams_without_time`), else what the arrival times say, else the factory's 40 Hz. Where messages
+come at another rate than a register says, time after time, the arrivals are right.
 
 How the bytes were cut into chunks changes nothing: everything here goes by the messages and by the
 damage in front of each, never by what else came with them.
@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.evidence.values import HealthFacts
+from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.decompensation import (
     Extracted,
@@ -33,11 +33,17 @@ from ahrsd.stream.decompensation import (
     sample_blocks,
 )
 from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, StreamTimeline, TimelineSteps
-from ahrsd.stream.output_rates import RateWatch, offered_rate, rate_by_registers, rate_of_arrivals
-from ahrsd.stream.time_from_attitude import TurnWatch, attitude_columns
-from drivers.vn100.binary import BinaryLayout
+from ahrsd.stream.streams_without_time import (
+    RateWatch,
+    TurnWatch,
+    attitude_columns,
+    offered_rate,
+    rate_by_registers,
+    rate_of_arrivals,
+)
 from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
+from drivers.vn100.messages import BinaryLayout
 
 
 @dataclass(slots=True)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ahrsd.calibration import Affine
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.device_clock import Mask, TimelineSteps
-from drivers.vn100.fields import Layout
+from drivers.vn100.messages import Layout
 
 MAG, ACCEL, GYRO, ROTATION, HSI_CONTROL, HSI_RESULT = 23, 25, 84, 26, 44, 47
 HSI_APPLIED: Final = 3  # register 44, field Output

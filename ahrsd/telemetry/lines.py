@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ahrsd.counting import counted
+from ahrsd.printable import counted
 from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.telemetry.explain import STATES, holding
 

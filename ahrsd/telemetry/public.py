@@ -20,7 +20,7 @@ from ahrsd.telemetry.client import default_socket_path
 from ahrsd.telemetry.feeds import Feed, Outlet
 from ahrsd.telemetry.lines import service_line
 from ahrsd.telemetry.metrics import MetricsServer
-from ahrsd.telemetry.records import Newest, samples_record
+from ahrsd.telemetry.protocol import Newest, samples_record
 from ahrsd.telemetry.sd_notify import Notifier
 from ahrsd.telemetry.server import SocketServer
 from ahrsd.telemetry.status import LinkFacts, StatusMaker

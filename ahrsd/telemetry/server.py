@@ -18,17 +18,20 @@ from pathlib import Path
 import ahrsd
 from ahrsd import events
 from ahrsd.telemetry.explain import explain_json
-from ahrsd.telemetry.outbox import LIMIT_BYTES, Outbox
 from ahrsd.telemetry.protocol import (
+    LIMIT_BYTES,
     LONGEST_REQUEST,
     SCHEMA,
     STREAMS,
     BadRequest,
+    Outbox,
+    Record,
     SocketRequest,
     line_of,
     parse_request,
+    record_of,
+    stream_of,
 )
-from ahrsd.telemetry.records import Record, record_of, stream_of
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ahrsd.counting import counted
 from ahrsd.events import Noted, RegisterWritten, StateChanged
+from ahrsd.printable import counted
 from ahrsd.writeback.actions import (
     Action,
     AppendToJournal,

@@ -30,8 +30,8 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.samples import Array
+from drivers.vn100.messages import encode
 from drivers.vn100.registers import Values, as_stored, format_command
-from drivers.vn100.sentences import encode
 
 MAG, GYRO = 23, 84
 MAX_CONDITION: Final = 8.0  # daemon.md 4.3 G9: hard limits, not a person's to loosen

@@ -12,8 +12,8 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from drivers.vn100.decode import Reply
 from drivers.vn100.errors import ERRORS, DriverError, Remedy
+from drivers.vn100.messages import Reply
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,

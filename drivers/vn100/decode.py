@@ -13,11 +13,12 @@ from operator import truediv
 
 from drivers.vn100.deframer import Packet, Sentence
 from drivers.vn100.errors import code_of
-from drivers.vn100.fields import Layout
-from drivers.vn100.sentences import (
+from drivers.vn100.messages import (
     COMMAND_WORDS,
     MESSAGES,
     REGISTER_WORDS,
+    Layout,
+    Reply,
     sentence_layout,
 )
 
@@ -38,15 +39,6 @@ class Measurement:
     layout: Layout
     values: tuple[float, ...]
     offset: int
-
-
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """The device's answer to a command: its word, the register if it has one, and the rest."""
-
-    word: str
-    register: int | None
-    tokens: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

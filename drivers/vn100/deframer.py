@@ -35,9 +35,19 @@ from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 
-from drivers.vn100.binary import SYNC, BinaryLayout, is_of_vn100, layout_of, read_header, size_in
-from drivers.vn100.checksum import packet_intact
-from drivers.vn100.sentences import COMMAND_LINE, LINE, LINE_AT_THE_END, line_intact
+from drivers.vn100.messages import (
+    COMMAND_LINE,
+    LINE,
+    LINE_AT_THE_END,
+    SYNC,
+    BinaryLayout,
+    is_of_vn100,
+    layout_of,
+    line_intact,
+    packet_intact,
+    read_header,
+    size_in,
+)
 
 LONGEST_LINE = 320
 LONGEST_COMMAND = 256  # receive buffer of the device

@@ -11,7 +11,7 @@ not say which command it answers. Everything else on the wire passes through, in
 and a read's values must be ones that the register can have. Names of measurements differ from
 ``VNRRG``, so none can be taken for a reply. All other replies come out as `Stray`.
 
-**Echoes.** A line that sends commands back is recognised (`echo`); an echo answers nothing.
+**Echoes.** A line that sends commands back is recognised (`Echo`); an echo answers nothing.
 
 **Late replies.** The device carries out commands in the order of arrival and the wire keeps the
 order of its replies. So what can go wrong is only this: an attempt timed out (or was ended by a
@@ -31,6 +31,8 @@ a true reading too, and the order of the wire still puts it behind the echo of o
 
 from __future__ import annotations
 
+import re
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -53,18 +55,50 @@ from drivers.vn100.commands import (
     must_follow,
     patience,
 )
-from drivers.vn100.decode import (
-    ErrorReply,
-    Measurement,
-    Reply,
-    Undecodable,
-    Unused,
-    decode,
-)
+from drivers.vn100.decode import ErrorReply, Measurement, Undecodable, Unused, decode
 from drivers.vn100.deframer import Deframer, Frame, Sentence
-from drivers.vn100.echo import Echo
 from drivers.vn100.errors import DeviceRefused, DriverError
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import Reply, encode
+
+# -- Echoes ----------------------------------------------------------------------------------------
+
+
+_MOST_WAITING = 16  # commands whose echo may be under way
+# A read whose answer has values; that of an empty user tag has none, and one with a port parameter
+# ("VNRRG,06,1") reads like an answer.
+_PLAIN_READ = re.compile(r"VNRRG,(?!00$)[0-9]+")
+
+
+class Echo:
+    """Of one link. `echoes`: whether the line was seen to echo."""
+
+    def __init__(self) -> None:
+        self.echoes = False
+        self._waiting: deque[str] = deque(maxlen=_MOST_WAITING)
+
+    def sent(self, body: str) -> None:
+        """A command goes out; `body` is what is between $ and *."""
+        self._waiting.append(body)
+
+    def is_echo(self, body: str) -> bool:
+        """Whether a line with this body is the echo of a command; each command has one."""
+        if body not in self._waiting:
+            return False
+        if not self.echoes and not _PLAIN_READ.fullmatch(body):
+            return False
+        self.echoes = True
+        while self._waiting.popleft() != body:
+            pass  # an echo that was lost will not come any more
+        return True
+
+    def forget(self) -> None:
+        """The link is gone; the next one may be another adapter."""
+        self.echoes = False
+        self._waiting.clear()
+
+
+# -- The session -----------------------------------------------------------------------------------
+
 
 GHOST_LIFE_S = 5.0
 # Without a byte for so long, half a message is no message any more: longer than a retransmission

@@ -10,7 +10,7 @@ import pytest
 from simulation import GYRO_BIAS, HARD_IRON, blocks, clean
 
 from ahrsd.baselines import METHODS, MethodSettings, calibrate_with, joined, run
-from ahrsd.baselines.kinematic import per_sample, windowed
+from ahrsd.baselines.graph_methods import per_sample, windowed
 
 KNOWN = MethodSettings(known_gyro_bias_rad_s=GYRO_BIAS)
 

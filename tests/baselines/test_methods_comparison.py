@@ -10,8 +10,8 @@ import pytest
 from simulation import HARD_IRON, UNIT_SOFT_IRON, blocks, simulate
 
 from ahrsd.baselines import calibrate_with
-from ahrsd.baselines.comparison import PIECES, ComparisonRow, halves, spread_of
-from ahrsd.report.methods_figure import write_methods_figure
+from ahrsd.baselines.registry import PIECES, ComparisonRow, halves, spread_of
+from ahrsd.report.accuracy_figures import write_methods_figure
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from simulation import HARD_IRON, UNIT_SOFT_IRON, clean, simulate
 
 from ahrsd.baselines import MethodError, MethodSettings, run
-from ahrsd.baselines.ellipsoid import refuse_other_quadrics
+from ahrsd.baselines.attitude_independent import refuse_other_quadrics
 
 SIGNS = [np.array([x, y, z]) for x in (1, -1) for y in (1, -1) for z in (1, -1)]
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.optimize import minimize
 from simulation import FIELD, HARD_IRON, UNIT_SOFT_IRON, simulate
 
-from ahrsd.baselines import MethodSettings, norm_preserving, run
-from ahrsd.baselines.norm_preserving import (
+from ahrsd.baselines import MethodSettings, attitude_independent, run
+from ahrsd.baselines.attitude_independent import (
     linear_centre,
     solve_np,
     solve_np_uncertain_field,
@@ -147,8 +147,8 @@ def test_total_least_squares_differs_from_norm_preservation_in_second_order_only
 
 def test_iterations_that_do_not_end_are_said(monkeypatch):
     data = simulate("lam", 0, n=3000).data
-    monkeypatch.setattr(norm_preserving, "_NP_MAX_ITERATIONS", 2)
-    monkeypatch.setattr(norm_preserving, "_MAX_TURNS", 2)
+    monkeypatch.setattr(attitude_independent, "_NP_MAX_ITERATIONS", 2)
+    monkeypatch.setattr(attitude_independent, "_MAX_TURNS", 2)
     for method, words in (("np", "no end after 2 iterations"), ("np-uncertain-field", "2 turns")):
         result = run(method, data)
         assert not result.converged

@@ -37,7 +37,7 @@ from drivers_at_start import (
     SDK,
 )
 
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import encode
 
 ANSWER = re.compile(rb"\$(VN(?:RRG|WRG|ERR|ASY|WNV|RST)[^*\r]*)\*..\r\n")
 STARTS = {

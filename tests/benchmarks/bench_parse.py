@@ -13,10 +13,9 @@ from binascii import crc_hqx
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.vn100.binary import binary_layout, encode_packet
 from drivers.vn100.decode import decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.sentences import MESSAGES, encode_sentence
+from drivers.vn100.messages import MESSAGES, binary_layout, encode_packet, encode_sentence
 
 CALIBRATION = binary_layout(0x06, (0x0001, 0x083F))  # 64 bytes
 CHUNK_BYTES = 4096

@@ -28,12 +28,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS
-from ahrsd.baselines.comparison import ComparisonRow
+from ahrsd.baselines.registry import ComparisonRow
 from ahrsd.calibration import Affine
 from ahrsd.config.loading import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
-from ahrsd.evaluation.references import QUATERNION, course, optical
+from ahrsd.evaluation.heading import QUATERNION, course, optical
 from ahrsd.heading import wrapped
 from ahrsd.offline.calibrate import BatchResult, calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published

@@ -32,7 +32,7 @@ from ahrsd.inputs import Received
 from ahrsd.recording.capture import CaptureReader
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 
 BAUD = 921600

@@ -30,7 +30,7 @@ import psutil
 
 from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.protocol import line_of
-from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 
 BAUD, READERS = 921600, 8

@@ -45,8 +45,8 @@ from ahrsd.daemon.service import DAEMON_KEEPS
 from ahrsd.estimator.online import Estimator
 from ahrsd.events import Estimated, Event
 from ahrsd.recording.capture import CaptureWriter
-from drivers.vn100.checksum import crc16
 from drivers.vn100.emulator.scenarios import Setup, build
+from drivers.vn100.messages import crc16
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 from live_heap import heap_bytes

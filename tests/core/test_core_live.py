@@ -24,7 +24,7 @@ from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.writeback.states import State
 from drivers.serial_port import SerialPort
 from drivers.vn100.device import Device
-from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 from drivers.vn100.procedures import read_registers
 

@@ -14,7 +14,7 @@ from ahrsd.core.core import Core
 from ahrsd.core.sensor_checks import SensorChecks, SensorLimits
 from ahrsd.events import Noted
 from ahrsd.inputs import RegistersKnown, Samples
-from ahrsd.recording.inputs_json import to_json
+from ahrsd.recording.capture import to_json
 from ahrsd.samples import SampleBlock
 from ahrsd.so3 import exp
 from ahrsd.telemetry.explain import explain_json, explain_lines

@@ -19,7 +19,7 @@ from ahrsd.daemon.journal import Journal, journal_path, receipt_path
 from ahrsd.errors import JournalError
 from ahrsd.events import JournalAppend
 from ahrsd.inputs import Received, WallClock
-from ahrsd.recording.inputs_json import decode, encode
+from ahrsd.recording.capture import input_from_json, input_to_json
 from ahrsd.writeback.clocks import Stamp
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
@@ -150,7 +150,7 @@ def test_a_replay_of_the_inputs_concludes_the_same():
     assert run.until(lambda: run.state is State.CONFIRMED, 20.0)
     again = Core(run.core.settings)
     for item in run.fed:
-        again.handle(item if isinstance(item, Received) else decode(encode(item)))
+        again.handle(item if isinstance(item, Received) else input_from_json(input_to_json(item)))
     assert again.writeback.state is State.CONFIRMED
     assert again.decisions.sha256 == run.core.decisions.sha256
     old = Core(run.core.settings)  # and as an older version recorded it: nothing is proven
@@ -158,21 +158,21 @@ def test_a_replay_of_the_inputs_concludes_the_same():
         if isinstance(item, Received):
             old.handle(item)
             continue
-        body = json.loads(encode(item))
+        body = json.loads(input_to_json(item))
         for key in ("boot_id", "boot_s"):
             body.pop(key, None)
         for record in body.get("records", []):
             for key in ("boot_id", "boot_s", "device_s"):
                 record["facts"].pop(key, None)
-        old.handle(decode(json.dumps(body).encode()))
+        old.handle(input_from_json(json.dumps(body).encode()))
     assert old.writeback.state is State.COMMITTED
 
 
 def test_a_capture_without_boot_id_loads():
-    item = decode(b'{"type":"WallClock","host_ns":5,"wall_s":1.8e9}')
+    item = input_from_json(b'{"type":"WallClock","host_ns":5,"wall_s":1.8e9}')
     assert item == WallClock(5, 1.8e9, "", None)
     whole = WallClock(5, 1.8e9, "9d3a", 12.25)
-    assert decode(encode(whole)) == whole
+    assert input_from_json(input_to_json(whole)) == whole
 
 
 def test_every_record_has_the_time_by_every_clock(tmp_path):

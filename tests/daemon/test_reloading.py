@@ -20,7 +20,7 @@ from ahrsd.daemon.reloading import Reloader, may_change, merged
 from ahrsd.events import GateResult
 from ahrsd.inputs import LimitsChanged, Samples
 from ahrsd.offline.replay import replay
-from ahrsd.recording import inputs_json
+from ahrsd.recording import capture
 from ahrsd.recording.capture import CaptureReader
 
 
@@ -119,7 +119,7 @@ def limits(**changes):
 
 def test_limits_are_an_input_like_any_other():
     item = LimitsChanged(5, limits(max_heading_sigma_deg=0.5))
-    assert inputs_json.decode(inputs_json.encode(item)) == item
+    assert capture.input_from_json(capture.input_to_json(item)) == item
 
 
 def test_a_verdict_by_other_limits_allows_nothing():

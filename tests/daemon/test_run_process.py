@@ -26,7 +26,7 @@ from patience import PATIENCE_S
 from ahrsd.config.loading import Config
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import encode
 
 ANSWER = re.compile(rb"\$(VN(?:RRG|WRG|ERR|ASY|WNV|RST)[^*\r]*)\*..\r\n")
 READ = rb"\$VNRRG,\d+(,\d)?\*[0-9A-F]{2}"

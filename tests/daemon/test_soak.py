@@ -21,7 +21,7 @@ from ahrsd.evidence.segments import HistoryParameters
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.emulator.scenarios import Setup
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import encode
 
 SHORT = HistoryParameters(segment_s=6.0, shortest_s=2.0, segments=8)
 ESTIMATOR = {"epoch_steps": 64, "window_steps": 512}

@@ -18,7 +18,7 @@ from ahrsd.core.decision_log import DecisionLog
 from ahrsd.core.warm_start import CONFIRM_S, Present, WarmStart, too_old
 from ahrsd.daemon.recall import Recall
 from ahrsd.offline.replay import replay
-from ahrsd.recording import inputs_json
+from ahrsd.recording import capture
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.samples import SampleBlock
 from ahrsd.telemetry.explain import explain_json, explain_lines
@@ -305,8 +305,8 @@ def test_samples_between_two_readings_of_the_device_are_used(short, tmp_path):
 
 def test_earlier_samples_are_inputs_like_others(short, tmp_path):
     for item in read_again(short, tmp_path):
-        again = inputs_json.decode(inputs_json.encode(item))
-        assert inputs_json.encode(again) == inputs_json.encode(item)
+        again = capture.input_from_json(capture.input_to_json(item))
+        assert capture.input_to_json(again) == capture.input_to_json(item)
         if isinstance(item, inputs.EarlierRun):
             assert again == item
 

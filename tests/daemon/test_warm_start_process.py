@@ -18,7 +18,7 @@ from ahrsd.config.text import print_config
 from ahrsd.core.warm_start import CONFIRM_S
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader
-from drivers.vn100.emulator.process import EmulatorProcess
+from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 
 SPEED = 8.0

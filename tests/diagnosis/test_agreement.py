@@ -16,7 +16,7 @@ from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.unknown import borne_out
 from ahrsd.simulation import Experiment
-from ahrsd.simulation.tabular import columns
+from ahrsd.simulation.scenarios import columns
 
 #: scenario, motion, seed, gauss, rad/s: the default's noise, and a quiet gyro's
 PLAIN = (

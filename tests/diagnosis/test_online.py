@@ -14,10 +14,7 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.calibration_pipeline import Calibrator, CalibratorSettings
 from ahrsd.core.core import Core
-from ahrsd.events import Judged, Noted
-from ahrsd.evidence.values import BasisFacts, HealthFacts
-from ahrsd.inputs import Samples
-from ahrsd.monitoring.step_detector import (
+from ahrsd.estimator.step_detector import (
     KEPT,
     ReferenceCalibration,
     Scorer,
@@ -26,6 +23,9 @@ from ahrsd.monitoring.step_detector import (
     Thinned,
     carried,
 )
+from ahrsd.events import Judged, Noted
+from ahrsd.evidence.values import BasisFacts, HealthFacts
+from ahrsd.inputs import Samples
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.simulation import Experiment

@@ -34,7 +34,7 @@ from ahrsd.diagnosis.diagnosis import (
 from ahrsd.diagnosis.shown import MOST, shown
 from ahrsd.diagnosis.spoken import lines
 from ahrsd.diagnosis.values import NullModel
-from ahrsd.report import diagnosis_figures
+from ahrsd.report import diagnosis_page
 from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report
 from ahrsd.viewer.diagnosis import write_rrd
 
@@ -128,7 +128,7 @@ def test_one_line_where_before_and_after_are_the_same():
     assert drawn is not None
 
     def labels(drawn):
-        axes = diagnosis_figures.residual(found, drawn).axes[0]
+        axes = diagnosis_page.residual(found, drawn).axes[0]
         return [line.get_label() for line in axes.get_lines()]
 
     assert labels(drawn) == ["before", "after"]
@@ -146,10 +146,10 @@ def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
     drawn = found.drawn
     worse = replace(drawn, after=10.0 * drawn.before)
     better = replace(drawn, before=10.0 * drawn.after)
-    assert diagnosis_figures.spectrum_is_worse(worse)
-    assert not diagnosis_figures.spectrum_is_worse(better)
-    assert not diagnosis_figures.spectrum_is_worse(replace(drawn, after=drawn.before))
-    title = diagnosis_figures.spectrum(worse).axes[0].get_title(loc="left")
+    assert diagnosis_page.spectrum_is_worse(worse)
+    assert not diagnosis_page.spectrum_is_worse(better)
+    assert not diagnosis_page.spectrum_is_worse(replace(drawn, after=drawn.before))
+    title = diagnosis_page.spectrum(worse).axes[0].get_title(loc="left")
     assert title == "" or "Farther" in title
     assert "Here it is farther from 1 after than before" in page_of(
         replace(found, drawn=worse), tmp_path
@@ -200,9 +200,9 @@ def test_no_legend_lies_on_the_curves(draw):
     found = diagnosis()
     drawn = found.drawn
     figure = {
-        "residual": lambda: diagnosis_figures.residual(found, drawn),
-        "spectrum": lambda: diagnosis_figures.spectrum(drawn),
-        "contribution": lambda: diagnosis_figures.contribution(drawn.contributions[0]),
+        "residual": lambda: diagnosis_page.residual(found, drawn),
+        "spectrum": lambda: diagnosis_page.spectrum(drawn),
+        "contribution": lambda: diagnosis_page.contribution(drawn.contributions[0]),
     }[draw]()
     assert [axes.get_legend() for axes in figure.axes] == [None] * len(figure.axes)
     (legend,) = figure.legends
@@ -213,7 +213,7 @@ def test_no_legend_lies_on_the_curves(draw):
 
 def test_labels_of_the_map_do_not_overlap():
     row = diagnosis().regime_map[0]
-    figure = diagnosis_figures.regime_map((row,) * 10)
+    figure = diagnosis_page.regime_map((row,) * 10)
     FigureCanvasAgg(figure).draw()
     for axes in figure.axes[:2]:
         boxes = [label.get_window_extent() for label in axes.get_yticklabels()]
@@ -278,7 +278,7 @@ NAMES = ("$x_{", "a$b$c", "two\nlines\x1b[31m", "\\frac{$", "n" * 1_000_000)
 def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
     """No formula of matplotlib's, no control character."""
     maps = (RegimeMap(name, (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),)
-    figure = diagnosis_figures.regime_map(maps)
+    figure = diagnosis_page.regime_map(maps)
     figure.draw_without_rendering()
     label = figure.axes[0].get_yticklabels()[0].get_text()
     assert label.replace(r"\$", "$") == f"{shown(name)}\n0 to 27"

@@ -11,15 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd import so3
-from ahrsd.estimator.epoch_builder import (
+from ahrsd.estimator.epoch_data import (
     EpochBuilder,
     StepAverager,
     check_samples,
     join,
+    joined,
     samples_per_step,
     split,
+    thinned,
 )
-from ahrsd.estimator.epoch_data import joined, thinned
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import SampleBlock
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.estimator.epoch_builder import EpochBuilder, HeldReadings, rows_per_reading
+from ahrsd.estimator.epoch_data import EpochBuilder, HeldReadings, rows_per_reading
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import SampleBlock

@@ -10,17 +10,18 @@ from scipy.spatial.transform import Rotation
 from vehicle import DECLINATION_DEG, FIELD_N, HARD_IRON, SOFT_IRON
 
 from ahrsd.evaluation import EvaluationError, judge
-from ahrsd.evaluation.heading import HeadingFigures, compare, rms_difference
-from ahrsd.evaluation.judging import field_figures
-from ahrsd.evaluation.references import (
+from ahrsd.evaluation.heading import (
+    HeadingFigures,
     column,
+    compare,
     course,
     device_heading,
     fixes_from_degrees,
     fixes_of_track,
     optical,
+    rms_difference,
 )
-from ahrsd.evaluation.text import evaluation_json, evaluation_lines
+from ahrsd.evaluation.judging import evaluation_json, evaluation_lines, field_figures
 from ahrsd.evaluation.track import up_directions
 from ahrsd.heading import wrapped
 from ahrsd.world_field import world_field

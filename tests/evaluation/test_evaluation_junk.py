@@ -12,14 +12,8 @@ from hypothesis import strategies as st
 
 from ahrsd.calibration import Affine
 from ahrsd.evaluation import EvaluationError, EvaluationTrack, StoredCalibration, judge, tracked
-from ahrsd.evaluation.references import (
-    Fixes,
-    course,
-    device_heading,
-    fixes_of_track,
-    optical,
-)
-from ahrsd.evaluation.text import evaluation_json, evaluation_lines
+from ahrsd.evaluation.heading import Fixes, course, device_heading, fixes_of_track, optical
+from ahrsd.evaluation.judging import evaluation_json, evaluation_lines
 from ahrsd.samples import SampleBlock
 
 COLUMNS = (

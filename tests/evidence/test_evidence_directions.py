@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ahrsd.evidence.directions import CELLS, cells_of, centres, shown
+from ahrsd.evidence.coverage import CELLS, cells_of, centres, shown
 
 
 def test_the_middle_of_each_cell_lies_in_it():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
+from ahrsd.evidence.second_opinions import rest, stretches
 from ahrsd.evidence.segments import SegmentHistory
-from ahrsd.evidence.stillness import rest, stretches
 from ahrsd.samples import SampleBlock
 from ahrsd.world_field import WorldField
 

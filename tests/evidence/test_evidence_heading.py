@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.comparison import Envelope, heading_error_curve, worst_difference_deg
+from ahrsd.evidence.collector import Envelope, heading_error_curve, worst_difference_deg
 from ahrsd.evidence.coverage import turn_advice
 from ahrsd.evidence.heading import SECTORS, sectors
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.comparison import Envelope, heading_error_curve, worst_difference_deg
-from ahrsd.evidence.refits import gyro_fit, size_fit
+from ahrsd.evidence.collector import Envelope, heading_error_curve, worst_difference_deg
+from ahrsd.evidence.second_opinions import gyro_fit, size_fit
 from ahrsd.evidence.segments import SegmentHistory, nodes_at, track
 
 DIP = np.radians(60.0)

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from ahrsd.page.feed import Heard
+from ahrsd.page.app import Heard
 
 HERE = Path(__file__).parent
 

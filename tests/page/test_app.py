@@ -6,8 +6,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from ahrsd.page.access import Token
-from ahrsd.page.app import Site, make_app
-from ahrsd.page.feed import Heard
+from ahrsd.page.app import Heard, Site, make_app
 
 TOKEN = "a1b2c3d4e5f6a7b8"
 HERE = "http://127.0.0.1:9191"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from shown_status import cell_of, cells, level_ring, motion
 
-from ahrsd.evidence.directions import CELLS, centres
-from ahrsd.page.sphere import MIDDLES, RADIUS, Fresh, dots, marker, project
+from ahrsd.evidence.coverage import CELLS, centres
+from ahrsd.page.view import MIDDLES, RADIUS, Fresh, dots, marker, project
 from ahrsd.telemetry.driving import shown_of
 
 UPRIGHT = np.eye(3)

@@ -4,9 +4,8 @@ import pytest
 from shown_status import gate as view_gate
 
 from ahrsd.page import view
-from ahrsd.page.board import SECTIONS, Board
-from ahrsd.page.feed import Heard
-from ahrsd.telemetry.pace import Pace
+from ahrsd.page.app import SECTIONS, Board, Heard
+from ahrsd.telemetry.driving import Pace
 
 EVIL = "<script>alert(1)</script>"
 

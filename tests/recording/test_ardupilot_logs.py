@@ -10,7 +10,7 @@ import pytest
 from ros_files import sensor
 
 from ahrsd.errors import RecordingError
-from ahrsd.recording.foreign.dataflash import read_log
+from ahrsd.recording.foreign.ardupilot import read_log
 from ahrsd.recording.foreign.sensors import Choice
 from ahrsd.recording.opening import open_recording
 

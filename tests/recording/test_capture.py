@@ -44,7 +44,7 @@ from ahrsd.inputs import (
     Tick,
     WallClock,
 )
-from ahrsd.recording import inputs_json
+from ahrsd.recording import capture
 from ahrsd.recording.capture import CaptureReader, CaptureWriter, Sent, part_path
 from ahrsd.recording.retention import make_private_folder, new_capture_path
 from ahrsd.samples import SampleBlock
@@ -130,7 +130,7 @@ def test_samples_survive_json():
         epoch=3,
         gap_before=True,
     )
-    back = inputs_json.decode(inputs_json.encode(Samples(7, block)))
+    back = capture.input_from_json(capture.input_to_json(Samples(7, block)))
     assert isinstance(back, Samples)
     np.testing.assert_array_equal(back.block.raw_b_gauss, block.raw_b_gauss)
     np.testing.assert_array_equal(back.block.dt_s, block.dt_s)
@@ -143,7 +143,7 @@ def test_samples_survive_json():
 @given(st.binary(max_size=60) | st.sampled_from([b'{"type":"Tick"}', b'{"type":"x"}', b"[1]"]))
 def test_what_is_no_input_is_a_value_error(data):
     with pytest.raises(ValueError):
-        inputs_json.decode(data)
+        capture.input_from_json(data)
 
 
 def test_other_tools_can_read_it(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.report.run_time import RunTime
+from ahrsd.report.contents import RunTime
 
 
 def test_it_is_the_devices_time_until_it_restarts():

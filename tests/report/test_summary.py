@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from streams import emitted, inputs
 
-from ahrsd.cli.watch_screen import gates_table
+from ahrsd.cli.watch import gates_table
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
@@ -24,8 +24,8 @@ from ahrsd.report.summary import (
     summary_lines,
     warnings_of,
 )
-from ahrsd.telemetry.pace import Pace
-from ahrsd.viewer.recorder import gate_table
+from ahrsd.telemetry.driving import Pace
+from ahrsd.viewer.process import gate_table
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.emulator.scenarios import Setup, build

@@ -11,10 +11,9 @@ from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
 from ahrsd.stream.assembler import OTHERS, NoSamplesError, Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from drivers.vn100.binary import binary_layout
 from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import Cause, Skipped
-from drivers.vn100.sentences import MESSAGES
+from drivers.vn100.messages import MESSAGES, binary_layout
 
 VNYMR = MESSAGES["VNYMR"]
 VNYPR = MESSAGES["VNYPR"]

@@ -7,10 +7,14 @@ import pytest
 
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.stream.output_rates import RateWatch, offered_rate, rate_by_registers, rate_of_arrivals
-from drivers.vn100.binary import binary_layout
+from ahrsd.stream.streams_without_time import (
+    RateWatch,
+    offered_rate,
+    rate_by_registers,
+    rate_of_arrivals,
+)
 from drivers.vn100.decode import Measurement
-from drivers.vn100.sentences import sentence_layout
+from drivers.vn100.messages import binary_layout, sentence_layout
 
 AUTOPILOT = binary_layout(0x14, (0x073E, 0x0004))
 OTHER = binary_layout(0x01, (0x0538,))

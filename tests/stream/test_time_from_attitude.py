@@ -10,12 +10,16 @@ import pytest
 from streams import content, emitted
 
 from ahrsd import so3
-from ahrsd.stream.time_from_attitude import TurnWatch, attitude_columns, rate_from_attitude, rate_of
-from drivers.vn100.binary import binary_layout
+from ahrsd.stream.streams_without_time import (
+    TurnWatch,
+    attitude_columns,
+    rate_from_attitude,
+    rate_of,
+)
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.sentences import MESSAGES
+from drivers.vn100.messages import MESSAGES, binary_layout
 
 FOLDER = Path(__file__).parents[2] / "fixtures" / "replays"
 

@@ -23,8 +23,7 @@ from writeback_rig import Rig, estimate
 
 from ahrsd.calibration import Estimate
 from ahrsd.events import GateResult
-from ahrsd.gates import Level, for_level
-from ahrsd.gates.table import GATES
+from ahrsd.gates import GATES, Level, for_level
 from ahrsd.writeback import flow
 from ahrsd.writeback.composition import Proposal, UnwritableError
 from ahrsd.writeback.permissions import Mode

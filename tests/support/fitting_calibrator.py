@@ -12,9 +12,9 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.estimator.step_detector import Step
 from ahrsd.events import GateResult
-from ahrsd.gates.table import GATES
-from ahrsd.monitoring.step_detector import Step
+from ahrsd.gates import GATES
 from ahrsd.samples import Array, SampleBlock
 
 EVERY_S = 1.0

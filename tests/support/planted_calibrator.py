@@ -5,7 +5,7 @@ from __future__ import annotations
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.events import GateResult
-from ahrsd.gates.table import GATES
+from ahrsd.gates import GATES
 from ahrsd.samples import Array, SampleBlock
 
 EVERY_S = 1.0

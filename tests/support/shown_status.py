@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ahrsd.evidence.directions import cells_of, centres, shown
+from ahrsd.evidence.coverage import cells_of, centres, shown
 
 DIP_DEG = 60.0
 

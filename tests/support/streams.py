@@ -12,7 +12,7 @@ from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import make_motion
 from drivers.vn100.emulator.physics import TICK_HZ, draw_truth
 from drivers.vn100.emulator.scenarios import CALIBRATION_SET
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import encode
 
 
 def emitted(device: Emulator, seconds: float, commands: Sequence[tuple[float, str]] = ()) -> bytes:

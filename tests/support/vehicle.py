@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ahrsd.calibration import Affine
 from ahrsd.evaluation import EvaluationTrack, StoredCalibration
-from ahrsd.evaluation.references import Fixes
+from ahrsd.evaluation.heading import Fixes
 from ahrsd.samples import Array
 
 SOFT_IRON = np.array([[1.05, 0.03, 0.0], [0.03, 0.95, 0.02], [0.0, 0.02, 1.01]])

@@ -31,9 +31,9 @@ from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
 from ahrsd.writeback.trial import TrialMetrics
 from drivers.vn100.commands import Command, NoReply, NotPermitted, Pause, Read, Word, Write
-from drivers.vn100.decode import Reply
 from drivers.vn100.errors import DeviceRefused, DriverError
 from drivers.vn100.firmware import profile_of
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import CONFIGURATION, Identity, Seen, Unit
 from drivers.vn100.registers import REGISTERS, Values, as_stored, format_reply, parse
 

@@ -10,7 +10,7 @@ from cabled_run import BIAS, IRON, estimate
 
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.telemetry.calibration_in_use import QUALIFIED, REGISTERS, ChoiceFacts, Chooser
+from ahrsd.telemetry.feeds import QUALIFIED, REGISTERS, ChoiceFacts, Chooser
 from ahrsd.writeback.composition import compose
 from ahrsd.writeback.states import State
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from shown_status import cell_of, cells, gate, level_ring, motion
 
-from ahrsd.evidence.directions import centres
-from ahrsd.gates.table import GATES
+from ahrsd.evidence.coverage import centres
+from ahrsd.gates import GATES
 from ahrsd.telemetry.driving import HELPED_BY_TILT, drive_next, shown_of, tilt_is_wanted
 
 SHUT = [gate("observability.score")]

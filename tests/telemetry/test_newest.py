@@ -7,10 +7,9 @@ import numpy as np
 from ahrsd.calibration import Affine
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.telemetry.records import Newest, samples_record
-from drivers.vn100.binary import binary_layout
+from ahrsd.telemetry.protocol import Newest, samples_record
 from drivers.vn100.decode import Measurement
-from drivers.vn100.sentences import MESSAGES
+from drivers.vn100.messages import MESSAGES, binary_layout
 
 BINARY = binary_layout(0x06, (0x0001, 0x083F))  # with TimeStartup
 PRESENT = Affine(np.diag([1.1, 0.9, 1.0]), np.array([0.01, 0.02, 0.03]))

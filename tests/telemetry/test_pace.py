@@ -5,7 +5,7 @@ import math
 import pytest
 from shown_status import cells, gate, level_ring, motion
 
-from ahrsd.telemetry.pace import LEVEL, TILTED, Pace, about, left_s
+from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, left_s
 
 
 @pytest.mark.parametrize(

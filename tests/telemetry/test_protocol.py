@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ahrsd.telemetry.outbox import Outbox
-from ahrsd.telemetry.protocol import BadRequest, SocketRequest, line_of, parse_request
+from ahrsd.telemetry.protocol import BadRequest, Outbox, SocketRequest, line_of, parse_request
 
 
 def test_requests():

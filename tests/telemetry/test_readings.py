@@ -8,7 +8,7 @@ from ahrsd.events import SamplesSeen
 from ahrsd.samples import SampleBlock
 from ahrsd.telemetry.lines import heading_line, reading_lines, turned_deg
 from ahrsd.telemetry.protocol import plain
-from ahrsd.telemetry.readings import readings
+from ahrsd.telemetry.status import readings
 
 NORTH, DOWN = 0.25, 0.43
 IRON = np.array([0.05, -0.03, 0.1])

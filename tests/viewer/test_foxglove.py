@@ -24,7 +24,7 @@ from ahrsd import events
 from ahrsd.__main__ import group
 from ahrsd.errors import EXIT_BUSY, DeviceError
 from ahrsd.telemetry.server import SocketServer
-from ahrsd.viewer.foxglove_topics import CLOUDS, SCHEMAS, Topics
+from ahrsd.viewer.foxglove import CLOUDS, SCHEMAS, Topics
 
 SAMPLES = {
     "record": "samples",

@@ -37,8 +37,7 @@ from ahrsd.events import (
     StateChanged,
 )
 from ahrsd.samples import SampleBlock
-from ahrsd.viewer.process import free_part, part_name
-from ahrsd.viewer.recorder import quaternion_xyzw, record
+from ahrsd.viewer.process import free_part, part_name, quaternion_xyzw, record
 from ahrsd.viewer.sink import ProcessSettings, RerunLimits, RerunSink, SinkCounters
 
 RATE_HZ = 100.0

@@ -9,11 +9,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.binary import GROUPS, MAX_PACKET_BYTES, SYNC, binary_layout, encode_packet
-from drivers.vn100.checksum import crc16
 from drivers.vn100.decode import Measurement, Unused, decode
 from drivers.vn100.deframer import Deframer, Packet, Sentence
-from drivers.vn100.sentences import encode
+from drivers.vn100.messages import (
+    GROUPS,
+    MAX_PACKET_BYTES,
+    SYNC,
+    binary_layout,
+    crc16,
+    encode,
+    encode_packet,
+)
 
 SAT_INFO, RAW_MEAS = 14, 16
 DRIVER = (0x29, (0x7FFF, 0x0210, 0x000C))  # what the ROS 2 driver asks a VN-100 for

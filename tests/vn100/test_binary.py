@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.binary import (
+from drivers.vn100.decode import Measurement, decode
+from drivers.vn100.deframer import Deframer
+from drivers.vn100.messages import (
     FIELD_MASKS,
     GROUPS,
     MAX_PACKET_BYTES,
@@ -17,12 +19,10 @@ from drivers.vn100.binary import (
     binary_layout,
     encode_packet,
     layout_of,
+    packet_intact,
     packet_size,
     read_header,
 )
-from drivers.vn100.checksum import packet_intact
-from drivers.vn100.decode import Measurement, decode
-from drivers.vn100.deframer import Deframer
 
 # vn100-protocol 1.3, compact table; GNSS and INS by their length tables
 SIZES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.vn100.commands import RESUME, Read, Word, Write, reply_time_s
-from drivers.vn100.decode import Reply
+from drivers.vn100.messages import Reply
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 

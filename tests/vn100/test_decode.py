@@ -12,19 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.binary import binary_layout, encode_packet
-from drivers.vn100.decode import (
-    Decoded,
-    ErrorReply,
-    Measurement,
-    Reply,
-    Undecodable,
-    Unused,
-    decode,
-)
+from drivers.vn100.decode import Decoded, ErrorReply, Measurement, Undecodable, Unused, decode
 from drivers.vn100.deframer import Deframer, Packet, Sentence
 from drivers.vn100.errors import ERRORS, DeviceRefused, DriverError, Remedy, device_error
-from drivers.vn100.sentences import encode, sentence_layout
+from drivers.vn100.messages import Reply, binary_layout, encode, encode_packet, sentence_layout
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "bench_parse.py"
 

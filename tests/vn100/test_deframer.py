@@ -8,13 +8,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.binary import (
-    MAX_PACKET_BYTES,
-    BinaryLayout,
-    binary_layout,
-    encode_packet,
-)
-from drivers.vn100.checksum import crc16
 from drivers.vn100.deframer import (
     KEPT_SKIPPED_BYTES,
     LONGEST_LINE,
@@ -24,7 +17,15 @@ from drivers.vn100.deframer import (
     Sentence,
     Skipped,
 )
-from drivers.vn100.sentences import encode, encode_sentence
+from drivers.vn100.messages import (
+    MAX_PACKET_BYTES,
+    BinaryLayout,
+    binary_layout,
+    crc16,
+    encode,
+    encode_packet,
+    encode_sentence,
+)
 
 CALIBRATION = binary_layout(0x06, (0x0001, 0x083F))
 LAYOUTS = (

@@ -6,8 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.vn100.emulator.chain import BIAS_S, ChainSettings, FilterState, SensorOutputs
-from drivers.vn100.emulator.hsi import OnBoardHsi
+from drivers.vn100.emulator.chain import (
+    BIAS_S,
+    ChainSettings,
+    FilterState,
+    OnBoardHsi,
+    SensorOutputs,
+)
 from drivers.vn100.emulator.motion import make_motion
 from drivers.vn100.emulator.physics import BLOCK_TICKS, EmulatedTruth, EmulatedWorld, SensorBlock
 

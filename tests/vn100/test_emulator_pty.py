@@ -18,8 +18,7 @@ from patience import PATIENCE_S
 from drivers.vn100.emulator.emulator import Emulator
 from drivers.vn100.emulator.motion import make_motion
 from drivers.vn100.emulator.physics import EmulatedTruth
-from drivers.vn100.emulator.process import EmulatorProcess
-from drivers.vn100.emulator.pty import OVERRUN_BYTES, Line, PtyEmulator
+from drivers.vn100.emulator.pty import OVERRUN_BYTES, EmulatorProcess, Line, PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup
 
 STREAM = {5: (921600,), 6: (0,), 75: (1, 4, 1, 0x0001)}  # TimeStartup at 200 Hz, 14 bytes

@@ -6,9 +6,7 @@ import math
 
 import pytest
 
-from drivers.vn100.binary import GROUPS
-from drivers.vn100.fields import Column
-from drivers.vn100.sentences import MESSAGES, sentence_layout
+from drivers.vn100.messages import GROUPS, MESSAGES, Column, sentence_layout
 
 ALL = {
     column.name: column

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.vn100.messages import MESSAGES
 from drivers.vn100.registers import (
     REGISTERS,
     RegisterValueError,
@@ -22,7 +23,6 @@ from drivers.vn100.registers import (
     parse,
     same,
 )
-from drivers.vn100.sentences import MESSAGES
 
 WIRE = Path(__file__).parents[2] / "fixtures" / "vn100" / "wire_examples.json"
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)

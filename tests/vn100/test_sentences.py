@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
-from drivers.vn100.sentences import MESSAGES, Check, encode, encode_sentence, sentence_layout
+from drivers.vn100.messages import MESSAGES, Check, encode, encode_sentence, sentence_layout
 
 # vn100-protocol 2: name, ADOR, register, number of values; 1.5: bytes of a line
 TABLE = [

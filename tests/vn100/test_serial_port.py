@@ -20,7 +20,6 @@ import pytest
 from patience import PATIENCE_S
 
 from drivers import serial_port
-from drivers.port_holders import holders
 from drivers.serial_port import (
     BaudNotFound,
     PortAbsent,
@@ -30,8 +29,9 @@ from drivers.serial_port import (
     PortUnusable,
     SerialPort,
     detect_baud,
+    holders,
+    latency_timer_ms,
 )
-from drivers.usb import latency_timer_ms
 
 YMR = (
     b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,"

@@ -19,8 +19,9 @@ from drivers.vn100.commands import (
     Word,
     Write,
 )
-from drivers.vn100.decode import Measurement, Reply
+from drivers.vn100.decode import Measurement
 from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import quiet, read, save_settings, write_verified
 from drivers.vn100.session import DeviceFault, ProcedureFinished, Session, Stray
 

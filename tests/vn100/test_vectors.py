@@ -20,15 +20,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.vn100.decode import (
-    ErrorReply,
-    Measurement,
-    Reply,
-    Undecodable,
-    Unused,
-    decode,
-)
+from drivers.vn100.decode import ErrorReply, Measurement, Undecodable, Unused, decode
 from drivers.vn100.deframer import Cause, Deframer, Packet, Sentence
+from drivers.vn100.messages import Reply
 
 PROJECT = Path(__file__).parent.parent.parent
 OWN = PROJECT / "fixtures" / "vn100" / "manual_examples.toml"

@@ -14,7 +14,7 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import check_config
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.events import GateResult
-from ahrsd.gates.table import GATES
+from ahrsd.gates import GATES
 
 STEP = np.array([0.06, 0.0, 0.0])
 OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2

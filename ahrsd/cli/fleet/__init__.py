@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ahrsd.cli.files import columns_option, make_folder
 from ahrsd.cli.fleet import answers
-from ahrsd.cli.output_files import make_folder
 from ahrsd.cli.progress import fleet_progress
-from ahrsd.cli.recording_options import columns_option
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.fleet.row import Calibrated
 from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
+from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.diagnosis.diagnosis import Diagnosis

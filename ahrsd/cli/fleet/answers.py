@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from ahrsd.cli.output_files import make_folder, refuse_unwritable, write_json
-from ahrsd.counting import counted
+from ahrsd.cli.files import make_folder, refuse_unwritable, write_json
+from ahrsd.printable import counted
 
 _FOLDER = click.Path(path_type=Path)
 

@@ -21,12 +21,11 @@ from typing import TypeVar
 import click
 
 from ahrsd.cli.device_access import PORT, describe, open_device
-from ahrsd.cli.output_files import refuse_unwritable, write_text
+from ahrsd.cli.files import refuse_unwritable, write_text
 from ahrsd.cli.registers import locks
 from ahrsd.cli.registers.changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.cli.registers.sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.config.loading import default_state_directory
-from ahrsd.counting import counted
 from ahrsd.daemon.journal import (
     Journal,
     Record,
@@ -36,6 +35,7 @@ from ahrsd.daemon.journal import (
     wrg_lines,
 )
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, JournalError
+from ahrsd.printable import counted
 from ahrsd.writeback.journal_history import of_another_device
 from drivers.vn100.device import Device
 from drivers.vn100.procedures import (

@@ -23,10 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.recording.foreign.sensors import Choice, RawBytes, Sensors, SensorSeries, positions
 from ahrsd.recording.limits import TABLE_BYTES, TABLE_CELLS, refuse_beyond
 from ahrsd.samples import Array

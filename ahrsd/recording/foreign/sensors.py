@@ -13,9 +13,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
+from ahrsd.printable import counted
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, NO_MAP, TIME, UNITS, ColumnMap, Source
 from ahrsd.recording.limits import TABLE_ROWS, refuse_beyond
 from ahrsd.samples import Array

@@ -17,9 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.counting import counted
 from ahrsd.errors import RecordingError
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.recording.foreign.sensors import (
     Choice,
     Sensors,

@@ -14,7 +14,7 @@ from ahrsd.__main__ import main as ahrsd
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import load_track
-from ahrsd.report import diagnosis_figures, figures
+from ahrsd.report import diagnosis_page, figures
 
 _SIZE_PX = (1000, 920)
 #: picture -> effect as `ahrsd simulate` takes it, and a column to leave out
@@ -55,7 +55,7 @@ def main() -> None:
             what = [one.effect for one in found.findings] or ["unknown"]
             sys.stderr.write(f"{family}: {effect}: {', '.join(what)}\n")
             path = target / f"mismatch-{family}.png"
-            figures.save_png(partial(diagnosis_figures.residual, found, drawn), path, *_SIZE_PX)
+            figures.save_png(partial(diagnosis_page.residual, found, drawn), path, *_SIZE_PX)
 
 
 if __name__ == "__main__":

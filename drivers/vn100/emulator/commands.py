@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from drivers.vn100.emulator.memory import PER_PORT, Memory
-from drivers.vn100.emulator.output import (
+from drivers.vn100.emulator.physics import GRAVITY_M_S2, HISTORY_TICKS, EmulatedWorld
+from drivers.vn100.emulator.sensor import (
     KNOWN_ACCELERATION,
     KNOWN_MAGNETIC,
     MEASURED,
+    Sensor,
     quantities_of,
 )
-from drivers.vn100.emulator.physics import GRAVITY_M_S2, HISTORY_TICKS, EmulatedWorld
-from drivers.vn100.emulator.sensor import Sensor
 from drivers.vn100.emulator.streams import BINARY_OUTPUTS, binary_packet, fits
 from drivers.vn100.register_codec import RegisterValueError, Values
 from drivers.vn100.registers import format_reply

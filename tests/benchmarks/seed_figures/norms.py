@@ -19,7 +19,7 @@ from seed_figures.chapter5 import Each, Said
 
 from ahrsd import so3
 from ahrsd.baselines import MethodData, MethodError, MethodSettings, run
-from ahrsd.baselines.norm_preserving import fnp_rows, linear_centre, minimise, tls_rows
+from ahrsd.baselines.attitude_independent import fnp_rows, linear_centre, minimise, tls_rows
 from ahrsd.montecarlo.runs import batch_method
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, Iron

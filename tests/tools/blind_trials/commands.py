@@ -9,10 +9,10 @@ from pathlib import Path
 
 import click
 
-from ahrsd.cli.output_files import refuse_unwritable
+from ahrsd.cli.files import refuse_unwritable
 from ahrsd.cli.progress import count_progress
-from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO
+from ahrsd.printable import counted
 
 _RINGS = (
     "full",

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ahrsd.counting import counted
+from ahrsd.printable import counted
 from ahrsd.report.template import render
 
 if TYPE_CHECKING:

@@ -1,7 +1,8 @@
-"""Files that a command writes: refused before any work, told where one is replaced, whole or not.
+"""Files of a command: `--columns` of the recordings that it reads, and what it writes.
 
-A file that can be made again is replaced, and a line says so. What cannot (a recording of a device)
-is never replaced: `capture` asks for another name.
+What it writes is refused before any work, told where one is replaced, whole or not. A file that can
+be made again is replaced, and a line says so. What cannot (a recording of a device) is never
+replaced: `capture` asks for another name.
 """
 
 from __future__ import annotations
@@ -9,13 +10,40 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 
 from ahrsd.errors import AhrsdError
+
+# -- Recordings that it reads ----------------------------------------------------------------------
+
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+def _parsed(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> object:
+    from ahrsd.recording.column_names import parse_columns
+
+    return parse_columns(texts)
+
+
+def columns_option(command: _Command) -> _Command:
+    """The option, which gives the command a `ColumnMap` as `columns`."""
+    return click.option(
+        "--columns",
+        multiple=True,
+        callback=_parsed,
+        metavar="NAME=COLUMN:UNIT,...",
+        help="Names and units of a foreign table: mag_x=MagX:uT,gyro_x=GyrX:deg/s,time=t:ms; a "
+        "minus before COLUMN turns its sign (docs/guide/recordings.md).",
+    )(command)
+
+
+# -- Files that it writes --------------------------------------------------------------------------
 
 
 def refuse_unwritable(target: str | Path | None) -> None:

@@ -4,7 +4,7 @@ import ast
 import re
 from pathlib import Path
 
-from ahrsd.counting import counted
+from ahrsd.printable import counted
 
 PROJECT = Path(__file__).parent.parent
 THINGS = "sample|row|line|message|column|record|gap|reading|thing|packet|place|finding"

@@ -1,14 +1,89 @@
-"""All gates, one row per number that is judged; docs/reference/gates.md is checked against it.
+"""What must hold before a calibration is written: limits, the table of gates, and its judge.
 
+Guards (`Level`): CANDIDATE - it may be shown; RAM - an operator may approve it; FLASH - it may be
+saved; UNATTENDED - RAM without an operator. For a field engineer: docs/reference/gates.md.
+
+The table has one row per number that is judged; docs/reference/gates.md is checked against it.
 `value` is the path of a number or of a yes/no in Evidence (yes = 1), `limit` the name of a limit in
 GateLimits or a number. In `advice`, {v} is the value, {l} the limit, {e} the whole evidence.
 `applies` names a property of Evidence; where it is false, the row does not exist.
+
+Judging fails closed: a number that is not finite is not ok, whatever its row says, and a row of the
+table that is not among the results counts as red.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from operator import attrgetter
+
+from ahrsd.events import GateResult
+from ahrsd.evidence.values import Evidence
+
+# -- Limits ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class GateLimits:
+    """One limit per row of the table; docs/reference/gates.md says why each is what it is."""
+
+    max_error_rate: float = 1e-3  # of messages
+    max_drop_rate: float = 5e-3  # of samples
+    min_rate_hz: float = 10.0
+    min_heading_excursion_deg: float = 280.0
+    min_planar_circle_deg: float = 340.0
+    min_observability: float = 1.0
+    max_heading_sigma_deg: float = 1.0
+    max_moved_unseen_gauss: float = 0.02
+    field_min_gauss: float = 0.22
+    field_max_gauss: float = 0.67
+    field_model_percent: float = 10.0
+    field_spread_ram_percent: float = 2.0
+    field_spread_flash_percent: float = 1.0
+    max_inclination_error_deg: float = 3.0
+    holdout_segments: float = 2.0
+    min_holdout_excursion_deg: float = 280.0
+    holdout_rms_deg: float = 1.5
+    holdout_max_deg: float = 3.0
+    closure_deg: float = 2.0
+    min_improvement_percent: float = 20.0
+    min_improvement_deg: float = 0.3
+    min_improvement_lower_deg: float = 0.01
+    repeat_hard_iron_gauss: float = 0.01
+    repeat_heading_deg: float = 1.0
+    second_opinion_deg: float = 2.0
+    min_eigenvalue: float = 0.05
+    min_diagonal: float = 0.2
+    max_diagonal: float = 5.0
+    max_condition_auto: float = 2.0
+    max_condition_operator: float = 8.0
+    max_offset_auto_gauss: float = 0.6
+    max_offset_operator_gauss: float = 1.3
+    max_scale_change_percent: float = 5.0
+    max_step_auto_deg: float = 5.0
+    max_step_operator_deg: float = 20.0
+    max_field_change_gauss: float = 0.05
+    max_inclination_change_deg: float = 2.0
+    max_temperature_drift_c: float = 5.0
+    max_gyro_bias_deg_s: float = 3.0
+    min_rest_s: float = 3.0
+    max_gyro_sigma_share: float = 1.0 / 3.0
+    max_gyro_disagreement: float = 4.0
+
+    def with_margin(self, margin: float) -> GateLimits:
+        """After a rollback: an improvement must be `margin` times as clear."""
+        return replace(
+            self,
+            min_improvement_percent=min(self.min_improvement_percent * margin, 95.0),
+            min_improvement_deg=self.min_improvement_deg * margin,
+            min_improvement_lower_deg=self.min_improvement_lower_deg * margin,
+        )
+
+
+# -- The table -------------------------------------------------------------------------------------
 
 
 class Level(IntEnum):
@@ -680,3 +755,87 @@ STEADY = (
 
 
 GATES: tuple[Gate, ...] = STREAM + MOTION + FIELD + PROOF + CHANGE + STEADY
+
+
+# -- Judging ---------------------------------------------------------------------------------------
+
+
+_ROUNDING = 1e-6  # of the limit: 10 Hz that is summed up to 9.9999999 is 10 Hz
+
+
+def judge(
+    evidence: Evidence,
+    limits: GateLimits,
+    at_s: float,
+    previous: tuple[GateResult, ...] = (),
+) -> tuple[GateResult, ...]:
+    """Every row that applies, in the order of the table; `since_s`: when its `ok` last changed."""
+    before = {result.gate: result for result in previous}
+    return tuple(
+        _result(gate, evidence, limits, at_s, before.get(gate.gate))
+        for gate in GATES
+        if not gate.applies or attrgetter(gate.applies)(evidence)
+    )
+
+
+def for_level(results: Iterable[GateResult], level: Level) -> tuple[GateResult, ...]:
+    """The results that guard `level` and what is below it.
+
+    UNATTENDED adds its rows to those of RAM; what it adds for flash is the operator's policy.
+    """
+    guards = {gate.gate: gate.level for gate in GATES}
+    wanted = _levels(level)
+    return tuple(r for r in results if guards.get(r.gate, Level.CANDIDATE) in wanted)
+
+
+_UNATTENDED = frozenset(gate.gate for gate in GATES if gate.level is Level.UNATTENDED)
+
+
+def guards_a_write(gate: str) -> bool:
+    """Whether it guards what a person approves: the write or its save.
+
+    These are the gates that are counted, wherever a number of gates is told. The others guard only
+    a write that nobody approves.
+    """
+    return gate not in _UNATTENDED
+
+
+def holds(results: Iterable[GateResult], level: Level) -> bool:
+    """Whether every row that guards `level` is there and ok."""
+    chosen = {r.gate: r.ok for r in for_level(results, level)}
+    needed = {g.gate for g in GATES if g.level in _levels(level) and not g.applies}
+    return needed <= chosen.keys() and all(chosen.values())
+
+
+def limit_of(gate: Gate, limits: GateLimits) -> float:
+    """The number a row is compared with."""
+    return float(getattr(limits, gate.limit)) if isinstance(gate.limit, str) else gate.limit
+
+
+def _levels(level: Level) -> set[Level]:
+    if level is Level.UNATTENDED:
+        return {Level.CANDIDATE, Level.RAM, Level.UNATTENDED}
+    return {other for other in Level if other <= level}
+
+
+def _result(
+    gate: Gate,
+    evidence: Evidence,
+    limits: GateLimits,
+    at_s: float,
+    before: GateResult | None,
+) -> GateResult:
+    value, limit = float(attrgetter(gate.value)(evidence)), limit_of(gate, limits)
+    measured = math.isfinite(value)
+    slack = _ROUNDING * abs(limit)
+    ok = measured and (value <= limit + slack if gate.at_most else value >= limit - slack)
+    words = (gate.advice if measured else gate.missing).format(v=value, l=limit, e=evidence)
+    return GateResult(
+        gate=gate.gate,
+        value=value,
+        limit=limit,
+        ok=ok,
+        since_s=before.since_s if before is not None and before.ok == ok else at_s,
+        unit=gate.unit,
+        advice="" if ok else words,
+    )

@@ -1,1 +1,0 @@
-"""The online step detector of the magnetometer's residual."""
