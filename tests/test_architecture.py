@@ -65,7 +65,7 @@ MOST_IMPORTS = 15  # other modules of the project that one module imports
 IMPORTS_OVER_THE_LIMIT = {
     "ahrsd.core.core": 29,
     "ahrsd.daemon.service": 23,
-    "ahrsd.daemon.daemon": 18,
+    "ahrsd.daemon.daemon": 17,
     "ahrsd.writeback.machine": 17,
 }
 LONGEST_CHAIN = 19  # modules, each of which imports the next; the aim is 12

@@ -117,6 +117,7 @@ class Config(Section):
             configure_stream=self.device.configure_stream,
             serial=self.device.serial_number,
             interlock_max_age_s=self.interlock.max_age_s,
+            reply_timeout_s=self.device.reply_timeout_s,
             max_change_auto_deg=self.gates.max_step_auto_deg,
             trial=self.trial.policy(),
             still=self.still.policy(),

@@ -54,7 +54,7 @@ _RATE_HZ = 50
 _MOTION = (("survey", 240.0), ("survey", 160.0), *(("static", 60.0), ("survey", 120.0)) * 10)
 # On the Black Sea, where the world model has the emulator's field: 0.49 G, 60 deg down.
 _PLACE = {"latitude_deg": 42.0, "longitude_deg": 34.2, "date": datetime.date(2026, 1, 1)}
-_REPLY_S = 0.1  # real time that a reply may take; the clock of the demo runs `speed` times faster
+_REPLY_S = 0.3  # real time that a reply may take; the clock of the demo runs `speed` times faster
 _REST_S = 10.0  # longer than the stops between pirouettes, which are too short for a save
 _LONGEST_AGE_S = 60.0  # of the vehicle's word, as far as the configuration goes
 _CLOSE_S = 60.0  # real time at most for the files to be whole: nobody waits for a demo's end

@@ -61,6 +61,7 @@ STATE_COLOURS: dict[str, Colour] = {
     "STAGED": _WRITING,
     "TRIAL": (230, 150, 50),
     "PROVEN": (120, 190, 90),
+    "SET_ASIDE": _WRITING,
     "SAVE_PREPARING": _WRITING,
     "SAVING": _WRITING,
     "COMMITTED": (60, 170, 90),

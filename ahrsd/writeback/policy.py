@@ -78,6 +78,7 @@ class WriteBackPolicy:
     margin_after_rollback: and then only for changes so many times as large [2]
     rollbacks_to_lock: so many in a row lock the write-back [2]
     interlock_max_age_s: an older word of the vehicle counts as no [1]
+    reply_timeout_s:   how long one reply may take [0.4]
     recheck_s:         who answers and what it holds is read again so often, beside the running
                        output, in every mode but passive [10 s]
     """
@@ -100,6 +101,7 @@ class WriteBackPolicy:
     margin_after_rollback: float = 2.0
     rollbacks_to_lock: int = 2
     interlock_max_age_s: float = 1.0
+    reply_timeout_s: float = 0.4
     recheck_s: float = 10.0
     trial: TrialPolicy = field(default_factory=TrialPolicy)
     still: StillPolicy = field(default_factory=StillPolicy)

@@ -217,9 +217,12 @@ class Safeguards:
         """Why what was judged when the save was decided is too old by now; empty where it is not.
 
         The checks before VNWNV pause the stream, so nobody sees what happens to the vehicle. They
-        may last as long as they do on this line with no answer late.
+        may last as long as they do on this line with no answer late, and as one reply may take
+        where the vehicle's word holds for so long.
         """
-        most_s = max(SAVE_CHECKS_S, SAVE_CHECKS_PER_ASKING * self._on_this_line_s)
+        on_this_line_s = SAVE_CHECKS_PER_ASKING * self._on_this_line_s
+        reply_s = min(self.policy.reply_timeout_s, self.policy.interlock_max_age_s)
+        most_s = max(SAVE_CHECKS_S, on_this_line_s, reply_s)
         if (took_s := host_s - self.save_from_s) <= most_s:
             return ""
         return (

@@ -43,7 +43,7 @@ from pathlib import Path
 from bench_replug import measure
 found = measure(20, Path(sys.argv[1]))
 print(found, file=sys.stderr)
-kept = {name: getattr(found, name) for name in ("descriptors", "threads", "rss_mb", "p99_s")}
+kept = {name: getattr(found, name) for name in ("descriptors", "threads", "rss_mb")}
 print(json.dumps(kept))
 """
 
@@ -66,4 +66,3 @@ def test_unplugging_leaks_nothing(tmp_path):
     assert figures["descriptors"][0] == figures["descriptors"][1]
     assert figures["threads"][0] == figures["threads"][1]
     assert figures["rss_mb"][1] - figures["rss_mb"][0] < 5.0
-    assert figures["p99_s"] < 2.0
