@@ -9,6 +9,7 @@
     store      rows: spool/KEY.json, then parts/serial=N/HASH.parquet
     driver     a bounded window of recordings in flight, resumed where it was killed
     cluster    the same on a Dask cluster
+    drift      all calibrations as columns, averaged to points by device and time
     trend      drift and change points of one device's calibrations
     questions  what the rows say: drift, recurring, failures, SQL
     told       answers as lines for a person

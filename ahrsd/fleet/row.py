@@ -142,12 +142,12 @@ def diagnosis_columns(found: Diagnosis) -> Row:
     """What `diagnose` says."""
     return {
         "mismatch": found.mismatch,
-        "p_value": _finite(found.p_value),
+        "p_value": finite(found.p_value),
         "unexplained": found.unexplained.detected,
         "findings": [
             {
                 "effect": one.effect,
-                "probability": _finite(one.confidence),
+                "probability": finite(one.confidence),
                 "frame": one.where.frame,
                 "words": printable(one.words, LINE),
             }
@@ -205,7 +205,8 @@ def _named(name: str) -> datetime | None:
         return None
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """As JSON can hold it."""
     return float(value) if math.isfinite(value) else None
 
 
