@@ -70,9 +70,8 @@ COLUMNS: dict[str, str] = {
 }
 
 DONE, PARTLY, REFUSED = "done", "partly done", "refused"
-TOO_SLOW, TOO_LARGE, CRASHED = "too slow", "out of memory", "crashed"
-UNREADABLE, BUG = "unreadable", "internal error"
-ANSWERED = (DONE, PARTLY)  # every other outcome is a failure
+UNREADABLE = "unreadable"
+ANSWERED = (DONE, PARTLY)  # every other outcome is a failure: these, and those of `guard`
 
 _EARLIEST_S, _LATEST_S = 946684800.0, 4102444800.0  # 2000 to 2100: what a stamp of UTC can be
 _IN_NAME = re.compile(

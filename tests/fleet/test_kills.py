@@ -19,8 +19,6 @@ from fleet_kills import (
     write_archive,
 )
 
-pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
-
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory):
