@@ -13,13 +13,10 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from ahrsd.errors import EXIT_BUSY, AhrsdError
-from ahrsd.fleet.guard import Guard, Limits, Loss
-
-if TYPE_CHECKING:
-    from ahrsd.fleet.crew import Ask
+from ahrsd.fleet.guard import Ask, Guard, Limits, Loss
 
 START = "start some on every machine: dask worker {address} --no-nanny --nthreads CORES"
 _WAIT_S = 20.0

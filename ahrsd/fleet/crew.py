@@ -13,9 +13,9 @@ from concurrent.futures import ThreadPoolExecutor as Threads
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from ahrsd.fleet.guard import Guard, Limits, Loss
+from ahrsd.fleet.guard import Ask, Guard, Limits, Loss
 
 _WINDOW = 4  # tasks in flight for each process
 
@@ -33,14 +33,6 @@ class Place:
     jobs: int
     loads: tuple[str, ...] = ()
     cluster: str | None = None
-
-
-class Ask(Protocol):
-    """What takes a task: `Guard.ask`, but at once."""
-
-    def __call__(  # noqa: D102
-        self, do: Callable[[_T], _R], task: _T, lost: Callable[[_T, Loss], _R]
-    ) -> Future[_R]: ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,10 +22,10 @@ import resource
 import signal
 import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError, wait
+from concurrent.futures import CancelledError, Future, wait
 from concurrent.futures import TimeoutError as LateError
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from pebble import ProcessExpired, ProcessPool
 
@@ -63,6 +63,14 @@ class Loss:
     words: str
     tries: int
     seconds: float
+
+
+class Ask(Protocol):
+    """What takes a task: `Guard.ask`, but at once."""
+
+    def __call__(  # noqa: D102
+        self, do: Callable[[_T], _R], task: _T, lost: Callable[[_T, Loss], _R]
+    ) -> Future[_R]: ...
 
 
 class Guard:
