@@ -19,7 +19,7 @@ from ahrsd.errors import EXIT_BUSY, AhrsdError
 from ahrsd.fleet.guard import Ask, Guard, Limits, Loss
 
 START = "start some on every machine: dask worker {address} --no-nanny --nthreads CORES"
-_WAIT_S = 20.0
+_WAIT_S = 5.0
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -41,7 +41,9 @@ def connected(address: str, limits: Limits, loads: tuple[str, ...]) -> Iterator[
     try:
         client = make(address, timeout=_WAIT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ClusterGoneError(address, f"no scheduler answers ({error}); start one") from error
+        raise ClusterGoneError(
+            address, f"no scheduler answers within {_WAIT_S:g} s ({error}); start one"
+        ) from error
     with client:
         processes = sum(client.nthreads().values())
         if not processes:

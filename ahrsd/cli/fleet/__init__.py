@@ -9,40 +9,20 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.fleet import answers
+from ahrsd.cli.fleet.examiner import EXAMINER, LOADS
 from ahrsd.cli.output_files import make_folder
 from ahrsd.cli.progress import fleet_progress
 from ahrsd.cli.recording_options import columns_option
 from ahrsd.cli.task_options import limit_options
 from ahrsd.counting import counted
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
-from ahrsd.fleet.row import Calibrated
-from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
+from ahrsd.fleet.work import ROLES, Orders, summary
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.diagnosis import Diagnosis
     from ahrsd.fleet.driver import Progress
     from ahrsd.recording.column_names import ColumnMap
 
 _FOLDER = click.Path(path_type=Path)
-
-
-def calibrated(path: Path, orders: Orders) -> Calibrated:
-    """`ahrsd calibrate` of one recording of an archive."""
-    from ahrsd.config.loading import Config
-    from ahrsd.offline.calibrate import calibrate
-
-    return calibrate(path, Config(), rate_hz=orders.rate_hz, columns=orders.columns)
-
-
-def diagnosed(path: Path, orders: Orders) -> Diagnosis:
-    """`ahrsd diagnose` of one recording of an archive."""
-    from ahrsd.offline.diagnose import diagnose_recording
-
-    return diagnose_recording(path, rate_hz=orders.rate_hz, columns=orders.columns)
-
-
-EXAMINER = Examiner(calibrated, diagnosed)
-LOADS = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")  # slow to import
 
 
 @click.group()
