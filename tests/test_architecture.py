@@ -31,6 +31,7 @@ SHELL = (
     "ahrsd.demo",
     "ahrsd.fleet.archive",
     "ahrsd.fleet.cluster",
+    "ahrsd.fleet.crew",
     "ahrsd.fleet.driver",
     "ahrsd.fleet.guard",
     "ahrsd.fleet.page",

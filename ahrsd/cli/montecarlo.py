@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,11 +12,14 @@ import click
 
 from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.cli.progress import count_progress
+from ahrsd.cli.task_options import limit_options
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
-    from ahrsd.montecarlo.runs import Plan
+    from ahrsd.fleet.crew import Crew
+    from ahrsd.fleet.guard import Loss
+    from ahrsd.montecarlo.runs import Plan, Record
     from ahrsd.montecarlo.summary import SummaryRow
 
 _ALL = "all"
@@ -64,6 +69,7 @@ def _list(_context: click.Context, _option: click.Parameter, text: str) -> tuple
 )
 @click.option("--hard-iron-as-read", is_flag=True, help="b = m_b as in [R]'s tables, not A m_b.")
 @click.option("--jobs", type=click.IntRange(1), default=os.cpu_count() or 1, show_default=True)
+@limit_options("a seed")
 @click.option("--resume", type=click.Path(path_type=Path), help="Folder of runs already done.")
 @click.option("--json", "json_path", help="Figures into this file, - for stdout.")
 @click.option("--figure", "figure_path", type=click.Path(path_type=Path), help="A picture, PNG.")
@@ -80,25 +86,34 @@ def command(
     gyro_mrad: float,
     hard_iron_as_read: bool,
     jobs: int,
+    limit_s: float,
+    memory_bytes: int,
     resume: Path | None,
     json_path: str | None,
     figure_path: Path | None,
 ) -> None:
     """Simulate SCENARIO (wam, mam, lam or all of them) for many seeds; compare with the bound.
 
-    Exit 1 where a method had no answer at the last time in some run.
+    A seed that takes too long or too much memory, or whose process crashes, is a failure of every
+    method and not the end; --resume runs it again. Exit 1 where a method had no answer at the last
+    time in some run.
     """
+    from ahrsd.fleet.crew import Place, crew
+    from ahrsd.fleet.guard import Limits
+
     refuse_unwritable(json_path)
     refuse_unwritable(figure_path)
     wanted = _plans(
         scenario, motion, methods, at_s, rate_hz, noise_mg, scales, gyro_mrad, hard_iron_as_read
     )
     sets = []
-    for plan in wanted:
-        rows = _run(plan, range(seed, seed + runs), jobs, resume)
-        sets.append((plan, rows))
-        if json_path != "-":
-            _say(plan, rows)
+    place = Place(min(jobs, runs), loads=("ahrsd.montecarlo.runs",))
+    with crew(place, Limits(limit_s, memory_bytes)) as processes:
+        for plan in wanted:
+            rows = _run(plan, range(seed, seed + runs), processes, resume)
+            sets.append((plan, rows))
+            if json_path != "-":
+                _say(plan, rows)
     if json_path != "-":
         _say_headings(sets)
     if json_path is not None:
@@ -141,12 +156,22 @@ def _plans(
         raise AhrsdError(str(error)) from None
 
 
-def _run(plan: Plan, seeds: range, jobs: int, resume: Path | None) -> list[SummaryRow]:
-    from ahrsd.montecarlo.runs import run_many
+def _run(plan: Plan, seeds: range, processes: Crew, resume: Path | None) -> list[SummaryRow]:
+    from ahrsd.montecarlo.runs import run_many, run_one
     from ahrsd.montecarlo.summary import summarise
 
+    def runner(plan: Plan, seeds: Sequence[int]) -> Iterator[Record]:
+        lost = partial(_lost, plan)
+        return (record for _, record in processes.map(partial(run_one, plan), seeds, lost))
+
     with count_progress(plan.name) as done:
-        return summarise(run_many(plan, seeds, jobs=jobs, resume=resume, done=done))
+        return summarise(run_many(plan, seeds, runner=runner, resume=resume, done=done))
+
+
+def _lost(plan: Plan, seed: int, loss: Loss) -> Record:
+    from ahrsd.montecarlo.runs import lost_record
+
+    return lost_record(plan, seed, loss.words)
 
 
 def _say(plan: Plan, rows: list[SummaryRow]) -> None:

@@ -11,27 +11,26 @@ import importlib.util
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 from ahrsd.errors import EXIT_BUSY, AhrsdError
-from ahrsd.fleet.archive import ArchiveEntry
-from ahrsd.fleet.guard import Guard, Task
-from ahrsd.fleet.work import Answer, Orders
+from ahrsd.fleet.guard import Ask, Guard, Limits, Loss
 
 START = "start some on every machine: dask worker {address} --no-nanny --nthreads CORES"
-_WAIT_S = 20.0
+_WAIT_S = 5.0
 
-_guards: dict[int, Guard] = {}  # of this worker, by their limits of memory
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+_guards: dict[Limits, Guard] = {}  # of this worker
 _lock = threading.Lock()
 
 
 @contextmanager
-def connected(
-    address: str, orders: Orders, task: Task, loads: tuple[str, ...]
-) -> Iterator[tuple[Callable[[ArchiveEntry], Future[Answer]], int]]:
-    """What takes a recording, and how many are examined at once.  AhrsdError."""
+def connected(address: str, limits: Limits, loads: tuple[str, ...]) -> Iterator[tuple[Ask, int]]:
+    """What takes a task, and how many are done at once.  AhrsdError."""
     if importlib.util.find_spec("distributed") is None:
         raise AhrsdError("--cluster: Dask runs it; install it: pip install 'ahrsd[cluster]'")
     from distributed import Client
@@ -42,14 +41,19 @@ def connected(
     try:
         client = make(address, timeout=_WAIT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ClusterGoneError(address, f"no scheduler answers ({error}); start one") from error
+        raise ClusterGoneError(
+            address, f"no scheduler answers within {_WAIT_S:g} s ({error}); start one"
+        ) from error
     with client:
         processes = sum(client.nthreads().values())
         if not processes:
             raise ClusterGoneError(address, f"has no workers; {START.format(address=address)}")
         executor = client.get_executor(pure=False)
         try:
-            yield lambda entry: executor.submit(on_worker, entry, orders, task, loads), processes
+            yield (
+                lambda do, task, lost: executor.submit(on_worker, do, task, lost, limits, loads),
+                processes,
+            )
         except (CancelledError, KilledWorker) as error:
             raise ClusterGoneError(
                 address,
@@ -67,13 +71,19 @@ class ClusterGoneError(AhrsdError):
         super().__init__(f"--cluster {address}: {what}")
 
 
-def on_worker(entry: ArchiveEntry, orders: Orders, task: Task, loads: tuple[str, ...]) -> Answer:
+def on_worker(
+    do: Callable[[_T], _R],
+    task: _T,
+    lost: Callable[[_T, Loss], _R],
+    limits: Limits,
+    loads: tuple[str, ...],
+) -> _R:
     """The task of a Dask worker."""
     from distributed import get_worker
 
     worker: Any = get_worker()
     with _lock:
-        if orders.memory_bytes not in _guards:
+        if limits not in _guards:
             threads: int = worker.state.nthreads
-            _guards[orders.memory_bytes] = Guard(threads, orders.memory_bytes, task, loads)
-    return _guards[orders.memory_bytes].examine(entry, orders)
+            _guards[limits] = Guard(threads, limits, loads)
+    return _guards[limits].ask(do, task, lost)

@@ -9,26 +9,28 @@ from __future__ import annotations
 import collections
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures import ThreadPoolExecutor as Threads
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from itertools import islice
+from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.archive import Archive, ArchiveEntry
-from ahrsd.fleet.guard import Guard, Task
+from ahrsd.fleet.archive import Archive, ArchiveEntry, sweep
+from ahrsd.fleet.crew import Place, crew
+from ahrsd.fleet.guard import Limits
 from ahrsd.fleet.row import ANSWERED
 from ahrsd.fleet.store import Known, Store
-from ahrsd.fleet.work import THERE, Answer, Orders, stamp
+from ahrsd.fleet.work import THERE, Answer, Orders, keep_loss, stamp
 
-_WINDOW = 4  # recordings in flight for each process
 _COMPACTED = 4096  # rows in the spool after which they are moved
 _TOLD_S = 2.0
 
-Submit = Callable[[ArchiveEntry], "Future[Answer]"]
+
+class Task(Protocol):
+    """One recording, one row: `work.Examiner`."""
+
+    def __call__(self, entry: ArchiveEntry, orders: Orders) -> Answer: ...  # noqa: D102
 
 
 @dataclass(slots=True)
@@ -71,21 +73,8 @@ class Progress:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where recordings are examined: so many processes here, or a Dask cluster.
-
-    loads: modules that the task needs
-    """
-
-    jobs: int
-    task: Task
-    loads: tuple[str, ...] = ()
-    cluster: str | None = None
-
-
 def run(
-    archive: Archive, orders: Orders, place: Place, tell: Callable[[Progress], None]
+    archive: Archive, orders: Orders, task: Task, place: Place, tell: Callable[[Progress], None]
 ) -> Progress:
     """Give every recording of the archive its row; what happened.  AhrsdError.
 
@@ -94,6 +83,7 @@ def run(
     store = Store(Path(orders.out))
     store.create()
     with store.alone():
+        sweep()
         store.compact()
         known = store.known("stamp", failures=not orders.again)
         progress = _planned(archive, orders, known)
@@ -101,7 +91,7 @@ def run(
         missing = (one for one in archive.entries() if not known.holds(stamp(one, orders)))
         try:
             if progress.total:
-                _through(missing, orders, place, store, progress, tell)
+                _through(missing, orders, task, place, store, progress, tell)
             store.compact()
             store.tell(progress.json())
         except OSError as error:
@@ -115,15 +105,17 @@ def run(
 def _through(
     missing: Iterable[ArchiveEntry],
     orders: Orders,
+    task: Task,
     place: Place,
     store: Store,
     progress: Progress,
     tell: Callable[[Progress], None],
 ) -> None:
     told_s = 0.0
-    with _executor(place, orders) as (submit, window):
+    do, lost = partial(task, orders=orders), partial(keep_loss, orders=orders)
+    with crew(place, Limits(orders.limit_s, orders.memory_bytes)) as processes:
         progress.begun_s = time.monotonic()
-        for answer in answers(missing, submit, window):
+        for _, answer in processes.map(do, missing, lost):
             progress.outcomes[answer.outcome] += 1
             tell(progress)
             if time.monotonic() - told_s > _TOLD_S:
@@ -146,33 +138,3 @@ def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:
     progress.total -= progress.before
     progress.begun_s = time.monotonic()
     return progress
-
-
-def answers(entries: Iterable[ArchiveEntry], submit: Submit, window: int) -> Iterator[Answer]:
-    """The answers as they come, with at most `window` recordings in flight."""
-    waiting = iter(entries)
-    flight = {submit(entry) for entry in islice(waiting, window)}
-    while flight:
-        done, flight = wait(flight, return_when=FIRST_COMPLETED)
-        for future in done:
-            answer = future.result()
-            flight |= {submit(entry) for entry in islice(waiting, 1)}
-            yield answer
-
-
-@contextmanager
-def _executor(place: Place, orders: Orders) -> Iterator[tuple[Submit, int]]:
-    """What takes a recording, and how many may be in flight."""
-    if place.cluster is not None:
-        from ahrsd.fleet.cluster import connected
-
-        with connected(place.cluster, orders, place.task, place.loads) as (submit, processes):
-            yield submit, _WINDOW * processes
-        return
-    guard = Guard(place.jobs, orders.memory_bytes, place.task, place.loads)
-    threads = Threads(place.jobs, thread_name_prefix="fleet")
-    try:
-        yield lambda entry: threads.submit(guard.examine, entry, orders), _WINDOW * place.jobs
-    finally:
-        threads.shutdown(wait=False, cancel_futures=True)
-        guard.close()

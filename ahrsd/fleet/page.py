@@ -9,7 +9,8 @@ import numpy as np
 
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import told
-from ahrsd.fleet.questions import DeviceDrift, FleetRows
+from ahrsd.fleet.drift import DeviceDrift
+from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.trend import Trend
 from ahrsd.printable import LINE, counted, printable

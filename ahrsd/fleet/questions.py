@@ -8,45 +8,28 @@ Where recordings were examined by several versions or options, it has the newest
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from scipy.stats import hypergeom
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.row import ANSWERED, AXES
+from ahrsd.fleet.drift import CALIBRATIONS, DeviceDrift, drifts
+from ahrsd.fleet.row import ANSWERED
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.trend import Series, Trend, binned, trends
 from ahrsd.printable import line
-from ahrsd.samples import Array
 
 if TYPE_CHECKING:
     import duckdb
 
-_FEWEST = 3  # recordings with a finding before it recurs
-_HORIZONTAL = 0.5  # of the field, where it dips by 60 deg as in middle latitudes
-_RACES = 3  # times that parts may be replaced while they are asked
-_IRON, _BIAS = slice(0, 3), slice(3, 6)
+_T = TypeVar("_T")
 
-_QUANTITIES = [
-    f"{name}_{part}{axis}_{unit}"
-    for part in ("", "sigma_")
-    for name, unit in (("hard_iron", "gauss"), ("gyro_bias", "rad_s"))
-    for axis in AXES
-]
-_USABLE = "converged and recorded_utc is not null and device is not null"
-_DEVICES = f"""
-    select device, max(vehicle), count(*), min(recorded_utc), max(recorded_utc),
-           count(*) filter (recorded_by = 'the file''s date')
-    from recordings where {_USABLE} group by device order by device"""
-_SERIES = f"""
-    select epoch(recorded_utc) / 86400.0 as day, temperature_c, field_gauss, heading_sigma_deg,
-           {", ".join(_QUANTITIES)}
-    from recordings where {_USABLE} order by device, recorded_utc, key"""
+_FEWEST = 3  # recordings with a finding before it recurs
+_RACES = 3  # times that parts may be replaced while they are asked
+
 #: by what a finding may recur
 GROUPS = ("device", "vehicle", "place", "temperature")
 _DIAGNOSED = """
@@ -83,46 +66,8 @@ class AnswerTable:
         return [dict(zip(self.columns, map(_plain, row), strict=True)) for row in self.rows]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DeviceDrift:
-    """Calibrations of one device over time and temperature.
-
-    by_file_date: recordings of which only the file says when they were made
-    heading_sigma_deg: of the newest calibration; heading_kept_deg: by how much headings would be
-    off now with the first calibration, where the field dips by 60 deg
-    iron, bias: drift and steps, gauss and rad/s; series: what they are fitted to
-    """
-
-    device: str
-    vehicle: str | None
-    recordings: int
-    first_day: float
-    last_day: float
-    by_file_date: int
-    heading_sigma_deg: float
-    heading_kept_deg: float
-    iron: Trend
-    bias: Trend
-    series: Series
-
-    def json(self) -> dict[str, Any]:
-        """For programs."""
-        return {
-            "device": self.device,
-            "vehicle": self.vehicle,
-            "recordings": self.recordings,
-            "first_utc": _date(self.first_day),
-            "last_utc": _date(self.last_day),
-            "by_file_date": self.by_file_date,
-            "heading_sigma_deg": _plain(self.heading_sigma_deg),
-            "heading_kept_deg": _plain(self.heading_kept_deg),
-            "hard_iron": _trend_json(self.iron, "gauss"),
-            "gyro_bias": _trend_json(self.bias, "rad_s"),
-        }
-
-
-class FleetRows:
-    """The rows of a fleet in DuckDB; a context manager."""
+class FleetRows(AbstractContextManager["FleetRows"]):
+    """The rows of a fleet in DuckDB."""
 
     def __init__(self, store: Store) -> None:
         if importlib.util.find_spec("duckdb") is None:
@@ -130,15 +75,7 @@ class FleetRows:
         self._store = store
         self._connection = _opened(store)
 
-    def __enter__(self) -> FleetRows:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._connection.close()
 
     def sql(self, query: str) -> AnswerTable:
@@ -159,21 +96,24 @@ class FleetRows:
             raise AhrsdError(f"ask: {words}") from error
 
     def _ask(self, query: str) -> AnswerTable:
-        found = self._retried(query)
-        names = tuple(name for name, *_ in found.description or ())
-        return AnswerTable(names, found.fetchall())
+        def answer(connection: duckdb.DuckDBPyConnection) -> AnswerTable:
+            found = connection.execute(query)
+            names = tuple(name for name, *_ in found.description or ())
+            return AnswerTable(names, found.fetchall())
 
-    def _retried(self, query: str) -> duckdb.DuckDBPyConnection:
-        """Run it; where a part was replaced meanwhile, over the new ones."""
+        return self._retried(answer)
+
+    def _retried(self, ask: Callable[[duckdb.DuckDBPyConnection], _T]) -> _T:
+        """Ask; where a part was replaced meanwhile, over the new ones."""
         import duckdb
 
         for _ in range(_RACES):
             try:
-                return self._connection.execute(query)
+                return ask(self._connection)
             except duckdb.IOException:
                 self._connection.close()
                 self._connection = _opened(self._store)
-        return self._connection.execute(query)
+        return ask(self._connection)
 
     def counts(self) -> dict[str, Any]:
         """How many rows of what."""
@@ -203,8 +143,10 @@ class FleetRows:
         p: the probability that of all pairs of its kind one comes so often, if it were as frequent
         there as everywhere
         """
+        from scipy.stats import hypergeom  # half a second that the other questions need not wait
+
         out: list[tuple[Any, ...]] = []
-        self._retried(_DIAGNOSED)
+        self._retried(lambda connection: connection.execute(_DIAGNOSED))
         for kind in GROUPS:
             rows = self._ask(_RECURRING.format(what=kind, fewest=_FEWEST)).rows
             for name, effect, found, size, everywhere, total in rows:
@@ -222,30 +164,9 @@ class FleetRows:
 
     def drift(self) -> list[DeviceDrift]:
         """Every device with two calibrations or more; the largest heading error first."""
-        devices = self._ask(_DEVICES).rows
-        columns: Any = self._retried(_SERIES).fetchnumpy()
-        table = np.column_stack([_filled(columns[name]) for name in columns])
-        found = list(_drifts(devices, table))
-        return sorted(found, key=lambda one: -np.nan_to_num(one.heading_kept_deg))
-
-
-def _drifts(devices: list[tuple[Any, ...]], table: Array) -> Iterator[DeviceDrift]:
-    """Devices in the order of the table's rows."""
-    ends = np.cumsum([count for _, _, count, *_ in devices])
-    several = [(one, table[end - one[2] : end]) for one, end in zip(devices, ends) if one[2] > 1]
-    every = [binned(Series(own[:, 0], own[:, 1], own[:, 4:10], own[:, 10:])) for _, own in several]
-    irons, biases = (
-        trends([Series(s.day, s.temperature_c, s.values[:, k], s.sigmas[:, k]) for s in every])
-        for k in (_IRON, _BIAS)
-    )
-    for (one, own), series, iron, bias in zip(several, every, irons, biases, strict=True):
-        device, vehicle, count, first, last, by_file = one
-        moved = np.linalg.norm(series.values[-1, _IRON] - series.values[0, _IRON])
-        kept = np.degrees(np.arctan2(moved, _HORIZONTAL * own[-1, 2]))
-        yield DeviceDrift(
-            device, vehicle, count, _day(first), _day(last), by_file,
-            float(own[-1, 3]), float(kept), iron, bias, series,
-        )  # fmt: skip
+        return drifts(
+            self._retried(lambda connection: connection.sql(CALIBRATIONS).to_arrow_table())
+        )
 
 
 def _opened(store: Store) -> duckdb.DuckDBPyConnection:
@@ -303,18 +224,6 @@ def _quoted(path: Path) -> str:
     return "'" + str(path.resolve()).replace("'", "''") + "'"
 
 
-def _filled(column: Any) -> Array:  # noqa: ANN401 - numpy's, masked where there are nulls
-    return np.ma.filled(np.ma.asarray(column, dtype=np.float64), np.nan)
-
-
-def _day(at: Any) -> float:  # noqa: ANN401 - a datetime, UTC without a zone
-    return float(np.datetime64(at, "ms").astype(np.int64)) / 86400e3
-
-
-def _date(day: float) -> str:
-    return str(np.datetime64(round(day * 86400.0), "s"))
-
-
 def _plain(value: Any) -> Any:  # noqa: ANN401 - of DuckDB
     """As JSON can hold it."""
     if isinstance(value, float):
@@ -326,24 +235,3 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - of DuckDB
     if value is None or isinstance(value, str | int | bool):
         return value
     return str(value)
-
-
-def _trend_json(found: Trend, unit: str) -> dict[str, Any]:
-    return {
-        "days": found.days,
-        f"per_year_{unit}": _plain(found.per_year.tolist()),
-        f"per_year_sigma_{unit}": _plain(found.per_year_sigma.tolist()),
-        f"per_degc_{unit}": _plain(found.per_degree.tolist()),
-        f"per_degc_sigma_{unit}": _plain(found.per_degree_sigma.tolist()),
-        f"scatter_{unit}": _plain(found.scatter.tolist()),
-        "changes": [
-            {
-                "after_utc": _date(change.before_day),
-                "until_utc": _date(change.after_day),
-                f"size_{unit}": _plain(change.size.tolist()),
-                f"sigma_{unit}": _plain(change.sigma.tolist()),
-                "chi2": change.chi2,
-            }
-            for change in found.changes
-        ],
-    }

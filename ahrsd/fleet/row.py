@@ -70,9 +70,8 @@ COLUMNS: dict[str, str] = {
 }
 
 DONE, PARTLY, REFUSED = "done", "partly done", "refused"
-TOO_SLOW, TOO_LARGE, CRASHED = "too slow", "out of memory", "crashed"
-UNREADABLE, BUG = "unreadable", "internal error"
-ANSWERED = (DONE, PARTLY)  # every other outcome is a failure
+UNREADABLE = "unreadable"
+ANSWERED = (DONE, PARTLY)  # every other outcome is a failure: these, and those of `guard`
 
 _EARLIEST_S, _LATEST_S = 946684800.0, 4102444800.0  # 2000 to 2100: what a stamp of UTC can be
 _IN_NAME = re.compile(
@@ -142,12 +141,12 @@ def diagnosis_columns(found: Diagnosis) -> Row:
     """What `diagnose` says."""
     return {
         "mismatch": found.mismatch,
-        "p_value": _finite(found.p_value),
+        "p_value": finite(found.p_value),
         "unexplained": found.unexplained.detected,
         "findings": [
             {
                 "effect": one.effect,
-                "probability": _finite(one.confidence),
+                "probability": finite(one.confidence),
                 "frame": one.where.frame,
                 "words": printable(one.words, LINE),
             }
@@ -205,7 +204,8 @@ def _named(name: str) -> datetime | None:
         return None
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """As JSON can hold it."""
     return float(value) if math.isfinite(value) else None
 
 

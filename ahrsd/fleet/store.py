@@ -60,6 +60,12 @@ _TYPES: dict[str, Any] = {
     ),
 }
 SCHEMA = pyarrow.schema([(name, _TYPES[kind]) for name, kind in COLUMNS.items()])
+#: columns whose texts come again and again; of any other a dictionary is larger than its values
+_REPEATED = [
+    *("version", "options", "outcome", "error", "remedy", "vehicle", "place", "recorded_by"),
+    *("verdict", "warnings.list.element"),
+    *(f"findings.list.element.{name}" for name in ("effect", "frame", "words")),
+]
 _TIMES = [name for name, kind in COLUMNS.items() if kind == "time"]
 
 
@@ -187,7 +193,7 @@ class Store:
         folder = self.root / "parts" / name
         folder.mkdir(parents=True, exist_ok=True)
         sink = pyarrow.BufferOutputStream()
-        pyarrow.parquet.write_table(own, sink, compression="zstd")
+        pyarrow.parquet.write_table(own, sink, compression="zstd", use_dictionary=_REPEATED)
         data = sink.getvalue().to_pybytes()
         path = folder / f"{hashlib.sha256(data).hexdigest()[:16]}.parquet"
         write_whole(path, data)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats would take half of the time of a question
 
 from ahrsd.samples import Array
 
@@ -74,22 +74,51 @@ class Trend:
     changes: tuple[StepChange, ...]
 
 
-def binned(series: Series, most: int = MOST_POINTS) -> Series:
-    """At most so many points: means of neighbours in time; sigmas of the means."""
-    n = len(series.day)
-    if n <= most:
-        return series
-    starts = np.arange(most) * n // most
-    count = np.diff([*starts, n])
-    warm = np.isfinite(series.temperature_c)
-    known = np.add.reduceat(warm.astype(float), starts)
-    total = np.add.reduceat(np.where(warm, series.temperature_c, 0.0), starts)
-    return Series(
-        np.add.reduceat(series.day, starts) / count,
-        np.divide(total, known, out=np.full(most, np.nan), where=known > 0),
-        np.add.reduceat(series.values, starts) / count[:, None],
-        np.sqrt(np.add.reduceat(series.sigmas**2, starts)) / count[:, None],
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class Bins:
+    """Calibrations of all devices, neighbours in time together: at most so many bins of a device.
+
+    of_row (n,): the bin of each calibration; count: calibrations of each bin; start (D + 1,): the
+    first bin of each device
+    """
+
+    of_row: _Rows
+    count: _Rows
+    start: _Rows
+
+    @staticmethod
+    def of(device: _Rows, order: _Rows, most: int = MOST_POINTS) -> Bins:
+        """device (n,): its number, from 0; order (n,): rows by device, then by time."""
+        number = np.bincount(device)
+        first = np.cumsum(number) - number
+        start = np.r_[0, np.cumsum(np.minimum(number, most))]
+        own, n = device[order], number[device[order]]
+        rank = np.arange(len(order)) - first[own]
+        within = np.where(n <= most, rank, ((rank + 1) * most - 1) // n)
+        of_row = np.empty_like(order)
+        of_row[order] = start[own] + within
+        return Bins(of_row, np.bincount(of_row), start)
+
+    def sums(self, column: Array) -> Array:
+        """Of a value of each calibration."""
+        total: Array = np.bincount(self.of_row, column).astype(np.float64, copy=False)
+        return total
+
+    def means(self, columns: Sequence[Array]) -> Array:
+        """(bins, k) of k values of each calibration."""
+        return np.column_stack([self.sums(column) for column in columns]) / self.count[:, None]
+
+    def known_means(self, column: Array) -> Array:
+        """Of those that are known; nan where none is."""
+        known = np.isfinite(column)
+        number = self.sums(known.astype(np.float64))
+        total = self.sums(np.where(known, column, 0.0))
+        return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+
+    def sigmas(self, columns: Sequence[Array]) -> Array:
+        """(bins, k) of the means of values with these standard deviations."""
+        squares = [self.sums(column * column) for column in columns]
+        return np.sqrt(np.column_stack(squares)) / self.count[:, None]
 
 
 def trends(every: Sequence[Series]) -> list[Trend]:
@@ -126,24 +155,28 @@ class _Batch:
     def of(every: Sequence[Series]) -> _Batch:
         """The series side by side."""
         length = np.array([len(one.day) for one in every])
-        D, N, k = len(every), int(length.max()), every[0].values.shape[1]
-        day, lines, root = np.zeros((D, N)), np.zeros((D, N, 3)), np.zeros((D, N))
-        Y, scale, scatter = np.zeros((D, N, k)), np.ones((D, k)), np.zeros((D, k))
-        for i, (one, n) in enumerate(zip(every, length, strict=True)):
-            lines[i, :n] = _lines(one)
-            scatter[i] = _scatter(one, lines[i, :n, 2])
-            variance = one.sigmas**2 + scatter[i] ** 2 + _TINY**2
-            scale[i] = np.sqrt(variance.mean(axis=0))
-            root[i, :n] = np.sqrt(1.0 / (variance / scale[i] ** 2).mean(axis=1))
-            day[i, :n], Y[i, :n] = one.day, one.values / scale[i]
-        return _Batch(length, day, lines, root, Y, scale, scatter)
+        here = np.arange(max(length.max(), 2)) < length[:, None]
+        day = _padded([one.day for one in every], here)
+        values, sigmas = (
+            np.stack([_padded(columns, here) for columns in zip(*split, strict=True)], axis=2)
+            for split in ([one.values.T for one in every], [one.sigmas.T for one in every])
+        )
+        lines = _lines(day, _padded([one.temperature_c for one in every], here), length)
+        scatter = _scatter(values, sigmas, lines[:, :, 2], length)
+        variance = sigmas**2 + scatter[:, None, :] ** 2 + _TINY**2
+        variance = np.where(here[:, :, None], variance, 0.0)
+        scale = np.sqrt(variance.sum(axis=1) / length[:, None])
+        weight = (variance / scale[:, None, :] ** 2).mean(axis=2)
+        root = np.sqrt(np.divide(1.0, weight, out=np.zeros_like(weight), where=here))
+        Y = np.where(here[:, :, None], values / scale[:, None, :], 0.0)
+        return _Batch(length, np.where(here, day, 0.0), lines, root, Y, scale, scatter)
 
     def steps(self) -> tuple[_Rows, Array]:
         """Rows of the steps (D, steps) in order, N where there is none, and their gains of chi2."""
         D, N, k = self.Y.shape
         rows, gains = np.full((D, _MOST_STEPS), N), np.zeros((D, _MOST_STEPS))
         points = (self.root > 0.0).sum(axis=1)
-        limit = chi2.isf(_CHANCE / np.maximum(points, 1), k)
+        limit = chdtri(k, _CHANCE / np.maximum(points, 1))
         active = np.flatnonzero(points >= 2 * FEWEST)
         for number in range(_MOST_STEPS):
             row, gain = self._best(active, rows[active])
@@ -218,27 +251,50 @@ class _Batch:
         return StepChange(float(before), float(after), size, sigma, gain)
 
 
-def _scatter(series: Series, degrees: Array) -> Array:
-    """(k,) beyond the sigmas, from each point to the next; what follows the temperature is not."""
-    if len(series.day) < FEWEST:
-        return np.zeros(series.values.shape[1])
-    step, warmer = np.diff(series.values, axis=0), np.diff(degrees)
-    if warmer.any():
-        step -= np.outer(warmer, warmer @ step / (warmer @ warmer))
-    seen: Array = (_MAD * np.median(np.abs(step), axis=0)) ** 2 / 2.0
-    return np.sqrt(np.maximum(seen - np.median(series.sigmas**2, axis=0), 0.0))
+def _padded(parts: Sequence[Array], here: NDArray[np.bool_]) -> Array:
+    """(D, N): one beside the other, nan behind the last of each."""
+    out = np.full(here.shape, np.nan)
+    out[here] = np.concatenate(parts)
+    return out
 
 
-def _lines(series: Series) -> Array:
-    """(n, 3): constant, years, degrees, about their means; 0 where the series does not tell."""
-    n, warm = len(series.day), series.temperature_c
-    out = np.zeros((n, 3))
-    out[:, 0] = 1.0
-    if n > FEWEST:
-        out[:, 1] = (series.day - series.day.mean()) / 365.25
+def _scatter(values: Array, sigmas: Array, degrees: Array, length: _Rows) -> Array:
+    """(D, k) beyond the sigmas, from each point to the next; what follows the temperature is not.
+
+    values, sigmas (D, N, k): nan behind the last
+    """
+    step, warmer = np.diff(values, axis=1), np.diff(degrees, axis=1)
+    warmer = np.where(np.isnan(step[:, :, 0]), 0.0, warmer)
+    power = (warmer**2).sum(axis=1)[:, None]
+    common = np.einsum("dn,dnk->dk", warmer, np.nan_to_num(step))
+    slope = np.divide(common, power, out=np.zeros_like(common), where=power > 0.0)
+    step -= warmer[:, :, None] * slope[:, None, :]
+    seen = (_MAD * _medians(np.abs(step), length - 1)) ** 2 / 2.0
+    told = np.sqrt(np.maximum(seen - _medians(sigmas**2, length), 0.0))
+    return np.where(length[:, None] < FEWEST, 0.0, told)
+
+
+def _medians(values: Array, length: _Rows) -> Array:
+    """(D, k) of the first `length` (D,) of values (D, N, k), which are nan behind them."""
+    ordered = np.sort(values, axis=1)
+    places = np.maximum(np.stack([(length - 1) // 2, length // 2], axis=1), 0)
+    middle: Array = np.take_along_axis(ordered, places[:, :, None], 1).mean(axis=1)
+    return middle
+
+
+def _lines(day: Array, warm: Array, length: _Rows) -> Array:
+    """(D, N, 3): constant, years, degrees, about their means; 0 where a series does not tell."""
+    out = np.zeros((*day.shape, 3))
+    out[:, :, 0] = ~np.isnan(day)
+    years = (day - np.nansum(day, axis=1)[:, None] / length[:, None]) / 365.25
+    out[:, :, 1] = np.where(length[:, None] > FEWEST, np.nan_to_num(years), 0.0)
     known = np.isfinite(warm)
-    if n >= 2 * FEWEST and known.mean() >= _KNOWN and np.std(warm[known]) > _SPREAD_C:
-        out[:, 2] = np.where(known, warm, warm[known].mean()) - warm[known].mean()
+    number = np.maximum(known.sum(axis=1), 1)
+    warmer = np.where(known, warm, 0.0) - (np.where(known, warm, 0.0).sum(axis=1) / number)[:, None]
+    warmer = np.where(known, warmer, 0.0)
+    spread = np.sqrt((warmer**2).sum(axis=1) / number)
+    tells = (length >= 2 * FEWEST) & (known.sum(axis=1) >= _KNOWN * length) & (spread > _SPREAD_C)
+    out[:, :, 2] = np.where(tells[:, None], warmer, 0.0)
     return out
 
 

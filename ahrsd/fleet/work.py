@@ -19,6 +19,7 @@ from ahrsd import __version__
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import row as rows
 from ahrsd.fleet.archive import ArchiveEntry, local_file, pieces
+from ahrsd.fleet.guard import TOO_LARGE, TOO_SLOW, Loss
 from ahrsd.fleet.row import Calibrated, Row
 from ahrsd.fleet.store import Store
 from ahrsd.printable import printable
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 ROLES = ("vehicle", "place", "serial")  # what a level of folders may name
+_REMEDIES = {
+    TOO_SLOW: "give more time: --limit 1h --retry-failed",
+    TOO_LARGE: "give more memory: --memory 4G --retry-failed",
+}
 THERE = "was there"  # the answer about the same bytes under another name
 
 
@@ -127,7 +132,8 @@ def _examined(by: Examiner, entry: ArchiveEntry, orders: Orders) -> Answer:
             found = [_labels(entry, orders), {"key": own, "content_sha256": sha256}]
             found.append(_answers(by, path, entry, orders))
     except OSError as error:
-        return keep_loss(entry, orders, rows.UNREADABLE, error.strerror or str(error))
+        words = error.strerror or str(error)
+        return keep_loss(entry, Loss(rows.UNREADABLE, words, 1, 0.0), orders)
     spent: Row = {
         "seconds": time.monotonic() - begun,
         "cpu_s": time.process_time() - begun_cpu,
@@ -138,18 +144,10 @@ def _examined(by: Examiner, entry: ArchiveEntry, orders: Orders) -> Answer:
     return Answer(own, made["outcome"])
 
 
-def keep_loss(
-    entry: ArchiveEntry,
-    orders: Orders,
-    outcome: str,
-    words: str,
-    *,
-    tries: int = 1,
-    seconds: float = 0.0,
-) -> Answer:
+def keep_loss(entry: ArchiveEntry, loss: Loss, orders: Orders) -> Answer:
     """The row of a recording that gave no answer."""
-    sha256 = None
-    if outcome != rows.UNREADABLE:
+    sha256, words = None, loss.words
+    if loss.outcome != rows.UNREADABLE:
         try:
             with local_file(entry) as path:
                 sha256 = content(path)
@@ -159,15 +157,16 @@ def keep_loss(
     lost: Row = {
         "key": own,
         "content_sha256": sha256,
-        "outcome": outcome,
+        "outcome": loss.outcome,
         "error": printable(words, 500),
-        "tries": tries,
-        "seconds": seconds,
+        "remedy": _REMEDIES.get(loss.outcome),
+        "tries": loss.tries,
+        "seconds": loss.seconds,
         "finished_utc": rows.now_utc(),
         **rows.recorded(None, entry.url, entry.modified_s),
     }
     Store(Path(orders.out)).put(rows.whole([_labels(entry, orders), lost]))
-    return Answer(own, outcome)
+    return Answer(own, loss.outcome)
 
 
 def _labels(entry: ArchiveEntry, orders: Orders) -> Row:

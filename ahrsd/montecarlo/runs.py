@@ -1,22 +1,19 @@
 """Monte Carlo: methods on many seeds of one scenario, against truth and the Cramer-Rao bound.
 
 One run is one seed: simulate, compute the bound, let every method answer at every time asked for.
-Runs go to separate processes; each finished run is one line of a file, so that a stopped
-experiment goes on where it was (`resume`). The record of a seed does not depend on the others.
+Each finished run is one line of a file, so that a stopped experiment goes on where it was
+(`resume`). The record of a seed does not depend on the others, so they may come in any order from
+as many processes; `ahrsd montecarlo` gives them to those of `fleet.crew`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +117,6 @@ Record = dict[str, Any]  # one run, as it stands in the file: see `run_one`
 
 _CHUNK = 25  # samples handed to the stream at a time
 _FORMAT = 2  # of a record: bounds hold `sigma` and headings
-_THREADS = "OPENBLAS_NUM_THREADS"
 
 
 # -- Runs ------------------------------------------------------------------------------------------
@@ -198,6 +194,22 @@ def run_one(plan: Plan, seed: int) -> Record:
         results += answers(plan, method, experiment)
     return {"seed": seed, "bounds": [bound_at(plan, experiment, t) for t in plan.at_s]} | {
         "results": results
+    }
+
+
+def lost_record(plan: Plan, seed: int, words: str) -> Record:
+    """The record of a seed whose process gave no answer: no figure, and the same failure in each
+    result. It is counted and not kept: `resume` runs the seed again."""
+    unknown = dict.fromkeys((*BOUNDED, *HEADINGS, "sigma"))
+    return {
+        "seed": seed,
+        "bounds": [{"at_s": at_s} | unknown for at_s in plan.at_s],
+        "results": [
+            {"method": method, "at_s": at_s, "failure": words, "cpu_s": None}
+            for method in plan.methods
+            for at_s in plan.at_s
+        ],
+        "lost": words,
     }
 
 
@@ -282,18 +294,27 @@ def _listed(value: Array | None) -> list[float] | None:
     return None if value is None else value.tolist()
 
 
+#: the records of seeds, in any order
+Runner = Callable[[Plan, Sequence[int]], Iterable[Record]]
+
+
+def one_by_one(plan: Plan, seeds: Sequence[int]) -> Iterator[Record]:
+    """In this process."""
+    return (run_one(plan, seed) for seed in seeds)
+
+
 def run_many(
     plan: Plan,
     seeds: Sequence[int],
     *,
-    jobs: int = 1,
+    runner: Runner = one_by_one,
     resume: Path | None = None,
     done: Callable[[int, int], None] | None = None,
 ) -> list[Record]:
     """All runs in the order of the seeds; those already in `resume` are read, not run again.
 
     done: called with the number of runs finished and of all. Raises AhrsdError where the file
-    cannot be used or a process died.
+    cannot be used.
     """
     path = None if resume is None else resume / f"{plan.key}.jsonl"
     records = {} if path is None else _kept(path)
@@ -301,30 +322,14 @@ def run_many(
     finished = len(seeds) - len(missing)
     if done is not None:
         done(finished, len(seeds))
-    for record in _computed(plan, missing, jobs):
+    for record in runner(plan, missing):
         records[record["seed"]] = record
-        if path is not None:
+        if path is not None and "lost" not in record:
             _keep(path, record)
         finished += 1
         if done is not None:
             done(finished, len(seeds))
     return [records[seed] for seed in seeds]
-
-
-def _computed(plan: Plan, seeds: Sequence[int], jobs: int) -> Iterator[Record]:
-    if jobs == 1 or len(seeds) < 2:
-        for seed in seeds:
-            yield run_one(plan, seed)
-        return
-    os.environ.setdefault(_THREADS, "1")  # read by the children when they load numpy
-    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
-    try:
-        for future in as_completed([pool.submit(run_one, plan, seed) for seed in seeds]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise AhrsdError("a process of the Monte Carlo died; --resume goes on from here") from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _kept(path: Path) -> dict[int, Record]:

@@ -90,6 +90,7 @@ def _row(results: Sequence[Record], bounds: Sequence[Record]) -> SummaryRow:
     answers = [r for r, _ in good]
     parameters = _parameters(answers)
     nees = _column(answers, "nees")
+    cpu = [r["cpu_s"] for r in results if r["cpu_s"] is not None]
     failures = Counter(r["failure"] for r in results if r["failure"] is not None)
     few = len(nees) < 2
     return SummaryRow(
@@ -109,7 +110,7 @@ def _row(results: Sequence[Record], bounds: Sequence[Record]) -> SummaryRow:
         nees=float(np.mean(nees)) if len(nees) else None,
         nees_spread=None if few else float(np.std(nees, ddof=1)),
         nees_standard_error=None if few else float(np.std(nees, ddof=1) / np.sqrt(len(nees))),
-        cpu_s=float(np.mean([r["cpu_s"] for r in results])) if results else None,
+        cpu_s=float(np.mean(cpu)) if cpu else None,
     )
 
 

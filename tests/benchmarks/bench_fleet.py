@@ -1,12 +1,13 @@
 """What a fleet costs beside its recordings: overhead, scaling, the driver's memory, questions.
 
-    python tests/benchmarks/bench_fleet.py overhead   ms a task beside the task, of all processes
-    python tests/benchmarks/bench_fleet.py scaling    recordings a minute, 1 and 2 processes
-    python tests/benchmarks/bench_fleet.py memory     the driver from 10^3 to 10^5 simulated tasks
+    python tests/benchmarks/bench_fleet.py overhead   beside tasks of 2 s that sleep, 2 processes
+    python tests/benchmarks/bench_fleet.py scaling    2 processes over 1: sleep, compute, recordings
+    python tests/benchmarks/bench_fleet.py memory     peak of a driver of 10^3, 10^4, 10^5 tasks
     python tests/benchmarks/bench_fleet.py ask        questions over 10^6 made-up rows
     python tests/benchmarks/bench_fleet.py threads    CPU of a library caller, 1 BLAS thread or all
 
-`overhead` and `scaling` also say what a task of 2 s makes of it; `scaling` needs two idle cores.
+Each is the driver that `ahrsd fleet run` is, over an archive of files. What computes needs as many
+idle cores as processes: beside it stand the load and what two processes gain with no fleet.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 from fleet_kills import write_archive
-from fleet_rows import nothing, sleeping
+from fleet_rows import computing, nothing, sleeping
 
-from ahrsd.cli.fleet import EXAMINER, LOADS
+from ahrsd.cli.fleet.examiner import EXAMINER, LOADS
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.driver import Place, run
+from ahrsd.fleet.crew import Place
+from ahrsd.fleet.driver import run
 from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import SCHEMA, Store
 from ahrsd.fleet.work import Orders
@@ -41,26 +43,22 @@ TASK_S = 2.0
 DEVICES, DAY_MS = 500, 86_400_000
 
 
-def ran(
-    archive: Path, out: Path, jobs: int, task=EXAMINER, tell=lambda _: None
-) -> tuple[float, int]:
-    """Wall seconds between the first and the last answer, and how many."""
+def ran(archive: Path, out: Path, jobs: int, task=EXAMINER) -> tuple[float, int]:
+    """Wall seconds for each task of a process, and how many tasks; the start is left out.
+
+    From the first answer to the last each process does all its tasks but one.
+    """
     shutil.rmtree(out, ignore_errors=True)
     begun: list[float] = []
 
     def told(progress) -> None:
         if progress.done:
             begun.append(time.monotonic())
-            del begun[2:-1]
-        tell(progress)
+            del begun[1:-1]
 
-    done = run(
-        Archive(str(archive)),
-        Orders(out=str(out)),
-        Place(jobs, task, LOADS if task is EXAMINER else ()),
-        told,
-    )
-    return begun[-1] - begun[0], done.done - 1
+    loads = LOADS if task is EXAMINER else ()
+    done = run(Archive(str(archive)), Orders(out=str(out)), task, Place(jobs, loads), told)
+    return (begun[-1] - begun[0]) / (done.done / jobs - 1.0), done.done
 
 
 def simulated(folder: Path, number: int, milliseconds: int) -> Path:
@@ -74,41 +72,73 @@ def simulated(folder: Path, number: int, milliseconds: int) -> Path:
 
 
 def overhead(folder: Path) -> None:
-    for milliseconds, number in ((0, 2000), (200, 200)):
+    for milliseconds, number in ((0, 2000), (round(1e3 * TASK_S), 60)):
         archive = simulated(folder / str(milliseconds), number, milliseconds)
         cpu = _cpu()
-        wall_s, count = ran(archive, folder / "out", 2, sleeping)
-        beside_ms = 1e3 * (2 * wall_s / count) - milliseconds
+        each_s, count = ran(archive, folder / "out", 2, sleeping)
+        beside_ms = 1e3 * each_s - milliseconds
         print(
             f"tasks of {milliseconds} ms, 2 processes: {beside_ms:.2f} ms beside each "
             f"({beside_ms / TASK_S / 10:.2f} % of one of {TASK_S:g} s), "
-            f"{1e3 * (_cpu() - cpu) / count:.2f} ms CPU with starting and compacting"
+            f"{1e3 * (_cpu() - cpu) / count:.2f} ms CPU with starting and compacting; {_load()}"
         )
 
 
 def scaling(folder: Path) -> None:
+    archive = simulated(folder / "simulated", 20, round(1e3 * TASK_S))
     write_archive(folder / "archive", 24, seconds=60.0)
-    rates = []
+    for name, tasks, task in (
+        (f"tasks that sleep {TASK_S:g} s", archive, sleeping),
+        (f"tasks of {TASK_S:g} s of CPU", archive, computing),
+        ("recordings of 60 s", folder / "archive", EXAMINER),
+    ):
+        whole = []
+        for jobs in (1, 2):
+            each_s, _ = ran(tasks, folder / f"out{jobs}", jobs, task)
+            whole.append(each_s / jobs)
+            print(f"{name}, {jobs} processes: {60 / whole[-1]:.1f} a minute; {_load()}", flush=True)
+        print(f"{name}: 2 processes are {whole[0] / whole[1]:.2f} times as fast as one", flush=True)
+        if task is not sleeping:
+            print(
+                f"two processes that only compute, with no fleet: {plain():.2f} times", flush=True
+            )
+
+
+def plain() -> float:
+    """How many times as fast as one two processes are here and now, with no fleet round them."""
+    burn = "import time\nwhile time.process_time() < 5.0: sum(range(10_000))"
+    whole = []
     for jobs in (1, 2):
-        wall_s, count = ran(folder / "archive", folder / f"out{jobs}", jobs)
-        rates.append(60.0 * count / wall_s)
-        print(f"{jobs} processes: {rates[-1]:.1f} recordings a minute")
-    print(f"2 processes are {rates[1] / rates[0]:.2f} times as fast as one")
+        begun = time.monotonic()
+        running = [subprocess.Popen([sys.executable, "-c", burn]) for _ in range(jobs)]
+        for process in running:
+            process.wait()
+        whole.append((time.monotonic() - begun) / jobs)
+    return whole[0] / whole[1]
 
 
 def memory(folder: Path, most: int, *, kept: bool) -> None:
-    """Resident size of the driver as the tasks go by."""
-    archive = simulated(folder, most, 0)
-    said: dict[int, float] = {}
+    """Peak of the driver's resident size; each number of tasks has a driver of its own."""
+    for number in (1_000, 10_000, 100_000):
+        if number <= most:
+            words = [sys.executable, __file__, "driver", str(folder / str(number))]
+            simulated(folder / str(number), number, 0)
+            subprocess.run(
+                [*words, "--most", str(number), *(["--rows"] if kept else [])], check=True
+            )
 
-    def tell(progress) -> None:
-        for number in (1_000, 10_000, 30_000, 100_000):
-            if progress.done == number:
-                said[number] = _resident_mb()
-                print(f"{number:,} tasks: {said[number]:.1f} MB", flush=True)
 
-    wall_s, count = ran(archive, folder / "out", 2, sleeping if kept else nothing, tell)
-    print(f"{count:,} tasks in {wall_s:.0f} s; {len(Store(folder / 'out').parts())} parts")
+def driver(folder: Path, number: int, *, kept: bool) -> None:
+    """One of the drivers of `memory`."""
+    archive = folder / f"archive{number}"
+    begun = time.monotonic()
+    ran(archive, folder / "out", 2, sleeping if kept else nothing)
+    wall_s = time.monotonic() - begun
+    status = Path("/proc/self/status").read_text()
+    peak = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+    rows = len(Store(folder / "out").known("key", failures=True))
+    peak_mb = int(peak.split()[1]) / 1e3
+    print(f"{number:,} tasks, {rows:,} rows: peak {peak_mb:.1f} MB, {wall_s:.0f} s", flush=True)
 
 
 def ask(folder: Path, rows: int) -> None:
@@ -122,7 +152,7 @@ def ask(folder: Path, rows: int) -> None:
     with FleetRows(store) as asked:
         print(f"opened in {time.monotonic() - begun:.2f} s")
         for question in (asked.drift, asked.recurring, asked.failures, asked.counts):
-            for _ in range(2):
+            for _ in range(3):
                 begun, cpu = time.monotonic(), time.process_time()
                 question()
                 print(
@@ -131,6 +161,16 @@ def ask(folder: Path, rows: int) -> None:
                 )
         stepped = [one for one in asked.drift() if one.iron.changes]
     print(f"devices with a step: {len(stepped)} (one in ten has one)")
+    for _ in range(2):
+        begun, cpu = time.monotonic(), _cpu()
+        subprocess.run(
+            [sys.executable, "-m", "ahrsd", "fleet", "ask", str(store.root), "drift"],
+            check=True, stdout=subprocess.DEVNULL,
+        )  # fmt: skip
+        print(
+            f"the whole command `ask drift`: {time.monotonic() - begun:.2f} s, "
+            f"{_cpu() - cpu:.2f} s CPU; {_load()}"
+        )
 
 
 def made_up(root: Path, rows: int) -> Store:
@@ -186,17 +226,21 @@ def _cpu() -> float:
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
-def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 1e6
+def _load() -> str:
+    return f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
 
 
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    words.add_argument("what", choices=["overhead", "scaling", "memory", "ask", "threads"])
+    parts = ["overhead", "scaling", "memory", "ask", "threads", "driver"]
+    words.add_argument("what", choices=parts)
+    words.add_argument("folder", nargs="?", type=Path, help="Of `driver`, which `memory` starts.")
     words.add_argument("--most", type=int, help="Tasks of memory, rows of ask.")
     words.add_argument("--rows", action="store_true", help="Tasks of memory leave their rows.")
     given = words.parse_args()
+    if given.what == "driver":
+        driver(given.folder, given.most, kept=given.rows)
+        return
     folder = Path(tempfile.mkdtemp(prefix="bench-fleet-"))
     try:
         if given.what == "memory":

@@ -5,8 +5,9 @@ import os
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
-from blind_trials import making, sealing
+from blind_trials import making, running, sealing
 from blind_trials.commands import command
 from blind_trials.running import command_of, run
 from blind_trials.scoring import score
@@ -111,6 +112,30 @@ def test_a_stopped_run_goes_on(sealed):
     run(trial, tool, name="fake")
     assert json.loads((kept / "bad00000.json").read_text())["answer"] == {"findings": []}
     assert json.loads((kept / "step0000.json").read_text())["exit"] == 0
+
+
+def test_a_tool_that_hangs_on_a_case_is_ended_and_has_no_answer_to_it(
+    sealed, tmp_path, monkeypatch
+):
+    trial, _, _ = sealed
+    slow = tmp_path / "slow.py"
+    slow.write_text(f"""
+import os, pathlib, sys, time
+if "null0000" in sys.argv[1]:
+    pathlib.Path({str(tmp_path / "process")!r}).write_text(str(os.getpid()))
+    time.sleep(600)
+pathlib.Path(sys.argv[2]).write_text('{{"mismatch": false}}')
+""")
+    monkeypatch.setattr(running, "TIMEOUT_S", 3.0)
+    run(trial, f"{sys.executable} {slow} {{case}} {{json}}", name="slow", jobs=2)
+    lost = json.loads((trial.answers("slow") / "null0000.json").read_text())
+    assert (lost["exit"], lost["answer"], lost["failure"]) == (None, None, "stopped after 3 s")
+    assert 3.0 <= lost["seconds"] < 60.0
+    done = json.loads((trial.answers("slow") / "step0000.json").read_text())
+    assert (done["exit"], done["failure"], done["answer"]) == (0, None, {"mismatch": False})
+    process = int((tmp_path / "process").read_text())
+    if psutil.pid_exists(process):  # it ends as soon as its parent has
+        psutil.Process(process).wait(timeout=10)
 
 
 def test_a_changed_case_a_changed_key_and_a_changed_answer_are_found(sealed, tmp_path):

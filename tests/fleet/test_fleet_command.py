@@ -38,7 +38,6 @@ def out(tmp_path):
 
 
 def test_an_archive_that_holds_nothing_that_answers_is_exit_1(said, tmp_path):
-    pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
     (tmp_path / "archive").mkdir()
     (tmp_path / "archive" / "a.csv").write_text("a\n1\n")
     (tmp_path / "archive" / "notes.md").write_text("x")

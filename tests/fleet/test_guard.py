@@ -5,16 +5,14 @@ from __future__ import annotations
 import time
 
 import pytest
-from fleet_rows import by_name, nothing
+from fleet_rows import by_name
 
-from ahrsd.errors import AhrsdError
 from ahrsd.fleet import guard
-from ahrsd.fleet.archive import Archive, ArchiveEntry
-from ahrsd.fleet.driver import Place, answers, run
+from ahrsd.fleet.archive import Archive
+from ahrsd.fleet.crew import Place
+from ahrsd.fleet.driver import run
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.work import Answer, Orders
-
-pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
+from ahrsd.fleet.work import Orders
 
 NAMES = ("good1", "hang", "good2", "hog", "kill", "good3", "once", "bug", "good4")
 
@@ -27,7 +25,7 @@ def ended(tmp_path_factory):
         (folder / "archive" / f"{name}.mcap").write_bytes(name.encode())
     orders = Orders(out=str(folder / "out"), limit_s=9.0, memory_bytes=1 << 30)
     begun = time.monotonic()
-    done = run(Archive(str(folder / "archive")), orders, Place(2, by_name), lambda _: None)
+    done = run(Archive(str(folder / "archive")), orders, by_name, Place(2), lambda _: None)
     assert time.monotonic() - begun < 120
     table, parts = Store(folder / "out").rows()
     assert (table.num_rows, len(parts)) == (0, 1)
@@ -46,8 +44,8 @@ def test_good_ones_are_done_beside_bad_ones(ended):
 @pytest.mark.parametrize(
     ("name", "outcome", "words"),
     [
-        ("hang", "too slow", "stopped after 9 s (--limit)"),
-        ("hog", "out of memory", "asked for more than 1024 MiB (--memory)"),
+        ("hang", "too slow", "stopped after 9 s"),
+        ("hog", "out of memory", "asked for more than 1024 MiB"),
         ("kill", "crashed", "its process ended by signal 9 (SIGKILL), 3 times"),
         ("bug", "internal error", "KeyError: 'nobody foresaw it'"),
     ],
@@ -62,29 +60,11 @@ def test_what_was_killed_once_is_done_at_the_second_try(ended):
     assert ended["kill"]["tries"] == guard.TRIES == 3
 
 
-def test_no_more_are_in_flight_than_the_window():
-    from concurrent.futures import Future
-
-    flying: list[Future[Answer]] = []
-    most = 0
-
-    def submit(entry: ArchiveEntry) -> Future[Answer]:
-        nonlocal most
-        future: Future[Answer] = Future()
-        flying.append(future)
-        most = max(most, len(flying))
-        if len(flying) == 5 or entry.url == "99":
-            for one in flying:
-                one.set_result(nothing(entry, Orders(out="")))
-            flying.clear()
-        return future
-
-    entries = (ArchiveEntry(str(i), 0, "") for i in range(100))
-    assert len(list(answers(entries, submit, 5))) == 100
-    assert most == 5
-
-
-def test_without_pebble_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(AhrsdError, match=r"pip install 'ahrsd\[fleet\]'"):
-        guard.Guard(1, 0, nothing)
+def test_what_to_do_is_beside_what_a_limit_ended(ended):
+    remedies = {name: ended[name]["remedy"] for name in ("hang", "hog", "kill", "bug")}
+    assert remedies == {
+        "hang": "give more time: --limit 1h --retry-failed",
+        "hog": "give more memory: --memory 4G --retry-failed",
+        "kill": None,
+        "bug": None,
+    }

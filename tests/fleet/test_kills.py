@@ -1,4 +1,7 @@
-"""A run under SIGKILL, and on a cluster of three processes; the full form is a benchmark."""
+"""A run under SIGKILL, and on a cluster of three processes; the full form is a benchmark.
+
+Recordings only take time here (`quick_fleet`); the benchmark calibrates and diagnoses them.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import time
 
 import pytest
 from fleet_kills import (
+    ENVIRONMENT,
     Cluster,
     Fleet,
     Reader,
@@ -16,57 +20,60 @@ from fleet_kills import (
     summary,
     tree,
     under_fire,
-    write_archive,
 )
-
-pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
-
-
-@pytest.fixture(scope="module")
-def archive(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("killed")
-    write_archive(folder / "archive", 8)
-    return folder / "archive"
+from quick_fleet import write_quick_archive
 
 
-def test_every_recording_has_one_row_whoever_is_killed(archive, tmp_path):
-    fleet = Fleet(archive, tmp_path / "out")
+def test_every_recording_has_one_row_whoever_is_killed(tmp_path):
+    write_quick_archive(tmp_path / "archive", 30, milliseconds=400)
+    fleet = Fleet(tmp_path / "archive", tmp_path / "out", quick=True)
     try:
-        reader = under_fire(fleet, recordings=8, kills=3, seed=7, least_s=0.2)
+        reader = under_fire(fleet, recordings=30, kills=3, seed=7, least_s=0.0)
     finally:
         fleet.stop()
     found = summary(fleet, reader)
-    assert found["rows"] == found["keys"] == found["recordings"] == 8
-    assert found["outcomes"] == {"done": 8}
+    assert found["rows"] == found["keys"] == found["recordings"] == 30
+    assert found["outcomes"] == {"done": 30}
     assert found["left_running"] == found["partial_files"] == found["faults"] == []
     assert found["readings"] > 5
-    assert sum(found["kills"].values()) >= 2
+    assert sum(found["kills"].values()) == 3
     assert {"driver", "process"} <= found["kills"].keys()
 
 
-def test_an_interrupted_run_says_so_and_leaves_nothing(archive, tmp_path):
-    fleet = Fleet(archive, tmp_path / "out")
-    fleet.start()
-    while fleet.rows() < 1:
-        assert fleet.driver.poll() is None
-    below = tree(fleet.driver.pid)
-    fleet.driver.send_signal(signal.SIGINT)
-    assert fleet.driver.wait(timeout=60) == 130
-    assert still_running(below) == []
-    assert "ahrsd: interrupted" in (tmp_path / "out.log").read_text()
-    assert fleet.finish() == 0
-    assert len(rows_of(tmp_path / "out")) == 8
+def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
+    """It cannot end before the signal: two of its recordings wait for a file."""
+    archive = tmp_path / "archive"
+    write_quick_archive(archive, 3, milliseconds=10)
+    for number in range(2):
+        (archive / "rov0" / f"held_{number}.mcap").write_bytes(bytes(10 + number))
+    fleet = Fleet(archive, tmp_path / "out", jobs=3, quick=True)
+    try:
+        fleet.start()
+        while fleet.rows() < 1:
+            assert fleet.driver.poll() is None
+            time.sleep(0.05)
+        below = tree(fleet.driver.pid)
+        fleet.driver.send_signal(signal.SIGINT)
+        assert fleet.driver.wait(timeout=60) == 130
+        assert still_running(below) == []
+        assert "ahrsd: interrupted" in (tmp_path / "out.log").read_text()
+        (archive / "rov0" / "open").touch()
+        assert fleet.finish() == 0
+    finally:
+        fleet.stop()
+    assert len(rows_of(tmp_path / "out")) == 5
 
 
-def test_on_a_cluster_a_scheduler_and_a_worker_may_die(archive, tmp_path):
+def test_on_a_cluster_a_scheduler_and_a_worker_may_die(tmp_path):
     pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
+    write_quick_archive(tmp_path / "archive", 24, milliseconds=500)
     cluster = Cluster(tmp_path)
-    fleet = Fleet(archive, tmp_path / "out", cluster=cluster)
+    fleet = Fleet(tmp_path / "archive", tmp_path / "out", cluster=cluster, quick=True)
     reader = Reader(tmp_path / "out")
     try:
         reader.start()
         fleet.start()
-        for goal, name in ((2, "worker 1"), (4, "scheduler")):
+        for goal, name in ((2, "worker 1"), (8, "scheduler")):
             while fleet.rows() < goal and fleet.driver.poll() is None:
                 time.sleep(0.1)
             victim = cluster.processes[name]
@@ -81,27 +88,24 @@ def test_on_a_cluster_a_scheduler_and_a_worker_may_die(archive, tmp_path):
         assert fleet.finish() == 0
         reader.close()
         found = summary(fleet, reader)
-        assert found["rows"] == found["keys"] == found["recordings"] == 8
-        assert found["outcomes"] == {"done": 8}
+        assert found["rows"] == found["keys"] == found["recordings"] == 24
+        assert found["outcomes"] == {"done": 24}
         assert found["faults"] == []
     finally:
         fleet.stop()
         cluster.stop()
 
 
-def test_a_cluster_that_is_not_there_is_one_line(archive, tmp_path):
+def test_a_cluster_that_is_not_there_is_one_line_after_five_seconds(tmp_path):
     pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
-    fleet = Fleet(archive, tmp_path / "out")
+    write_quick_archive(tmp_path / "archive", 1, milliseconds=10)
+    fleet = Fleet(tmp_path / "archive", tmp_path / "out", quick=True)
     done = subprocess.run(
-        [*fleet_command(fleet), "--cluster", "tcp://127.0.0.1:9"],
-        check=False, capture_output=True, text=True, timeout=120,
+        [*fleet.command, "--cluster", "tcp://127.0.0.1:9"],
+        check=False, capture_output=True, text=True, timeout=120, env=ENVIRONMENT,
     )  # fmt: skip
     assert done.returncode == 75
-    assert done.stderr.startswith("ahrsd: --cluster tcp://127.0.0.1:9: no scheduler answers")
+    assert done.stderr.startswith(
+        "ahrsd: --cluster tcp://127.0.0.1:9: no scheduler answers within 5 s ("
+    )
     assert done.stderr.count("\n") == 1
-
-
-def fleet_command(fleet: Fleet) -> list[str]:
-    from fleet_kills import PYTHON
-
-    return [PYTHON, "-m", "ahrsd", "fleet", "run", str(fleet.archive), "-o", str(fleet.out)]

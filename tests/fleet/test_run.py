@@ -13,11 +13,12 @@ from fleet_kills import write_archive
 from fleet_rows import row, store_of
 from ros_files import sensor
 
-from ahrsd.cli.fleet import EXAMINER, LOADS
+from ahrsd.cli.fleet.examiner import EXAMINER, LOADS
 from ahrsd.config.loading import Config
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.driver import Place, Progress, run
+from ahrsd.fleet.crew import Place
+from ahrsd.fleet.driver import Progress, run
 from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.work import Orders
@@ -26,14 +27,14 @@ from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.offline.simulate import write_experiment
 from ahrsd.simulation import ScenarioSettings, simulate
 
-pytest.importorskip("pebble", reason="pebble (the extra fleet) is not installed")
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
-PLACE = Place(2, EXAMINER, LOADS)
+PLACE = Place(2, LOADS)
 
 
 def ran(archive: Path | str, out: Path, **orders: object) -> Progress:
-    return run(Archive(str(archive)), Orders(out=str(out), **orders), PLACE, lambda _: None)  # type: ignore[arg-type]
+    given = Orders(out=str(out), **orders)  # type: ignore[arg-type]
+    return run(Archive(str(archive)), given, EXAMINER, PLACE, lambda _: None)
 
 
 def rows(out: Path) -> dict[str, dict[str, object]]:

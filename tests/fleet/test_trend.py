@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.fleet.trend import Series, binned, trends
+from ahrsd.fleet.trend import Bins, Series, trends
 
 PER_YEAR = np.array([2e-3, -1e-3, 0.0])
 PER_DEGREE = np.array([0.0, 1e-4, -2e-4])
@@ -96,7 +96,10 @@ def test_a_device_does_not_change_the_answer_about_another():
 
 def test_many_calibrations_are_averaged_and_a_step_within_an_average_is_one_step():
     one = series(4, 3001, step_at=1507)
-    small = binned(one)
+    bins = Bins.of(np.zeros(3001, np.int64), np.arange(3001))
+    (day,) = bins.means([one.day]).T
+    warm = bins.known_means(one.temperature_c)
+    small = Series(day, warm, bins.means(one.values.T), bins.sigmas(one.sigmas.T))
     assert len(small.day) == 200
     assert small.values.mean(axis=0) == pytest.approx(one.values.mean(axis=0), abs=1e-5)
     assert small.sigmas[0] == pytest.approx(2e-4 / np.sqrt(15), rel=1e-6)

@@ -9,7 +9,15 @@ import pytest
 
 from ahrsd.errors import AhrsdError
 from ahrsd.montecarlo.accuracy import FIGURES, HEADINGS
-from ahrsd.montecarlo.runs import Plan, is_known, known_methods, run_many, run_one
+from ahrsd.montecarlo.runs import (
+    Plan,
+    is_known,
+    known_methods,
+    lost_record,
+    one_by_one,
+    run_many,
+    run_one,
+)
 from ahrsd.montecarlo.summary import (
     BOUNDED,
     PARAMETERS,
@@ -48,11 +56,50 @@ def test_a_run_says_everything_and_its_seed_decides_it():
     assert without_time([run_one(SHORT, 4)]) != without_time([one])
 
 
-def test_processes_give_what_one_process_gives():
+def test_any_order_gives_what_one_after_the_other_gives():
     plan = Plan("mam", "rov", methods=("ellipsoid", "fnp"), at_s=(40.0,))
     here = run_many(plan, range(3))
-    there = run_many(plan, range(3), jobs=2)
+    there = run_many(plan, range(3), runner=lambda p, seeds: one_by_one(p, [*seeds][::-1]))
     assert without_time(there) == without_time(here)
+
+
+def test_a_seed_that_was_lost_is_a_failure_of_every_method_and_is_run_again(tmp_path):
+    plan = Plan("mam", "rov", methods=("ellipsoid", "fnp"), at_s=(40.0, 60.0))
+
+    def losing(p, seeds):
+        yield from one_by_one(p, [seed for seed in seeds if seed != 1])
+        yield lost_record(p, 1, "stopped after 9 s")
+
+    records = run_many(plan, range(3), runner=losing, resume=tmp_path)
+    rows = summarise(records)
+    assert [(row.method, row.at_s, row.runs, row.answered) for row in rows] == [
+        ("ellipsoid", 40.0, 3, 2), ("ellipsoid", 60.0, 3, 2), ("fnp", 40.0, 3, 2),
+        ("fnp", 60.0, 3, 2),
+    ]  # fmt: skip
+    assert all(row.failures == {"stopped after 9 s": 1} for row in rows)
+    kept = summarise([records[0], records[2]])
+    assert [row.against_bound for row in rows] == [row.against_bound for row in kept]
+    assert [row.cpu_s for row in rows] == [row.cpu_s for row in kept]
+    told = []
+    again = run_many(plan, range(3), resume=tmp_path, done=lambda n, of: told.append((n, of)))
+    assert told == [(2, 3), (3, 3)]
+    assert all(result["failure"] is None for result in again[1]["results"])
+
+
+def test_the_command_on_processes_says_what_this_process_says(run, tmp_path):
+    """All seeds by two processes; then a limit that none can meet."""
+    path, words = tmp_path / "m.json", ("--motion", "rov", "--runs", 3, "--at", "40", "--jobs", 2)
+    methods = ("--method", "ellipsoid", "--method", "fnp")
+    assert run("montecarlo", "mam", *words, *methods, "--json", path) == 0
+    rows = json.loads(path.read_text())["sets"][0]["rows"]
+    plan = Plan("mam", "rov", methods=("ellipsoid", "fnp"), at_s=(40.0,))
+    here = json.loads(json.dumps([row.json() for row in summarise(run_many(plan, range(3)))]))
+    assert [row | {"cpu_s": 0} for row in rows] == [row | {"cpu_s": 0} for row in here]
+    lost = ("--motion", "rov", "--runs", 1, "--at", "40", "--method", "fnp", "--limit", "0.001s")
+    assert run("montecarlo", "mam", *lost, "--resume", tmp_path / "runs", "--json", path) == 1
+    (row,) = json.loads(path.read_text())["sets"][0]["rows"]
+    assert row["failures"] == {"stopped after 0.001 s": 1}
+    assert not (tmp_path / "runs").exists()
 
 
 def test_what_is_done_is_not_done_again_and_a_torn_line_is(tmp_path):

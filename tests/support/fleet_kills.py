@@ -31,7 +31,11 @@ ENVIRONMENT = {
     **os.environ,
     "OPENBLAS_NUM_THREADS": "1",
     "PYTHONUNBUFFERED": "1",
+    "PYTHONPATH": str(Path(__file__).parent),  # a process of a quick run finds its task
+    # how long Dask looks for a scheduler that is gone: 30 s as it comes
+    "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s",
 }
+QUICK = Path(__file__).with_name("quick_fleet.py")
 
 
 def write_archive(folder: Path, recordings: int, *, seconds: float = 24.0, first: int = 0) -> None:
@@ -104,11 +108,15 @@ class Cluster:
 
 @dataclass
 class Fleet:
-    """A run that is killed and started again."""
+    """A run that is killed and started again.
+
+    quick: its recordings are those of `quick_fleet`
+    """
 
     archive: Path
     out: Path
     jobs: int = 2
+    quick: bool = False
     cluster: Cluster | None = None
     driver: subprocess.Popen[bytes] | None = None
     kills: Counter[str] = field(default_factory=Counter)
@@ -124,11 +132,14 @@ class Fleet:
         )
         with self.out.with_suffix(".log").open("ab") as log:
             self.driver = subprocess.Popen(
-                [PYTHON, "-m", "ahrsd", "fleet", "run", str(self.archive), "-o", str(self.out),
-                 *place, *options],
-                stdout=log, stderr=log, env=ENVIRONMENT,
-            )  # fmt: skip
+                [*self.command, *place, *options], stdout=log, stderr=log, env=ENVIRONMENT
+            )
         self.starts += 1
+
+    @property
+    def command(self) -> list[str]:
+        program = [str(QUICK)] if self.quick else ["-m", "ahrsd"]
+        return [PYTHON, *program, "fleet", "run", str(self.archive), "-o", str(self.out)]
 
     def rows(self) -> int:
         """FleetRows that are there now."""

@@ -82,6 +82,22 @@ def sleeping(entry, orders) -> Answer:
     return _done(entry, orders)
 
 
+def computing(entry, orders) -> Answer:
+    """A task that needs so many milliseconds of a processor."""
+    until = time.process_time() + entry.size_bytes / 1000.0
+    while time.process_time() < until:
+        sum(range(10_000))
+    return _done(entry, orders)
+
+
+def held(entry, orders) -> Answer:
+    """Like `sleeping`; one that is called held*.mcap waits until the file `open` lies beside it."""
+    path = Path(entry.url)
+    while path.name.startswith("held") and not path.with_name("open").exists():
+        time.sleep(0.05)
+    return sleeping(entry, orders)
+
+
 def nothing(entry, orders) -> Answer:
     """A task that costs nothing and leaves nothing."""
     return Answer(entry.url, "done")

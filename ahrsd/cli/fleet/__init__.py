@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,41 +10,18 @@ import click
 
 from ahrsd.cli.files import columns_option, make_folder
 from ahrsd.cli.fleet import answers
+from ahrsd.cli.fleet.examiner import EXAMINER, LOADS
 from ahrsd.cli.progress import fleet_progress
+from ahrsd.cli.task_options import limit_options
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
-from ahrsd.fleet.row import Calibrated
-from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
+from ahrsd.fleet.work import ROLES, Orders, summary
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.diagnosis import Diagnosis
     from ahrsd.fleet.driver import Progress
     from ahrsd.recording.column_names import ColumnMap
 
 _FOLDER = click.Path(path_type=Path)
-_UNITS = {
-    "--limit": {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0},
-    "--memory": {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30},
-}
-
-
-def calibrated(path: Path, orders: Orders) -> Calibrated:
-    """`ahrsd calibrate` of one recording of an archive."""
-    from ahrsd.config.loading import Config
-    from ahrsd.offline.calibrate import calibrate
-
-    return calibrate(path, Config(), rate_hz=orders.rate_hz, columns=orders.columns)
-
-
-def diagnosed(path: Path, orders: Orders) -> Diagnosis:
-    """`ahrsd diagnose` of one recording of an archive."""
-    from ahrsd.offline.diagnose import diagnose_recording
-
-    return diagnose_recording(path, rate_hz=orders.rate_hz, columns=orders.columns)
-
-
-EXAMINER = Examiner(calibrated, diagnosed)
-LOADS = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")  # slow to import
 
 
 @click.group()
@@ -61,8 +37,7 @@ def command() -> None:
 @click.option("-o", "--output", type=_FOLDER, required=True, help="The folder of the rows.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; default: one for each core.")
 @click.option("--cluster", metavar="tcp://...", help="A Dask scheduler, instead of processes here.")
-@click.option("--limit", default="600s", show_default=True, help="Time for a recording: s, min, h.")
-@click.option("--memory", default="2G", show_default=True, help="Memory for a recording: M, G.")
+@limit_options("a recording", limit="600s", memory="2G")
 @click.option("--retry-failed", "again", is_flag=True, help="Do those again that gave no answer.")
 @click.option("--folders", default="vehicle", show_default=True, metavar="LEVEL,...",
               help="What folders name, from the top: vehicle, place, serial, or -.")  # fmt: skip
@@ -78,8 +53,8 @@ def run(
     output: Path,
     jobs: int | None,
     cluster: str | None,
-    limit: str,
-    memory: str,
+    limit_s: float,
+    memory_bytes: int,
     again: bool,
     folders: str,
     vehicle: str | None,
@@ -96,7 +71,7 @@ def run(
     is gone.
     """
     from ahrsd.fleet.archive import Archive
-    from ahrsd.fleet.driver import Place
+    from ahrsd.fleet.crew import Place
     from ahrsd.fleet.driver import run as run_fleet
 
     if folder is not None:
@@ -108,15 +83,15 @@ def run(
         levels=_levels(folders),
         vehicle=vehicle,
         place=place,
-        limit_s=_amount("--limit", limit),
-        memory_bytes=round(_amount("--memory", memory)),
+        limit_s=limit_s,
+        memory_bytes=memory_bytes,
         again=again,
     )
-    where = Place(jobs or os.cpu_count() or 1, EXAMINER, LOADS, cluster)
+    where = Place(jobs or os.cpu_count() or 1, LOADS, cluster)
     source = Archive(archive if "://" in archive else str(Path(archive).resolve()), patterns)
     with fleet_progress() as show:
         done = run_fleet(
-            source, orders, where, lambda p: show(p.done, p.total, p.failed, p.per_minute)
+            source, orders, EXAMINER, where, lambda p: show(p.done, p.total, p.failed, p.per_minute)
         )
     for line in _end_lines(done, output):
         click.echo(line)
@@ -143,15 +118,6 @@ def _levels(text: str) -> tuple[str, ...]:
     if wrong := [name for name in names if name not in (*ROLES, "-")]:
         raise AhrsdError(f"--folders {wrong[0]}: a level is one of {', '.join(ROLES)}, or -")
     return names
-
-
-def _amount(option: str, text: str) -> float:
-    units = _UNITS[option]
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([A-Za-z]*)", text.strip())
-    factor = None if found is None else units.get(found[2].removesuffix("iB").removesuffix("B"))
-    if found is None or factor is None or float(found[1]) <= 0.0:
-        raise AhrsdError(f"{option} {text}: a number with one of {', '.join(filter(None, units))}")
-    return float(found[1]) * factor
 
 
 for _other in (answers.status, answers.compact, answers.ask):

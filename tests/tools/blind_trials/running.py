@@ -1,4 +1,8 @@
-"""A tool over all cases: one process per case, answers kept as they come, hashed at the end."""
+"""A tool over all cases: one process per case, answers kept as they come, hashed at the end.
+
+Each case is a task of `fleet.crew`: its process starts the tool, and the tool ends with it, at the
+limit of time and wherever a run is killed.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from ahrsd.errors import AhrsdError
+from ahrsd.fleet.crew import Place, crew
+from ahrsd.fleet.guard import Limits, Loss, end_with
 from blind_trials.sealing import (
     Json,
     Round,
@@ -29,7 +34,7 @@ from blind_trials.sealing import (
 
 OURS = "ahrsd"
 RIVALS = ("stlsq", "lasso-bic", "ruptures")
-_TIMEOUT_S = 600.0
+TIMEOUT_S = 600.0  # of a case
 _TRIED = 10  # cases that say nothing of any tool: one that answered none of so many cannot run here
 _NOT_FOUND = 127  # the exit code that every shell gives to a program that it cannot start
 #: last words of a tool that lacks a package: of our rivals, and of any program in Python
@@ -122,50 +127,29 @@ def run(
     records = _kept(folder, trial.cases)
     if done is not None:
         done(len(records), len(trial.cases))
-    for case, record in _answers(
-        trial, [c for c in trial.cases if c not in records], command, jobs
-    ):
-        records[case] = record
-        why = could_not_run(record)
-        if len(records) >= min(_TRIED, len(trial.cases)):
-            why = why or answered_nothing(records.values())
-        if why:
-            raise AhrsdError(f"{called} cannot run here: {why}; no answers were closed")
-        write_object(folder / f"{case}.json", record)
-        if done is not None:
-            done(len(records), len(trial.cases))
+    missing = [case for case in trial.cases if case not in records]
+    with crew(Place(jobs), Limits(time_s=TIMEOUT_S)) as processes:
+        for case, record in processes.map(partial(_answer, trial, command), missing, _lost):
+            records[case] = record
+            why = could_not_run(record)
+            if len(records) >= min(_TRIED, len(trial.cases)):
+                why = why or answered_nothing(records.values())
+            if why:
+                raise AhrsdError(f"{called} cannot run here: {why}; no answers were closed")
+            write_object(folder / f"{case}.json", record)
+            if done is not None:
+                done(len(records), len(trial.cases))
     return close_answers(trial, called)
 
 
-def _answers(
-    trial: Round, cases: Sequence[str], command: list[str], jobs: int
-) -> Iterator[tuple[str, Json]]:
-    """Case and record as they come; what has not begun is dropped where the caller stops."""
-    with ThreadPoolExecutor(jobs) as pool:
-        waiting = {pool.submit(_answer, trial, case, command): case for case in cases}
-        try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _answer(trial: Round, case: str, command: list[str]) -> Json:
+def _answer(trial: Round, command: list[str], case: str) -> Json:
     """What the tool said of one case; its failure in words where it said nothing."""
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "answer.json"
         files = {"case": trial.case(case), "spec": trial.spec(case), "json": out}
         filled = [part.format(**files) if "{" in part else part for part in command]
         ended = _timed(filled, Path(scratch) / "stderr")
-        record: Json = {
-            "case": case,
-            "exit": ended.code,
-            "said": ended.printed,
-            "seconds": round(ended.seconds, 3),
-            "cpu_seconds": round(ended.cpu_seconds, 3),
-            "failure": None,
-            "answer": None,
-        }
+        record = _record(case, ended)
         try:
             record["answer"] = json.loads(out.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -173,16 +157,35 @@ def _answer(trial: Round, case: str, command: list[str]) -> Json:
         return record
 
 
+def _lost(case: str, loss: Loss) -> Json:
+    """The record of a case whose process took too long or died."""
+    return _record(case, _Ended(None, "", loss.seconds, None)) | {"failure": loss.words}
+
+
+def _record(case: str, ended: _Ended) -> Json:
+    return {
+        "case": case,
+        "exit": ended.code,
+        "said": ended.printed,
+        "seconds": round(ended.seconds, 3),
+        "cpu_seconds": None if ended.cpu_seconds is None else round(ended.cpu_seconds, 3),
+        "failure": None,
+        "answer": None,
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class _Ended:
-    code: int
+    """code, cpu_seconds: None where the tool had to be ended"""
+
+    code: int | None
     printed: str  # the last line on stderr
     seconds: float
-    cpu_seconds: float
+    cpu_seconds: float | None
 
 
 def _timed(command: list[str], errors: Path) -> _Ended:
-    """Run to the end or to the time limit; wall and CPU seconds of this process alone."""
+    """Run to the end; wall and CPU seconds of this process alone."""
     begun = time.monotonic()
     try:
         with errors.open("wb") as stderr:
@@ -191,13 +194,11 @@ def _timed(command: list[str], errors: Path) -> _Ended:
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
                 env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+                preexec_fn=partial(end_with, os.getpid()),  # noqa: PLW1509 - one thread here
             )
     except OSError as error:
         return _Ended(_NOT_FOUND, str(error), 0.0, 0.0)
-    limit = threading.Timer(_TIMEOUT_S, process.kill)
-    limit.start()
     _, status, used = os.wait4(process.pid, 0)
-    limit.cancel()
     process.returncode = os.waitstatus_to_exitcode(status)
     lines = errors.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return _Ended(

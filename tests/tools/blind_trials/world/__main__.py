@@ -1,6 +1,8 @@
-"""`python -m blind_trials.world --cases N -o DIR --key FILE`: cases into DIR, truth into FILE.
+"""`python -m blind_trials.world --cases N --seed S -o DIR --key FILE`: cases into DIR, truth into
+FILE.
 
-Prints the number of cases first, then a line for every case that is written.
+With --some FIRST LAST only those of the N cases, counted from 0, the last one not: together such
+runs make what one makes.
 """
 
 from __future__ import annotations
@@ -8,8 +10,6 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
-import secrets
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
@@ -58,20 +58,14 @@ def case_ids(cases, seed):
     return list(found)
 
 
-def make_ring(ring, cases, seed, output, recordings, jobs, told=print):
-    """Write all cases; their truths in the order of the names."""
+def make_ring(ring, cases, seed, output, recordings, some=None):
+    """Write the cases, or some of them; their truths in the order of the names."""
     work = plan(cases, seed) if ring == "semireal" else orders(ring, cases, seed)
     names = case_ids(cases, seed)
-    told(f"{len(work)} cases")
-    truths = {}
-    with ProcessPoolExecutor(jobs) as pool:
-        waiting = {
-            pool.submit(make_one, ring, what, [seed, n], str(output / name), recordings): name
-            for n, (name, what) in enumerate(zip(names, work))
-        }
-        for future in as_completed(waiting):
-            truths[waiting[future]] = future.result()
-            told(waiting[future])
+    truths = {
+        names[n]: make_one(ring, work[n], [seed, n], str(output / names[n]), recordings)
+        for n in range(*(some or (0, cases)))
+    }
     return [{"id": name, **truths[name]} for name in sorted(truths)]
 
 
@@ -80,24 +74,16 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(prog="blind_trials.world", description=__doc__)
     parser.add_argument("--cases", type=int, required=True)
     parser.add_argument("--ring", choices=[*RINGS, "semireal"], default="full")
-    parser.add_argument("--seed", type=int, help="drawn in secret where it is left out")
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--some", type=int, nargs=2, metavar=("FIRST", "LAST"))
     parser.add_argument("--recordings", default="../shared/recordings")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--key", type=Path, required=True)
     asked = parser.parse_args(arguments)
-    seed = secrets.randbits(63) if asked.seed is None else asked.seed
+    seed = asked.seed
     if asked.ring == "semireal" and not Path(asked.recordings).is_dir():
         parser.error(f"{asked.recordings}: no such folder; name the real recordings' folder")
-    cases = make_ring(
-        asked.ring,
-        asked.cases,
-        seed,
-        asked.output,
-        asked.recordings,
-        asked.jobs,
-        lambda line: print(line, flush=True),
-    )
+    cases = make_ring(asked.ring, asked.cases, seed, asked.output, asked.recordings, asked.some)
     key = {"schema": "ahrsd.challenge.key/1", "ring": asked.ring, "seed": seed, "cases": cases}
     asked.key.parent.mkdir(parents=True, exist_ok=True)
     asked.key.write_text(json.dumps(key, indent=1) + "\n", encoding="utf-8")

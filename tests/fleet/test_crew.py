@@ -1,0 +1,131 @@
+"""A function over tasks: every task one answer, whoever dies; no more at once than the window."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+
+import psutil
+import pytest
+
+from ahrsd.fleet.crew import Crew, Place, crew
+from ahrsd.fleet.guard import BUG, CRASHED, TOO_LARGE, TOO_SLOW, TRIES, Limits, Loss
+
+
+def squared(number: int) -> tuple[int, object]:
+    return number, number**2
+
+
+def going_wrong(number: int) -> tuple[int, object]:
+    """Every fifth goes wrong, each in its own way."""
+    if number == 5:
+        time.sleep(600.0)
+    if number == 10:
+        return 10, len(bytearray(4 << 30))
+    if number == 15:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 20:
+        raise KeyError("nobody foresaw it")
+    return squared(number)
+
+
+def words(number: int, loss: Loss) -> tuple[int, object]:
+    return number, (loss.outcome, loss.words, loss.tries)
+
+
+def blas(_: int) -> tuple[int, object]:
+    return 0, os.environ["OPENBLAS_NUM_THREADS"]
+
+
+def own_process(folder: Path, number: int) -> int:
+    (folder / str(os.getpid())).touch()
+    time.sleep(0.1)
+    return number
+
+
+def failed(_: int, loss: Loss) -> int:
+    raise AssertionError(loss)
+
+
+def test_every_task_has_one_answer_and_failures_are_answers_too():
+    tasks = range(25)
+    with crew(Place(2), Limits(time_s=4.0, memory_bytes=1 << 30)) as workers:
+        found = list(workers.map(going_wrong, tasks, words))
+        again = dict(workers.map(squared, tasks, words))  # with the processes that are left
+    assert sorted(task for task, _ in found) == list(tasks)
+    assert all(task == answer[0] for task, answer in found)
+    by_task = {task: answer[1] for task, answer in found}
+    assert by_task.pop(5) == (TOO_SLOW, "stopped after 4 s", 1)
+    assert by_task.pop(10) == (TOO_LARGE, "asked for more than 1024 MiB", 1)
+    assert by_task.pop(15) == (CRASHED, "its process ended by signal 9 (SIGKILL), 3 times", TRIES)
+    assert by_task.pop(20) == (BUG, "KeyError: 'nobody foresaw it'", 1)
+    assert by_task == {task: task**2 for task in tasks if task not in (5, 10, 15, 20)}
+    assert again == {task: (task, task**2) for task in tasks}
+
+
+def test_a_process_that_is_killed_costs_no_task_and_all_end_with_the_crew(tmp_path):
+    found: list[int] = []
+    with crew(Place(2), Limits()) as workers:
+        for number, (task, answer) in enumerate(
+            workers.map(partial(own_process, tmp_path), range(30), failed)
+        ):
+            assert task == answer
+            found.append(answer)
+            if number == 10:
+                os.kill(int(min(tmp_path.iterdir()).name), signal.SIGKILL)
+    assert sorted(found) == list(range(30))
+    processes = [int(path.name) for path in tmp_path.iterdir()]
+    assert len(processes) >= 2
+    assert not any(psutil.pid_exists(process) for process in processes)
+
+
+def test_processes_hold_one_blas_thread(monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    with crew(Place(1), Limits()) as workers:
+        ((_, found),) = workers.map(blas, [0], words)
+    assert found == (0, "1")
+
+
+def test_no_more_are_in_flight_than_the_window():
+    flying: list[tuple[int, Future[int]]] = []
+    most = taken = 0
+
+    def ask(do, task, lost):
+        nonlocal most
+        future: Future[int] = Future()
+        flying.append((task, future))
+        most = max(most, len(flying))
+        if len(flying) == 5 or task == 99:
+            for number, one in flying:
+                one.set_result(do(number))
+            flying.clear()
+        return future
+
+    def tasks():
+        nonlocal taken
+        for number in range(100):
+            taken += 1
+            yield number
+
+    answers = Crew(ask, 5).map(lambda number: -number, tasks(), failed)
+    assert next(answers)[1] <= 0
+    assert taken <= 6
+    assert len(list(answers)) == 99
+    assert most == 5
+
+
+def test_who_stops_in_the_middle_leaves_nothing_running(tmp_path):
+    before = threading.active_count()
+    with pytest.raises(ZeroDivisionError), crew(Place(2), Limits()) as workers:
+        for _ in workers.map(partial(own_process, tmp_path), range(1000), failed):
+            raise ZeroDivisionError
+    assert not any(psutil.pid_exists(int(path.name)) for path in tmp_path.iterdir())
+    deadline = time.monotonic() + 5.0
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert threading.active_count() == before
