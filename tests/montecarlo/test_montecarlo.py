@@ -95,7 +95,7 @@ def test_the_command_on_processes_says_what_this_process_says(run, tmp_path):
     plan = Plan("mam", "rov", methods=("ellipsoid", "fnp"), at_s=(40.0,))
     here = json.loads(json.dumps([row.json() for row in summarise(run_many(plan, range(3)))]))
     assert [row | {"cpu_s": 0} for row in rows] == [row | {"cpu_s": 0} for row in here]
-    lost = ("--motion", "rov", "--runs", 1, "--at", "40", "--method", "fnp", "--limit", "0.001s")
+    lost = ("--motion", "rov", "--runs", 1, "--at", "400", "--method", "magyc", "--limit", "0.001s")
     assert run("montecarlo", "mam", *lost, "--resume", tmp_path / "runs", "--json", path) == 1
     (row,) = json.loads(path.read_text())["sets"][0]["rows"]
     assert row["failures"] == {"stopped after 0.001 s": 1}
