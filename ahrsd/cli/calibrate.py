@@ -118,16 +118,20 @@ def _placed(config: Config, position: str | None, date: str | None) -> Config:
         raise AhrsdError("--date without --position: the field is that of a place; give both")
     if date is not None:
         given["date"] = date
+    elif given["date"] is None:
+        click.echo("--position without --date: today's field is taken", err=True)
     try:
         return config.model_copy(
             update={"location": LocationSection.model_validate(given, strict=False)}
         )
     except ValidationError as error:
         wrong = error.errors()[0]
-        option = "--date" if wrong["loc"][:1] == ("date",) else "--position"
+        if wrong["loc"][:1] == ("date",):
+            raise AhrsdError(f"--date {date}: a day as YYYY-MM-DD is needed") from None
         raise AhrsdError(
-            f"{option} {date if option == '--date' else position}: {wrong['msg']}"
-        ) from (None)
+            f"--position {position}: {wrong['loc'][0]}: {wrong['msg']}; "
+            "LAT,LON[,ALT] in deg and m is needed"
+        ) from None
 
 
 def _refuse_page(folder: Path) -> None:
