@@ -25,10 +25,14 @@ from quick_fleet import write_quick_archive
 
 
 def test_every_recording_has_one_row_whoever_is_killed(tmp_path):
-    write_quick_archive(tmp_path / "archive", 30, milliseconds=400)
-    fleet = Fleet(tmp_path / "archive", tmp_path / "out", quick=True)
+    """It cannot end before the last kill: one of its recordings waits for a file."""
+    archive = tmp_path / "archive"
+    write_quick_archive(archive, 29, milliseconds=100)
+    (archive / "rov0" / "held.mcap").write_bytes(bytes(9))
+    fleet = Fleet(archive, tmp_path / "out", quick=True)
     try:
-        reader = under_fire(fleet, recordings=30, kills=3, seed=7, least_s=0.0)
+        opens = archive / "rov0" / "open"
+        reader = under_fire(fleet, recordings=30, kills=3, seed=7, least_s=0.0, opens=opens)
     finally:
         fleet.stop()
     found = summary(fleet, reader)

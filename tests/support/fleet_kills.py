@@ -262,8 +262,18 @@ def rows_of(out: Path) -> list[dict[str, object]]:
     return [row for table in tables for row in table.to_pylist()]
 
 
-def under_fire(fleet: Fleet, recordings: int, kills: int, seed: int, least_s: float) -> Reader:
-    """Kill so often while it runs, start it again each time, and let it end; who read meanwhile."""
+def under_fire(
+    fleet: Fleet,
+    recordings: int,
+    kills: int,
+    seed: int,
+    least_s: float,
+    opens: Path | None = None,
+) -> Reader:
+    """Kill so often while it runs, start it again each time, and let it end; who read meanwhile.
+
+    opens: the file without which it cannot end (`quick_fleet`), made after the last kill
+    """
     rng = random.Random(seed)
     reader = Reader(fleet.out)
     reader.start()
@@ -280,6 +290,8 @@ def under_fire(fleet: Fleet, recordings: int, kills: int, seed: int, least_s: fl
             fleet.kill_one(rng)
         if fleet.driver.poll() is not None:
             fleet.start()
+    if opens is not None:
+        opens.touch()
     code = fleet.finish()
     assert code == 0, fleet.out.with_suffix(".log").read_text()[-2000:]
     reader.close()
