@@ -57,7 +57,7 @@ from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.states import LIVED_WITH, State
-from ahrsd.writeback.trial_metrics import LiveTrial
+from ahrsd.writeback.trial import LiveTrial
 from drivers.vn100.decode import Measurement, Undecodable, Unused
 from drivers.vn100.registers import Values
 from drivers.vn100.session import DeviceFault, LineEchoes, Stray

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from ahrsd.core.device_session import DeviceSession
 from ahrsd.inputs import JournalOpened
 from ahrsd.writeback.actions import Action
-from ahrsd.writeback.journal_history import StoredRecord, of_another_device
 from ahrsd.writeback.machine import WriteBack
+from ahrsd.writeback.transaction import StoredRecord, of_another_device
 from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import COMPENSATING, Values, same
 

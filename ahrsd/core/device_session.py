@@ -23,9 +23,9 @@ from enum import Enum
 
 from ahrsd.core.client_settings import ClientSettings
 from ahrsd.core.kept_outputs import KeptOutputs
-from ahrsd.writeback.journal_history import JournalRecord
 from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
 from ahrsd.writeback.reconcile import RecordKind
+from ahrsd.writeback.transaction import JournalRecord
 from drivers.vn100.calibration_stream import (
     CalibrationStream,
     DoesNotFit,

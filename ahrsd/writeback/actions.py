@@ -3,20 +3,28 @@
 JournalAppend is carried out with fsync *before* the next action runs, and its end is told with
 `on_journal_ok` or `on_journal_failed`, whose own actions come before the rest of the list.
 RunProcedure waits until the session is idle; CancelProcedure throws Cancelled into the running one.
+
+`ActionOutbox` collects them, with what the write-back knows of time and journal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from ahrsd.events import Event
+from ahrsd.events import Event, Noted, RegisterWritten, StateChanged
+from ahrsd.printable import counted
+from ahrsd.writeback.clocks import Now, Stamp, plausible
 from ahrsd.writeback.permissions import Purpose
 from ahrsd.writeback.reconcile import RecordKind
+from ahrsd.writeback.transaction import JournalHistory, JournalRecord
 from drivers.vn100.commands import Command, Procedure
 from drivers.vn100.procedures import Unit
 from drivers.vn100.registers import Values
+
+# -- Actions ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,3 +105,206 @@ Action = (
     | Look
     | CalibrateAnew
 )
+
+
+# -- The outbox ------------------------------------------------------------------------------------
+
+
+JOURNAL_AGAIN_S = 30.0
+_ANNOUNCED = (
+    RecordKind.PREPARED,
+    RecordKind.RAM_VERIFIED,
+    RecordKind.FLASH_SENT,
+    RecordKind.CLIENT_WRITES,
+)  # not on the disk: not done
+
+
+class ActionOutbox:
+    """Outgoing actions in order, each stamped with the newest time; the history beside them.
+
+    A record that says what was done (a rollback) and that the disk did not take is kept and asked
+    for again until it does: otherwise the next start would have to guess.
+    """
+
+    def __init__(self, allow: Callable[[Command, Purpose, float], bool]) -> None:
+        self.host_s = self.at_s = 0.0
+        self.device_s: float | None = None  # the device's time since its start-up, as last heard
+        self.history = JournalHistory()
+        self.running = ""
+        self._allow = allow
+        self._wall_offset_s: float | None = None
+        self._least_offset_s: float | None = None  # of every wall clock that may have been right
+        self._boot: tuple[str, float | None] = ("", None)  # and what to add to `host_s`
+        self._serial: int | None = None
+        self._bound_s = 0.0
+        self._asked: deque[tuple[RecordKind, dict[str, Any], JournalHistory]] = deque()
+        self._unjournaled: list[tuple[RecordKind, dict[str, Any]]] = []
+        self._journal_again_s = 0.0
+        self._runs = 0
+        self._out: list[Action] = []
+        self._last_note = ""
+
+    @property
+    def wall_s(self) -> float:
+        """The wall clock now, for people to read; the monotonic one while it is unknown."""
+        return self.host_s + (self._wall_offset_s or 0.0)
+
+    @property
+    def stamp(self) -> Stamp:
+        """The present by every clock, for a record."""
+        return self.stamp_at(self.host_s)
+
+    def stamp_at(self, host_s: float) -> Stamp:
+        """That moment by every clock of the host, and the device's time as last heard."""
+        (boot_id, boot_s), wall_s = self._boot, self._wall_offset_s
+        return Stamp(
+            wall_s=None if wall_s is None else host_s + wall_s,
+            boot_id=boot_id,
+            boot_s=None if boot_s is None else host_s + boot_s,
+            device_s=self.device_s,
+        )
+
+    @property
+    def now(self) -> Now:
+        """The present for a budget: by the earliest wall clock that this run was told."""
+        stamp, least_s = self.stamp, None
+        if self._least_offset_s is not None:
+            since_s = self.host_s if stamp.boot_s is None else stamp.boot_s
+            least_s = since_s + self._least_offset_s
+        return Now(replace(stamp, wall_s=least_s), self.host_s - self._bound_s)
+
+    def set_clocks(self, wall_s: float, boot_id: str = "", boot_s: float | None = None) -> None:
+        """The host's other clocks at this moment; the wall clock may have been set since."""
+        self._wall_offset_s = wall_s - self.host_s
+        if plausible(wall_s):
+            offset_s = wall_s - (self.host_s if boot_s is None else boot_s)
+            least_s = offset_s if self._least_offset_s is None else self._least_offset_s
+            self._least_offset_s = min(offset_s, least_s)
+        self._boot = (boot_id, None if boot_s is None else boot_s - self.host_s)
+
+    def bind(self, serial: int, journal: Sequence[JournalRecord] | None) -> None:
+        """Another device, or the same one again: its journal is what counts.
+
+        Where it cannot be read, what is remembered of an open transaction is better than nothing;
+        and what the disk has not taken yet comes behind what it has.
+        """
+        if serial != self._serial and self._unjournaled:
+            self.note(
+                "error", f"lost: {counted(len(self._unjournaled), 'record')} of {self._serial}"
+            )
+            self._unjournaled.clear()
+        self._serial, self._bound_s, self.device_s = serial, self.host_s, None
+        remembered = self.history.open
+        if journal is not None or remembered is None or remembered.serial != serial:
+            self.history = JournalHistory.of(journal or ())
+            for kind, facts in self._unjournaled:
+                self.history = self.history.with_record(kind, facts)
+
+    def take(self) -> list[Action]:
+        """The actions since the last call."""
+        out, self._out = self._out, []
+        return out
+
+    def ask(self, action: Action) -> None:
+        """Append an action."""
+        self._out.append(action)
+
+    def record(self, kind: RecordKind, **facts: object) -> None:
+        """Append a record behind those still missing on the disk; the history counts it at once."""
+        self.journal_again()
+        transaction = self.history.open
+        complete = {
+            **({} if transaction is None else {"txn": transaction.id}),
+            **facts,
+            **self.stamp.facts(),
+        }
+        before, self.history = self.history, self.history.with_record(kind, complete)
+        self._append(kind, complete, before)
+
+    def journaled(self, kind: RecordKind) -> bool:
+        """A record of this kind is on the disk; returns whether none is missing any more."""
+        self._answered(kind)
+        self.journal_again()
+        return not self._unjournaled and not self._asked
+
+    def not_journaled(self, kind: RecordKind) -> None:
+        """A record of this kind is not on the disk: what it announced does not happen."""
+        asked = self._answered(kind)
+        if asked is None:
+            return
+        _, facts, before = asked
+        if kind not in _ANNOUNCED:
+            self._unjournaled.append((kind, facts))
+            self._journal_again_s = self.host_s + JOURNAL_AGAIN_S
+        elif kind is RecordKind.PREPARED:  # nothing was opened
+            self.history = replace(
+                self.history,
+                open=before.open,
+                last=before.last,
+                last_at=before.last_at,
+                holds=before.holds,
+            )
+
+    @property
+    def journal_again_s(self) -> float | None:
+        """When the records that the disk did not take are tried again."""
+        return self._journal_again_s if self._unjournaled else None
+
+    def journal_again(self) -> None:
+        """Try the missing records again, in their order."""
+        waiting, self._unjournaled = self._unjournaled, []
+        for kind, facts in waiting:
+            self._append(kind, facts, self.history)
+
+    def _append(self, kind: RecordKind, facts: dict[str, Any], before: JournalHistory) -> None:
+        self._asked.append((kind, facts, before))
+        self.ask(AppendToJournal(kind, facts))
+
+    def _answered(
+        self, kind: RecordKind
+    ) -> tuple[RecordKind, dict[str, Any], JournalHistory] | None:
+        asked = next((one for one in self._asked if one[0] is kind), None)
+        if asked is not None:
+            self._asked.remove(asked)
+        return asked
+
+    def note(self, level: str, text: str) -> None:
+        """One line for the log; not the same one twice in a row."""
+        if text != self._last_note:
+            self.ask(Emit(Noted(self.at_s, self.host_s, level, text)))
+        self._last_note = text
+
+    def changed(self, old: str, new: str, reason: str) -> None:
+        """The state changed."""
+        self.ask(Emit(StateChanged(self.at_s, self.host_s, old, new, reason)))
+
+    def written(
+        self, before: Mapping[int, Values], after: Mapping[int, Values], outcome: str
+    ) -> None:
+        """Registers were written, refused or undone."""
+        for number in after:
+            old, new = (tuple(float(v) for v in side[number]) for side in (before, after))
+            self.ask(Emit(RegisterWritten(self.at_s, self.host_s, number, old, new, outcome)))
+
+    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+        """The device applies these registers from now on; None: unknown."""
+        self.ask(InForce(None if registers is None else dict(registers)))
+
+    def run(self, what: str, purpose: Purpose, make: Callable[[], Procedure[object]]) -> None:
+        """Start a procedure; the gate judges each command at the newest host time."""
+        self._runs += 1
+        self.running = f"{what} {self._runs}"
+        self.ask(
+            RunProcedure(
+                self.running,
+                purpose,
+                make,
+                lambda command: self._allow(command, purpose, self.host_s),
+            )
+        )
+
+    def stop_running(self) -> None:
+        """End the procedure that runs, if any."""
+        if self.running:
+            self.ask(CancelProcedure(self.running))
+        self.running = ""

@@ -1,18 +1,42 @@
 """What happens on each way of the table: the state, and what is done on entering one.
 
 `states.TABLE` says where a signal leads; this module says what is asked of the core on arrival.
+
+**Set aside.** What was on trial, while a program on a shared port saves all of RAM.
+
+Only what is proven may get to flash, so the trial's registers are undone before that save: with the
+record of every rollback, and so with all that follows from it where the power goes. Behind the save
+they are written again as a transaction of their own: prepared in the journal, checked, written,
+read back, and tried from the beginning, for nothing that came in between is of the new values.
+The approval is carried over, and with it all that a write needs (`Flow.aside_holds`). It counts as
+a write of the day's budget; only the pause between two writes is not waited for.
+
+The second write needs the save's acknowledgement and, `SETTLE_S` behind it, an answer of the device
+that it is the same one and holds what it held: a driver that saves at its start may reset the
+device next, and a save that failed is reported up to 1.5 s late.
+
+**Client's write.** A client's write of what calibrates, where its share says `calibration_writes =
+"pass"`.
+
+It is somebody's, so it is treated as one: journaled before it is sent, with the values before and
+after; while it is on its way nobody knows what samples passed; and behind it, whatever was
+answered, the device is read again, which is how a change by others is found as well. Registers that
+changed that way are not saved by a save of ahrsd's.
+
+Never while values of ahrsd's own are in RAM, are about to be or wait for their confirmation: what
+is undone then, and over what, would depend on who was first. So it is refused, and a person ends
+the trial first. A transaction that begins later has that person's values as its old ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Final
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.writeback.action_outbox import ActionOutbox
-from ahrsd.writeback.actions import CalibrateAnew, IdentifyAgain, SetUpStream
-from ahrsd.writeback.client_write import ClientWrite
+from ahrsd.writeback.actions import ActionOutbox, CalibrateAnew, IdentifyAgain, SetUpStream
 from ahrsd.writeback.composition import (
     GYRO,
     MAG,
@@ -27,7 +51,6 @@ from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
 from ahrsd.writeback.reconcile import RecordKind, found
 from ahrsd.writeback.safeguards import Safeguards
-from ahrsd.writeback.set_aside import SetAside
 from ahrsd.writeback.states import (
     LIVED_WITH,
     ON_TIMEOUT,
@@ -40,6 +63,57 @@ from ahrsd.writeback.transaction import ProcedureOutcome, Transaction, check, ro
 from ahrsd.writeback.trial import Trial, TrialVerdict
 from drivers.vn100.procedures import Identity, Unit, VerifyFailed
 from drivers.vn100.registers import Values, same
+
+# -- What programs on shared ports bring about -----------------------------------------------------
+
+
+SETTLE_S: Final = 2.0
+
+
+@dataclass(slots=True)
+class SetAside:
+    """What was undone, for whom; host times of the save's end and of the newest good answer."""
+
+    transaction: Transaction
+    client: str
+    saved_s: float | None = None
+    confirmed_s: float = float("-inf")  # when the device was asked
+
+    @property
+    def settled_s(self) -> float | None:
+        """When the device may be asked; None while the save is not acknowledged."""
+        return None if self.saved_s is None else self.saved_s + SETTLE_S
+
+    def settled(self, host_s: float) -> bool:
+        """Whether it may be asked now."""
+        return self.settled_s is not None and host_s >= self.settled_s
+
+    def waits_for_look(self, doubt_s: float, host_s: float) -> bool:
+        """Whether all that lacks is that the device is asked. `doubt_s`: of the last doubt."""
+        return self.settled(host_s) and not self.confirmed(doubt_s)
+
+    def confirmed(self, doubt_s: float) -> bool:
+        """Whether the device has shown, behind the save and any doubt, that it is as it was."""
+        settled_s = self.settled_s
+        return settled_s is not None and self.confirmed_s >= max(settled_s, doubt_s)
+
+
+@dataclass(slots=True)
+class ClientWrite:
+    """What goes to the device, and for whom; whether the journal has it."""
+
+    client: str
+    number: int
+    values: Values
+    journaled: bool = False
+
+    def is_of(self, client: str, number: int, values: Values) -> bool:
+        """Whether this is that very write."""
+        return (self.client, self.number, self.values) == (client, number, values)
+
+
+# -- The ways of the table -------------------------------------------------------------------------
+
 
 RETRY_SAVE_S = 600.0  # after a save that was not sent
 Answer = tuple[bool, str]  # to a person: whether it is accepted, and what follows or why not

@@ -23,13 +23,11 @@ from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.actions import Action, IdentifyAgain, Look
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
+from ahrsd.writeback.device_watch import Recheck, RestartWatch
 from ahrsd.writeback.flow import Answer, Flow
-from ahrsd.writeback.journal_history import JournalHistory, JournalRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy, margin
-from ahrsd.writeback.recheck import Recheck
 from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.restarts import RestartWatch
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     LIVED_WITH,
@@ -38,7 +36,7 @@ from ahrsd.writeback.states import (
     Signal,
     State,
 )
-from ahrsd.writeback.transaction import HSI_RESULT, ProcedureOutcome
+from ahrsd.writeback.transaction import HSI_RESULT, JournalHistory, JournalRecord, ProcedureOutcome
 from ahrsd.writeback.trial import TrialMetrics, TrialVerdict
 from drivers.vn100.procedures import Identity, Seen, differences
 from drivers.vn100.registers import COMPENSATING, Values, same

@@ -8,8 +8,8 @@ from typing import Final, Literal
 from ahrsd.calibration import Estimate
 from ahrsd.writeback.clocks import Now, passed_s
 from ahrsd.writeback.composition import Proposal
-from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.transaction import JournalHistory
 
 DAY_S: Final = 86400.0
 CLEAR_SIGMAS: Final = 4.0

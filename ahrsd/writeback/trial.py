@@ -1,13 +1,68 @@
-"""The trial: new registers against the old ones, on the same live samples."""
+"""The trial: new registers against the old ones, on the same live samples.
+
+**Figures.** The figure is the spread (std / mean) of the corrected field over the newest minute:
+both corrections see the same motion and the same disturbances, so only their quality differs. At
+rest both show the sensor's noise, scaled by a matrix each, and are not compared. Whether the new
+ones are *right* is not told by the spread, which noise has as well, but by how much of it an error
+of the calibration explains (`LeftoverError`). That says nothing of the gyroscope, nor of a matrix
+that is turned: `CarriedField` does, with the new registers and with each alternative to them
+(either one put back, or both; at rest only the gyroscope's).
+
+The heading's jump is the difference of the two tilt-compensated headings of the same samples,
+averaged over the first seconds of samples in which the vehicle is nearly level. It was predicted
+for level, on the side it may be twice as much, and at 15 deg a hard iron along the vertical adds
+half as much again: so each sample is turned level on its own heading before the two are compared.
+Seconds are those that samples cover, taken in pieces of a quarter of one: over a gap, or over the
+many seconds that a busy host reads at once, the vehicle turns, and a mean over a turn is no field.
+
+**Leftover error.** How much of the corrected field's variation a wrong calibration still explains.
+
+y = |C (m - B)| / its mean    u = direction of C (m - B), sensor frame
+
+With right registers y varies by noise and by the places that the vehicle passes, neither of which
+knows the attitude. A hard or soft iron that is still in there makes y a function of u:
+
+y = const + d . u + u' S u       d: 3 numbers, S: 5
+
+The samples are cut into stretches in which the vehicle turned; within each, y and its columns are
+taken about their means, so that a field that differs from place to place explains nothing.
+
+b, the eight numbers of d and S, is fitted twice, to every other stretch. With A the Gram matrix of
+the columns and n the samples, Q = b1' (A / n) b2 is the mean square that is explained: the noise of
+b1 knows nothing of that of b2, so with right registers Q is zero on average at any level of noise.
+What each stretch leaves over of the other half's fit, g_k - A_k b, says how uncertain b is,
+whatever colour the noise has within a stretch:
+
+Cov b = A^-1 (sum r_k r_k') A^-1    var Q = 4 b' (A/n) Cov (A/n) b + 2 tr((A/n) Cov (A/n) Cov)
+
+**Steadiness of the field.** How still the corrected field stands when the corrected gyroscope
+carries it into one frame.
+
+u_k = R_k C (m_k - B),  R_k = R_{k-1} Exp((w_k - w_b) dt_k),  R = I at the start of a stretch
+
+On the Earth u does not move: its spread over a stretch, |u - mean| / |mean| (rms), is the error of
+both corrections together and knows no other reference. A wrong gyro bias turns u, a wrong C or B
+makes it wander as the vehicle turns, and a C that is turned about an axis does so wherever the
+vehicle turns about another one.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
+from ahrsd import so3
+from ahrsd.calibration import Affine
+from ahrsd.heading import tilt_compensated_heading
+from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.policy import TrialPolicy
+
+# -- Verdicts --------------------------------------------------------------------------------------
+
 
 JUMP_NOISE_DEG = 1.0  # of a heading read off single samples; below it no jump is unexpected
 
@@ -139,3 +194,278 @@ def _worse(metrics: TrialMetrics, factor: float) -> str | None:
             f"put back by {metrics.old_swing:.2%}"
         )
     return None
+
+
+# -- Leftover error --------------------------------------------------------------------------------
+
+
+SHORTEST_S, LONGEST_S = 5.0, 20.0  # of a stretch
+LEFTOVER_STRETCHES = 60  # the newest ones, that are remembered
+LEFTOVER_FEWEST = 6  # from which something is said
+TURNED = 0.02  # variance of u over a stretch that says something; 0.02 is some 8 deg each way
+_WELL_TURNED = 0.15  # and that need not become longer
+_FEWEST_ROWS = 20
+_BELIEF = 0.05  # size of d and S before anything is known, in parts of the field
+_LEAST_SIGMA = 1e-7  # of Q: rounding, where there is no noise at all
+_UPPER = np.triu_indices(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Leftover:
+    """What is explained, rms in parts of the field, and by how many of its own sigmas its square is
+    beyond that of a limit: negative where right registers are likelier. nan: too few stretches.
+    """
+
+    share: float = float("nan")
+    sigmas: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stretch:
+    rows: int
+    A: Array
+    g: Array
+    yy: float
+
+
+class LeftoverError:
+    """Corrected fields in, `Leftover` out. Bounded memory."""
+
+    def __init__(self) -> None:
+        self._fields: list[Array] = []
+        self._begun_s = 0.0
+        self._done: deque[_Stretch] = deque(maxlen=LEFTOVER_STRETCHES)
+
+    def add(self, time_s: float, corrected: Array) -> None:
+        """One corrected field (3,), some ten a second."""
+        if not self._fields:
+            self._begun_s = time_s
+        self._fields.append(corrected)
+        length_s = time_s - self._begun_s
+        if not 0.0 <= length_s <= 2.0 * LONGEST_S:  # a gap, or the clock fell
+            self._fields = [corrected]
+            self._begun_s = time_s
+        elif length_s >= SHORTEST_S:
+            self._close(last=length_s >= LONGEST_S)
+
+    def leftover(self, limit: float) -> Leftover:
+        """What is explained, and how clearly it is more than `limit` (parts of the field)."""
+        count = len(self._done)
+        if count < LEFTOVER_FEWEST:
+            return Leftover()
+        halves = [list(self._done)[half::2] for half in (0, 1)]
+        (first, _), (second, _) = (_fit(half) for half in halves)
+        both, A = _fit([one for half in halves for one in half])
+        left = [one.g - one.A @ second for one in halves[0]]
+        left += [one.g - one.A @ first for one in halves[1]]
+        solved = np.linalg.solve(A, np.array(left).T)
+        per_row = A / sum(one.rows for one in self._done)
+        spread = per_row @ (solved @ solved.T)
+        square = float(first @ per_row @ second)
+        variance = 4.0 * both @ spread @ per_row @ both + 2.0 * np.trace(spread @ spread)
+        sigma = max(float(np.sqrt(max(variance, 0.0))), _LEAST_SIGMA)
+        return Leftover(float(np.sqrt(max(square, 0.0))), (square - limit**2) / sigma)
+
+    def _close(self, *, last: bool) -> None:
+        """End the stretch where the vehicle turned in it; where it did not, it says nothing."""
+        field = np.array(self._fields)
+        size = np.linalg.norm(field, axis=1)
+        u = field / np.maximum(size, 1e-9)[:, None]
+        turned = float(u.var(axis=0).sum())
+        if turned < _WELL_TURNED and not last:
+            return
+        self._fields = []
+        if turned > TURNED and len(field) >= _FEWEST_ROWS and np.isfinite(field).all():
+            square = (u[:, :, None] * u[:, None, :])[:, _UPPER[0], _UPPER[1]][:, :5]
+            X = np.column_stack([u, square])
+            X = X - X.mean(axis=0)
+            y = size / size.mean()
+            y = y - y.mean()
+            self._done.append(_Stretch(len(y), X.T @ X, X.T @ y, float(y @ y)))
+
+
+def _fit(stretches: list[_Stretch]) -> tuple[Array, Array]:
+    """b (8,) by least squares, held towards zero by what is believed before; its matrix (8, 8)."""
+    A, g = sum(one.A for one in stretches), sum(one.g for one in stretches)
+    noise = sum(one.yy for one in stretches) / sum(one.rows for one in stretches)
+    held = np.asarray(A) + np.eye(8) * (noise / _BELIEF**2 + 1e-9)
+    return np.asarray(np.linalg.solve(held, np.asarray(g))), held
+
+
+# -- Steadiness of the carried field ---------------------------------------------------------------
+
+
+STRETCH_S = 10.0
+CARRIED_STRETCHES = 6  # that are remembered: a minute
+_CARRIED_FEWEST = 10  # samples of a stretch that count
+
+
+class CarriedField:
+    """Pairs of corrections side by side on the same samples; `spreads` in the order of `pairs`."""
+
+    def __init__(self, pairs: Sequence[tuple[Affine, Array]]) -> None:
+        self._pairs = [(mag, bias.copy()) for mag, bias in pairs]
+        self._done: deque[Array] = deque(maxlen=CARRIED_STRETCHES)
+        self._begin()
+
+    def take(self, block: SampleBlock) -> None:
+        """Further samples; a step of unknown length begins a new stretch."""
+        usable = np.isfinite(block.gyro_b_rad_s).all(axis=1) & np.isfinite(block.dt_s)
+        dt_s = np.where(usable, block.dt_s, 0.0)
+        rate = np.where(usable[:, None], block.gyro_b_rad_s, 0.0)
+        turns = [so3.exp((rate - bias) * dt_s[:, None]) for _, bias in self._pairs]
+        fields = [mag.apply(block.raw_b_gauss) for mag, _ in self._pairs]
+        for k in range(len(block)):
+            if not usable[k] or self._length_s > STRETCH_S:
+                self._end()
+                self._begin()
+                continue
+            self._length_s += float(dt_s[k])
+            for n in range(len(self._pairs)):
+                self._R[n] = self._R[n] @ turns[n][k]
+                self._carried[n].append(self._R[n] @ fields[n][k])
+
+    @property
+    def spreads(self) -> Array:
+        """(pairs,) rms over the newest stretches; nan before the first one has ended."""
+        if not self._done:
+            return np.full(len(self._pairs), np.nan)
+        return np.asarray(np.sqrt(np.mean(self._done, axis=0)))
+
+    def _begin(self) -> None:
+        self._length_s = 0.0
+        self._R = [np.eye(3) for _ in self._pairs]
+        self._carried: list[list[Array]] = [[] for _ in self._pairs]
+
+    def _end(self) -> None:
+        if len(self._carried[0]) < _CARRIED_FEWEST:
+            return
+        u = np.array(self._carried)
+        mean = u.mean(axis=1)
+        squares = ((u - mean[:, None]) ** 2).sum(axis=2).mean(axis=1)
+        self._done.append(squares / (mean**2).sum(axis=1))
+
+
+# -- Live figures ----------------------------------------------------------------------------------
+
+
+_WINDOW_S = 60.0
+_JUMP_S = 3.0
+_PIECE_S = 0.25  # one heading each; a vehicle turns by little in it
+_LEVEL = np.cos(np.radians(15.0))
+_OLD_GYRO = 2  # of the pairs that are carried: the new magnetometer's register, the old gyro's
+_SPACING_S = 0.1  # samples closer than this add nothing to a spread
+
+
+class LiveTrial:
+    """Collects what `TrialMetrics` needs from the moment the new registers are in force."""
+
+    def __init__(
+        self,
+        new: Affine,
+        old: Affine,
+        gyro_bias_rad_s: Array,
+        old_gyro_bias_rad_s: Array | None = None,
+        *,
+        wrong_limit: float = 0.005,
+    ) -> None:
+        self._wrong_limit = wrong_limit
+        self._leftover, self._old_leftover = LeftoverError(), LeftoverError()
+        self._new, self._old, self._bias = new, old, gyro_bias_rad_s.copy()
+        before = self._bias if old_gyro_bias_rad_s is None else old_gyro_bias_rad_s
+        self._carried = CarriedField(
+            [(new, self._bias), (old, self._bias), (new, before), (old, before)]
+        )
+        self._rows: deque[tuple[float, Array]] = deque()
+        self._jumps: list[float] = []
+        self._jump_covered_s = 0.0  # by the samples of the jumps
+        self._start_s: float | None = None
+        self._last_s = 0.0
+        self._turned_rad = 0.0
+
+    def take(self, block: SampleBlock) -> TrialMetrics:
+        """Further samples; the figures so far."""
+        if self._start_s is None:
+            self._start_s = self._last_s = float(block.time_s[0])
+        self._carried.take(block)
+        down = _down(block.accel_b_m_s2)
+        rate = (block.gyro_b_rad_s - self._bias) @ down if np.isfinite(down).all() else np.zeros(1)
+        self._turned_rad += abs(float(np.nansum(rate * np.nan_to_num(block.dt_s))))
+        for t, m in zip(block.time_s.tolist(), block.raw_b_gauss, strict=True):
+            if not self._rows or t - self._rows[-1][0] >= _SPACING_S:
+                self._rows.append((t, m))
+                self._leftover.add(t, self._new.apply(m[None])[0])
+                self._old_leftover.add(t, self._old.apply(m[None])[0])
+        now_s = float(block.time_s[-1])
+        while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
+            self._rows.popleft()
+        self._last_s = now_s
+        for piece in _pieces(block.time_s):
+            if self._jump_covered_s < _JUMP_S:
+                self._see_jump(
+                    block.raw_b_gauss[piece], block.accel_b_m_s2[piece], block.dt_s[piece]
+                )
+        return self._metrics()
+
+    def _see_jump(self, raw: Array, accel: Array, dt_s: Array) -> None:
+        """How far the heading of these samples is from what it was with the old registers."""
+        down = _down(accel)
+        if not down[2] >= _LEVEL:  # nor where it is nan
+            return
+        field = self._new.apply(raw.mean(axis=0)[None])
+        heading = tilt_compensated_heading(field, -down[None])
+        level = self._new.undo(_levelled(field[0], heading[0], down)[None])
+        before = tilt_compensated_heading(self._old.apply(level), np.array([[0.0, 0.0, -1.0]]))
+        self._jumps.append(float((heading - before)[0]))
+        self._jump_covered_s += float(np.nansum(np.minimum(dt_s, _PIECE_S)))
+
+    def _metrics(self) -> TrialMetrics:
+        field = np.array([m for _, m in self._rows])
+        new = np.linalg.norm(self._new.apply(field), axis=1)
+        old = np.linalg.norm(self._old.apply(field), axis=1)
+        directions = self._new.apply(field) / new[:, None]
+        turned = bool(len(field) > 1 and directions.var(axis=0).sum() > TURNED)
+        spread = float(new.std() / new.mean()) if len(field) > 1 else float("nan")
+        jump = None
+        if self._jumps:
+            angles = np.array(self._jumps)
+            jump = float(np.degrees(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())))
+        left = self._leftover.leftover(self._wrong_limit)
+        swing = np.nan_to_num(self._carried.spreads)
+        start = self._last_s if self._start_s is None else self._start_s
+        return TrialMetrics(
+            duration_s=self._last_s - start,
+            turns=self._turned_rad / (2 * np.pi),
+            new_figure=spread,
+            old_figure=float(old.std() / old.mean()) if len(field) > 1 else float("nan"),
+            field_spread=spread,
+            turned=turned,
+            heading_jump_deg=jump,
+            new_swing=float(swing[0]),
+            old_swing=float(swing[1:].min() if turned else swing[_OLD_GYRO]),
+            wrong=left.share,
+            old_wrong=self._old_leftover.leftover(self._wrong_limit).share,
+            wrong_sigmas=left.sigmas,
+        )
+
+
+def _levelled(field_b: Array, heading_rad: float, down_b: Array) -> Array:
+    """The same field as it would be in the sensor's axes were it level, on the same heading."""
+    vertical = float(down_b @ field_b)
+    horizontal = float(np.linalg.norm(field_b - vertical * down_b))
+    north = np.array([np.cos(heading_rad), -np.sin(heading_rad), 0.0])
+    return np.asarray(horizontal * north + np.array([0.0, 0.0, vertical]))
+
+
+def _pieces(time_s: Array) -> list[slice]:
+    """Samples that follow each other within `_PIECE_S` of the first of their piece."""
+    starts = [0]
+    for k, t in enumerate(time_s.tolist()):
+        if not 0.0 <= t - time_s[starts[-1]] < _PIECE_S:
+            starts.append(k)
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(time_s)], strict=True)]
+
+
+def _down(accel: Array) -> Array:
+    mean = accel.mean(axis=0)
+    return np.asarray(-mean / max(float(np.linalg.norm(mean)), 1e-9))

@@ -8,7 +8,7 @@ import pytest
 from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.field_steadiness import CarriedField
+from ahrsd.writeback.trial import CarriedField
 
 FIELD_N = np.array([0.24, 0.0, 0.42])
 BIAS = np.array([0.004, -0.003, 0.006])

@@ -232,12 +232,12 @@ def test_the_histories_end_in_every_way(told):
 
 def test_the_observer_would_notice(monkeypatch):
     """With a program that believes the wall clock, as it once did, the same histories are wrong."""
-    from ahrsd.writeback import restarts
+    from ahrsd.writeback import device_watch
 
     def by_the_wall(record, now, uptime_s):
         return uptime_s is not None and 0.0 <= uptime_s < now.wall_s - record.wall_s
 
-    monkeypatch.setattr(restarts, "restarted_since", by_the_wall)
+    monkeypatch.setattr(device_watch, "restarted_since", by_the_wall)
     false = 0
     for seed in range(40):
         rig = Observed(WriteBackPolicy(mode=Mode.COMMIT), np.random.default_rng([78, seed]))

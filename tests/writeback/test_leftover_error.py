@@ -8,10 +8,15 @@ import pytest
 from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.leftover_error import Leftover, LeftoverError
 from ahrsd.writeback.policy import TrialPolicy
-from ahrsd.writeback.trial import Trial, TrialMetrics, TrialVerdict
-from ahrsd.writeback.trial_metrics import LiveTrial
+from ahrsd.writeback.trial import (
+    Leftover,
+    LeftoverError,
+    LiveTrial,
+    Trial,
+    TrialMetrics,
+    TrialVerdict,
+)
 
 FIELD_N = np.array([0.24, 0.0, 0.42])
 TRUE = Affine(np.diag([1.05, 1.0, 0.95]), np.array([0.05, -0.03, 0.02]))

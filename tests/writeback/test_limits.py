@@ -9,11 +9,11 @@ import pytest
 
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.clocks import Now, Stamp
-from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy, flash_budget, ram_budget
+from ahrsd.writeback.safeguards import Stillness
 from ahrsd.writeback.states import State
-from ahrsd.writeback.stillness import Stillness
+from ahrsd.writeback.transaction import JournalHistory
 from drivers.vn100.commands import Word, Write
 
 DAY_S = 86400.0

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind, found
 from ahrsd.writeback.states import Signal, State, after
+from ahrsd.writeback.transaction import JournalHistory
 from drivers.vn100.commands import Word, Write
 
 HOLDS_OLD = {

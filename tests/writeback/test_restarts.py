@@ -8,10 +8,10 @@ from writeback_rig import Record
 
 from ahrsd.writeback.actions import IdentifyAgain
 from ahrsd.writeback.clocks import Stamp, restarted_since
-from ahrsd.writeback.journal_history import JournalHistory
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind
 from ahrsd.writeback.states import State
+from ahrsd.writeback.transaction import JournalHistory
 from drivers.vn100.commands import Read, Word, Write
 
 OTHER = (2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3)

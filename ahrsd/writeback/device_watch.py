@@ -1,4 +1,14 @@
-"""Whether the device restarted, by what it shows itself: seen in this run, or told by its time.
+"""Whether the device is still the one that was read, and still runs: asked again, seen by itself.
+
+**Recheck.** When a device that is written or listened to is asked again who it is and what it
+holds.
+
+At intervals, because another program may write through the device's other port and a restart in a
+stream without device time shows nowhere else; soon after anything that makes it doubtful (a
+silence, readings or a time that jump), because another device may have the cable.
+
+**Restarts.** Whether the device restarted, by what it shows itself: seen in this run, or told by
+its time.
 
 A suspicion has the device read again at once. Only a proof confirms what is in flash: its time
 since start-up against the journal's newest record (`clocks.restarted_since`); its time that fell in
@@ -14,9 +24,52 @@ earliest start-up that a second of messages shows.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 from ahrsd.writeback.clocks import CLOCK_RATE, LATENCY_S, Stamp, restarted_since
+
+# -- Recheck ---------------------------------------------------------------------------------------
+
+
+LEAST_S = 2.0  # between two that something waits for: a poor link must not be filled with reads
+
+
+@dataclass(slots=True)
+class Recheck:
+    """See the module. `due_s` is None while nothing is to be asked."""
+
+    interval_s: float
+    due_s: float | None = None
+    asked_s: float = float("-inf")  # the newest time
+    unanswered: bool = False
+
+    def begin(self, host_s: float) -> None:
+        """Restart the interval: the device was read, or is being read."""
+        self.asked_s, self.due_s = host_s, host_s + self.interval_s
+        self.unanswered = False
+
+    def off(self) -> None:
+        """Stop asking: no device is there."""
+        self.due_s = None
+
+    def soon(self, host_s: float) -> None:
+        """Ask again soon: something is doubtful, or nobody answered."""
+        if self.due_s is not None:
+            self.due_s = min(self.due_s, max(host_s, self.asked_s + LEAST_S))
+
+    def now(self, host_s: float) -> None:
+        """Ask now: something waits for the answer."""
+        if self.due_s is not None:
+            self.due_s = host_s
+
+    def is_due(self, host_s: float) -> bool:
+        """Whether to ask now."""
+        return self.due_s is not None and host_s >= self.due_s
+
+
+# -- Restarts --------------------------------------------------------------------------------------
+
 
 SETTLE_S: Final = 1.0
 
