@@ -158,7 +158,8 @@ class LiveDaemon:
 
     def __init__(self, folder: Path, setup: dict[str, object], tables: dict[str, object]) -> None:
         from ahrsd.config.loading import check_config
-        from ahrsd.daemon.daemon import Daemon, HostClock
+        from ahrsd.daemon.daemon import Daemon
+        from ahrsd.daemon.host_clock import HostClock
         from ahrsd.daemon.service import open_shell
         from drivers.vn100.emulator.pty import PtyEmulator
         from drivers.vn100.emulator.scenarios import Setup, build
@@ -204,7 +205,7 @@ class LiveDaemon:
         return self
 
     def __exit__(self, *_: object) -> None:
-        from ahrsd.daemon.service import close_shell
+        from ahrsd.daemon.core_runner import close_shell
 
         self.stop()
         close_shell(self.shell)

@@ -30,7 +30,6 @@ SHELL = (
     "ahrsd.daemon",
     "ahrsd.demo",
     "ahrsd.fleet.archive",
-    "ahrsd.fleet.cluster",
     "ahrsd.fleet.crew",
     "ahrsd.fleet.driver",
     "ahrsd.fleet.guard",

@@ -16,12 +16,11 @@ import numpy as np
 
 from ahrsd import events, inputs
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.core.action_queue import ActionQueue
+from ahrsd.core.action_queue import ActionQueue, DeviceRecord
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.clients import Clients
 from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.decision_log import DecisionLog
-from ahrsd.core.device_record import DeviceRecord
 from ahrsd.core.device_session import (
     ECHOES,
     Closed,
@@ -45,8 +44,7 @@ from ahrsd.core.estimation_queue import (
 )
 from ahrsd.core.sensor_checks import SensorChecks
 from ahrsd.core.settings import CoreSettings
-from ahrsd.core.stream_watch import StreamWatch
-from ahrsd.core.unconfirmed_samples import UnconfirmedSamples
+from ahrsd.core.unconfirmed_samples import StreamWatch, UnconfirmedSamples
 from ahrsd.core.warm_start import Present, WarmStart
 from ahrsd.evidence.values import BasisFacts
 from ahrsd.gates import GateLimits, Level, for_level

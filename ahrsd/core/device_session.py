@@ -6,7 +6,7 @@
                                                                 READY <-> LOOKING (who answers?)
                                                                 READY <-> SERVING (a client's)
 ```
-Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_outputs`).
+Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_settings`).
 A device that stops sending although its output may be switched on is asked for it
 (`OutputWatchdog`), and a stop ends within `STOP_S`, whatever the device does (`StopLimit`).
 
@@ -21,8 +21,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from ahrsd.core.client_settings import ClientSettings
-from ahrsd.core.kept_outputs import KeptOutputs
+from ahrsd.core.kept_settings import ClientSettings, KeptOutputs
 from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
 from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.transaction import JournalRecord

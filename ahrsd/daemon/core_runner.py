@@ -7,6 +7,7 @@ before the core sees it, carries out what the core answers, and returns the byte
 from __future__ import annotations
 
 import logging
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,11 +22,14 @@ from ahrsd.daemon.journal import Journal
 from ahrsd.errors import JournalError
 from ahrsd.inputs import Input, Journalled, JournalOpened
 from ahrsd.recording.capture import CaptureWriter
+from ahrsd.viewer.sink import RerunSink
 from ahrsd.writeback.transaction import of_another_device
 
 log = logging.getLogger("ahrsd")
 
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
+_CLOSE_S = 8.0  # where nobody waits for the end
+_LEAST_S = 0.2
 _FOLD_S = 60.0
 _FOLD_TEXTS = 64
 
@@ -213,3 +217,22 @@ def journal_in(directory: Path) -> Callable[[int], Journal]:
         return Journal.open(journal_path(directory, serial))
 
     return opener
+
+
+def close_shell(shell: Shell, until_s: float | None = None) -> None:
+    """Close what `open_shell` opened, all of it by `until_s` (monotonic) or soon."""
+    until_s = time.monotonic() + _CLOSE_S if until_s is None else until_s
+
+    def left_s() -> float:
+        return max(until_s - time.monotonic(), _LEAST_S)
+
+    if shell.worker is not None:
+        shell.worker.close(left_s() / 4)
+    if shell.capture is not None:
+        status = shell.capture.close(left_s())  # before the viewer: it can be replayed
+        if not status.complete:
+            log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
+    if isinstance(shell.viewer, RerunSink):
+        shell.viewer.close(left_s())
+        if fault := shell.viewer.counters.last_fault:
+            log.warning("rerun: %s", fault)

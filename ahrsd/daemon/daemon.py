@@ -12,21 +12,21 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
 from ahrsd import events, inputs
 from ahrsd.config.loading import Config
-from ahrsd.daemon import host_clock
-from ahrsd.daemon.columns_file import ColumnsFile
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
+from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorInbox
 from ahrsd.daemon.recall import Recall
 from ahrsd.daemon.reloading import Change, Reloader
 from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink, find_device
+from ahrsd.daemon.vehicle_files import ColumnsFile
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
 from ahrsd.viewer.sink import RerunSink
@@ -63,31 +63,6 @@ class Vehicle(Protocol):
 
     def safe(self) -> bool:
         """The word; anything that goes wrong is no."""
-
-
-@dataclass(frozen=True, slots=True)
-class HostClock:
-    """Monotonic host time in ns, `speed` times as fast as real time (1 but for demonstrations).
-
-    patient_bytes: where time stands still while the device is not read, so much may lie unread
-    """
-
-    speed: float = 1.0
-    start_ns: int = field(default_factory=time.monotonic_ns)
-    patient_bytes: int | None = None
-
-    def now_ns(self) -> int:
-        """Nanoseconds, never falling."""
-        return self.start_ns + int((time.monotonic_ns() - self.start_ns) * self.speed)
-
-    def boot(self) -> tuple[str, float]:
-        """Id of the host's boot and seconds since then; one that runs faster began with itself."""
-        if self.speed == 1.0:
-            return host_clock.boot_id(), host_clock.boot_s()
-        return self._own_boot()
-
-    def _own_boot(self) -> tuple[str, float]:
-        return f"{host_clock.boot_id()} {self.start_ns}", (self.now_ns() - self.start_ns) * 1e-9
 
 
 class Daemon:

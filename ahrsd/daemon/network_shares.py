@@ -23,7 +23,7 @@ from typing import Final
 from ahrsd.config.addresses import Address
 from ahrsd.config.sections import ShareSection
 from ahrsd.errors import ConfigError
-from ahrsd.sharing.share_facts import ShareFacts
+from ahrsd.sharing.share_output import ShareFacts
 from ahrsd.telemetry.protocol import Outbox
 
 log = logging.getLogger("ahrsd")

@@ -19,16 +19,16 @@ from ahrsd.config.loading import CONFIG_KEY, Config
 from ahrsd.config.text import print_config
 from ahrsd.core.core import Core
 from ahrsd.core.settings import BESIDE_KEY
-from ahrsd.daemon.columns_file import ColumnsFile
-from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
-from ahrsd.daemon.daemon import Daemon, HostClock
+from ahrsd.daemon.core_runner import JournalKeeper, Shell, close_shell, journal_in
+from ahrsd.daemon.daemon import Daemon
 from ahrsd.daemon.estimation_worker import SWITCH_S, Worker
 from ahrsd.daemon.heap import needed_bytes, take_heap
-from ahrsd.daemon.interlock import InterlockFile
+from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.operator_inbox import OperatorBox, OperatorInbox
 from ahrsd.daemon.recall import Recall
 from ahrsd.daemon.reloading import Reloader
 from ahrsd.daemon.serial_link import find_device
+from ahrsd.daemon.vehicle_files import ColumnsFile, InterlockFile
 from ahrsd.errors import EXIT_DONE, CaptureError, ConfigError
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.retention import make_private_folder, new_capture_path
@@ -40,7 +40,6 @@ from drivers.serial_port import BaudFound, PortError, spelled
 
 log = logging.getLogger("ahrsd")
 
-_CLOSE_S = 8.0  # where nobody waits for the end
 _EXIT_S = 2.6  # from a signal to the end of everything that is waited for
 _LEAST_S = 0.2
 _SEARCH_AGAIN_S = 0.5
@@ -131,25 +130,6 @@ def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
         public.open_metrics(config.metrics.port)
     shell.listeners.append(public.event)
     return public
-
-
-def close_shell(shell: Shell, until_s: float | None = None) -> None:
-    """Close what `open_shell` opened, all of it by `until_s` (monotonic) or soon."""
-    until_s = time.monotonic() + _CLOSE_S if until_s is None else until_s
-
-    def left_s() -> float:
-        return max(until_s - time.monotonic(), _LEAST_S)
-
-    if shell.worker is not None:
-        shell.worker.close(left_s() / 4)
-    if shell.capture is not None:
-        status = shell.capture.close(left_s())  # before the viewer: it can be replayed
-        if not status.complete:
-            log.error("capture incomplete: %d bytes lost: %s", status.lost_bytes, status.error)
-    if isinstance(shell.viewer, RerunSink):
-        shell.viewer.close(left_s())
-        if fault := shell.viewer.counters.last_fault:
-            log.warning("rerun: %s", fault)
 
 
 def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudFound:

@@ -18,10 +18,10 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import CONFIG_KEY, Config, check_config
 from ahrsd.config.text import print_config
 from ahrsd.core.core import Core
-from ahrsd.daemon.core_runner import JournalKeeper, Shell
-from ahrsd.daemon.daemon import Daemon, HostClock
+from ahrsd.daemon.core_runner import JournalKeeper, Shell, close_shell
+from ahrsd.daemon.daemon import Daemon
+from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.journal import Journal
-from ahrsd.daemon.service import close_shell
 from ahrsd.demo.emulated import (
     BAUD,
     UNREAD_BYTES,

@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
-from ahrsd.daemon.daemon import Daemon, HostClock
+from ahrsd.daemon.host_clock import HostClock
 from ahrsd.errors import EXIT_BUSY, DeviceError
 from drivers.serial_port import PortError, SerialPort
 from drivers.vn100.device import Device
@@ -39,6 +40,16 @@ class WorldClock(HostClock):
         return self._own_boot()
 
 
+class Watched(Protocol):
+    """The daemon, as far as it is watched here."""
+
+    def run(self) -> None:
+        """Until it is stopped."""
+
+    def stop(self, reason: str) -> None:
+        """From another thread."""
+
+
 class AlwaysSafe:
     """A vehicle that never objects."""
 
@@ -61,7 +72,7 @@ def emulated_device(setup: Setup, link: Path, speed: float) -> Iterator[Emulator
         raise DeviceError(f"no emulated device: {error}", EXIT_BUSY) from error
 
 
-def run_watched(daemon: Daemon, emulated: EmulatorProcess, longest_s: float) -> None:
+def run_watched(daemon: Watched, emulated: EmulatorProcess, longest_s: float) -> None:
     """The daemon until somebody ends it, or the emulated device is gone or stands still.
 
     longest_s: of device time, in case no samples come that could end the scene

@@ -9,10 +9,9 @@ import numpy as np
 
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import told
-from ahrsd.fleet.drift import DeviceDrift
+from ahrsd.fleet.drift import DeviceDrift, Trend
 from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.trend import Trend
 from ahrsd.printable import LINE, counted, printable
 from ahrsd.report.fleet_page import (
     DeviceLine,

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.fleet.drift import DeviceDrift
+from ahrsd.fleet.drift import DeviceDrift, StepChange, Trend
 from ahrsd.fleet.questions import AnswerTable
-from ahrsd.fleet.trend import StepChange, Trend
 from ahrsd.printable import counted, printable
 from ahrsd.samples import Array
 

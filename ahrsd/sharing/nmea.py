@@ -8,13 +8,28 @@ Talkers: HC, a magnetic compass; YX, a transducer. Transducer types A (angle, un
 C (temperature, units C). PITCH is positive with the bow up, ROLL with the right side down; the
 names are those of the standard's list of 2019 (Pitch, Roll), in capitals, as older programs compare
 them.
+
+**Attitude** for them. Which way is up, sample by sample, in the frame of the device's outputs
+(body).
+
+Where the stream has the device's own pitch and roll, they say it. Else the specific force says it,
+carried on by the gyro: one sample of a vehicle that brakes or turns is no plumb line, so each
+corrects the direction by dt / 5 s only, and one that is not of about 1 g not at all. That takes
+5 s of samples to settle, after each gap again.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from ahrsd.samples import Array
 from drivers.vn100.messages import encode
+
+# -- Sentences -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,3 +67,90 @@ def attitude(
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{round(value, 1) + 0.0:.1f}"  # no -0.0
+
+
+# -- Which way is up -------------------------------------------------------------------------------
+
+
+SETTLED_S = 5.0  # memory of the specific force, and when the direction is first believed
+_LOST_S = 15.0  # without a believable specific force
+_LONGEST_STEP_S = 0.5
+_G_M_S2, _NEAR_G = 9.81, 0.1
+_STEEP = math.sin(math.radians(60.0))  # pitch beyond which there is no heading: it turns to roll
+
+
+class Tilt:
+    """Of one stream; samples in order."""
+
+    def __init__(self) -> None:
+        self._up: tuple[float, float, float] | None = None
+        self._rate = [0.0, 0.0, 0.0]
+        self._at_s = self._age_s = self._without_s = 0.0
+
+    def up(
+        self,
+        time_s: Array,
+        gyro_body_rad_s: Array,
+        accel_body_m_s2: Array,
+        pitch_roll_rad: tuple[Array, Array] | None = None,
+    ) -> Array:
+        """(N, 3) unit vectors that point up, nan where nobody knows."""
+        if pitch_roll_rad is not None:
+            pitch, roll = pitch_roll_rad
+            level = np.cos(pitch)
+            return np.stack([np.sin(pitch), -level * np.sin(roll), -level * np.cos(roll)], axis=1)
+        rows = zip(time_s.tolist(), gyro_body_rad_s.tolist(), accel_body_m_s2.tolist(), strict=True)
+        return np.array([self._next(*row) for row in rows]).reshape(-1, 3)
+
+    def _next(self, at_s: float, rate: list[float], force: list[float]) -> tuple[float, ...]:
+        dt_s, self._at_s = at_s - self._at_s, at_s
+        before, self._rate = self._rate, rate
+        size = math.sqrt(sum(part * part for part in force))  # nan where the stream has none
+        believable = abs(size / _G_M_S2 - 1.0) < _NEAR_G
+        if self._up is None or not 0.0 < dt_s < _LONGEST_STEP_S:
+            self._up = (force[0] / size, force[1] / size, force[2] / size) if believable else None
+            self._age_s = self._without_s = 0.0
+            return (math.nan,) * 3
+        turned = [0.5 * dt_s * (a + b) for a, b in zip(before, rate, strict=True)]
+        x, y, z = _turned_back(self._up, turned)
+        if believable:
+            share = min(dt_s / SETTLED_S, 1.0)
+            x, y, z = (u + share * (f / size - u) for u, f in zip((x, y, z), force, strict=True))
+        length = math.sqrt(x * x + y * y + z * z)
+        self._up = (x / length, y / length, z / length)
+        self._age_s += dt_s
+        self._without_s = 0.0 if believable else self._without_s + dt_s
+        if self._without_s > _LOST_S:
+            self._up = None
+        known = self._up is not None and self._age_s >= SETTLED_S
+        return self._up if known and self._up is not None else (math.nan,) * 3
+
+
+def _turned_back(u: tuple[float, float, float], by_rad: list[float]) -> tuple[float, float, float]:
+    """What stands still, seen from a frame that turned by this small vector; to second order."""
+    first = _cross(by_rad, u)
+    second = _cross(by_rad, first)
+    return (
+        u[0] - first[0] + 0.5 * second[0],
+        u[1] - first[1] + 0.5 * second[1],
+        u[2] - first[2] + 0.5 * second[2],
+    )
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def pitch_deg(up_body: Array) -> Array:
+    """(N,) pitch, positive with the x axis up."""
+    return np.asarray(np.degrees(np.arcsin(np.clip(up_body[:, 0], -1.0, 1.0))))
+
+
+def roll_deg(up_body: Array) -> Array:
+    """(N,) roll, positive with the y axis down."""
+    return np.asarray(np.degrees(np.arctan2(-up_body[:, 1], -up_body[:, 2])))
+
+
+def has_heading(up_body: Array) -> Array:
+    """(N,) whether up is known and the pitch at most 60 deg."""
+    return np.asarray(np.abs(up_body[:, 0]) < _STEEP)

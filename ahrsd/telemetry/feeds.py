@@ -24,8 +24,7 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.core.core import Core
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.sharing.nmea import attitude, hdm, xdr
-from ahrsd.sharing.tilt import Tilt, has_heading, pitch_deg, roll_deg
+from ahrsd.sharing.nmea import Tilt, attitude, has_heading, hdm, pitch_deg, roll_deg, xdr
 from ahrsd.stream.decompensation import Compensation
 from ahrsd.telemetry.explain import STATES, estimator_trouble, stream_trouble
 from ahrsd.telemetry.protocol import Record, line_of

@@ -13,7 +13,7 @@ from ahrsd.events import GateResult, SamplesSeen
 from ahrsd.evidence.values import Evidence
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array
-from ahrsd.sharing.share_facts import ShareFacts
+from ahrsd.sharing.share_output import ShareFacts
 from ahrsd.telemetry.protocol import STATUS_SCHEMA
 
 # -- Readings of now -------------------------------------------------------------------------------

@@ -18,8 +18,10 @@ import pytest
 
 from ahrsd.config.loading import Config, check_config
 from ahrsd.config.sections import GatesSection
-from ahrsd.daemon.daemon import Daemon, HostClock
-from ahrsd.daemon.service import close_shell, open_shell
+from ahrsd.daemon.core_runner import close_shell
+from ahrsd.daemon.daemon import Daemon
+from ahrsd.daemon.host_clock import HostClock
+from ahrsd.daemon.service import open_shell
 from ahrsd.events import SamplesSeen, StateChanged
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader, Sent

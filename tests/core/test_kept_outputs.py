@@ -16,7 +16,7 @@ from writeback_rig import estimate
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.device_session import Phase
-from ahrsd.core.kept_outputs import KeptOutputs, open_record
+from ahrsd.core.kept_settings import KeptOutputs, open_record
 from ahrsd.events import Send
 from ahrsd.offline.replay import replay
 from ahrsd.writeback.permissions import Mode

@@ -16,7 +16,7 @@ from ahrsd.config.core_settings import core_settings, terms_text
 from ahrsd.config.loading import Config, check_config
 from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.core import Core
-from ahrsd.daemon.columns_file import ColumnsFile
+from ahrsd.daemon.vehicle_files import ColumnsFile
 from ahrsd.diagnosis.column_terms import follows_a_column
 from ahrsd.diagnosis.model_file import RepairedModel, to_text
 from ahrsd.diagnosis.values import Noise, NullModel, Term

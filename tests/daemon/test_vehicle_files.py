@@ -13,7 +13,7 @@ import pytest
 from patience import PATIENCE_S
 from planted_operator import Operator
 
-from ahrsd.daemon.interlock import InterlockFile
+from ahrsd.daemon.vehicle_files import InterlockFile
 from ahrsd.foreign_file import Contents
 
 

@@ -158,7 +158,7 @@ def test_slopes_and_steps_are_those_of_one_plain_fit(tmp_path, seed):
 
 def test_times_of_other_ages_are_still_in_order(tmp_path):
     """A clock that was never set and one that is far ahead, of very many devices or few."""
-    from ahrsd.fleet.trend import Bins
+    from ahrsd.fleet.drift import Bins
 
     rows = [row(1, day=-700000.0), row(2, day=2900000.0), row(3, day=1.0)]
     rows[2]["hard_iron_x_gauss"] = 0.2

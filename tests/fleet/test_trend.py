@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.fleet.trend import Bins, Series, trends
+from ahrsd.fleet.drift import Bins, Series, trends
 
 PER_YEAR = np.array([2e-3, -1e-3, 0.0])
 PER_DEGREE = np.array([0.0, 1e-4, -2e-4])

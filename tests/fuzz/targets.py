@@ -16,9 +16,9 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config, check_config
 from ahrsd.config.text import print_config
 from ahrsd.core.core import Core
-from ahrsd.daemon.columns_file import columns_of
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.journal import Journal, wrg_lines
+from ahrsd.daemon.vehicle_files import columns_of
 from ahrsd.errors import CaptureError, ConfigError, JournalError, RecordingError
 from ahrsd.inputs import Received, Stop
 from ahrsd.recording.capture import CaptureReader, Sent

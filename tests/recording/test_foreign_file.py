@@ -11,8 +11,7 @@ import pytest
 from patience import PATIENCE_S
 
 from ahrsd.config.loading import load_config
-from ahrsd.daemon.columns_file import ColumnsFile
-from ahrsd.daemon.interlock import InterlockFile
+from ahrsd.daemon.vehicle_files import ColumnsFile, InterlockFile
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import (
     Changes,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cabled_units import crc16, sentence
 
-from ahrsd.sharing.message_splitter import MessageSplitter, is_reply
+from ahrsd.sharing.share_output import MessageSplitter, is_reply
 
 REPLIES = ["VNRRG,01,VN-100T-CR", "VNWRG,06,0", "VNERR,03", "VNASY,1", "VNWNV", "VNRST", "VNTAR"]
 TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,+0.1,+0.2,+0.3")

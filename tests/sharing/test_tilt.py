@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.sharing.tilt import SETTLED_S, Tilt, has_heading, pitch_deg, roll_deg
+from ahrsd.sharing.nmea import SETTLED_S, Tilt, has_heading, pitch_deg, roll_deg
 
 RATE_HZ = 50.0
 

@@ -10,7 +10,7 @@ from virtual_run import VirtualRun
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core.device_record import DeviceRecord
+from ahrsd.core.action_queue import DeviceRecord
 from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
 from drivers.vn100.emulator.scenarios import Setup, build

@@ -1,4 +1,6 @@
-"""Device bytes into whole messages for clients, without the replies to commands.
+"""What a share hands on of the device's bytes, and how it stands.
+
+**Messages.** Device bytes into whole messages for clients, without the replies to commands.
 
 A driver needs a whole message before it can use any of it, so handing messages on when their last
 byte is there costs no time, and an answer of ours fits between any two of them. Every byte comes
@@ -8,8 +10,13 @@ whoever asked.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from drivers.vn100.deframer import Deframer, Sentence, Skipped
 from drivers.vn100.messages import COMMAND_WORDS, REGISTER_WORDS
+
+# -- Whole messages --------------------------------------------------------------------------------
+
 
 _REPLIES = REGISTER_WORDS | COMMAND_WORDS | {"VNERR"}
 
@@ -48,3 +55,25 @@ class MessageSplitter:
         """Nothing came for a while: what waits for more bytes is no message and comes out."""
         self._deframer.drop_pending()
         return self.feed(b"")
+
+
+# -- How a share stands ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ShareFacts:
+    """One `[[share]]`.
+
+    send:    what it sends: measurements and answers where it is empty (a pty)
+    readers: programs that have it open; None where nobody knows (udp)
+    lost_bytes: of whole messages that a reader did not take in time
+    turned_away: connections beyond the limit; ignored_bytes: what readers of tcp sent
+    """
+
+    name: str
+    send: str = ""
+    readers: int | None = 0
+    lost_bytes: int = 0
+    turned_away: int = 0
+    ignored_bytes: int = 0
+    fault: str = ""

@@ -1,4 +1,10 @@
-"""What the vehicle measures beside the stream: a file with a JSON object that it keeps rewriting.
+"""What the vehicle says beside the stream, in files that it keeps rewriting: its word, and columns.
+
+**The word that a write is safe.** Safe means: the file says exactly `safe`, and it was seen to be
+written again within the last `max_age_s`, by a clock that only runs forward. Anything else, also an
+error, a file that nobody rewrites and a disk that hangs, is no.
+
+**Columns**: what the vehicle measures, a file with a JSON object.
 
     {"motor_current_a": 3.2, "rudder_deg": -4.0}
 
@@ -16,8 +22,49 @@ from pathlib import Path
 
 from ahrsd.foreign_file import Contents, FileWatch, boot_s, read_regular
 
-_LONGEST = 4096
-_EVERY_S = 0.02
+# -- The word that a write is safe -----------------------------------------------------------------
+
+
+_LONGEST_WORD = 64
+_EVERY_S = 0.05
+
+
+class InterlockFile:
+    """The newest word, read in a thread of its own; asking never waits."""
+
+    def __init__(
+        self,
+        path: Path,
+        max_age_s: float,
+        *,
+        read: Callable[[Path, int], Contents] = read_regular,
+        now_s: Callable[[], float] = boot_s,
+    ) -> None:
+        self.path, self.max_age_s = path, max_age_s
+        every_s = min(_EVERY_S, max_age_s / 10)
+        self._watch = FileWatch(path, _LONGEST_WORD, every_s, read=read, now_s=now_s)
+
+    def safe(self) -> bool:
+        """Whether the vehicle says so now."""
+        sight = self._watch.sight
+        fresh = self._watch.now_s() - sight.since_s <= self.max_age_s
+        return fresh and sight.data is not None and sight.data.strip() == b"safe"
+
+    @property
+    def fault(self) -> str:
+        """Why the file is no word, in one line; empty where it can be read."""
+        return f"interlock.file = {text}" if (text := self._watch.fault) else ""
+
+    def close(self) -> None:
+        """Look no more."""
+        self._watch.close()
+
+
+# -- Columns ---------------------------------------------------------------------------------------
+
+
+_LONGEST_OBJECT = 4096
+_COLUMNS_EVERY_S = 0.02
 
 
 class ColumnsFile:
@@ -35,7 +82,7 @@ class ColumnsFile:
         now_s: Callable[[], float] = boot_s,
     ) -> None:
         self.path, self.max_age_s = path, max_age_s
-        self._watch = FileWatch(path, _LONGEST, _EVERY_S, read=read, now_s=now_s)
+        self._watch = FileWatch(path, _LONGEST_OBJECT, _COLUMNS_EVERY_S, read=read, now_s=now_s)
         self._taken = 0
         self._wrong = ""
 

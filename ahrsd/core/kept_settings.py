@@ -1,12 +1,18 @@
-"""The user's outputs, in the journal for as long as those of a session may be in the device.
+"""What is the user's in the device, kept while a session and clients have theirs there.
 
-A session changes registers 6 and 75 to 77. A program that is killed cannot put them back, and the
-next one would take what it finds for the user's. So the user's values go into the journal before
-the first byte (`OUTPUTS_KEPT`), and are done with when they were put back (`OUTPUTS_BACK`).
+**Outputs.** A session changes registers 6 and 75 to 77. A program that is killed cannot put them
+back, and the next one would take what it finds for the user's. So the user's values go into the
+journal before the first byte (`OUTPUTS_KEPT`), and are done with when they were put back
+(`OUTPUTS_BACK`).
 
 A record that is still open tells a run whose outputs it finds, register by register: what only a
 session leaves there (`calibration_stream.left_by_session`) stands for the value that was kept; any
 other value was put there since, by a person or by a restart of the device, and is the user's own.
+
+**Clients.** A driver sets its outputs at every start, in RAM. For the user's own configuration they
+count as little as a session of ours: they are put back before a save and set again behind it, so
+that a save of a calibration makes nothing else permanent. When the device restarts they are gone,
+and what a client saves itself is the user's from then on.
 """
 
 from __future__ import annotations
@@ -20,7 +26,9 @@ from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.transaction import JournalRecord
 from drivers.vn100.calibration_stream import left_by_session
 from drivers.vn100.procedures import SESSION_SETTINGS
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Values, same
+
+# -- Outputs of the session ------------------------------------------------------------------------
 
 
 class KeptOutputs:
@@ -108,3 +116,41 @@ def open_record(journal: Sequence[JournalRecord], serial: int) -> dict[int, Valu
         elif record.kind == RecordKind.OUTPUTS_KEPT and record.facts.get("serial") == serial:
             kept = {int(number): tuple(row) for number, row in record.facts["old"].items()}
     return kept
+
+
+# -- Settings of clients ---------------------------------------------------------------------------
+
+
+class ClientSettings:
+    """Of one device. `now`: what the clients set; `users`: what these registers held before."""
+
+    def __init__(self) -> None:
+        self.now: dict[int, Values] = {}
+        self.users: dict[int, Values] = {}
+        self._serial: int | None = None
+
+    def of(self, serial: int) -> None:
+        """This device was identified; another one has none of it."""
+        if self._serial != serial:
+            self._serial = serial
+            self.forget()
+
+    def written(self, number: int, values: Values, before: Values | None) -> None:
+        """A client's write was carried out; `before` None: nobody knows what was there."""
+        if before is None:
+            return
+        users = self.users.setdefault(number, before)
+        self.now[number] = values
+        if same(number, users, values):  # the user's own again
+            del self.users[number], self.now[number]
+
+    def read(self, registers: Mapping[int, Values]) -> dict[int, Values]:
+        """All registers were read; those that still hold a client's value, as the user had them."""
+        for number in list(self.now):
+            if not same(number, self.now[number], registers.get(number, ())):
+                del self.users[number], self.now[number]
+        return dict(self.users)
+
+    def forget(self) -> None:
+        """They are saved, and so the user's."""
+        self.now, self.users = {}, {}
