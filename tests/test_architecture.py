@@ -63,12 +63,11 @@ MOST_LINES_OF_A_FUNCTION = 60
 MOST_ENTRIES_OF_A_FOLDER = 15  # longer listings are printed
 MOST_IMPORTS = 15  # other modules of the project that one module imports
 IMPORTS_OVER_THE_LIMIT = {
-    "ahrsd.core.core": 29,
+    "ahrsd.core.core": 27,
     "ahrsd.daemon.service": 23,
     "ahrsd.daemon.daemon": 17,
-    "ahrsd.writeback.machine": 17,
 }
-LONGEST_CHAIN = 19  # modules, each of which imports the next; the aim is 12
+LONGEST_CHAIN = 15  # modules, each of which imports the next; the aim is 12
 
 
 @cache

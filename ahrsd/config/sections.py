@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from ahrsd.config.addresses import Address
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.gates import GateLimits
-from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy
+from ahrsd.writeback.trial import TrialPolicy
 
 Baud = Literal["auto", 9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600]
 

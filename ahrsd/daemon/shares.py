@@ -1,9 +1,9 @@
 """Every `[[share]]` of a run: ports for programs that may speak, addresses for those that read.
 
-The addresses are in `network_shares`; here are the ports: ptys with stable names.
-Two threads write into a port: the one that reads the device (measurements) and the daemon's
-(answers). A third one reads what the programs write, at the rate of a real
-line, so nobody can flood the daemon. What a program does not read is lost for it alone.
+The addresses are in `network_shares`; here are the ports: ptys with stable names. Two threads write
+into a port: the one that reads the device (measurements) and the daemon's (answers). A third one
+reads what the programs write, at the rate of a real line, so nobody can flood the daemon. What a
+program does not read is lost for it alone.
 
 What ptys ask for, each met with real drivers: the port is raw before anybody opens it, else its
 echo would come back as commands; a program has it open when its master does not hang up; TIOCEXCL

@@ -47,10 +47,9 @@ from ahrsd.writeback.composition import (
     register_lines,
 )
 from ahrsd.writeback.permissions import Mode, Purpose
-from ahrsd.writeback.policy import WriteBackPolicy, contradicts, worth_writing
+from ahrsd.writeback.policy import Safeguards, WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
 from ahrsd.writeback.reconcile import RecordKind, found
-from ahrsd.writeback.safeguards import Safeguards
 from ahrsd.writeback.states import (
     LIVED_WITH,
     ON_TIMEOUT,

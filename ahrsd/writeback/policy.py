@@ -1,46 +1,37 @@
-"""When a write is allowed: what a person sets, and the reasons that hold a write back now."""
+"""When a write is allowed: what a person sets, and the reasons that hold a write back now.
+
+**Safeguards**: what must be true of the device, the vehicle and the journal for anything to be sent.
+They fail closed: what is not known, not fresh or not readable counts as no. Whether the vehicle
+stands still (`Stillness`) is judged from its own samples.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+import numpy as np
+
 from ahrsd.calibration import Estimate
+from ahrsd.events import GateResult
+from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.clocks import Now, passed_s
-from ahrsd.writeback.composition import Proposal
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.composition import GYRO, MAG, Proposal
+from ahrsd.writeback.permissions import Mode, Purpose, permitted
 from ahrsd.writeback.transaction import JournalHistory
+from ahrsd.writeback.trial import TrialPolicy
+from drivers.vn100.commands import Command, Word, Write
+from drivers.vn100.procedures import Identity
+from drivers.vn100.registers import Values, same
+
+# -- What a person sets, and what holds a write back -----------------------------------------------
+
 
 DAY_S: Final = 86400.0
 CLEAR_SIGMAS: Final = 4.0
 VERDICT_AGE_S: Final = 600.0  # a save must be of what is true now, as an approval must
-
-
-@dataclass(frozen=True, slots=True)
-class TrialPolicy:
-    """How written registers prove themselves. Times are of the device's clock.
-
-    duration_s, turns: whichever comes first ends the trial; longer proves more [600 s, 2 turns]
-    worse_percent, worse_for_s: undo where the live figure is worse than the old registers' on the
-                       same samples by this, for this long [10 %, 60 s]
-    max_wrong_percent, wrong_sigmas: undo where an error of the calibration explains more of the
-                       corrected field than this, by so many of the figure's own sigmas [0.5 %, 2.5]
-    max_spread_percent: undo where std/mean of the corrected field exceeds this, whatever explains
-                       it [10 %]
-    max_jump_deg:      undo where the heading jumped by this much more than predicted [5 deg]
-    interlock:         undo where the vehicle withdraws its word; false lets the trial live through
-                       driving, for vehicles whose word is only about the moment of writing [true]
-    """
-
-    duration_s: float = 600.0
-    turns: float = 2.0
-    worse_percent: float = 10.0
-    worse_for_s: float = 60.0
-    max_wrong_percent: float = 0.5
-    wrong_sigmas: float = 2.5
-    max_spread_percent: float = 10.0
-    max_jump_deg: float = 5.0
-    interlock: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,3 +168,337 @@ def flash_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> 
             f"{history.flashes} flash writes of this device, limit {policy.flash_writes_lifetime}"
         )
     return reasons
+
+
+# -- Whether the vehicle stands still --------------------------------------------------------------
+
+
+_SLOTS_PER_WINDOW = 30  # the window is kept as sums of so many parts: memory does not grow
+
+
+class Stillness:
+    """A window of `duration_s` over rate (less bias) and specific force.
+
+    Without an accelerometer, without samples, after a gap or with a rate over the limit it is not
+    still.
+    """
+
+    def __init__(self, policy: StillPolicy) -> None:
+        self._policy = policy
+        self._since_s: float | None = None  # device time of the first sample of the still run
+        self._device_s = self._host_s = -np.inf
+        self._slots: deque[tuple[float, int, Array, Array]] = deque()
+
+    def reset(self) -> None:
+        """Nothing is known any more."""
+        self._since_s = None
+        self._slots.clear()
+
+    def update(self, block: SampleBlock, gyro_bias_rad_s: Array) -> None:
+        """Take N further samples of the raw sensor."""
+        if not len(block):
+            return
+        if block.gap_before:
+            self.reset()
+        rate = np.linalg.norm(block.gyro_b_rad_s - gyro_bias_rad_s, axis=1)
+        quiet = (rate < self._policy.gyro_rad_s) & np.isfinite(block.accel_b_m_s2).all(axis=1)
+        loud = np.flatnonzero(~quiet)
+        if len(loud):
+            self.reset()
+        first = int(loud[-1]) + 1 if len(loud) else 0
+        if first < len(block):
+            self._extend(block.time_s[first:], block.accel_b_m_s2[first:])
+        self._device_s, self._host_s = float(block.time_s[-1]), float(block.host_s[-1])
+
+    def why_not(self, host_s: float) -> str | None:
+        """Why the vehicle does not count as still at this instant, None where it does."""
+        policy = self._policy
+        age_s = host_s - self._host_s
+        if not age_s <= policy.max_age_s:
+            return f"the newest sample is {age_s:.1f} s old, limit {policy.max_age_s} s"
+        if self._since_s is None or self._device_s - self._since_s < policy.duration_s:
+            still_s = 0.0 if self._since_s is None else self._device_s - self._since_s
+            return f"still for {still_s:.1f} s, needed {policy.duration_s} s"
+        spread = self._spread()
+        if not spread < policy.accel_m_s2:
+            return f"the specific force varies by {spread:.3f} m/s^2, limit {policy.accel_m_s2}"
+        return None
+
+    def _extend(self, time_s: Array, accel_m_s2: Array) -> None:
+        if self._since_s is None:
+            self._since_s = float(time_s[0])
+        slot_s = self._policy.duration_s / _SLOTS_PER_WINDOW
+        for index in np.unique(np.floor(time_s / slot_s)):
+            part = accel_m_s2[np.floor(time_s / slot_s) == index]
+            self._slots.append(
+                (float(index * slot_s), len(part), part.sum(axis=0), (part**2).sum(axis=0))
+            )
+        newest_s = float(time_s[-1])
+        while self._slots and newest_s - self._slots[0][0] > self._policy.duration_s + slot_s:
+            self._slots.popleft()
+
+    def _spread(self) -> float:
+        """Standard deviation of the window, of the worst axis."""
+        count = sum(slot[1] for slot in self._slots)
+        mean = np.sum([slot[2] for slot in self._slots], axis=0) / count
+        variance = np.sum([slot[3] for slot in self._slots], axis=0) / count - mean**2
+        return float(np.sqrt(max(float(variance.max()), 0.0)))
+
+
+# -- What must be true -----------------------------------------------------------------------------
+
+
+HSI_CONTROL, HSI_APPLIED = 44, 3
+UNEXAMINED_S = 2.0  # samples that the estimate has not seen yet may hold a step
+SAVE_CHECKS_S = 0.5  # what stands before VNWNV reads every register, and no sample comes meanwhile
+SAVE_CHECKS_PER_ASKING = 6.0  # four to five times the answers of asking it who it is
+ASKINGS = 5  # of so many the quickest had no late answer; more, and a line that slowed is not seen
+NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
+
+
+class Safeguards:
+    """Device, vehicle and journal as they were last told; each question takes the present time."""
+
+    def __init__(self, policy: WriteBackPolicy) -> None:
+        self.policy = policy
+        self.stillness = Stillness(policy.still)
+        self.journal_ok = False
+        self.stopping = False
+        self.armed = policy.armed_at_start
+        self.gates: tuple[GateResult, ...] = ()
+        self.flash_gates: tuple[GateResult, ...] = ()
+        self.doubt_s = float("-inf")  # host time of the last doubt about what is in force
+        self.judged_s = float("-inf")  # host time of the newest verdict's samples
+        self.void = ""  # why the transaction's values hold no more
+        self.disagrees = ""  # how the newest estimate differs from them, or a gate does
+        self.proof_waits = ""  # why they must be proven again
+        self.sampled_s: float | None = None  # host time of the newest sample
+        self.examined_s: float | None = None  # and of the newest one in the estimate
+        self._asking_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
+        self.save_from_s = float("-inf")  # when the save was decided
+        self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
+        self.client_wrote: dict[int, Values] = {}  # and held before a client wrote and did not save
+        self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
+        self._serial = policy.serial
+        self._limits: list[str] = ["no device yet"]
+        self._is_ours = False
+        self._hsi_applied = True
+        self._interlock: tuple[bool, float] | None = None
+
+    @property
+    def mode(self) -> Mode:
+        """The policy's mode, observe at most while the device or its journal is in doubt."""
+        return min(self.policy.mode, Mode.OBSERVE) if self._limits else self.policy.mode
+
+    def no_device(self, why: str) -> None:
+        """Nothing can be asked, so nothing can be written."""
+        self._limits, self._is_ours = [why], False
+
+    def bind(
+        self, identity: Identity, registers: Mapping[int, Values], journal_readable: bool
+    ) -> None:
+        """Judge a device that was identified and read; the first one is the one to write to."""
+        self.journal_ok = journal_readable
+        self.gates = self.flash_gates = ()  # what was judged before is of before
+        self._asking_s.clear()
+        hsi = registers.get(HSI_CONTROL)
+        self._hsi_applied = hsi is None or hsi[1] == HSI_APPLIED
+        self._serial = identity.serial if self._serial is None else self._serial
+        self._limits = []
+        self._is_ours = identity.serial == self._serial and identity.profile.writable
+        if identity.serial != self._serial:
+            self._limits.append(
+                f"this is the device {identity.serial}, writes are for {self._serial} only"
+            )
+        if not identity.profile.writable:
+            self._limits.append(f"observe only: {identity.profile.observed_for}")
+        if missing := [n for n in (MAG, GYRO, HSI_CONTROL) if n not in registers]:
+            self._limits.append(f"registers {missing} could not be read")
+        if not journal_readable:
+            self._limits.append("the journal cannot be read; see its error")
+
+    def arm(self, armed: bool) -> str:
+        """Whether this run may begin a write or a save; in words."""
+        self.armed = armed
+        return "armed: this run may write" if armed else NOT_ARMED
+
+    def client_writes(self, number: int, before: Values) -> None:
+        """A client wrote this register; what it held before is its own as long as nobody knows."""
+        self.client_wrote.setdefault(number, before)
+
+    def read_again(self, theirs: frozenset[int], registers: Mapping[int, Values]) -> frozenset[int]:
+        """Registers that others changed, without those that hold what they held before a client."""
+        returned = {
+            n for n, before in self.client_wrote.items() if same(n, before, registers.get(n, ()))
+        }
+        self.theirs = theirs - returned
+        left = self.client_wrote.keys() & self.theirs
+        self.client_wrote = {n: self.client_wrote[n] for n in left}
+        return self.theirs
+
+    def doubt(self, host_s: float) -> None:
+        """What was judged of samples until now is of before a doubt: nothing is saved by it."""
+        if self.examined_s is not None:
+            self.examined_s = min(self.examined_s, host_s)
+        self.flash_gates, self.doubt_s = (), host_s
+        self.stillness.reset()
+
+    def hear_interlock(self, safe: bool, host_s: float) -> None:
+        """The vehicle's word."""
+        self._interlock = (safe, host_s)
+
+    def interlock_holds(self, host_s: float) -> str:
+        """Why the vehicle does not allow a write now; empty where it does."""
+        if self._interlock is None:
+            return "the vehicle has not said that a write is safe"
+        safe, since_s = self._interlock
+        if not safe:
+            return "the vehicle says that a write is not safe now"
+        if not 0.0 <= host_s - since_s <= self.policy.interlock_max_age_s:
+            return f"the vehicle's word is {host_s - since_s:.1f} s old"
+        return ""
+
+    def interlock_broken(self, host_s: float, since_s: float) -> str:
+        """Why what began at `since_s` must end: the vehicle withdrew its word, or fell silent.
+
+        A daemon that has just started gives the vehicle as long to speak as a word lasts.
+        """
+        begun = self._interlock is None or self._interlock[0]
+        if begun and host_s - since_s <= self.policy.interlock_max_age_s:
+            return ""
+        return self.interlock_holds(host_s)
+
+    def write_holds(
+        self, history: JournalHistory, host_s: float, now: Now, *, again: bool = False
+    ) -> list[str]:
+        """Why no write may begin now, but for the approval. `again`: see `policy.ram_budget`."""
+        reasons = list(self._limits)
+        if self.policy.mode < Mode.STAGE:
+            reasons.append(
+                f"the mode is {self.policy.mode.name.lower()}; stage or commit may write"
+            )
+        elif self.policy.approval == "auto" and not self.armed:
+            reasons.append(NOT_ARMED)
+        reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.gates if not gate.ok]
+        if not self.gates:
+            reasons.append("no gate has judged yet")
+        if self._hsi_applied:
+            reasons.append("the on-board estimator is applied; set register 44 to 0,1,5")
+        if unsaved := sorted(self.client_wrote.keys() & {MAG, GYRO}):
+            reasons.append(
+                f"register {', '.join(map(str, unsaved))} holds what a program on a shared port "
+                "wrote and did not save: let it save that, or switch the device off and on"
+            )
+        reasons += ram_budget(self.policy, history, now, again=again)
+        return reasons + self._always(host_s)
+
+    def again_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+        """Why what was set aside may not be written again now: its approval must still hold."""
+        reasons = [word for word in (self.void, self.disagrees) if word]
+        if not self.armed:
+            reasons.append(NOT_ARMED)
+        reasons += self._old_verdict(host_s)
+        more = self.write_holds(history, host_s, now, again=True)
+        return list(dict.fromkeys([*reasons, *more]))
+
+    def save_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+        """Why the flash may not be written now."""
+        reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
+        if not self.armed:
+            reasons.append(NOT_ARMED)
+        unattended = history.open is not None and history.open.approver != "operator"
+        if unattended and not self.policy.commit_unattended:
+            reasons.append("no operator approved it and commit_unattended is off")
+        reasons += [f"gate {gate.gate}: {gate.advice}" for gate in self.flash_gates if not gate.ok]
+        if not self.flash_gates:
+            reasons.append("no gate has judged for flash yet")
+        reasons += flash_budget(self.policy, history, now)
+        reasons += self._not_as_judged(host_s)
+        if still := self.stillness.why_not(host_s):
+            reasons.append(still)
+        return reasons + self._always(host_s)
+
+    def _not_as_judged(self, host_s: float) -> list[str]:
+        """Why what is in force may not be what was judged, or not be right any more."""
+        reasons = [word for word in (self.void, self.disagrees, self.proof_waits) if word]
+        if self.theirs:
+            which = ", ".join(map(str, sorted(self.theirs)))
+            reasons.append(
+                f"somebody else changed register {which} in this run, and a save would make it "
+                "permanent; once it is right, switch the device off and on"
+            )
+        return reasons + self._old_verdict(host_s) + self.unexamined()
+
+    def _old_verdict(self, host_s: float) -> list[str]:
+        old_s = host_s - self.judged_s
+        return [f"the newest verdict is {old_s:.0f} s old"] if old_s > VERDICT_AGE_S else []
+
+    def asking_took(self, took_s: float) -> None:
+        """The device was asked who it is and what it holds, and answered as it ought to."""
+        self._asking_s.append(took_s)
+
+    @property
+    def _on_this_line_s(self) -> float:
+        """How long it takes to ask that, where no answer is late; samples wait meanwhile."""
+        return min(self._asking_s, default=0.0)
+
+    def save_too_late(self, host_s: float) -> str:
+        """Why what was judged when the save was decided is too old by now; empty where it is not.
+
+        The checks before VNWNV pause the stream, so nobody sees what happens to the vehicle. They
+        may last as long as they do on this line with no answer late, and as one reply may take
+        where the vehicle's word holds for so long.
+        """
+        on_this_line_s = SAVE_CHECKS_PER_ASKING * self._on_this_line_s
+        reply_s = min(self.policy.reply_timeout_s, self.policy.interlock_max_age_s)
+        most_s = max(SAVE_CHECKS_S, on_this_line_s, reply_s)
+        if (took_s := host_s - self.save_from_s) <= most_s:
+            return ""
+        return (
+            f"the device's answers were late: {took_s:.1f} s without a sample since the save was "
+            f"decided, {most_s:.1f} s are allowed"
+        )
+
+    def examined(self, to_s: float) -> bool:
+        """Whether the estimate has taken the samples up to this host time into account."""
+        return self.examined_s is None or self.examined_s >= to_s
+
+    def unexamined(self) -> list[str]:
+        """Whether the estimate lags behind the samples, which wait for the device's answer."""
+        if self.sampled_s is None or self.examined_s is None:
+            return []
+        late_s = self.sampled_s - self.examined_s
+        if late_s <= UNEXAMINED_S + self._on_this_line_s:
+            return []
+        return [f"the newest {late_s:.0f} s of samples are not judged yet"]
+
+    def allow(self, command: Command, purpose: Purpose, host_s: float) -> bool:
+        """The gate in front of every command of the write-back.
+
+        A rollback asks neither the vehicle nor the journal: the old values are what it lived with.
+        """
+        mode = self.mode
+        if purpose is Purpose.ROLL_BACK and self._is_ours:
+            mode = self.policy.mode
+        changes = self.policy.configure_stream
+        if not permitted(command, mode, changes, purpose, self.client_registers):
+            return False
+        if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
+            return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_holds(host_s)
+        if isinstance(command, Word) and command.word == "VNWNV":
+            return (
+                self.armed
+                and self.journal_ok
+                and not (self.void or self.disagrees or self.proof_waits or self.theirs)
+                and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
+                and not self.save_too_late(host_s)
+            )
+        return True
+
+    def _always(self, host_s: float) -> list[str]:
+        reasons = [word] if (word := self.interlock_holds(host_s)) else []
+        if not self.journal_ok:
+            reasons.append("the journal cannot be written; free the disk, then unlock")
+        if self.stopping:
+            reasons.append("the daemon is stopping")
+        return reasons

@@ -59,12 +59,38 @@ from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.policy import TrialPolicy
 
 # -- Verdicts --------------------------------------------------------------------------------------
 
 
 JUMP_NOISE_DEG = 1.0  # of a heading read off single samples; below it no jump is unexpected
+
+
+@dataclass(frozen=True, slots=True)
+class TrialPolicy:
+    """How written registers prove themselves. Times are of the device's clock.
+
+    duration_s, turns: whichever comes first ends the trial; longer proves more [600 s, 2 turns]
+    worse_percent, worse_for_s: undo where the live figure is worse than the old registers' on the
+                       same samples by this, for this long [10 %, 60 s]
+    max_wrong_percent, wrong_sigmas: undo where an error of the calibration explains more of the
+                       corrected field than this, by so many of the figure's own sigmas [0.5 %, 2.5]
+    max_spread_percent: undo where std/mean of the corrected field exceeds this, whatever explains
+                       it [10 %]
+    max_jump_deg:      undo where the heading jumped by this much more than predicted [5 deg]
+    interlock:         undo where the vehicle withdraws its word; false lets the trial live through
+                       driving, for vehicles whose word is only about the moment of writing [true]
+    """
+
+    duration_s: float = 600.0
+    turns: float = 2.0
+    worse_percent: float = 10.0
+    worse_for_s: float = 60.0
+    max_wrong_percent: float = 0.5
+    wrong_sigmas: float = 2.5
+    max_spread_percent: float = 10.0
+    max_jump_deg: float = 5.0
+    interlock: bool = True
 
 
 @dataclass(frozen=True, slots=True)

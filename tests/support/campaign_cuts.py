@@ -19,8 +19,9 @@ import numpy as np
 from writeback_rig import Cut, Device, Rig
 
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
+from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Read, Word, Write
 from drivers.vn100.registers import Values, parse
 

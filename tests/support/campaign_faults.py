@@ -33,7 +33,8 @@ from ahrsd.calibration import Estimate
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.emulator.faults import FAULTS
 from drivers.vn100.emulator.physics import draw_truth
 from drivers.vn100.emulator.scenarios import Setup, build

@@ -27,8 +27,9 @@ from ahrsd.gates import GATES, Level, for_level
 from ahrsd.writeback import flow
 from ahrsd.writeback.composition import Proposal, UnwritableError
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
+from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Read, Word, Write
 
 FAMILIES = ("ram gate red", "flash gate red", "observe", "passive", "not armed", "mixed")

@@ -32,7 +32,8 @@ from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
 from ahrsd.sharing.client_commands import SharePolicy
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import StillPolicy, TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy
+from ahrsd.writeback.trial import TrialPolicy
 
 CHUNK_S, INTERLOCK_S = 0.2, 0.3
 POLICY = WriteBackPolicy(

@@ -35,7 +35,8 @@ from write_observer import KINDS
 
 from ahrsd.config.loading import Config
 from ahrsd.config.sections import LocationSection
-from ahrsd.writeback.policy import StillPolicy, TrialPolicy
+from ahrsd.writeback.policy import StillPolicy
+from ahrsd.writeback.trial import TrialPolicy
 
 MOTION = Motion(rest_s=2.5, turn_s=3.5)
 LENGTH_S, LONG_S = 15.0, 28.0

@@ -9,7 +9,8 @@ import pytest
 from writeback_rig import Device, Rig
 
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.trial import TrialPolicy
 
 
 @pytest.fixture

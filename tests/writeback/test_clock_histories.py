@@ -13,8 +13,9 @@ import pytest
 from writeback_rig import Device, Rig
 
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy, WriteBackPolicy
+from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
+from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Word, Write
 
 DAY_S, HOUR_S = 86400.0, 3600.0

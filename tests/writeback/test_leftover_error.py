@@ -8,13 +8,13 @@ import pytest
 from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.policy import TrialPolicy
 from ahrsd.writeback.trial import (
     Leftover,
     LeftoverError,
     LiveTrial,
     Trial,
     TrialMetrics,
+    TrialPolicy,
     TrialVerdict,
 )
 

@@ -10,8 +10,7 @@ import pytest
 from ahrsd.samples import SampleBlock
 from ahrsd.writeback.clocks import Now, Stamp
 from ahrsd.writeback.permissions import Mode, Purpose
-from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy, flash_budget, ram_budget
-from ahrsd.writeback.safeguards import Stillness
+from ahrsd.writeback.policy import Stillness, StillPolicy, WriteBackPolicy, flash_budget, ram_budget
 from ahrsd.writeback.states import State
 from ahrsd.writeback.transaction import JournalHistory
 from drivers.vn100.commands import Word, Write

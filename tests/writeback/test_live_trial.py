@@ -10,8 +10,7 @@ import pytest
 from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.policy import TrialPolicy
-from ahrsd.writeback.trial import LiveTrial, Trial, TrialVerdict
+from ahrsd.writeback.trial import LiveTrial, Trial, TrialPolicy, TrialVerdict
 
 RATE_HZ = 40.0
 FIELD_N = np.array([0.24, 0.0, 0.42])

@@ -7,9 +7,9 @@ import pytest
 
 from ahrsd.events import RegisterWritten
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy
-from ahrsd.writeback.safeguards import NOT_ARMED
+from ahrsd.writeback.policy import NOT_ARMED
 from ahrsd.writeback.states import State
+from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Word, Write
 
 STAGED = ["PREPARED", "RAM_VERIFIED"]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.policy import TrialPolicy
 from ahrsd.writeback.states import State
+from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Word, Write
 
 HISTORIES, STEPS = 60, 120
