@@ -1,8 +1,8 @@
 """When a write is allowed: what a person sets, and the reasons that hold a write back now.
 
-**Safeguards**: what must be true of the device, the vehicle and the journal for anything to be sent.
-They fail closed: what is not known, not fresh or not readable counts as no. Whether the vehicle
-stands still (`Stillness`) is judged from its own samples.
+**Safeguards**: what must be true of device, vehicle and journal for anything to be sent. They fail
+closed: what is not known, not fresh or not readable counts as no. Whether the vehicle stands still
+(`Stillness`) is judged from its own samples.
 """
 
 from __future__ import annotations
