@@ -1,4 +1,4 @@
-"""The host's clocks: wall clock, boot id, time since boot (suspends included), a run's own clock."""
+"""The host's clocks: wall clock, boot id, time since boot (with suspends), a run's own clock."""
 
 from __future__ import annotations
 
