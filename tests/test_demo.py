@@ -204,4 +204,4 @@ def test_the_configuration_allows_for_the_speed(tmp_path):
     assert slow.mode == fast.mode == "commit"
     assert slow.interlock.max_age_s == 3.0
     assert fast.interlock.max_age_s == 30.0
-    assert math.isclose(fast.device.reply_timeout_s, 1.0)
+    assert math.isclose(fast.device.reply_timeout_s, 3.0)

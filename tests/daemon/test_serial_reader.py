@@ -14,6 +14,7 @@ from ahrsd.daemon.serial_link import Bytes, Inbox, Lost, SerialLink, SerialReade
 from ahrsd.inputs import LinkLost, Received
 from ahrsd.recording.capture import CaptureReader
 from drivers.vn100.deframer import Cause
+from drivers.vn100.session import SILENCE_S
 
 
 class Endless:
@@ -143,7 +144,7 @@ def test_half_a_message_is_not_given_up_while_the_rest_waits_to_be_read(live):
     cut = deframer.counters.damage.get(Cause.CUT, 0)
     one._link = Starved(one._link)
     one._feed(Received(one.clock.now_ns(), b"$VNIMU,-00.1"))
-    threading.Event().wait(0.15)  # longer than a silence that cuts
+    threading.Event().wait(1.5 * SILENCE_S)
     for _ in range(3):
         one._turn(0.0)
     assert deframer.pending > 0
