@@ -118,12 +118,8 @@ def _placed(config: Config, position: str | None, date: str | None) -> Config:
         raise AhrsdError("--date without --position: the field is that of a place; give both")
     if date is not None:
         given["date"] = date
-    elif given["date"] is None:
-        click.echo("--position without --date: today's field is taken", err=True)
     try:
-        return config.model_copy(
-            update={"location": LocationSection.model_validate(given, strict=False)}
-        )
+        place = LocationSection.model_validate(given, strict=False)
     except ValidationError as error:
         wrong = error.errors()[0]
         if wrong["loc"][:1] == ("date",):
@@ -132,6 +128,9 @@ def _placed(config: Config, position: str | None, date: str | None) -> Config:
             f"--position {position}: {wrong['loc'][0]}: {wrong['msg']}; "
             "LAT,LON[,ALT] in deg and m is needed"
         ) from None
+    if place.date is None:
+        click.echo("--position without --date: today's field is taken", err=True)
+    return config.model_copy(update={"location": place})
 
 
 def _refuse_page(folder: Path) -> None:

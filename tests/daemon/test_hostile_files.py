@@ -168,7 +168,14 @@ def test_a_bundle_follows_no_link_and_waits_for_no_fifo(program, tmp_path):
 
 
 @root_only
-@pytest.mark.parametrize(("owner", "mode"), [(STRANGER, 0o777), (STRANGER, 0o700), (0, 0o777)])
+@pytest.mark.parametrize(
+    ("owner", "mode"),
+    [
+        (STRANGER, 0o777),
+        pytest.param(STRANGER, 0o700, marks=pytest.mark.slow),
+        pytest.param(0, 0o777, marks=pytest.mark.slow),
+    ],
+)
 def test_a_folder_of_words_that_others_may_write_is_refused_by_name(program, owner, mode):
     with program(approval="operator") as running:
         box = running.state / "operator"

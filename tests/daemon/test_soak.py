@@ -93,6 +93,7 @@ def test_nothing_grows_and_nothing_gets_slower(soak, tmp_path, short_histories):
     assert found.column("samples")[-1] > 0.95 * 9 * 60 * 40 * 60 / 62
 
 
+@pytest.mark.slow
 def test_a_log_that_keeps_everything_is_seen(soak, tmp_path, short_histories, monkeypatch):
     """The proof that the test above can fail: four kilobytes per update."""
     monkeypatch.setattr(soak, "DAEMON_KEEPS", None)

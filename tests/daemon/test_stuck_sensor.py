@@ -94,7 +94,7 @@ def until(condition):
     [
         (constant, "the magnetometer gives the same value on all axes"),
         (saturated_axis, "saturated"),
-        (OneInFifty(1e30), "% of the newest"),
+        pytest.param(OneInFifty(1e30), "% of the newest", marks=pytest.mark.slow),
         (OneInFifty(float("nan")), "% of the newest"),
         (OneInFifty(float("inf")), "% of the newest"),
     ],
