@@ -34,7 +34,6 @@ from ahrsd.inputs import (
 )
 from ahrsd.recording import capture
 from ahrsd.recording.blocks import SEQUENCES, Damage, Entry, read_entries, read_head
-from ahrsd.recording.capture import part_path
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
@@ -321,7 +320,7 @@ def _newest(folder: Path, own: Path | None) -> list[Path]:
 
 def _parts(path: Path) -> Iterator[Path]:
     part = 1
-    while (one := part_path(path, part)).exists():
+    while (one := capture.part_path(path, part)).exists():
         if not stat.S_ISREG(one.lstat().st_mode):
             return
         yield one

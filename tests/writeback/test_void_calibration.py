@@ -15,6 +15,7 @@ from ahrsd.config.loading import check_config
 from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES
+from ahrsd.writeback.policy import Safeguards, WriteBackPolicy
 
 STEP = np.array([0.06, 0.0, 0.0])
 OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
@@ -207,3 +208,17 @@ def test_the_estimator_itself_sees_the_step_and_the_old_values_are_not_saved():
     run.run(100.0)
     run.park()
     undone(run)
+
+
+@pytest.mark.parametrize(
+    ("reply_timeout_s", "max_age_s", "most_s"),
+    [(0.4, 1.0, 0.5), (0.4, 60.0, 0.5), (2.0, 60.0, 2.0), (2.0, 1.0, 1.0), (60.0, 1.0, 1.0)],
+)
+def test_the_checks_of_a_save_last_no_longer_than_a_reply_and_the_vehicles_word(
+    reply_timeout_s, max_age_s, most_s
+):
+    policy = WriteBackPolicy(reply_timeout_s=reply_timeout_s, interlock_max_age_s=max_age_s)
+    safe = Safeguards(policy)
+    safe.save_from_s = 100.0
+    assert safe.save_too_late(100.0 + most_s - 0.01) == ""
+    assert f"{most_s:.1f} s are allowed" in safe.save_too_late(100.0 + most_s + 0.01)
