@@ -161,7 +161,7 @@ class Fleet:
             victim.send_signal(signal.SIGKILL)
         except psutil.NoSuchProcess:
             return
-        psutil.wait_procs([victim], timeout=GRACE_S)
+        still_running([victim])
         if kind in ("driver", "worker"):
             self.left_running += still_running(below)
         if kind in ("driver", "scheduler"):
@@ -192,16 +192,23 @@ def tree(process: int) -> list[psutil.Process]:
 
 
 def still_running(processes: list[psutil.Process]) -> list[str]:
-    """What of them runs after the grace."""
-    _, alive = psutil.wait_procs(processes, timeout=GRACE_S)
-    found = []
-    for process in alive:
-        try:
-            if process.status() != psutil.STATUS_ZOMBIE:
-                found.append(f"{process.pid} {' '.join(process.cmdline())[:80]}")
-        except psutil.NoSuchProcess:
-            continue
-    return found
+    """What of them runs after the grace; whoever is dead and not reaped does not."""
+    until = time.monotonic() + GRACE_S
+    while (alive := [text for one in processes if (text := running(one))]) and (
+        time.monotonic() < until
+    ):
+        time.sleep(0.02)
+    return alive
+
+
+def running(process: psutil.Process) -> str:
+    """Its number and command line; empty where it has ended."""
+    try:
+        if process.status() == psutil.STATUS_ZOMBIE:
+            return ""
+        return f"{process.pid} {' '.join(process.cmdline())[:80]}"
+    except psutil.NoSuchProcess:
+        return ""
 
 
 def keys_of(out: Path) -> list[str]:

@@ -63,10 +63,16 @@ def save(
     topics = list(dict.fromkeys((name, number) for name, number, _, _ in data))
     for k, (name, number) in enumerate(topics):
         out += _message(b"A", struct.pack("<BH", number, k) + name.encode())
-    for name, number, time_s, values in sorted(data, key=lambda one: one[2]):
-        body = struct.pack(_layout(formats[name]), us(time_s), *values)
-        out += _message(b"D", struct.pack("<H", topics.index((name, number))) + body)
-    path.write_bytes(out)
+    layouts = {name: _layout(text) for name, text in formats.items()}
+    messages = [
+        _message(
+            b"D",
+            struct.pack("<H", topics.index((name, number)))
+            + struct.pack(layouts[name], us(time_s), *values),
+        )
+        for name, number, time_s, values in sorted(data, key=lambda one: one[2])
+    ]
+    path.write_bytes(out + b"".join(messages))
     return path
 
 

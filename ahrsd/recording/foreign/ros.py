@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,7 @@ _TAKES: dict[str, tuple[_Take, ...]] = {
 }  # fmt: skip
 _WIDTHS = {"mag": 3, "gyro": 3, "accel": 3, "fix": 3, "vn_attitude": 3, "attitude": 4}
 _DEVICE_TIME = "CommonGroup"
+_NAN = float("nan")
 
 
 @dataclass(slots=True)
@@ -343,7 +345,10 @@ def _gather(path: Path, reader: _Message, found: _Found) -> None:
             found.unread[connection.topic] = kind
             continue
         plans[connection.id, connection.topic] = (
-            list(_places(reader.typestore, kind, "")),
+            [
+                _Place(connection.topic, attributes, base)
+                for attributes, base in _places(reader.typestore, kind, "")
+            ],
             [name for name, node in definition[1] if _holds_bytes(node)],
         )
         if any(plans[connection.id, connection.topic]):
@@ -357,8 +362,8 @@ def _gather(path: Path, reader: _Message, found: _Found) -> None:
             continue
         message = reader.deserialize(data, connection.msgtype)
         found.base_ns = found.base_ns or at_ns
-        for attributes, base in places:
-            taken += _take(message, attributes, base, connection.topic, at_ns, found)
+        for place in places:
+            taken += place.take(message, at_ns, found)
         for name in fields:
             raw = found.raw.setdefault(connection.topic, _Raw())
             raw.take(at_ns, _bytes_of(getattr(message, name)))
@@ -394,36 +399,49 @@ def _ns(part: _Message) -> int:
     header = getattr(part, "header", None)
     if header is None:
         return 0
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    stamp = header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def _take(
-    message: _Message, attributes: str, base: str, topic: str, at_ns: int, found: _Found
-) -> int:
-    part = message
-    for name in attributes.split(".") if attributes else ():
-        part = getattr(part, name)
-    stamp_ns = _ns(part) or _ns(message) or at_ns
-    device_s = float("nan")
-    if base == _DEVICE_TIME and int(part.group_fields) & 1:
-        device_s = int(part.timestartup) * 1e-9
-    name = f"{topic}.{attributes}" if attributes else topic
-    count = 0
-    for kind, rank, unit, take in _TAKES[base]:
-        values = take(part)
-        if values is None:
-            continue
-        key = (kind, rank, name)
-        one = found.series.get(key)
-        if one is None:
-            one = _Series(kind, topic, name, unit, rank, _WIDTHS.get(kind, 1))
-            found.series[key] = one
-        one.stamp_s.append((stamp_ns - found.base_ns) * 1e-9)
-        one.log_s.append((at_ns - found.base_ns) * 1e-9)
-        one.device_s.append(device_s)
-        one.values.extend(values)
-        count += 3 + len(values)
-    return count
+class _Place:
+    """A part of a topic's messages that holds a sensor, and the series that it feeds."""
+
+    def __init__(self, topic: str, attributes: str, base: str) -> None:
+        self._topic, self._name = topic, f"{topic}.{attributes}" if attributes else topic
+        self._part = attrgetter(attributes) if attributes else None
+        self._device = base == _DEVICE_TIME
+        self._takes: list[tuple[_Take, _Series | None]] = [(take, None) for take in _TAKES[base]]
+
+    def take(self, message: _Message, at_ns: int, found: _Found) -> int:
+        """One more message; how many numbers were kept."""
+        part = message if self._part is None else self._part(message)
+        stamp_ns = _ns(part) or (_ns(message) if part is not message else 0) or at_ns
+        stamp_s, log_s = (stamp_ns - found.base_ns) * 1e-9, (at_ns - found.base_ns) * 1e-9
+        device_s = _NAN
+        if self._device and int(part.group_fields) & 1:
+            device_s = int(part.timestartup) * 1e-9
+        count = 0
+        for number, (take, series) in enumerate(self._takes):
+            values = take[3](part)
+            if values is None:
+                continue
+            if series is None:
+                series = self._series(take, found)
+                self._takes[number] = take, series
+            series.stamp_s.append(stamp_s)
+            series.log_s.append(log_s)
+            series.device_s.append(device_s)
+            series.values.extend(values)
+            count += 3 + len(values)
+        return count
+
+    def _series(self, take: _Take, found: _Found) -> _Series:
+        """Several connections may publish one topic."""
+        kind, rank, unit, _ = take
+        return found.series.setdefault(
+            (kind, rank, self._name),
+            _Series(kind, self._topic, self._name, unit, rank, _WIDTHS.get(kind, 1)),
+        )
 
 
 def _bytes_of(value: _Message) -> bytes:
