@@ -42,9 +42,12 @@ class DaemonConnection:
             self._socket.connect(str(path))
         except OSError as error:
             self._socket.close()
+            where = f"{path}: no daemon answers ({error.strerror})"
+            if not path.parent.exists():
+                where = f"{path.parent}: no daemon answers (there is no such folder)"
             raise DeviceError(
-                f"{path}: no daemon answers ({error.strerror}); is `ahrsd run` running, under this "
-                "user or as a service? --socket names another place",
+                f"{where}; is `ahrsd run` running, under this user or as a service? --socket or "
+                "--state-directory names another place",
                 EXIT_BUSY,
             ) from None
         try:
