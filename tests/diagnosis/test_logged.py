@@ -36,6 +36,7 @@ def logged(track: Track, name: str, values: Array) -> Track:
     return track.with_columns({**track.covariates, name: values})
 
 
+@pytest.mark.slow
 def test_a_wrong_clock_is_found_beside_a_magnetometer_that_is_late(driven) -> None:
     """What a delay of 100 ms leaves is larger than the current's field: it is taken out first."""
     track, _ = driven

@@ -91,6 +91,7 @@ def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_l
     assert nowhere.unexplained.where.frame == "world"
 
 
+@pytest.mark.slow
 def test_a_way_through_a_gradient_is_unknown_where_no_position_is_logged() -> None:
     """Most of it is a wave of some length, and the rest may look like bumps."""
     track, readings = _quiet(5)

@@ -114,7 +114,8 @@ def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
     assert all(one.confidence > 0.5 for one in found.findings)
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 4])
 def test_what_a_large_walk_hides_is_named_beside_it(seed):
     """Iron that a walk of 1e-4 hides: once nothing but a course, or a height and the earth's turn.
 
