@@ -249,7 +249,9 @@ def stamped(running: Program, ahead_s: float) -> None:
     draft.rename(running.interlock)
 
 
-@pytest.mark.parametrize("ahead_s", [0.8, *(pytest.param(s, marks=pytest.mark.slow) for s in (8.0, 30.0))])
+@pytest.mark.parametrize(
+    "ahead_s", [0.8, *(pytest.param(s, marks=pytest.mark.slow) for s in (8.0, 30.0))]
+)
 def test_an_old_word_with_a_stamp_ahead_is_never_fresh_again(program, ahead_s):
     with program(approval="operator") as running:
         running.start()
