@@ -21,10 +21,9 @@ from drivers.serial_port import (
     SerialPort,
     spelled,
 )
-from drivers.vn100.commands import Command
+from drivers.vn100.commands import Command, Identity, identify, read_configuration
 from drivers.vn100.device import Device, Tap, reads_only
 from drivers.vn100.errors import DriverError
-from drivers.vn100.procedures import Identity, identify, read_configuration
 from drivers.vn100.registers import Values
 from drivers.vn100.session import Event, LineEchoes
 

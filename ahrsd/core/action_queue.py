@@ -32,8 +32,7 @@ from ahrsd.writeback.actions import (
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.reconcile import OF_OUTPUTS, RecordKind
 from ahrsd.writeback.transaction import StoredRecord, of_another_device
-from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import COMPENSATING, Values, same
+from drivers.vn100.registers import COMPENSATING, Unit, Values, same
 from drivers.vn100.session import Event as SessionEvent
 
 # -- Actions of the write-back ---------------------------------------------------------------------

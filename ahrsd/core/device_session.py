@@ -35,25 +35,18 @@ from drivers.vn100.calibration_stream import (
 from drivers.vn100.commands import (
     RESUME,
     Command,
+    Identity,
     LinkGone,
     NoReply,
     Pause,
     Procedure,
     Read,
+    Seen,
     SessionError,
     Speech,
     TooLate,
     Word,
     Write,
-)
-from drivers.vn100.decode import Measurement
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import (
-    SESSION_SETTINGS,
-    Identity,
-    Seen,
-    Unit,
     differences,
     identify,
     look,
@@ -64,7 +57,10 @@ from drivers.vn100.procedures import (
     restore,
     resume,
 )
-from drivers.vn100.registers import Values, format_command, same
+from drivers.vn100.decode import Measurement
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.messages import Reply
+from drivers.vn100.registers import SESSION_SETTINGS, Unit, Values, format_command, same
 from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
 ECHOES = (

@@ -41,8 +41,7 @@ from ahrsd.writeback.clocks import Stamp
 from drivers.vn100.decode import Measurement, Undecodable, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import COMPENSATING, Values, parse, same
+from drivers.vn100.registers import COMPENSATING, Unit, Values, parse, same
 
 RUNS = 4  # captures that are looked at
 FIRST_S = 2.0  # of a capture that is read for its clocks, however long ago it began

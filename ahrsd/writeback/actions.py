@@ -21,8 +21,7 @@ from ahrsd.writeback.permissions import Purpose
 from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.transaction import JournalHistory, JournalRecord
 from drivers.vn100.commands import Command, Procedure
-from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Unit, Values
 
 # -- Actions ---------------------------------------------------------------------------------------
 

@@ -37,15 +37,7 @@ from typing import Final
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.actions import ActionOutbox, CalibrateAnew, IdentifyAgain, SetUpStream
-from ahrsd.writeback.composition import (
-    GYRO,
-    MAG,
-    Proposal,
-    UnwritableError,
-    apart_deg,
-    compose,
-    register_lines,
-)
+from ahrsd.writeback.composition import GYRO, MAG, Proposal, UnwritableError, apart_deg, compose
 from ahrsd.writeback.permissions import Mode, Purpose
 from ahrsd.writeback.policy import Safeguards, WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
@@ -60,8 +52,8 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import ProcedureOutcome, Transaction, check, roll_back, save, stage
 from ahrsd.writeback.trial import Trial, TrialVerdict
-from drivers.vn100.procedures import Identity, Unit, VerifyFailed
-from drivers.vn100.registers import Values, same
+from drivers.vn100.commands import Identity, VerifyFailed
+from drivers.vn100.registers import Unit, Values, register_lines, same
 
 # -- What programs on shared ports bring about -----------------------------------------------------
 

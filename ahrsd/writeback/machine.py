@@ -38,7 +38,7 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import HSI_RESULT, JournalHistory, JournalRecord, ProcedureOutcome
 from ahrsd.writeback.trial import TrialMetrics, TrialVerdict
-from drivers.vn100.procedures import Identity, Seen, differences
+from drivers.vn100.commands import Identity, Seen, differences
 from drivers.vn100.registers import COMPENSATING, Values, same
 
 RESTS = frozenset(  # states in which a proven restart since the newest record has it read again

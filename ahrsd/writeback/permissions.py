@@ -23,8 +23,7 @@ from enum import Enum, IntEnum
 from typing import Final
 
 from drivers.vn100.commands import Command, Pause, Read, Word, Write
-from drivers.vn100.procedures import SESSION_SETTINGS
-from drivers.vn100.registers import REGISTERS
+from drivers.vn100.registers import REGISTERS, SESSION_SETTINGS
 
 CALIBRATION: Final = (23, 84)
 GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # for no client: line rate and calibration

@@ -22,8 +22,7 @@ from ahrsd.writeback.composition import GYRO, MAG, Proposal
 from ahrsd.writeback.permissions import Mode, Purpose, permitted
 from ahrsd.writeback.transaction import JournalHistory
 from ahrsd.writeback.trial import TrialPolicy
-from drivers.vn100.commands import Command, Word, Write
-from drivers.vn100.procedures import Identity
+from drivers.vn100.commands import Command, Identity, Word, Write
 from drivers.vn100.registers import Values, same
 
 # -- What a person sets, and what holds a write back -----------------------------------------------

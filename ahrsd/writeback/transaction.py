@@ -23,16 +23,17 @@ from functools import partial
 from typing import Any, Final, Protocol
 
 from ahrsd.writeback.clocks import UNKNOWN, Stamp
-from ahrsd.writeback.composition import register_lines
 from ahrsd.writeback.reconcile import OF_OTHERS, OPEN, RecordKind
-from drivers.vn100.commands import QUIET, NoReply, NotPermitted, Procedure, TooLate, Write
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.firmware import Profile, profile_of
-from drivers.vn100.procedures import (
+from drivers.vn100.commands import (
+    QUIET,
     WRITE_TRIES,
+    NoReply,
+    NotPermitted,
+    Procedure,
     RestoreFailed,
-    Unit,
+    TooLate,
     VerifyFailed,
+    Write,
     differences,
     quiet,
     read,
@@ -43,7 +44,8 @@ from drivers.vn100.procedures import (
     resume,
     save_settings,
 )
-from drivers.vn100.registers import Values, parse, same
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.registers import Profile, Unit, Values, parse, profile_of, register_lines, same
 
 # -- One transaction -------------------------------------------------------------------------------
 

@@ -27,10 +27,10 @@ from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.writeback.states import State
 from drivers.serial_port import SerialPort
+from drivers.vn100.commands import read_registers
 from drivers.vn100.device import Device
 from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
-from drivers.vn100.procedures import read_registers
 
 SPEED = 15.0  # a disk that takes 0.3 s to sync must not look like one that hangs
 BAUD, RATE_HZ = 115200, 50

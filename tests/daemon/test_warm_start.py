@@ -26,7 +26,7 @@ from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
 from ahrsd.writeback.clocks import Stamp
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.procedures import Unit
+from drivers.vn100.registers import Unit
 
 SCENE = Setup(
     "rov",

@@ -9,8 +9,7 @@ from functools import reduce
 from operator import xor
 
 from drivers.vn100.emulator.emulator import Emulator
-from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import EmulatedTruth
+from drivers.vn100.emulator.physics import EmulatedTruth, make_motion
 
 
 def xor8(body: bytes) -> bytes:

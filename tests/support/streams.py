@@ -9,8 +9,7 @@ from pathlib import Path
 
 from ahrsd.inputs import Input, Received, Stop
 from drivers.vn100.emulator.emulator import Emulator
-from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import TICK_HZ, draw_truth
+from drivers.vn100.emulator.physics import TICK_HZ, draw_truth, make_motion
 from drivers.vn100.emulator.scenarios import CALIBRATION_SET
 from drivers.vn100.messages import encode
 

@@ -30,12 +30,29 @@ from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State
 from ahrsd.writeback.trial import TrialMetrics
-from drivers.vn100.commands import Command, NoReply, NotPermitted, Pause, Read, Word, Write
+from drivers.vn100.commands import (
+    CONFIGURATION,
+    Command,
+    Identity,
+    NoReply,
+    NotPermitted,
+    Pause,
+    Read,
+    Seen,
+    Word,
+    Write,
+)
 from drivers.vn100.errors import DeviceRefused, DriverError
-from drivers.vn100.firmware import profile_of
 from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import CONFIGURATION, Identity, Seen, Unit
-from drivers.vn100.registers import REGISTERS, Values, as_stored, format_reply, parse
+from drivers.vn100.registers import (
+    REGISTERS,
+    Unit,
+    Values,
+    as_stored,
+    format_reply,
+    parse,
+    profile_of,
+)
 
 MODEL, FIRMWARE, SERIAL = "VN-100T-CR", "3.1.0.0", 100130608
 PROFILE = profile_of(FIRMWARE)

@@ -13,8 +13,13 @@ from drivers.vn100.emulator.chain import (
     OnBoardHsi,
     SensorOutputs,
 )
-from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import BLOCK_TICKS, EmulatedTruth, EmulatedWorld, SensorBlock
+from drivers.vn100.emulator.physics import (
+    BLOCK_TICKS,
+    EmulatedTruth,
+    EmulatedWorld,
+    SensorBlock,
+    make_motion,
+)
 
 EYE = (np.eye(3), np.zeros(3))
 PLAIN = ChainSettings(EYE, EYE, EYE, np.eye(3), None, np.array([0.245, 0, 0.424]))

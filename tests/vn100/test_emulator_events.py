@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.vn100.emulator.emulator import Emulator
-from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import EmulatedTruth
+from drivers.vn100.emulator.physics import EmulatedTruth, make_motion
 from drivers.vn100.emulator.scenarios import SCENARIOS, Setup, build
 
 QUIET = {6: (0,)}

@@ -5,27 +5,25 @@ import math
 import numpy as np
 import pytest
 
-from drivers.vn100.emulator.motion import (
-    MOTIONS,
-    TRANSITION_S,
-    YAW,
-    Stops,
-    euler_angles,
-    make_motion,
-    matrices,
-    quaternion_of,
-    quaternions,
-)
 from drivers.vn100.emulator.physics import (
     BLOCK_TICKS,
     HISTORY_TICKS,
+    MOTIONS,
     TICK_HZ,
+    TRANSITION_S,
+    YAW,
     Dipole,
     EmulatedTruth,
     EmulatedWorld,
     IronStep,
+    Stops,
     draw_truth,
+    euler_angles,
     field_from,
+    make_motion,
+    matrices,
+    quaternion_of,
+    quaternions,
 )
 
 

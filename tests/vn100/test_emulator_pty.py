@@ -16,8 +16,7 @@ import serial
 from patience import PATIENCE_S
 
 from drivers.vn100.emulator.emulator import Emulator
-from drivers.vn100.emulator.motion import make_motion
-from drivers.vn100.emulator.physics import EmulatedTruth
+from drivers.vn100.emulator.physics import EmulatedTruth, make_motion
 from drivers.vn100.emulator.pty import OVERRUN_BYTES, EmulatorProcess, Line, PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup
 

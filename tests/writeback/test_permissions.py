@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 
 from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
 from drivers.vn100.commands import WORDS, Command, Pause, Read, Word, Write
-from drivers.vn100.procedures import SESSION_SETTINGS
-from drivers.vn100.registers import REGISTERS
+from drivers.vn100.registers import REGISTERS, SESSION_SETTINGS
 
 WRITES = [
     Write(row.id, row.defaults[generation])

@@ -12,8 +12,7 @@ from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.forward import simulated
 from ahrsd.samples import Array
-from drivers.vn100.emulator.motion import matrices, quaternions
-from drivers.vn100.emulator.physics import GRAVITY_M_S2
+from drivers.vn100.emulator.physics import GRAVITY_M_S2, matrices, quaternions
 from drivers.vn100.emulator.scenarios import Setup, hidden
 
 RATE_HZ = 100.0

@@ -37,8 +37,7 @@ from ahrsd.daemon.journal import (
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, JournalError
 from ahrsd.printable import counted
 from ahrsd.writeback.transaction import of_another_device
-from drivers.vn100.device import Device
-from drivers.vn100.procedures import (
+from drivers.vn100.commands import (
     Identity,
     identify,
     missing,
@@ -46,6 +45,7 @@ from drivers.vn100.procedures import (
     read_present,
     read_registers,
 )
+from drivers.vn100.device import Device
 from drivers.vn100.register_codec import Register, RegisterField, Value
 from drivers.vn100.registers import (
     REGISTERS,

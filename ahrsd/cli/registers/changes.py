@@ -18,17 +18,21 @@ from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, Record, register_values
 from ahrsd.errors import DeviceError
 from drivers.serial_port import PortError
-from drivers.vn100.commands import Command, Procedure, Read, Word, Write
-from drivers.vn100.device import Device
-from drivers.vn100.errors import DriverError
-from drivers.vn100.procedures import (
+from drivers.vn100.commands import (
+    Command,
     Identity,
+    Procedure,
+    Read,
+    Word,
+    Write,
     quiet,
     read_registers,
     restore,
     save_settings,
     write_verified,
 )
+from drivers.vn100.device import Device
+from drivers.vn100.errors import DriverError
 from drivers.vn100.registers import Values, same
 
 Changes = dict[int, Values]

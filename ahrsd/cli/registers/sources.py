@@ -13,8 +13,8 @@ from ahrsd.daemon.journal import Journal, Record, journal_path, register_values
 from ahrsd.errors import AhrsdError, JournalError
 from ahrsd.foreign_file import ForeignFileError, read_regular
 from ahrsd.writeback.composition import GYRO, MAG, UnwritableError, refuse_unsafe
+from drivers.vn100.commands import Identity, read_registers
 from drivers.vn100.device import Device
-from drivers.vn100.procedures import Identity, read_registers
 from drivers.vn100.registers import REGISTERS, RegisterValueError, format_command, parse
 
 _LARGEST_BYTES = 4 << 20
