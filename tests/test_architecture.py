@@ -16,7 +16,7 @@ SOURCES = sorted(
     path for folder in ("ahrsd", "drivers") for path in (PROJECT / folder).rglob("*.py")
 )
 
-SUPERVISOR = "estimation_queue"  # whatever breaks off in the estimator is a state, never an end
+SUPERVISOR = "estimation"  # whatever breaks off in the estimator is a state, never an end
 IO_MODULES = {
     "asyncio", "fcntl", "logging", "multiprocessing", "os", "pathlib", "random", "select", "signal",
     "socket", "subprocess", "tempfile", "termios", "threading", "time",

@@ -19,8 +19,8 @@ from ahrsd.config.text import print_config, reference, to_toml
 from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.gates import GATES, GateLimits
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 
 PROJECT = Path(__file__).parent.parent
 

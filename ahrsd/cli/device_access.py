@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-from ahrsd.core.device_session import ECHOES
 from ahrsd.daemon.serial_link import find_device
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, DeviceError
 from drivers.serial_port import (
@@ -25,7 +24,7 @@ from drivers.vn100.commands import Command, Identity, identify, read_configurati
 from drivers.vn100.device import Device, Tap, reads_only
 from drivers.vn100.errors import DriverError
 from drivers.vn100.registers import Values
-from drivers.vn100.session import Event, LineEchoes
+from drivers.vn100.session import ECHOES, Event, LineEchoes
 
 _EXIT = dict.fromkeys((PortAbsent, PortBusy, PortForbidden, BaudNotFound, PortLost), EXIT_BUSY)
 # Whether it may be opened is for the driver to say: it knows the group that one must join.

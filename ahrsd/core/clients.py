@@ -24,7 +24,8 @@ from ahrsd.sharing.client_commands import (
 )
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.permissions import PASSABLE, Mode
+from ahrsd.writeback.permissions import PASSABLE
+from ahrsd.writeback.states import Mode
 from drivers.vn100.commands import NoReply, Seen, TooLate, Write
 from drivers.vn100.messages import Reply
 from drivers.vn100.registers import Values

@@ -21,8 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ahrsd.writeback.actions import Action, AppendToJournal, SetUpStream
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.transaction import JournalRecord
+from ahrsd.writeback.journal_history import JournalRecord, RecordKind
 from drivers.vn100.calibration_stream import left_by_session
 from drivers.vn100.registers import SESSION_SETTINGS, Values, register_lines, same
 

@@ -24,7 +24,7 @@ from ahrsd.calibration import Estimate
 from ahrsd.inputs import EarlierRun, EarlierSamples, WallClock
 from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.clocks import Stamp, plausible, same_boot_s
+from ahrsd.writeback.journal_history import Stamp, plausible, same_boot_s
 from drivers.vn100.registers import COMPENSATING, Unit, Values, same
 
 CONFIRM_S = 60.0  # of samples of this run before a candidate

@@ -23,7 +23,7 @@ from ahrsd.errors import JournalError
 from ahrsd.inputs import Input, Journalled, JournalOpened
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.viewer.sink import RerunSink
-from ahrsd.writeback.transaction import of_another_device
+from ahrsd.writeback.journal_history import of_another_device
 
 log = logging.getLogger("ahrsd")
 

@@ -15,11 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ahrsd.config.loading import Config
-from ahrsd.core.estimation_queue import supervised
+from ahrsd.core.estimation import supervised
 from ahrsd.daemon import host_clock
 from ahrsd.inputs import EarlierRun, EarlierSamples
 from ahrsd.recording.earlier_run import earlier_inputs
-from ahrsd.writeback.clocks import Stamp
+from ahrsd.writeback.journal_history import Stamp
 
 LONGEST_S = 120.0
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from ahrsd.calibration import Estimate
 from ahrsd.config.loading import Config
-from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.core import Core
+from ahrsd.core.estimation import Calibrator
 from ahrsd.diagnosis.model_file import RepairedModel
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.model_checks import Misalignment

@@ -65,8 +65,7 @@ from ahrsd.recording import blocks
 from ahrsd.recording.blocks import SEQUENCES, Damage, Entry
 from ahrsd.recording.retention import prune
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.transaction import StoredRecord
+from ahrsd.writeback.journal_history import RecordKind, StoredRecord
 
 # -- Inputs as JSON --------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ from ahrsd.recording.blocks import SEQUENCES, Damage, Entry, read_entries, read_
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.writeback.clocks import Stamp
+from ahrsd.writeback.journal_history import Stamp
 from drivers.vn100.decode import Measurement, Undecodable, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.messages import Reply

@@ -26,7 +26,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Literal
 
-from ahrsd.writeback.permissions import GUARDED, PASSABLE, Purpose
+from ahrsd.writeback.permissions import GUARDED, PASSABLE
+from ahrsd.writeback.states import Purpose
 from drivers.vn100.commands import Read, Speech, Word, Write
 from drivers.vn100.registers import REGISTERS, RegisterValueError, parse
 

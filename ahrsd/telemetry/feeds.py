@@ -373,6 +373,7 @@ def _known(core: Core) -> ChoiceFacts:
         core.writeback.state,
         core.writeback.proposal,
         estimate,
-        trusted=not (calibrator.step_open or core.estimator.failed or core.sensors.findings)
+        trusted=not (calibrator.step_open or core.estimation.state.failed)
+        and not core.source.sensors.findings
         and (estimate is None or estimate.contradicted_s is None),
     )

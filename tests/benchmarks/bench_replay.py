@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from ahrsd.config.loading import Config
-from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.estimation import Calibrator
 from ahrsd.estimator.online import Estimator
 from ahrsd.evidence.collector import EvidenceCollector
 from ahrsd.offline.replay import replay

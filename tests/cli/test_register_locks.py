@@ -14,8 +14,8 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.daemon.journal import Journal, journal_path
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorBox, OperatorInbox
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.registers import same
 

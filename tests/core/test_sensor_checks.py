@@ -20,8 +20,8 @@ from ahrsd.so3 import exp
 from ahrsd.telemetry.explain import explain_json, explain_lines
 from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 
 RATE_HZ = 40.0
 FIELD = np.array([0.22, 0.02, 0.42])

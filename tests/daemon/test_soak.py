@@ -71,7 +71,7 @@ def run(soak, folder, minutes):
 @pytest.fixture
 def short_histories(monkeypatch):
     monkeypatch.setattr(
-        "ahrsd.core.calibration_pipeline.EvidenceCollector",
+        "ahrsd.core.estimation.EvidenceCollector",
         functools.partial(EvidenceCollector, SHORT),
     )
 

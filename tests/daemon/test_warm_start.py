@@ -24,7 +24,7 @@ from ahrsd.samples import SampleBlock
 from ahrsd.telemetry.explain import explain_json, explain_lines
 from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
-from ahrsd.writeback.clocks import Stamp
+from ahrsd.writeback.journal_history import Stamp
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.registers import Unit
 

@@ -19,14 +19,14 @@ from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
-from ahrsd.core.estimation_queue import EstimationTask, EstimatorState
+from ahrsd.core.estimation import EstimationTask, EstimatorState
 from ahrsd.daemon.estimation_worker import MOST_WAITING, Worker
 from ahrsd.events import Examine
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
 from ahrsd.samples import SampleBlock
 from ahrsd.telemetry.public import Public
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 
 
@@ -268,8 +268,8 @@ def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
     run.work()
     first = run.core.calibrator
     break_off(run)
-    assert run.core.estimator.failed
-    assert (run.core.estimator.reason, run.core.estimator.failures) == (REASON, 1)
+    assert run.core.estimation.state.failed
+    assert (run.core.estimation.state.reason, run.core.estimation.state.failures) == (REASON, 1)
     assert ("error", f"ESTIMATOR FAILED: {REASON}; it begins anew in 5 s") in run.notes
     assert len(failures(run)) == 1
     second, samples = run.core.calibrator, run.core.stream.facts.samples
@@ -280,7 +280,7 @@ def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
     assert not second.started
     run.run(4.0)
     run.work()
-    assert not run.core.estimator.failed
+    assert not run.core.estimation.state.failed
     assert second.started
 
 

@@ -26,8 +26,8 @@ from ahrsd.report.summary import (
 )
 from ahrsd.telemetry.driving import Pace
 from ahrsd.viewer.process import gate_table
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 
 

@@ -12,7 +12,8 @@ from ahrsd.sharing import client_commands
 from ahrsd.sharing.arbiter import Arbiter
 from ahrsd.writeback import flow
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.permissions import WRITES, Purpose
+from ahrsd.writeback.permissions import WRITES
+from ahrsd.writeback.states import Purpose
 
 
 @pytest.mark.parametrize("seed", range(8))

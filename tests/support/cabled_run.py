@@ -16,8 +16,8 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.config.sections import GatesSection
 from ahrsd.core.core import Core
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy
 
 IRON, BIAS = np.array([0.05, -0.03, 0.04]), np.array([0.01, -0.02, 0.005])

@@ -18,9 +18,8 @@ from functools import cache
 import numpy as np
 from writeback_rig import Cut, Device, Rig
 
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Read, Word, Write
 from drivers.vn100.registers import Values, parse

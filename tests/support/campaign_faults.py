@@ -32,8 +32,8 @@ from writeback_rig import estimate
 from ahrsd.calibration import Estimate
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.emulator.faults import FAULTS
 from drivers.vn100.emulator.physics import draw_truth

@@ -26,9 +26,8 @@ from ahrsd.events import GateResult
 from ahrsd.gates import GATES, Level, for_level
 from ahrsd.writeback import flow
 from ahrsd.writeback.composition import Proposal, UnwritableError
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Read, Word, Write
 

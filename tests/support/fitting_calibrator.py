@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate, Observability
-from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.estimation import Calibrator
 from ahrsd.estimator.step_detector import Step
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.estimation import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES
 from ahrsd.samples import Array, SampleBlock

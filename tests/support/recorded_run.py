@@ -13,7 +13,7 @@ from ahrsd.config.loading import check_config
 from ahrsd.config.text import print_config
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.earlier_run import earlier_inputs
-from ahrsd.writeback.clocks import Stamp
+from ahrsd.writeback.journal_history import Stamp
 from drivers.vn100.emulator.emulator import Emulator
 
 LIMIT_S = 1800.0

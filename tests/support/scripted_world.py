@@ -31,8 +31,8 @@ from ahrsd.core import core as core_module
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
 from ahrsd.sharing.client_commands import SharePolicy
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy
 
 CHUNK_S, INTERLOCK_S = 0.2, 0.3

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from writeback_rig import Device, Rig
 
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Word, Write
 

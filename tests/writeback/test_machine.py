@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ahrsd.events import RegisterWritten
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import NOT_ARMED
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Word, Write
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind, found
-from ahrsd.writeback.states import Signal, State, after
-from ahrsd.writeback.transaction import JournalHistory
+from ahrsd.writeback.journal_history import JournalHistory, RecordKind
+from ahrsd.writeback.reconcile import TABLE, DeviceContents, found
+from ahrsd.writeback.states import Mode, Signal, State, after
 from drivers.vn100.commands import Word, Write
 
 HOLDS_OLD = {
@@ -224,7 +223,7 @@ def test_a_restart_that_only_the_streams_time_tells_confirms_a_save(make_rig, ac
 
 
 def test_the_table_is_total_and_its_signals_are_taken():
-    from ahrsd.writeback.reconcile import OPEN
+    from ahrsd.writeback.journal_history import OPEN
 
     assert set(TABLE) == set(OPEN)
     for row in TABLE.values():

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Word, Write
 

@@ -11,7 +11,7 @@ from cabled_run import BIAS, FIRST, IRON, SPARE, CabledRun, two_units
 from cabled_units import Cable, Unit
 
 from ahrsd.inputs import Operator
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.states import Mode
 
 THEIRS = "1.02,0,0,0,1.01,0,0,0,1,0.11,0.01,0.02"
 OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2

@@ -36,7 +36,7 @@ from ahrsd.daemon.journal import (
 )
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, JournalError
 from ahrsd.printable import counted
-from ahrsd.writeback.transaction import of_another_device
+from ahrsd.writeback.journal_history import of_another_device
 from drivers.vn100.commands import (
     Identity,
     identify,

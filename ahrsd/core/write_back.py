@@ -1,22 +1,24 @@
-"""The write-back's actions, carried out one after the other.
+"""The write-back inside the core: what carries out its actions, and what it is told.
 
-A journal record stops the queue until it is on the disk: what waits behind it may be a byte to the
-device. A procedure waits until the session is idle.
+`ActionQueue`: its actions, one after the other. A journal record stops the queue until it is on the
+disk: what waits behind it may be a byte to the device. A procedure waits until the session is idle.
 
-`DeviceRecord` collects identity, registers and journal of a device, and passes them on to the
-write-back once all three are known.
+`DeviceRecord` collects identity, registers and journal of a device, and passes them on once all
+three are known. `TrialComparison` compares the registers on trial with those before them.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from ahrsd import events
 from ahrsd.core.device_session import DeviceSession
 from ahrsd.inputs import Journalled, JournalOpened
+from ahrsd.samples import SampleBlock
+from ahrsd.stream.decompensation import user_compensation
 from ahrsd.writeback.actions import (
     Action,
     AppendToJournal,
@@ -29,9 +31,10 @@ from ahrsd.writeback.actions import (
     RunProcedure,
     SetUpStream,
 )
+from ahrsd.writeback.journal_history import OF_OUTPUTS, RecordKind, StoredRecord, of_another_device
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.reconcile import OF_OUTPUTS, RecordKind
-from ahrsd.writeback.transaction import StoredRecord, of_another_device
+from ahrsd.writeback.states import LIVED_WITH, State
+from ahrsd.writeback.trial import LiveTrial
 from drivers.vn100.registers import COMPENSATING, Unit, Values, same
 from drivers.vn100.session import Event as SessionEvent
 
@@ -235,3 +238,66 @@ class DeviceRecord:
             clients=frozenset(device_session.clients.now),
             read_from_s=self._read_from_s,
         )
+
+
+# -- A candidate on trial --------------------------------------------------------------------------
+
+
+class TrialComparison:
+    """On the same samples: the registers in force, and those that they replaced."""
+
+    def __init__(self, writeback: WriteBack) -> None:
+        self._writeback = writeback
+        self._trial: LiveTrial | None = None
+
+    def changed(self, change: events.StateChanged, registers: Mapping[int, Values]) -> None:
+        """The state of the write-back changed, with these registers in force."""
+        proven_again = (change.new, change.old) == (State.PROVEN, State.RECONCILING)
+        if change.new == State.TRIAL or proven_again:
+            self._begin(registers)
+        elif change.new not in LIVED_WITH:
+            self._trial = None
+
+    def jumped(self, registers: Mapping[int, Values]) -> None:
+        """The readings jumped: what is on trial is judged by what comes after that."""
+        if self._trial is not None:
+            self._begin(registers)
+
+    def _begin(self, registers: Mapping[int, Values]) -> None:
+        transaction = self._writeback.history.open
+        old = {} if transaction is None else transaction.old
+        mag, bias = user_compensation(registers)
+        old_mag, old_bias = user_compensation({**registers, **old})
+        limit = 0.01 * self._writeback.policy.trial.max_wrong_percent
+        self._trial = LiveTrial(mag, old_mag, bias, old_bias, wrong_limit=limit)
+
+    def take(self, block: SampleBlock, host_s: float) -> list[Action]:
+        """Samples without what the vehicle's columns add; what follows of them."""
+        if self._trial is None:
+            return []
+        return self._writeback.on_trial_metrics(self._trial.take(block), host_s)
+
+
+# -- A person's words ------------------------------------------------------------------------------
+
+
+class OperatorAnswers:
+    """Answers to a person, due once nothing waits for the journal."""
+
+    def __init__(self) -> None:
+        self._due: list[events.Answered] = []
+
+    def add(self, word: str, answer: tuple[bool, str]) -> None:
+        """What became of the word."""
+        self._due.append(events.Answered(word, *answer))
+
+    def journalled(self, item: Journalled) -> None:
+        """A lock that the disk did not take holds for this run only."""
+        if item.error and item.kind in (RecordKind.LOCKED, RecordKind.UNLOCKED):
+            text = f"not in the journal: {item.error}; it holds for this run only"
+            self._due = [replace(a, accepted=False, text=text) for a in self._due]
+
+    def take(self) -> list[events.Answered]:
+        """Those that are due; then there are none."""
+        due, self._due = self._due, []
+        return due
