@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
-from ahrsd.cli.progress import byte_progress
+from ahrsd.cli.long_work import byte_progress
 from ahrsd.config.loading import Config, load_config
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.baselines.registry import ComparisonRow
-    from ahrsd.offline.calibrate import BatchResult
+    from ahrsd.offline.batch_result import BatchResult
     from ahrsd.recording.column_names import ColumnMap
 
 _ALL = "all"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.files import columns_option, refuse_unwritable
-from ahrsd.cli.progress import byte_progress
+from ahrsd.cli.long_work import byte_progress
 from ahrsd.errors import AhrsdError
 from ahrsd.printable import counted
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 
-from ahrsd.daemon.serial_link import find_device
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, DeviceError
 from drivers.serial_port import (
     BaudNotFound,
@@ -18,6 +17,7 @@ from drivers.serial_port import (
     PortForbidden,
     PortLost,
     SerialPort,
+    find_device,
     spelled,
 )
 from drivers.vn100.commands import Command, Identity, identify, read_configuration

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
-from ahrsd.cli.progress import byte_progress
+from ahrsd.cli.long_work import byte_progress
 from ahrsd.daemon.heap import keep_heap
 from ahrsd.errors import AhrsdError
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.files import refuse_unwritable, write_json
-from ahrsd.cli.progress import count_progress
-from ahrsd.cli.task_options import limit_options
+from ahrsd.cli.long_work import count_progress, limit_options
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.printable import counted
 

@@ -20,8 +20,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from ahrsd.config.addresses import Address
-from ahrsd.config.sections import ShareSection
+from ahrsd.config.sections import Address, ShareSection
 from ahrsd.errors import ConfigError
 from ahrsd.sharing.share_output import ShareFacts
 from ahrsd.telemetry.protocol import Outbox

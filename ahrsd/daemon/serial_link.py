@@ -23,20 +23,20 @@ from ahrsd.config.sections import ShareSection
 from ahrsd.daemon.shares import Shares
 from ahrsd.inputs import ClientLeft, ClientSent
 from drivers.serial_port import (
-    LISTEN_S,
     SCANNED_BAUD,
-    BaudFound,
     PortLost,
     SerialPort,
-    detect_baud,
+    find_device,
 )
+from drivers.vn100.commands import Command, Procedure
+from drivers.vn100.device import Device
+from drivers.vn100.errors import DriverError
 
 BACKLOG_BYTES = 4 << 20  # what waits costs this much memory at most: minutes at 200 Hz
 _READ_BYTES = 128  # what one read costs besides its data
 _POLL_S = 0.2
 _PATIENT_POLL_S = 0.001
 _JOIN_S = 2.0
-_PATIENT_S = 1.1  # where nothing may be asked: a stream of 1 Hz must be heard
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,16 +162,6 @@ class SerialReader:
         return not self._thread.is_alive()
 
 
-def find_device(path: Path, baud: int | None, *, may_query: bool) -> BaudFound:
-    """The rate at which a device is heard on the port: `baud`, or where that is None, any.
-
-    Raises PortError and BaudNotFound: there is nobody to talk to.
-    """
-    listen_s = LISTEN_S if may_query else _PATIENT_S
-    rates = SCANNED_BAUD if baud is None else ()
-    return detect_baud(path, None, baud, listen_s, may_query=may_query, rates=rates)
-
-
 class SerialLink:
     """One port, opened as often as it takes. Everything that it hears comes out of `inbox`."""
 
@@ -236,6 +226,24 @@ class SerialLink:
         self._port = self._reader = None
         ended = reader is None or reader.stop()
         return port if ended else None  # a descriptor in use must not be closed, and so used again
+
+    def put_back(
+        self,
+        procedure: Procedure[object] | None,
+        allow: Callable[[Command], bool],
+        longest_s: float,
+    ) -> str:
+        """Give the port back behind one last procedure; returns why that failed, else nothing."""
+        port = self.take_port()
+        if port is None:
+            return ""
+        try:
+            with Device(port, allow) as device:
+                if procedure is not None:
+                    device.run(procedure, longest_s)
+        except DriverError as error:
+            return str(error)
+        return ""
 
     def close(self) -> list[Bytes | ClientSent | ClientLeft]:
         """Give the port back, and what was read and not taken yet; safe to call again."""

@@ -13,7 +13,7 @@ from ahrsd.baselines.data import stuck
 from ahrsd.baselines.registry import ComparisonRow, halves, spread_of
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import SamplesSeen
-from ahrsd.offline.calibrate import BatchResult
+from ahrsd.offline.batch_result import BatchResult
 from ahrsd.report.calibration_json import calibration_json
 from ahrsd.samples import Array, SampleBlock
 

@@ -35,7 +35,8 @@ from ahrsd.config.sections import LocationSection
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
 from ahrsd.evaluation.heading import QUATERNION, course, optical
 from ahrsd.heading import wrapped
-from ahrsd.offline.calibrate import BatchResult, calibrate
+from ahrsd.offline.batch_result import BatchResult
+from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published
 from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
 from ahrsd.samples import Array

@@ -20,10 +20,9 @@ import numpy as np
 import psutil
 
 from ahrsd.config.loading import check_config
-from ahrsd.daemon.core_runner import close_shell
+from ahrsd.daemon.core_runner import close_shell, open_shell
 from ahrsd.daemon.daemon import Daemon
 from ahrsd.daemon.host_clock import HostClock
-from ahrsd.daemon.service import open_shell
 from ahrsd.events import Event, SamplesSeen
 from drivers.vn100.emulator.pty import PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup, build

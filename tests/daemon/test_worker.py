@@ -20,7 +20,7 @@ from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import EstimationTask, EstimatorState
-from ahrsd.daemon.estimation_worker import MOST_WAITING, Worker
+from ahrsd.daemon.background import MOST_WAITING, Worker
 from ahrsd.events import Examine
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
 from ahrsd.samples import SampleBlock
@@ -78,7 +78,7 @@ def test_giving_never_waits_and_who_gives_too_much_is_told(worker):
 
 
 def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch):
-    monkeypatch.setattr("ahrsd.daemon.estimation_worker._STUCK_S", 0.05)
+    monkeypatch.setattr("ahrsd.daemon.background._STUCK_S", 0.05)
     gate = threading.Event()
     assert not worker.stuck
     worker.put(lambda: gate.wait() and None)
@@ -105,7 +105,7 @@ def test_a_thread_that_ended_is_told(worker, monkeypatch):
 
 
 def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch):
-    monkeypatch.setattr("ahrsd.daemon.estimation_worker._STUCK_S", 0.2)
+    monkeypatch.setattr("ahrsd.daemon.background._STUCK_S", 0.2)
     gate, fed = threading.Event(), []
     with live({"output": "imu"}) as daemon:
         public = Public(time.monotonic())
@@ -296,7 +296,7 @@ def test_a_replay_fails_at_the_same_place_without_failing_itself():
         again.handle(item)
     assert len(failures(run)) == 1
     assert again.decisions.sha256 == run.core.decisions.sha256
-    assert again.estimator.failures == 1
+    assert again.estimation.state.failures == 1
 
 
 def test_soon_again_means_a_longer_pause():

@@ -10,16 +10,42 @@ import click
 
 from ahrsd.cli.files import columns_option, make_folder
 from ahrsd.cli.fleet import answers
-from ahrsd.cli.fleet.examiner import EXAMINER, LOADS
-from ahrsd.cli.progress import fleet_progress
-from ahrsd.cli.task_options import limit_options
+from ahrsd.cli.long_work import fleet_progress, limit_options
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
-from ahrsd.fleet.work import ROLES, Orders, summary
+from ahrsd.fleet.row import Calibrated
+from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
+    from ahrsd.diagnosis.diagnosis import Diagnosis
     from ahrsd.fleet.driver import Progress
     from ahrsd.recording.column_names import ColumnMap
+
+
+# -- What is done with each recording --------------------------------------------------------------
+
+
+def calibrated(path: Path, orders: Orders) -> Calibrated:
+    """`ahrsd calibrate` of one recording of an archive."""
+    from ahrsd.config.loading import Config
+    from ahrsd.offline.calibrate import calibrate
+
+    return calibrate(path, Config(), rate_hz=orders.rate_hz, columns=orders.columns)
+
+
+def diagnosed(path: Path, orders: Orders) -> Diagnosis:
+    """`ahrsd diagnose` of one recording of an archive."""
+    from ahrsd.offline.diagnose import diagnose_recording
+
+    return diagnose_recording(path, rate_hz=orders.rate_hz, columns=orders.columns)
+
+
+EXAMINER = Examiner(calibrated, diagnosed)
+LOADS = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")  # slow to import
+
+
+# -- A run over an archive -------------------------------------------------------------------------
+
 
 _FOLDER = click.Path(path_type=Path)
 

@@ -1,7 +1,12 @@
-"""The thread that does the slow part of the core beside it (`estimation_queue`).
+"""Threads beside the daemon's loop: the estimation's tasks, and samples of an earlier run.
 
-Python lets one thread run at a time, and lets another one have its turn after `SWITCH_S`: that, and
-no longer, is what a byte waits for a long computation.
+**Tasks of the estimation** (`Worker`, `core.estimation`). Python lets one thread run at a time, and
+lets another one have its turn after `SWITCH_S`: that, and no longer, is what a byte waits for a
+long computation.
+
+**Samples of an earlier run** (`Recall`): the newest captures are read for a warm start, beside the
+run that begins. The thread ends by itself, within `LONGEST_S`; whatever goes wrong in it is a
+reason for a run that begins with nothing, never an end of the run.
 """
 
 from __future__ import annotations
@@ -9,10 +14,22 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from queue import SimpleQueue
 
+from ahrsd.config.loading import Config
+from ahrsd.core.estimation import supervised
+from ahrsd.daemon import host_clock
 from ahrsd.events import Failure
+from ahrsd.inputs import EarlierRun, EarlierSamples
+from ahrsd.recording.earlier_run import earlier_inputs
+from ahrsd.writeback.journal_history import Stamp
+
+# -- Tasks of the estimation -----------------------------------------------------------------------
+
 
 SWITCH_S = 0.0005
 MOST_WAITING = 40  # pieces, of up to two seconds of samples each: older verdicts are of no use
@@ -108,3 +125,48 @@ class Worker:
             return
         self._reasons.add(failure.reason)
         log.error("the estimator broke off: %s", failure.reason, extra={"trace": failure.trace})
+
+
+# -- Samples of an earlier run ---------------------------------------------------------------------
+
+
+LONGEST_S = 120.0
+
+
+class Recall:
+    """Reads; `take` gives one input at a time, once all of them are there."""
+
+    def __init__(
+        self, read: Callable[[Callable[[], bool]], list[EarlierSamples | EarlierRun]]
+    ) -> None:
+        self._read = read
+        self._found: deque[EarlierSamples | EarlierRun] = deque()
+        self._until_s = time.monotonic() + LONGEST_S
+        self._thread = threading.Thread(target=self._run, name="earlier runs", daemon=True)
+        self._thread.start()
+
+    @staticmethod
+    def of(config: Config, own: Path | None) -> Recall | None:
+        """As the configuration says; None where no earlier run is of use."""
+        limit_s = config.estimator.warm_start_s
+        if limit_s <= 0.0 or config.mode == "passive":
+            return None
+        now = Stamp(time.time(), host_clock.boot_id(), host_clock.boot_s())
+        folder, rate_hz = config.captures, config.estimator.step_rate_hz
+        return Recall(lambda go_on: earlier_inputs(folder, own, now, limit_s, rate_hz, go_on))
+
+    def _run(self) -> None:
+        found, failure = supervised(lambda: self._read(self._go_on))
+        if failure is not None:
+            log.error("no warm start: %s", failure.reason, extra={"trace": failure.trace})
+            found = [EarlierRun(0, why=failure.reason)]
+        self._found.extend(found or ())
+
+    def _go_on(self) -> bool:
+        return time.monotonic() < self._until_s
+
+    def take(self, host_ns: int) -> EarlierSamples | EarlierRun | None:
+        """The next input, as of now; None while there is none."""
+        if self._thread.is_alive() or not self._found:
+            return None
+        return replace(self._found.popleft(), host_ns=host_ns)
