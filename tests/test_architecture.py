@@ -55,7 +55,7 @@ SHELL = (
     "drivers.vn100.emulator.pty",
 )
 
-# What a reader has to hold in mind; `pytest -s -k figures` prints it. The diagnosis has its own plan.
+# What a reader has to hold in mind: `pytest -s -k figures`. The diagnosis has its own plan.
 ENGINE = "ahrsd.diagnosis"
 MOST_AT_THE_ROOT = 14  # modules beside the packages of ahrsd
 MOST_LINES_OF_A_FUNCTION = 60

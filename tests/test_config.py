@@ -220,7 +220,7 @@ def test_the_reference_is_up_to_date():
 def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp_path):
     from click.testing import CliRunner
 
-    from ahrsd.cli.run import command
+    from ahrsd.cli.device.run import command
 
     said = CliRunner().invoke(command, ["--state-directory", str(tmp_path), "--print-config"])
     assert said.exit_code == 0

@@ -31,7 +31,7 @@ import pyarrow.parquet
 from fleet_kills import write_archive
 from fleet_rows import computing, nothing, sleeping
 
-from ahrsd.cli.fleet import EXAMINER, LOADS
+from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
 from ahrsd.fleet.archive import Archive
 from ahrsd.fleet.crew import Place
 from ahrsd.fleet.driver import run

@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from ahrsd.cli import simulate
+from ahrsd.cli.recordings import simulate
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.offline.diagnose import diagnose_recording

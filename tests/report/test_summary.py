@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from streams import emitted, inputs
 
-from ahrsd.cli.watch import gates_table
+from ahrsd.cli.running.watch import gates_table
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fleet_rows import held
 
-import ahrsd.cli.fleet
+import ahrsd.cli.recordings.fleet
 from ahrsd.__main__ import main
 
 
@@ -24,5 +24,5 @@ def write_quick_archive(folder: Path, recordings: int, *, milliseconds: int) -> 
 
 
 if __name__ == "__main__":
-    ahrsd.cli.fleet.EXAMINER, ahrsd.cli.fleet.LOADS = held, ()  # type: ignore[assignment]
+    ahrsd.cli.recordings.fleet.EXAMINER, ahrsd.cli.recordings.fleet.LOADS = held, ()  # type: ignore[assignment]
     main(sys.argv[1:])

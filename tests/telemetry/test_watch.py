@@ -5,7 +5,7 @@ from collections import deque
 from rich.console import Console
 from shown_status import cells, level_ring, motion
 
-from ahrsd.cli.watch import Scroll, countdown, event_line, screen
+from ahrsd.cli.running.watch import Scroll, countdown, event_line, screen
 from ahrsd.telemetry.driving import Pace
 from ahrsd.telemetry.lines import motion_line
 

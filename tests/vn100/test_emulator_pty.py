@@ -279,5 +279,5 @@ def test_list_names_scenarios_and_faults():
 
 
 def test_importing_the_command_is_light():
-    code = "import sys, ahrsd.cli.emulate; sys.exit('numpy' in sys.modules)"
+    code = "import sys, ahrsd.cli.device.emulate; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path.cwd()).returncode == 0

@@ -26,7 +26,7 @@ from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
-from ahrsd.cli.running_daemon import DaemonPlace, place_options
+from ahrsd.cli.running.daemon import DaemonPlace, place_options
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import counted, line
 from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, drive_next, shown_of

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ahrsd.cli.device_access import describe
+from ahrsd.cli.device.access import describe
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, Record, register_values
 from ahrsd.errors import DeviceError

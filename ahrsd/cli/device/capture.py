@@ -14,7 +14,7 @@ from pathlib import Path
 
 import click
 
-from ahrsd.cli.device_access import PORT, describe, driver_errors, open_port, read_all
+from ahrsd.cli.device.access import PORT, describe, driver_errors, open_port, read_all
 from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.daemon import host_clock
 from ahrsd.errors import EXIT_BUSY, EXIT_DONE, EXIT_NO, DeviceError

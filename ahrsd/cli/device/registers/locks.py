@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ahrsd.cli.registers.sources import journals
+from ahrsd.cli.device.registers.sources import journals
 from ahrsd.config.loading import default_state_directory
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, journal_path

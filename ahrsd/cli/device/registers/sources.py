@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ahrsd.cli.device_access import open_device, read_all
-from ahrsd.cli.registers.changes import Changes, to_write
+from ahrsd.cli.device.access import open_device, read_all
+from ahrsd.cli.device.registers.changes import Changes, to_write
 from ahrsd.daemon.journal import Journal, Record, journal_path, register_values
 from ahrsd.errors import AhrsdError, JournalError
 from ahrsd.foreign_file import ForeignFileError, read_regular

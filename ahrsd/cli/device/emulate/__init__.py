@@ -39,7 +39,7 @@ def _device(setup: Setup, effects: Sequence[str]) -> Emulator:
     try:
         if not effects:
             return build(setup)
-        from ahrsd.cli.emulate.effects import EmulatedEffects
+        from ahrsd.cli.device.emulate.effects import EmulatedEffects
 
         return build(setup, EmulatedEffects(setup, effects))
     except ValueError as error:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ahrsd.cli.running_daemon import DaemonPlace, in_url, ip_address, place_options
+from ahrsd.cli.running.daemon import DaemonPlace, in_url, ip_address, place_options
 from ahrsd.errors import AhrsdError, DeviceError
 
 if TYPE_CHECKING:

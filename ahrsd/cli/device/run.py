@@ -55,7 +55,7 @@ def command(
         return
     if config.device.port is None:
         raise click.UsageError("no port: give --port, or device.port in the configuration")
-    from ahrsd.cli.device_access import driver_errors
+    from ahrsd.cli.device.access import driver_errors
     from ahrsd.daemon.service import run_daemon
 
     with driver_errors():

@@ -20,11 +20,11 @@ from typing import TypeVar
 
 import click
 
-from ahrsd.cli.device_access import PORT, describe, open_device
+from ahrsd.cli.device.access import PORT, describe, open_device
+from ahrsd.cli.device.registers import locks
+from ahrsd.cli.device.registers.changes import Changes, apply, gate, save_to_flash, to_write
+from ahrsd.cli.device.registers.sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.cli.files import refuse_unwritable, write_text
-from ahrsd.cli.registers import locks
-from ahrsd.cli.registers.changes import Changes, apply, gate, save_to_flash, to_write
-from ahrsd.cli.registers.sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.config.loading import default_state_directory
 from ahrsd.daemon.journal import (
     Journal,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from ahrsd.cli.files import columns_option, make_folder
-from ahrsd.cli.fleet import answers
 from ahrsd.cli.long_work import fleet_progress, limit_options
+from ahrsd.cli.recordings.fleet import answers
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.fleet.row import Calibrated
 from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
