@@ -7,9 +7,9 @@ all of them together, as JSON and as a table.
 Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """
 
+from ahrsd.calibration_json import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.heading import Fixes, HeadingReference
 from ahrsd.evaluation.judging import Evaluation, judge
-from ahrsd.evaluation.stored import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, tracked
 
 __all__ = [

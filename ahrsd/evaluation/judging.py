@@ -13,6 +13,7 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from ahrsd.baselines.data import field_spread
+from ahrsd.calibration_json import StoredCalibration
 from ahrsd.evaluation import dead_reckoning
 from ahrsd.evaluation.dead_reckoning import ReckoningFigures
 from ahrsd.evaluation.heading import (
@@ -23,7 +24,6 @@ from ahrsd.evaluation.heading import (
     compare,
     rms_difference,
 )
-from ahrsd.evaluation.stored import StoredCalibration
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
 from ahrsd.printable import counted
 from ahrsd.samples import Array

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.calibration import Estimate
+from ahrsd.calibration_json import calibration_json, why_not_converged
 from ahrsd.core.core import Core
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.model_checks import Misalignment
 from ahrsd.events import Event
-from ahrsd.report.calibration_json import calibration_json, why_not_converged
 from ahrsd.report.summary import serial_of, warnings_of
 
 

@@ -8,16 +8,16 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.core.core import Core
-from ahrsd.events import GateResult
-from ahrsd.gates import Level, guards_a_write
-from ahrsd.printable import counted
-from ahrsd.report.calibration_json import (
+from ahrsd.calibration_json import (
     HeadingErrors,
     calibration_json,
     heading_words,
     why_not_converged,
 )
+from ahrsd.core.core import Core
+from ahrsd.events import GateResult
+from ahrsd.gates import Level, guards_a_write
+from ahrsd.printable import counted
 from ahrsd.stream.decompensation import Compensation
 
 _TABLE_IS_RAW = (

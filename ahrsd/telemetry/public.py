@@ -25,11 +25,11 @@ from ahrsd.samples import SampleBlock
 from ahrsd.stream.decompensation import user_compensation
 from ahrsd.telemetry.client import default_socket_path
 from ahrsd.telemetry.feeds import Feed, Outlet
-from ahrsd.telemetry.lines import service_line
 from ahrsd.telemetry.metrics import MetricsServer
 from ahrsd.telemetry.protocol import Newest, samples_record
 from ahrsd.telemetry.server import SocketServer
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
+from ahrsd.telemetry.words import service_line
 
 # -- systemd ---------------------------------------------------------------------------------------
 

@@ -21,9 +21,8 @@ from ahrsd.offline.replay import replay
 from ahrsd.recording import capture
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.samples import SampleBlock
-from ahrsd.telemetry.explain import explain_json, explain_lines
-from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
+from ahrsd.telemetry.words import explain_json, explain_lines, status_lines
 from ahrsd.writeback.journal_history import Stamp
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.registers import Unit

@@ -30,9 +30,8 @@ from ahrsd.inputs import Samples
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.simulation import Experiment
-from ahrsd.telemetry.explain import explain_json, explain_lines
-from ahrsd.telemetry.lines import mismatch_line
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
+from ahrsd.telemetry.words import explain_json, explain_lines, mismatch_line
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import Mode
 

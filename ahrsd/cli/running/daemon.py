@@ -156,7 +156,7 @@ def status(place: DaemonPlace, json_path: str | None) -> None:
 
     Exit 75 where no daemon answers.
     """
-    from ahrsd.telemetry.lines import status_lines
+    from ahrsd.telemetry.words import status_lines
 
     print_answer(place, "status", json_path, status_lines)
 
@@ -169,7 +169,7 @@ def explain(place: DaemonPlace, json_path: str | None) -> None:
 
     Exit 75 where no daemon answers.
     """
-    from ahrsd.telemetry.explain import explain_lines
+    from ahrsd.telemetry.words import explain_lines
 
     print_answer(place, "explain", json_path, explain_lines)
 

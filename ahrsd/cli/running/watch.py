@@ -30,8 +30,7 @@ from ahrsd.cli.running.daemon import DaemonPlace, place_options
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import counted, line
 from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, drive_next, shown_of
-from ahrsd.telemetry.explain import explain_json, holding
-from ahrsd.telemetry.lines import heading_line, reading_lines, status_lines
+from ahrsd.telemetry.words import explain_json, heading_line, holding, reading_lines, status_lines
 
 # -- Keys of a terminal ----------------------------------------------------------------------------
 
