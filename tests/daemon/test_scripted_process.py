@@ -1,6 +1,6 @@
 """`ahrsd run` as a program on a scripted device: exchange, second master, clocks, changed iron.
 
-The promises of tests/writeback/test_write_moments.py, each once with real processes, files and
+The promises of tests/writeback/histories/test_write_moments.py, each once with real processes, files and
 time: half a minute to two minutes each (`pytest -m slow`).
 """
 

@@ -15,7 +15,7 @@ from quiet_device import Host, bodies, command, device, quiet
 from drivers.vn100.emulator.emulator import BOOT_S
 from drivers.vn100.emulator.physics import EmulatedTruth, draw_truth
 
-WIRE = Path(__file__).parents[2] / "fixtures" / "vn100" / "wire_examples.json"
+WIRE = Path(__file__).parents[3] / "fixtures" / "vn100" / "wire_examples.json"
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from ahrsd.gates import GATES, GateLimits
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import Mode
 
-PROJECT = Path(__file__).parent.parent
+PROJECT = Path(__file__).parents[2]
 
 
 def load(tmp_path: Path, text: str) -> Config:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ahrsd.printable import counted
 
-PROJECT = Path(__file__).parent.parent
+PROJECT = Path(__file__).parents[2]
 THINGS = "sample|row|line|message|column|record|gap|reading|thing|packet|place|finding"
 PLURAL = re.compile(rf" (?:(?!holds)\w+ )?(?:{THINGS})s\b")
 #: in front of a number that is a limit or a whole, and so never one

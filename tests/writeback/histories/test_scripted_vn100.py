@@ -25,7 +25,7 @@ from scripted_vn100.wire import BadLine, crc16, layout_of, packet, parse_command
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 
-VECTORS = Path(__file__).parents[2] / "fixtures" / "vn100" / "wire_examples.json"
+VECTORS = Path(__file__).parents[3] / "fixtures" / "vn100" / "wire_examples.json"
 IRON = Iron(
     np.array([[1.1, 0.02, 0.0], [0.02, 0.95, 0.01], [0.0, 0.01, 1.0]]),
     np.array([0.05, -0.03, 0.04]),

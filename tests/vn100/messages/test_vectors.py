@@ -24,7 +24,7 @@ from drivers.vn100.decode import ErrorReply, Measurement, Undecodable, Unused, d
 from drivers.vn100.deframer import Cause, Deframer, Packet, Sentence
 from drivers.vn100.messages import Reply
 
-PROJECT = Path(__file__).parent.parent.parent
+PROJECT = Path(__file__).parents[3]
 OWN = PROJECT / "fixtures" / "vn100" / "manual_examples.toml"
 WIRE = PROJECT / "fixtures" / "vn100" / "wire_examples.json"
 

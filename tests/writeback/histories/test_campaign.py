@@ -10,7 +10,7 @@ import campaign_faults
 import campaign_histories
 import pytest
 
-RESULT = Path(__file__).parents[2] / "docs" / "validation" / "campaign" / "campaign.json"
+RESULT = Path(__file__).parents[3] / "docs" / "validation" / "campaign" / "campaign.json"
 
 
 def test_power_cuts_leave_no_device_that_disagrees_without_an_alarm():

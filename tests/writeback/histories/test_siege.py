@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-PATH = Path(__file__).parents[1] / "benchmarks" / "bench_siege.py"
+PATH = Path(__file__).parents[2] / "benchmarks" / "bench_siege.py"
 
 
 @pytest.mark.benchmark
