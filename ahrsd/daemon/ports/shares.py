@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ahrsd.config.sections import ShareSection
-from ahrsd.daemon.network_shares import Listener, NetworkShares, Target
+from ahrsd.daemon.ports.network_shares import Listener, NetworkShares, Target
 from ahrsd.errors import ConfigError
 from ahrsd.events import SendToClient
 from ahrsd.inputs import ClientLeft, ClientSent

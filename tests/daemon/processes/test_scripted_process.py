@@ -1,7 +1,7 @@
 """`ahrsd run` as a program on a scripted device: exchange, second master, clocks, changed iron.
 
-The promises of tests/writeback/histories/test_write_moments.py, each once with real processes, files and
-time: half a minute to two minutes each (`pytest -m slow`).
+The promises of tests/writeback/histories/test_write_moments.py, each once with real processes,
+files and time: half a minute to two minutes each (`pytest -m slow`).
 """
 
 from __future__ import annotations
