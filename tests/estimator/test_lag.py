@@ -25,7 +25,7 @@ UPPER = np.triu_indices(3)
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     return importlib.import_module("bench_estimator")
 
 

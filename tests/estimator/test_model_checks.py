@@ -24,7 +24,7 @@ STEP_GAUSS = np.array([0.05, -0.04, 0.08])
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     return importlib.import_module("bench_estimator")
 
 

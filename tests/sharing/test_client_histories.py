@@ -1,4 +1,4 @@
-"""Two clients at random moments of a write-back; the long form is tests/benchmarks/clients.py."""
+"""Two clients at random moments of a write-back; the long form is clients.py."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A fleet's run under SIGKILL: recordings, a driver started again, who is killed, what holds.
 
-Used by the short test and by the full one (tests/benchmarks/fleet_kill.py).
+Used by the short test and by the full one (tests/benchmarks/fleet/fleet_kill.py).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from drivers.vn100.deframer import Deframer, Packet, Sentence
 from drivers.vn100.errors import ERRORS, DeviceRefused, DriverError, Remedy, device_error
 from drivers.vn100.messages import Reply, binary_layout, encode, encode_packet, sentence_layout
 
-BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "bench_parse.py"
+BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "daemon" / "bench_parse.py"
 
 
 def decoded(body: str) -> Decoded:

@@ -1,4 +1,4 @@
-"""Short form of tests/benchmarks/bench_siege.py: all that hangs on the daemon fails at once."""
+"""Short form of benchmarks/writeback/bench_siege.py: all that hangs on the daemon fails at once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "bench_siege.py"
+PATH = Path(__file__).parents[2] / "benchmarks" / "writeback" / "bench_siege.py"
 
 
 @pytest.mark.benchmark

@@ -1,4 +1,4 @@
-"""Short form of the histories that tests/benchmarks/histories.py runs by the hundred thousand."""
+"""Short form of the histories that histories.py runs by the hundred thousand."""
 
 from __future__ import annotations
 

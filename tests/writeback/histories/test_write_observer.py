@@ -23,7 +23,7 @@ GOOD = {
 }
 FACTORY = "1,0,0,0,1,0,0,0,1,0,0,0"
 FOREIGN = "1,0,0,0,1,0,0,0,1,0.3,0.1,0"
-BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "histories.py"
+BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "writeback" / "histories.py"
 
 
 class Story:
