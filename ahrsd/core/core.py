@@ -1,9 +1,10 @@
 """The pure core: inputs in, events out. `run` and `replay` feed it the same way.
 
-It joins the parts and decides nothing itself: `device_session` talks to the device, `stream` makes
-samples, `calibrator` estimates and judges, `writeback` says what may be written. Its time is that
-of the inputs. Whatever it answers depends on the list of inputs alone, which is why a replay takes
-the same decisions; `decisions` holds them and their hash.
+It joins the parts and decides nothing itself: `device_session` talks to the device, `sample_source`
+makes samples, `estimation` estimates and judges, the write-back says what may be written and
+`write_back` carries that out. The core's time is that of the inputs. Whatever it answers depends on
+the list of inputs alone, which is why a replay takes the same decisions; `decisions` holds them and
+their hash.
 """
 
 from __future__ import annotations
