@@ -15,7 +15,7 @@ from pathlib import Path
 from fitting_calibrator import FittingCalibrator
 
 from ahrsd.__main__ import main
-from ahrsd.core import core
+from ahrsd.core import estimation
 
 
 def wall_clock_of(path: Path) -> None:
@@ -33,5 +33,5 @@ def wall_clock_of(path: Path) -> None:
 
 if __name__ == "__main__":
     wall_clock_of(Path(sys.argv[1]))
-    core.Calibrator = FittingCalibrator  # type: ignore[misc]
+    estimation.Calibrator = FittingCalibrator  # type: ignore[misc]
     main(sys.argv[2:])

@@ -27,7 +27,7 @@ from write_observer import Observer
 from ahrsd import events, inputs
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core import core as core_module
+from ahrsd.core import estimation
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
 from ahrsd.sharing.client_commands import SharePolicy
@@ -53,12 +53,12 @@ class Killed(Exception):
 @contextmanager
 def fitted() -> Iterator[None]:
     """While it lasts, every core fits spheres instead of running the estimator."""
-    true = core_module.Calibrator
-    core_module.Calibrator = FittingCalibrator  # type: ignore[misc]
+    true = estimation.Calibrator
+    estimation.Calibrator = FittingCalibrator  # type: ignore[misc]
     try:
         yield
     finally:
-        core_module.Calibrator = true  # type: ignore[misc]
+        estimation.Calibrator = true  # type: ignore[misc]
 
 
 @dataclass

@@ -40,9 +40,8 @@ from ahrsd import inputs
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config, check_config
 from ahrsd.core.core import Core
-from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
+from ahrsd.daemon.core_runner import DAEMON_KEEPS, JournalKeeper, Shell, journal_in
 from ahrsd.daemon.heap import needed_bytes, take_heap
-from ahrsd.daemon.service import DAEMON_KEEPS
 from ahrsd.estimator.online import Estimator
 from ahrsd.events import Estimated, Event
 from ahrsd.recording.capture import CaptureWriter
