@@ -17,7 +17,7 @@ read like the device reads them, so what goes out on its behalf is always a comm
 | any other write, VNKMD, VNKAD | the device's for the owner; VNERR 09 for everybody else |
 
 Sources: UM001 "System Commands"; what drivers send at their start
-(tests/support/drivers_at_start.py).
+(tests/support/devices/drivers_at_start.py).
 """
 
 from __future__ import annotations

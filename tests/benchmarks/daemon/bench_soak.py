@@ -48,7 +48,7 @@ from ahrsd.recording.capture import CaptureWriter
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.messages import crc16
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 from live_heap import heap_bytes
 from reference_work import ReferenceWork
 

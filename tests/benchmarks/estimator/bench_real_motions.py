@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from mismatch_trials import covariates
 

@@ -25,7 +25,7 @@ import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 import numpy as np
 import pyarrow

@@ -3,7 +3,7 @@
     python tests/benchmarks/writeback/bench_drivers.py [--seconds S] [--rate HZ] [--json FILE]
 
 An emulated device, `ahrsd run` beside it, and two programs: one on the owner's port, which starts
-as each of four real drivers in turn (tests/support/drivers_at_start.py), and one on a second port
+as each of four real drivers in turn (drivers_at_start.py), and one on a second port
 that asks who the device is and what it holds. Each asks again where no answer came within 50 ms.
 Exit code 1 where a question was not answered, was answered wrongly, or an answer came to nothing
 that was asked.
@@ -27,7 +27,7 @@ import tty
 from collections import Counter
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from drivers_at_start import (
     ARDUPILOT,

@@ -5,7 +5,7 @@
 
 Each part is done in chunks; the file is written after each, and a later call with the same seed and
 file goes on where this one ended (or with `--seconds`, was ended). What a run of a part is, and
-what counts as wrong, is said in tests/support/campaign_*.py; figures: docs/validation/campaign.md.
+what counts as wrong, is said in campaign_*.py; figures: docs/validation/campaign.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 Tally = dict[str, Any]
 

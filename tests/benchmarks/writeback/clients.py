@@ -1,4 +1,4 @@
-"""Random histories of two clients beside a daemon that writes (tests/support/client_histories.py).
+"""Random histories of two clients beside a daemon that writes (support: client_histories).
 
     python tests/benchmarks/writeback/clients.py
         [--histories N] [--first SEED] [--passes] [--json FILE]
@@ -15,7 +15,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from client_histories import ClientHistory
 

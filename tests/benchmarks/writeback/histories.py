@@ -2,7 +2,7 @@
 
     python tests/benchmarks/writeback/histories.py --histories 100000 --seed 1 --json FILE
 
-Parts: `histories` (tests/support/write_histories.py), `moments` (every event at every moment of an
+Parts: `histories` (write_histories.py), `moments` (every event at every moment of an
 ordinary history, with --moments), `clients` (a driver that saves all of RAM, --clients N), `aside`
 (every event at every moment of what follows from such a save in a trial, with --aside) and `real`
 (whole histories with the estimator itself, --real N).
@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from campaign import added
 

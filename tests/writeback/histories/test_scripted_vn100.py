@@ -42,9 +42,9 @@ def ask(device: Unit, body: str) -> str:
     return answer
 
 
-@pytest.mark.parametrize("name", ["scripted_vn100", "write_observer.py"])
+@pytest.mark.parametrize("name", ["devices/scripted_vn100", "histories/write_observer.py"])
 def test_device_and_observer_import_nothing_of_the_project(name):
-    place = Path(write_observer.__file__).parent / name
+    place = Path(write_observer.__file__).parents[1] / name
     files = sorted(place.glob("*.py")) if place.is_dir() else [place]
     assert files
     for file in files:

@@ -20,7 +20,7 @@ from scripted_vn100 import Cable, Iron, Motion, Served, Unit, Vehicle
 from write_observer import Observer
 
 SUPPORT = Path(__file__).parent
-PROJECT = SUPPORT.parent.parent
+PROJECT = SUPPORT.parents[2]
 SERIAL = 100130608
 OUTPUT = {
     "binary": {6: "0", 7: "40", 75: "1,20,06,0001,083F"},

@@ -1,7 +1,7 @@
 """The golden replays: streams of our own emulated device, and what a replay must find in each.
 
-    python tests/support/golden.py             streams that are missing, and every decision anew
-    python tests/support/golden.py --streams   every stream anew, too
+    python tests/support/files/golden.py           streams that are missing, every decision anew
+    python tests/support/files/golden.py --streams every stream anew, too
 
 A stream is made once, in virtual time; `STREAMS` says how. `fixtures/replays/golden.toml` has, for
 each, counts, the gates that are red at the end, the estimate, and the hash of all decisions, which
@@ -30,7 +30,7 @@ from ahrsd.core.core import Core
 from ahrsd.offline.replay import replay
 from drivers.vn100.emulator.scenarios import Setup, build
 
-FOLDER = Path(__file__).parents[2] / "fixtures" / "replays"
+FOLDER = Path(__file__).parents[3] / "fixtures" / "replays"
 TABLE = FOLDER / "golden.toml"
 
 
@@ -166,7 +166,7 @@ def _toml(value: object) -> str:
 def main(arguments: Sequence[str]) -> None:
     """Write streams and table."""
     lines = [
-        "# Written by tests/support/golden.py, which says what is in here; not by hand.",
+        "# Written by tests/support/files/golden.py, which says what is in here; not by hand.",
         f'arithmetic = "{arithmetic()}"',
     ]
     for name in STREAMS:
