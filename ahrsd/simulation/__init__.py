@@ -8,7 +8,14 @@ Pure: nothing here reads or writes a file.
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023; [L] Lichlyter, thesis, Mississippi State 2022.
 """
 
-from ahrsd.simulation.experiment import Experiment, Iron, Truth
-from ahrsd.simulation.scenarios import MOTIONS, SCENARIOS, ScenarioSettings, simulate
+from ahrsd.simulation.scenarios import (
+    MOTIONS,
+    SCENARIOS,
+    Experiment,
+    Iron,
+    ScenarioSettings,
+    Truth,
+    simulate,
+)
 
 __all__ = ["MOTIONS", "SCENARIOS", "Experiment", "Iron", "ScenarioSettings", "Truth", "simulate"]

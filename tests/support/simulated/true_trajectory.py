@@ -6,7 +6,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.samples import Array
-from ahrsd.simulation.experiment import Experiment
+from ahrsd.simulation.scenarios import Experiment
 
 
 def predicted_directions(experiment: Experiment) -> Array:

@@ -21,8 +21,7 @@ from seed_figures.turning import Turning, sensed
 
 from ahrsd import so3
 from ahrsd.calibration import Affine
-from ahrsd.evaluation.dead_reckoning import DOPPLER, reckon, velocity_of
-from ahrsd.evaluation.heading import Fixes, HeadingReference, compare
+from ahrsd.evaluation.heading import DOPPLER, Fixes, HeadingReference, compare, reckon, velocity_of
 from ahrsd.evaluation.track import EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.montecarlo.accuracy import MethodAnswer

@@ -23,8 +23,7 @@ from ahrsd.baselines.attitude_independent import fnp_rows, linear_centre, minimi
 from ahrsd.montecarlo.runs import batch_method
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, Iron
-from ahrsd.simulation.experiment import measured
-from ahrsd.simulation.scenarios import generator, integrate
+from ahrsd.simulation.scenarios import generator, integrate, measured
 
 Rows = Callable[[Array, Array, Array], tuple[Array, Array]]
 

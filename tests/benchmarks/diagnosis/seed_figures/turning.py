@@ -9,8 +9,7 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.samples import Array
 from ahrsd.simulation import MOTIONS, Experiment, Iron
-from ahrsd.simulation.experiment import measured
-from ahrsd.simulation.scenarios import SUBSTEPS, generator, mean_rate
+from ahrsd.simulation.scenarios import SUBSTEPS, generator, mean_rate, measured
 
 #: the theses' sensor with b = m_b, as Table 5.1 was made
 SENSOR = Iron(offset_behind_iron=True)
