@@ -36,7 +36,7 @@ SHELL = (
     "ahrsd.fleet.page",
     "ahrsd.fleet.questions",
     "ahrsd.fleet.store",
-    "ahrsd.fleet.told",
+    "ahrsd.fleet.words",
     "ahrsd.fleet.work",
     "ahrsd.foreign_file",
     "ahrsd.montecarlo.runs",

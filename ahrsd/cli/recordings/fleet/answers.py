@@ -20,7 +20,7 @@ def status(output: Path, json_path: str | None, folder: Path | None) -> None:
     """How many rows there are, of what, and whether a run is at work."""
     from ahrsd.fleet.questions import FleetRows
     from ahrsd.fleet.store import Store
-    from ahrsd.fleet.told import status_lines
+    from ahrsd.fleet.words import status_lines
 
     refuse_unwritable(json_path)
     store = Store(output)
@@ -67,7 +67,7 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
     failures    what gave no answer, and why
     SELECT ...  one query over the table `recordings`; nothing can be written
     """
-    from ahrsd.fleet import told
+    from ahrsd.fleet import words
     from ahrsd.fleet.questions import AnswerTable, FleetRows
     from ahrsd.fleet.store import Store
 
@@ -77,17 +77,17 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
         if question == "drift":
             found = rows.drift()
             body = [one.json() for one in found]
-            lines = told.drift_lines(found, rows.of_no_device())
+            lines = words.drift_lines(found, rows.of_no_device())
         else:
             if question == "recurring":
                 answer = rows.recurring()
-                lines = told.recurring_lines(answer)
+                lines = words.recurring_lines(answer)
             elif question == "failures":
                 answer = rows.failures()
-                lines = told.failure_lines(answer)
+                lines = words.failure_lines(answer)
             else:
                 answer = rows.sql(question)
-                lines = told.table_lines(answer.columns, answer.rows)
+                lines = words.table_lines(answer.columns, answer.rows)
             body = answer.json()
     if json_path is not None:
         write_json(json_path, body)
