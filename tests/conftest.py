@@ -186,8 +186,8 @@ class LiveDaemon:
         self.core = self.shell.core
         self.events: list[object] = []
         self.shell.listeners.append(self.events.append)
-        files = VehicleFiles(self, max_age_s=config.interlock.max_age_s)
-        self.daemon = Daemon(config, self.shell, self.port, clock, files)
+        self.files = VehicleFiles(self, max_age_s=config.interlock.max_age_s)
+        self.daemon = Daemon(config, self.shell, self.port, clock, self.files)
         self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="live-daemon")
 

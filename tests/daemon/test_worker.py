@@ -110,7 +110,7 @@ def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch
     with live({"output": "imu"}) as daemon:
         public = Public(time.monotonic())
         public.notifier.feed = lambda: fed.append(time.monotonic())
-        daemon.daemon._public = public
+        daemon.daemon._telemetry = public
         daemon.until(lambda: len(fed) > 20)
         daemon.core.calibrator.take = lambda _: gate.wait(PATIENCE_S)
         daemon.until(lambda: daemon.shell.worker.stuck)

@@ -25,7 +25,7 @@ def served(live, tmp_path):
     public = Public(time.monotonic())
     public.open_socket(tmp_path / "socket", tmp_path)
     daemon.shell.listeners.append(public.event)
-    daemon.daemon._public = public
+    daemon.daemon._telemetry = public
     with daemon:
         yield daemon, tmp_path / "socket"
     public.close()
