@@ -37,7 +37,7 @@ class CoreSettings:
     columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
     warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
     shares: the ports on which other programs find the device
-    beside: the slow part of the work is done beside the core (`estimation_queue`), not at once
+    beside: the slow part of the work is done beside the core (`estimation`), not at once
     """
 
     calibrator: CalibratorSettings

@@ -29,7 +29,6 @@ CALIBRATION: Final = (23, 84)
 GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # for no client: line rate and calibration
 PASSABLE: Final = tuple(n for n in GUARDED if n != 5)  # but for one whose share says so
 
-
 NEEDS: Final[dict[Purpose, Mode]] = {
     Purpose.READ: Mode.OBSERVE,
     Purpose.STREAM: Mode.OBSERVE,
