@@ -1,6 +1,6 @@
 """Simulated experiments with their truth: the theses' scenarios, deterministic by seed.
 
-`scenarios` makes the experiments WAM, MAM and LAM of [R] and [L]'s from a recorded gyro stream, with
+`scenarios` makes the experiments WAM, MAM and LAM of [R] and [L]'s from a recorded gyro stream, and
 what goes wrong on real streams; an `Experiment` is what a sensor would have sent and what is hidden
 behind it, and is laid out in the columns of a table recording.
 Pure: nothing here reads or writes a file.
