@@ -7,7 +7,7 @@ Undoing:     in = C^-1 out + B;   with the reference frame rotation R of registe
              u = R C (m - B)  =>  m = C^-1 R^T u + B.
 Composition: a fit (C2, B2) on data that already passed (C1, B1) gives C' = C2 C1 and
              B' = B1 + C1^-1 B2, because C2 (C1 (m - B1) - B2) = C2 C1 (m - (B1 + C1^-1 B2)).
-Checked by tests/test_calibration.py.
+Checked by tests/vocabulary/test_calibration.py.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ with it: with d = -f / |f|, m_l = m - d (d.m), x_l = x - d (d.x),
     heading = atan2(d . (m_l x x_l), m_l . x_l)
 
 the angle from magnetic north to the sensor's forward axis, positive to the east, as the thesis' [R]
-2.1-2.2 gives it by roll and pitch (tests/test_headings.py compares the two).
+2.1-2.2 gives it by roll and pitch (tests/vocabulary/test_headings.py compares the two).
 """
 
 from __future__ import annotations

@@ -8,13 +8,13 @@ Quaternions are scipy's everywhere (`Rotation.from_quat`, `as_quat`). Here are
 * Exp, of the same terms as the Jacobian. Scipy's is faster, but its last digit is another, and on
   that rest the recorded decisions of the estimator.
 
-`python tests/benchmarks/bench_rotations.py` prints these ratios.
+`python tests/benchmarks/estimator/bench_rotations.py` prints these ratios.
 
 Exp(phi) = I + a [phi]x + b [phi]x^2,  a = sin(t)/t,  b = (1 - cos(t))/t^2,  t = |phi|
 Jl(phi)  = I + b [phi]x + c [phi]x^2,  c = (t - sin(t))/t^3
 with Exp(phi + d) = Exp(Jl(phi) d) Exp(phi) to first order in d (checked numerically in
-tests/test_so3.py). Below t = 1e-3 the coefficients are their Taylor series, whose first neglected
-terms are below 1e-15 there.
+tests/vocabulary/test_so3.py). Below t = 1e-3 the coefficients are their Taylor series, whose first
+neglected terms are below 1e-15 there.
 """
 
 from __future__ import annotations

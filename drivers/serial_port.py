@@ -183,6 +183,7 @@ def _file(path: str | Path, sysfs: Path) -> Path:
 READ_BYTES = 65536
 WRITE_TIMEOUT_S = 2.0
 LISTEN_S = 0.3
+_PATIENT_S = 1.1  # where nothing may be asked: a stream of 1 Hz must be heard
 SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
 _URL = re.compile(r"^(socket|rfc2217):/+")  # a Path has only one slash left
 _WHOLE_URL = re.compile(r"^(socket|rfc2217)://(\[[^\]]+\]|[^:/\[\]]+):\d+/?(\?.*)?$")
@@ -438,6 +439,16 @@ def detect_baud(
                         return BaudFound(baud, f"{how} through a device server", tuple(tried))
                     return BaudFound(baud, f"{how} at {baud} baud, {reason}", tuple(tried))
     raise BaudNotFound(str(path), tuple(tried), may_query)
+
+
+def find_device(path: Path, baud: int | None, *, may_query: bool) -> BaudFound:
+    """The rate at which a device is heard on the port: `baud`, or where that is None, any.
+
+    Raises PortError and BaudNotFound: there is nobody to talk to.
+    """
+    listen_s = LISTEN_S if may_query else _PATIENT_S
+    rates = SCANNED_BAUD if baud is None else ()
+    return detect_baud(path, None, baud, listen_s, may_query=may_query, rates=rates)
 
 
 def _listen(port: SerialPort, baud: int, listen_s: float) -> RateHeard:

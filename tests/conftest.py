@@ -158,9 +158,10 @@ class LiveDaemon:
 
     def __init__(self, folder: Path, setup: dict[str, object], tables: dict[str, object]) -> None:
         from ahrsd.config.loading import check_config
+        from ahrsd.daemon.core_runner import open_shell
         from ahrsd.daemon.daemon import Daemon
         from ahrsd.daemon.host_clock import HostClock
-        from ahrsd.daemon.service import open_shell
+        from ahrsd.daemon.vehicle_files import VehicleFiles
         from drivers.vn100.emulator.pty import PtyEmulator
         from drivers.vn100.emulator.scenarios import Setup, build
 
@@ -185,7 +186,8 @@ class LiveDaemon:
         self.core = self.shell.core
         self.events: list[object] = []
         self.shell.listeners.append(self.events.append)
-        self.daemon = Daemon(config, self.shell, self.port, clock, self)
+        self.files = VehicleFiles(self, max_age_s=config.interlock.max_age_s)
+        self.daemon = Daemon(config, self.shell, self.port, clock, self.files)
         self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="live-daemon")
 

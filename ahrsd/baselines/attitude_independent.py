@@ -47,8 +47,14 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
-from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings, mag_noise
-from ahrsd.baselines.soft_iron import answer
+from ahrsd.baselines.data import (
+    MethodData,
+    MethodError,
+    MethodFit,
+    MethodSettings,
+    answer,
+    mag_noise,
+)
 from ahrsd.estimator.chain import upper_triangle
 from ahrsd.samples import Array
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
+from ahrsd.estimator.chain import symmetric
 from ahrsd.printable import counted
 from ahrsd.samples import Array
 
@@ -309,3 +310,33 @@ def _runs(data: MethodData) -> tuple[NDArray[np.intp], Array]:
     begins = [np.arange(s.start, s.stop - steps, steps) for s in data.segments()]
     begin = np.concatenate(begins).astype(np.intp)
     return begin, turn[begin + np.arange(1, steps + 1)[:, None]]
+
+
+def answer(c6: Array, pseudo: Array) -> tuple[Array, Array]:
+    """A of unit volume and b = A b' of c and b' at any common scale.
+
+    MethodError where C is not positive definite or the answer no sensor's.
+    """
+    C = symmetric(c6)
+    if not (np.isfinite(c6).all() and np.isfinite(pseudo).all()):
+        raise MethodError("diverged: the answer is not finite")
+    values = np.linalg.eigvalsh(C)
+    if values[0] <= 0:
+        raise MethodError("the matrix that fits best is not positive definite: no soft iron")
+    if values[-1] > _LARGEST_CONDITION * values[0]:
+        raise MethodError(
+            f"the soft iron that fits best is distorted {values[-1] / values[0]:.0f} : 1: "
+            "the motion does not determine it"
+        )
+    A = np.asarray(np.linalg.inv(C), dtype=np.float64)
+    b = A @ pseudo  # the scale of C and b' cancels here
+    return rescaled(A), b
+
+
+_LARGEST_CONDITION = 50.0  # of A: no sensor in use is distorted like that; a diverged fit is
+
+
+def rescaled(A: Array) -> Array:
+    """A (l0 l1 l2)^(-1/3), symmetric to the last bit."""
+    A = (A + A.T) / 2
+    return np.asarray(A * float(np.linalg.det(A)) ** (-1 / 3))

@@ -31,6 +31,14 @@ MagFactor3 is GTSAM's magnetometer factor, m = alpha R_bw M + b, attitude R_bw a
 One uniform scale alpha and b; soft iron proper is not in the model. One vectorised factor
 
     r_k = alpha R_bw M + b - m_k,   dr/dalpha = R_bw M,   dr/db = I
+
+A soft iron is written in numbers in three ways, each with its derivative; all give C = A^-1 as
+c = [00 01 02 11 12 22]:
+
+    unit volume   6 terms of A, rescaled A (l0 l1 l2)^(-1/3) each time  ([R] appendix A)
+    triangle      the 6 terms of C themselves                           (magical-bfg, -ifg)
+    Cholesky      C = L L^T, L = [[e^p0 0 0] [p1 e^p2 0] [p3 p4 e^-(p0+p2)]]: positive definite
+                  and of det 1 whatever p is                            ([M], magyc-bfg, -ifg)
 """
 
 from __future__ import annotations
@@ -45,10 +53,72 @@ from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
 from ahrsd import so3
-from ahrsd.baselines.data import MethodData, MethodError, MethodFit, MethodSettings
-from ahrsd.baselines.soft_iron import answer, cholesky, positive, rescaled, triangle, unit_volume
+from ahrsd.baselines.data import (
+    MethodData,
+    MethodError,
+    MethodFit,
+    MethodSettings,
+    answer,
+    rescaled,
+)
 from ahrsd.estimator.chain import symmetric, symmetric_columns, upper_triangle
 from ahrsd.samples import Array
+
+# -- Three ways to write a soft iron ---------------------------------------------------------------
+
+
+def _symmetric_basis() -> Array:
+    return np.stack([symmetric(row) for row in np.eye(6)])
+
+
+BASIS = _symmetric_basis()  # (6, 3, 3): E_j = d(symmetric(x)) / d x_j
+
+
+def positive(a6: Array) -> bool:
+    """Whether symmetric(a6) is positive definite."""
+    return bool(np.isfinite(a6).all() and np.linalg.eigvalsh(symmetric(a6))[0] > 0)
+
+
+def unit_volume(a6: Array) -> tuple[Array, Array]:
+    """c (6,) of A = symmetric(a6) rescaled to det 1, and dc/da6 (6, 6), singular along A.
+
+    With s = det^(-1/3):  C = A^-1 / s,  dC = -C dA C s + C tr(A^-1 dA) / 3.
+    MethodError where A is not positive definite.
+    """
+    A = symmetric(a6)
+    if not positive(a6):
+        raise MethodError("diverged: the soft iron is no longer positive definite")
+    s = float(np.linalg.det(A)) ** (-1 / 3)
+    inverse = np.linalg.inv(A)
+    C = inverse / s
+    J = np.empty((6, 6))
+    for j, E in enumerate(BASIS):
+        J[:, j] = upper_triangle(-C @ E @ C * s + C * np.trace(inverse @ E) / 3)
+    return upper_triangle(C), J
+
+
+def triangle(c6: Array) -> tuple[Array, Array]:
+    """c itself and the identity."""
+    return c6.copy(), np.eye(6)
+
+
+def cholesky(p: Array) -> tuple[Array, Array]:
+    """c (6,) of C = L L^T and dc/dp (6, 5):  dC = dL L^T + L dL^T."""
+    with np.errstate(over="ignore"):  # infinite where a search diverges; the factor says so
+        x, y, z = np.exp(p[0]), np.exp(p[2]), np.exp(-(p[0] + p[2]))
+    L = np.array([[x, 0, 0], [p[1], y, 0], [p[3], p[4], z]])
+    dL = np.zeros((5, 3, 3))
+    dL[0, 0, 0], dL[0, 2, 2] = x, -z
+    dL[1, 1, 0] = 1.0
+    dL[2, 1, 1], dL[2, 2, 2] = y, -z
+    dL[3, 2, 0] = 1.0
+    dL[4, 2, 1] = 1.0
+    J = np.stack([upper_triangle(d @ L.T + L @ d.T) for d in dL], axis=1)
+    return upper_triangle(L @ L.T), J
+
+
+# -- The methods -----------------------------------------------------------------------------------
+
 
 # -- The kinematic residual ------------------------------------------------------------------------
 

@@ -1,8 +1,9 @@
 """The command line: a command's module is imported only when that command runs.
 
-The module of a command has its name, and the command in it is called `command`; of modules with
-several (`_SHARED`) each command has its own name. A command that answers "no" ends with
-`raise SystemExit(EXIT_NO)`; whatever a person can put right is raised as an `AhrsdError`.
+The module of a command has its name, in `device`, `recordings` or `running`, and the command in it
+is called `command`; of modules with several (`_SHARED`) each command has its own name. A command
+that answers "no" ends with `raise SystemExit(EXIT_NO)`; whatever a person can put right is raised
+as an `AhrsdError`.
 """
 
 from __future__ import annotations
@@ -37,12 +38,29 @@ COMMANDS: dict[str, str] = {
 }
 
 
+#: what each package has
+_PACKAGES = {
+    "device": ("capture", "demo", "emulate", "registers", "run"),
+    "recordings": (
+        "calibrate", "challenge", "convert", "diagnose", "evaluate", "fleet", "montecarlo",
+        "replay", "simulate",
+    ),
+    "running": ("foxglove", "page", "watch"),
+}  # fmt: skip
 #: commands that are not in a module of their own
-_SHARED = dict.fromkeys(("status", "explain", "operator", "bundle"), "running_daemon")
+_SHARED = dict.fromkeys(("status", "explain", "operator", "bundle"), "running.daemon")
+
+
+def module_of(name: str) -> str:
+    """Where the command of this name is."""
+    if name in _SHARED:
+        return f"ahrsd.cli.{_SHARED[name]}"
+    (package,) = (package for package, names in _PACKAGES.items() if name in names)
+    return f"ahrsd.cli.{package}.{name}"
 
 
 class LazyGroup(click.Group):
-    """A group that imports `ahrsd.cli.NAME` when NAME is called, and not before."""
+    """A group that imports a command's module when the command is called, and not before."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names in the order of a first visit."""
@@ -52,9 +70,8 @@ class LazyGroup(click.Group):
         """Import the command's module."""
         if cmd_name not in COMMANDS:
             return None
-        shared = _SHARED.get(cmd_name)
-        module = importlib.import_module(f"ahrsd.cli.{shared or cmd_name}")
-        command = getattr(module, cmd_name if shared else "command")
+        module = importlib.import_module(module_of(cmd_name))
+        command = getattr(module, cmd_name if cmd_name in _SHARED else "command")
         if not isinstance(command, click.Command):
             raise TypeError(f"{module.__name__} has no click command {cmd_name}")
         return command

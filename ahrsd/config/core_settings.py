@@ -5,8 +5,7 @@ from __future__ import annotations
 import datetime
 
 from ahrsd.config.loading import Config
-from ahrsd.core.calibration_pipeline import CalibratorSettings
-from ahrsd.core.settings import CoreSettings
+from ahrsd.core.settings import CalibratorSettings, CoreSettings
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import text_within
 from ahrsd.sharing.client_commands import SharePolicy

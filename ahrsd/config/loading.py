@@ -36,8 +36,8 @@ from ahrsd.config.sections import (
 )
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import ForeignFileError, text_within
-from ahrsd.writeback.permissions import Mode as Ceiling
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode as Ceiling
 
 Mode = Literal["passive", "observe", "stage", "commit"]
 

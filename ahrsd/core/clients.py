@@ -24,10 +24,10 @@ from ahrsd.sharing.client_commands import (
 )
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.permissions import PASSABLE, Mode
-from drivers.vn100.commands import NoReply, TooLate, Write
+from ahrsd.writeback.permissions import PASSABLE
+from ahrsd.writeback.states import Mode
+from drivers.vn100.commands import NoReply, Seen, TooLate, Write
 from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import Seen
 from drivers.vn100.registers import Values
 
 _UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"

@@ -1,28 +1,23 @@
 """The pure core: inputs in, events out. `run` and `replay` feed it the same way.
 
-It joins the parts and decides nothing itself: `device_session` talks to the device, `stream` makes
-samples, `calibrator` estimates and judges, `writeback` says what may be written. Its time is that
-of the inputs. Whatever it answers depends on the list of inputs alone, which is why a replay takes
-the same decisions; `decisions` holds them and their hash.
+It joins the parts and decides nothing itself: `device_session` talks to the device, `sample_source`
+makes samples, `estimation` estimates and judges, the write-back says what may be written and
+`write_back` carries that out. The core's time is that of the inputs. Whatever it answers depends on
+the list of inputs alone, which is why a replay takes the same decisions; `decisions` holds them and
+their hash.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from ahrsd import events, inputs
-from ahrsd.calibration import Affine, Estimate
-from ahrsd.core.action_queue import ActionQueue, DeviceRecord
-from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.clients import Clients
-from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.decision_log import DecisionLog
 from ahrsd.core.device_session import (
-    ECHOES,
     Closed,
     Completed,
     ConfigurationRead,
@@ -34,31 +29,23 @@ from ahrsd.core.device_session import (
     StreamChanged,
     Unanswered,
 )
-from ahrsd.core.estimation_queue import (
+from ahrsd.core.estimation import (
+    Calibrator,
     Circumstances,
+    Estimation,
     EstimationFailure,
-    EstimationQueue,
     EstimationResult,
     EstimationTask,
-    EstimatorState,
 )
-from ahrsd.core.sensor_checks import SensorChecks
+from ahrsd.core.sample_source import Doubt, SampleSource, SampleWarning
 from ahrsd.core.settings import CoreSettings
-from ahrsd.core.unconfirmed_samples import StreamWatch, UnconfirmedSamples
 from ahrsd.core.warm_start import Present, WarmStart
-from ahrsd.evidence.values import BasisFacts
-from ahrsd.gates import GateLimits, Level, for_level
-from ahrsd.samples import Array, SampleBlock
-from ahrsd.stream.assembler import Stream
-from ahrsd.stream.decompensation import Compensation, RegisterEpochs, user_compensation
+from ahrsd.core.write_back import ActionQueue, DeviceRecord, OperatorAnswers, TrialComparison
+from ahrsd.samples import SampleBlock
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.states import LIVED_WITH, State
-from ahrsd.writeback.trial import LiveTrial
-from drivers.vn100.decode import Measurement, Undecodable, Unused
+from ahrsd.writeback.states import Mode, State
 from drivers.vn100.registers import Values
-from drivers.vn100.session import DeviceFault, LineEchoes, Stray
+from drivers.vn100.session import DeviceFault
 from drivers.vn100.session import Event as SessionEvent
 
 _WATCHDOG_RESET, _HARD_FAULT = 0x0A, 0x01  # VNERR codes
@@ -70,40 +57,33 @@ class Core:
     def __init__(self, settings: CoreSettings) -> None:
         self.settings = settings
         self.decisions = DecisionLog(settings.keep)
-        self.epochs = RegisterEpochs()
-        rate, source = settings.stream_rate_hz, settings.stream_rate_source
-        self.stream = Stream(self.epochs, rate, source, keep_gaps=settings.keep)
-        self.vehicle = VehicleTerms(self.stream.warnings.setdefault, settings.columns_max_age_s)
+        passive = settings.policy.mode is Mode.PASSIVE
+        # the device, and what comes from it
+        self.source: SampleSource[Circumstances] = SampleSource(settings)
+        self.stream = self.source.stream
         self.device_session = DeviceSession(
             settings.policy.mode,
             change_stream=settings.policy.configure_stream,
             rate_hz=settings.output_rate_hz,
             reply_timeout_s=settings.reply_timeout_s,
         )
-        self.writeback = WriteBack(settings.policy)
-        self.registers: dict[int, Values] = {}
-        self._compared: tuple[Affine, Array] = (Affine.identity(), np.zeros(3))
-        self._from_scratch = (settings.calibrator, *self._compared)
-        self.calibrator = Calibrator(*self._from_scratch)
-        self._estimation_queue = EstimationQueue()
-        self.estimator, self.sensors = EstimatorState(), SensorChecks()
-        self._proposed: Affine | None = None
-        passive = settings.policy.mode is Mode.PASSIVE
+        # what is estimated of it
+        self.estimation = Estimation(settings.calibrator, self._begin_task)
         self.warm = WarmStart(settings.warm_start_s, passive=passive)
+        # what may be written by that
+        self.writeback = WriteBack(settings.policy)
+        self._action_queue = ActionQueue(self.device_session, self.writeback, self.stream.forgive)
+        self._device_record = DeviceRecord()
+        self._trial = TrialComparison(self.writeback)
+        self._answers = OperatorAnswers()
+        self.clients = Clients(settings.shares, self.device_session, self.writeback)
         self.at_s = self._host_s = 0.0
         self.first_s = float("nan")
-        self.faults = self.strays = self.undecodable = self._breaks = self._restarts = 0
+        self.faults = self._breaks = 0
         self._stopping, self._judged_anew = "", 0
         self._closing = self._unread = False
-        self._watch = StreamWatch()
-        self.unconfirmed: UnconfirmedSamples[Circumstances] = UnconfirmedSamples()
-        self._device_record = DeviceRecord()
-        self._action_queue = ActionQueue(self.device_session, self.writeback, self.stream.forgive)
-        self._trial: LiveTrial | None = None
-        self.clients = Clients(settings.shares, self.device_session, self.writeback)
         self._out: list[events.Event] = []
-        self._answers: list[events.Answered] = []  # due once nothing waits for the journal
-        if settings.policy.mode is Mode.PASSIVE:
+        if passive:
             self._no_device()
         device, back, add = self.device_session, self.writeback, self._action_queue.add
         self._handlers: dict[type, Callable[..., None]] = {
@@ -116,7 +96,7 @@ class Core:
             inputs.Operator: self._operator,
             inputs.ClientSent: lambda it: self.clients.sent(it, self._host_s),
             inputs.ClientLeft: self.clients.left,
-            **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.vehicle.take),
+            **dict.fromkeys((inputs.Columns, inputs.TermsKnown), self.source.vehicle.take),
             inputs.RegistersKnown: self._registers_known,
             inputs.Samples: self._samples_given,
             inputs.EarlierSamples: self.warm.sampled,
@@ -138,9 +118,8 @@ class Core:
         self._action_queue.add(self.writeback.tick(self._host_s))
         self._handlers[type(item)](item)
         self._drive()
-        if self._answers and not self._action_queue.awaiting_journal:
-            self._out += self._answers
-            self._answers = []
+        if not self._action_queue.awaiting_journal:
+            self._out += self._answers.take()
         out, self._out = self._out, []
         return out
 
@@ -151,6 +130,22 @@ class Core:
         due = [part.deadline_s for part in parts]
         known = [d for d in due if d is not None]
         return int(min(known) * 1e9) + 1 if known else None
+
+    # -- what others see of it ---------------------------------------------------------------------
+
+    @property
+    def registers(self) -> dict[int, Values]:
+        """The device's registers, as far as they are known."""
+        return self.source.registers
+
+    @property
+    def calibrator(self) -> Calibrator:
+        """The calibrator in use."""
+        return self.estimation.calibrator
+
+    @calibrator.setter
+    def calibrator(self, calibrator: Calibrator) -> None:
+        self.estimation.calibrator = calibrator
 
     # -- inputs ------------------------------------------------------------------------------------
 
@@ -166,7 +161,7 @@ class Core:
         if self.device_session.mode is Mode.PASSIVE:
             self._no_device()
         else:
-            self.epochs.begin_anew()  # nothing is un-mapped before it is known how, late or not
+            self.source.epochs.begin_anew()  # nothing is un-mapped before it is known how
         self.take(self.device_session.opened(item.baud, self._host_s))
 
     def _link_lost(self, item: inputs.LinkLost) -> None:
@@ -175,7 +170,7 @@ class Core:
         self._note("warning", f"link lost: {item.reason}")
         self.take(self.device_session.lost(self._host_s))
         self.stream.forget()
-        self.unconfirmed.drop()
+        self.source.unconfirmed.drop()
         self._action_queue.forget_procedure()
         self._action_queue.add(self.writeback.on_link_lost(self._host_s))
 
@@ -183,13 +178,11 @@ class Core:
         self._note("info", f"operator: {item.verb} {item.argument}".strip())
         back = self.writeback
         self._action_queue.add(back.on_operator(item.verb, item.argument, self._host_s))
-        self._answers.append(events.Answered(item.word, *back.operator_answer))
+        self._answers.add(item.word, back.operator_answer)
 
     def _journalled(self, item: inputs.Journalled) -> None:
         self._action_queue.journalled(item, self._host_s)
-        if item.error and item.kind in (RecordKind.LOCKED, RecordKind.UNLOCKED):
-            text = f"not in the journal: {item.error}; it holds for this run only"
-            self._answers = [replace(a, accepted=False, text=text) for a in self._answers]
+        self._answers.journalled(item)
 
     def _registers_known(self, item: inputs.RegistersKnown) -> None:
         self._flush()
@@ -207,12 +200,10 @@ class Core:
         self._device_known()
 
     def _limits_changed(self, item: inputs.LimitsChanged) -> None:
-        calibrator = replace(self.settings.calibrator, limits=GateLimits(**item.limits))
-        self.settings = replace(self.settings, calibrator=calibrator)
-        self._from_scratch = (calibrator, *self._from_scratch[1:])
         self._judged_anew += 1
         self._note("info", "the limits of the gates were changed")
-        self._begin_task(self._estimation_queue.adopt(self.calibrator, calibrator))
+        calibrator = self.estimation.adopt(item.limits)
+        self.settings = replace(self.settings, calibrator=calibrator)
         self._action_queue.add(self.writeback.on_limits_changed(self._host_s))
 
     def _stop(self, item: inputs.Stop) -> None:
@@ -223,37 +214,19 @@ class Core:
     # -- the device --------------------------------------------------------------------------------
 
     def take(self, found: list[SessionEvent]) -> None:
-        """Measurements to the stream, with what was damaged between them; the rest is counted."""
-        skipped = deque(self.device_session.session.deframer.take_skipped())
-        if any(isinstance(event, Measurement) for event in found):
-            silence = self._watch.heard(self._host_s, self.stream.facts.rate_hz)
-            if silence and not self.stream.carries_time:  # where it does, its time shows a gap
-                self._flush()
-                self._doubt(silence)
-        for event in found:
-            if isinstance(event, Measurement):
-                while skipped and skipped[0].offset < event.offset:
-                    self.stream.damaged(skipped.popleft())
-                for block in self.stream.take(event, self._host_s):
-                    self._block(block)
-            elif isinstance(event, Undecodable):
-                self.undecodable += 1
-                self.stream.undecodable()
-            elif isinstance(event, Unused):
-                self.stream.unused(event.name)
-            elif isinstance(event, LineEchoes):
-                self._note("warning", ECHOES)
-            elif isinstance(event, DeviceFault):
-                self._fault(event.code)
-            elif isinstance(event, Stray):
-                self.strays += 1
-        for piece in skipped:
-            self.stream.damaged(piece)
-        facts = self.stream.facts
-        for text in self.sensors.count(facts.unusable + self.undecodable, facts.samples):
-            self._note("warning", text)
-        if self.stream.restarts > self._restarts:
-            self._restarts = self.stream.restarts
+        """Measurements become samples, or a reason to doubt whose they are."""
+        skipped = self.device_session.session.deframer.take_skipped()
+        for item in self.source.take(found, skipped, self._host_s):
+            match item:
+                case SampleBlock():
+                    self._block(item)
+                case Doubt(reason):
+                    self._doubt(reason)
+                case SampleWarning(text):
+                    self._note("warning", text)
+                case DeviceFault(code):
+                    self._fault(code)
+        if self.source.take_restart():
             self._device_reset("its time fell", self.at_s)
 
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
@@ -262,11 +235,11 @@ class Core:
             self.warm.doubt()
             if not jumped:
                 restarted = not self.stream.carries_time  # else its time would have fallen
-                self.unconfirmed.doubt(self._host_s, perhaps_restarted=restarted)
+                self.source.unconfirmed.doubt(self._host_s, perhaps_restarted=restarted)
             more = self.writeback.on_doubt(reason, self._host_s, jumped=jumped)
             self._action_queue.add(more)
-            if jumped and self._trial is not None:
-                self._begin_trial()  # it is judged by what comes after the jump
+            if jumped:
+                self._trial.jumped(self.registers)
 
     def _fault(self, code: int) -> None:
         self.faults += 1
@@ -278,10 +251,10 @@ class Core:
     def _device_reset(self, why: str, uptime_s: float | None = None) -> None:
         self._note("warning", f"the device restarted ({why})")
         self._breaks += 1
-        self.unconfirmed.drop()
+        self.source.unconfirmed.drop()
         if self.device_session.identity is None:
             return
-        self.epochs.begin(self._host_s, None)
+        self.source.in_doubt(self._host_s)
         self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s))
         self._action_queue.forget_procedure()
         self.take(self.device_session.identify_again(self._host_s))
@@ -298,16 +271,10 @@ class Core:
 
     def _in_force(self, values: dict[int, Values]) -> None:
         """Samples from now on passed these registers; the first ones are the estimator's prior."""
-        self.registers = values
-        compensation = Compensation.from_registers(values)
-        self.epochs.begin(self._host_s, compensation)
-        self.stream.warnings.update(dict.fromkeys(compensation.warnings))
-        self.stream.registers = values
+        self.source.in_force(values, self._host_s)
         # on trial, a candidate is still compared with what the user had before it
         trial = self.writeback.history.open
-        users = values if trial is None else {**values, **trial.old}
-        self._compared = user_compensation(users)
-        self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
+        self.estimation.compare_with(values if trial is None else {**values, **trial.old})
 
     def _identified(self, event: Identified) -> None:
         """A device said who it is; what was estimated of another one is not for it."""
@@ -315,11 +282,10 @@ class Core:
         self._note("info", str(unit))
         if (before := self._device_record.identified(unit)) not in (None, unit):
             self._flush()
-            self.stream.forget()
-            self._watch.resumed(self._host_s)
+            self.source.paused(self._host_s)
             text = f"{before} was here before: the calibration begins anew for this one"
             self._note("warning", f"another device, {unit}; {text}")
-            self.calibrator = Calibrator(*self._from_scratch)
+            self.estimation.begin_from_scratch()
             self.warm.over("another device was here")
         self._out.append(events.OpenJournal(unit.serial))
 
@@ -329,12 +295,13 @@ class Core:
                 self._identified(event)
             case ConfigurationRead(values):
                 self._flush()
-                self.unconfirmed.drop()  # it was asked for because something is not sure
+                self.source.unconfirmed.drop()  # it was asked for because something is not sure
                 believed = {} if self.writeback.history.open else self.registers
                 if others := self._device_record.registers_read(values, believed, self._breaks):
                     self._note("warning", f"somebody changed registers {others}: calibrated anew")
                 if self._unread or others:  # as it came does not mix with what is un-mapped
-                    self.calibrator, self._unread = Calibrator(*self._from_scratch), False
+                    self.estimation.begin_from_scratch()
+                    self._unread = False
                     self.warm.over("calibrated anew")
                 self._in_force(values)
                 self._out.append(events.RegistersRead(self._host_s, values))
@@ -343,25 +310,23 @@ class Core:
                 back = self.writeback
                 self._action_queue.add(back.on_looked(seen, str(error or ""), self._host_s))
                 if back.confirmed_s is not None:
-                    for blocks, when in self.unconfirmed.confirm(back.confirmed_s):
+                    for blocks, when in self.source.unconfirmed.confirm(back.confirmed_s):
                         self._examine(blocks, when)
             case Served(result, error):
                 self._client_served(result, error)
             case StreamChanged(text, level):
                 self._flush()
-                self._watch.resumed(self._host_s)
-                self.stream.forget()
+                self.source.paused(self._host_s)
                 if text:
                     self._note(level, text)
             case Unanswered(text):
                 self._unread = True
                 self._note("warning", f"{text}; listening only, nothing can be written")
-                self.epochs.begin(self._host_s, Compensation.unknown())
+                self.source.unread(self._host_s)
                 self._no_device()
             case Completed(name, result, error):
                 self._flush()
-                self._watch.resumed(self._host_s)
-                self.stream.forget()
+                self.source.paused(self._host_s)
                 if error is None:
                     more = self.writeback.on_procedure_finished(name, result, self._host_s)
                 else:
@@ -410,9 +375,8 @@ class Core:
         served = self.clients.served(result, error, self.registers, self._host_s)
         if served.wrote:
             self._flush()
-            self.registers = self.stream.registers = {**self.registers, **served.wrote}
-            self._watch.resumed(self._host_s)
-            self.stream.forget()
+            self.source.wrote(served.wrote)
+            self.source.paused(self._host_s)
         self._action_queue.add(served.actions)
         if served.reset_by:
             self._device_reset(f"{served.reset_by} reset it")
@@ -427,7 +391,7 @@ class Core:
         """The device applies these registers from now on; None: unknown, a write is under way."""
         self._flush()
         if registers is None:
-            self.epochs.begin(self._host_s, None)
+            self.source.in_doubt(self._host_s)
         else:
             self._in_force(dict(registers))
 
@@ -440,22 +404,7 @@ class Core:
 
     def _on_state(self, change: events.StateChanged) -> None:
         self.decisions.add(self.at_s, change.new, reason=change.reason)
-        if change.new == State.TRIAL or (change.new, change.old) == (
-            State.PROVEN,
-            State.RECONCILING,
-        ):
-            self._begin_trial()
-        elif change.new not in LIVED_WITH:
-            self._trial = None
-
-    def _begin_trial(self) -> None:
-        """From here on the registers in force are compared with those before them."""
-        transaction = self.writeback.history.open
-        old = {} if transaction is None else transaction.old
-        mag, bias = user_compensation(self.registers)
-        old_mag, old_bias = user_compensation({**self.registers, **old})
-        limit = 0.01 * self.settings.policy.trial.max_wrong_percent
-        self._trial = LiveTrial(mag, old_mag, bias, old_bias, wrong_limit=limit)
+        self._trial.changed(change, self.registers)
 
     # -- samples -----------------------------------------------------------------------------------
 
@@ -466,52 +415,54 @@ class Core:
     def _block(self, block: SampleBlock) -> None:
         self.at_s = float(block.time_s[-1])
         self.first_s = float(block.time_s[0]) if np.isnan(self.first_s) else self.first_s
-        if (
-            self.stream.facts.rate_source == "device time"
-            and self.stream.restarts == self._restarts
-        ):
+        if self.source.tells_uptime:
             heard_s = min(float(block.host_s[-1]), self._host_s)
             self._action_queue.add(self.writeback.on_uptime(self.at_s, self._host_s, heard_s))
         if self.stream.take_replaced():
-            self.unconfirmed.drop()
-            self.calibrator = self.calibrator.anew()
-            self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
+            self.source.unconfirmed.drop()
+            self.estimation.begin_anew()
             self.warm.again()
-        reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
+        reason, jumped = self.source.suspicion(block)
         self._doubt(reason, jumped=jumped)
-        block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
-        self._out.append(events.SamplesSeen(block, present, self._proposed))
+        block, present = self.source.vehicle.with_columns(block), self.source.present_correction
+        self._out.append(events.SamplesSeen(block, present, self.estimation.proposed))
         self._action_queue.add(self.writeback.on_samples(block))
-        for text in self.sensors.take(block):
+        for text in self.source.sensors.take(block):
             self._note("warning", text)
-        if (free := self.vehicle.without_terms(block)) is not None:
-            if self._trial is not None:
-                metrics = self._trial.take(free)
-                self._action_queue.add(self.writeback.on_trial_metrics(metrics, self._host_s))
-            how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
-            now = Circumstances(self.at_s, self._host_s or self.at_s, *how)
-            if self.device_session.identity is None or self.device_session.mode is Mode.PASSIVE:
-                self._examine([free], now)  # there is nobody to ask
-            else:
-                self.unconfirmed.hold(free, self._host_s, now)
-                self._action_queue.add(
-                    self.writeback.on_waiting(self.unconfirmed.span_s, self._host_s)
-                )
+        if (free := self.source.vehicle.without_terms(block)) is not None:
+            self._action_queue.add(self._trial.take(free, self._host_s))
+            self._to_estimate(free)
         self._action_queue.let_out(self)
+
+    def _to_estimate(self, block: SampleBlock) -> None:
+        """For the calibrator at once, or once the device has answered behind them."""
+        now = self._circumstances(self._host_s or self.at_s)
+        if self.device_session.identity is None or self.device_session.mode is Mode.PASSIVE:
+            self._examine([block], now)  # there is nobody to ask
+            return
+        waiting = self.source.unconfirmed
+        waiting.hold(block, self._host_s, now)
+        self._action_queue.add(self.writeback.on_waiting(waiting.span_s, self._host_s))
+
+    def _circumstances(self, host_s: float) -> Circumstances:
+        basis = self.source.basis(self.device_session.identity)
+        margin, era = self.writeback.margin, self._era()
+        return Circumstances(self.at_s, host_s, self.stream.health(), basis, margin, era)
 
     def _examine(self, blocks: list[SampleBlock], when: Circumstances) -> None:
         """Samples of the device that was read: for the calibrator."""
-        if taken := [block for block in blocks if self.estimator.takes(block)]:
+        if taken := [block for block in blocks if self.estimation.state.takes(block)]:
             taken[0] = self._recall(taken[0])
             for block in taken:
                 self.warm.live(block)
-            self._begin_task(self._estimation_queue.examine(self.calibrator, taken, when))
+            self.estimation.examine(taken, when)
 
     def _recall(self, block: SampleBlock) -> SampleBlock:
         """The block, after the calibrator was given the samples of an earlier run, if any."""
         if not self.warm.pending or self.writeback.state is State.RECONCILING:
             return block
-        identity, read = self.device_session.identity, self.epochs.now.compensation is not None
+        epoch = self.source.epochs.now
+        identity, read = self.device_session.identity, epoch.compensation is not None
         present = Present(
             identity.unit if identity is not None and read else None,
             self.registers,
@@ -520,19 +471,14 @@ class Core:
             self._host_s,
             open=self.writeback.history.open is not None,
             candidate=self.writeback.proposal is not None,
-            terms=bool(self.vehicle.terms),
+            terms=bool(self.source.vehicle.terms),
         )
         blocks, text = self.warm.due(present, float(block.time_s[0]))
         self._say_warm(text)
         if not blocks:
             return block
-        self.calibrator = Calibrator(*self._from_scratch)
-        self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
-        how = self.stream.health(), self._basis(), self.writeback.margin, self._era()
-        now = Circumstances(self.at_s, self._host_s, *how)
-        for old in blocks:
-            old = replace(old, epoch=self.epochs.now.number)
-            self._begin_task(self._estimation_queue.recall(self.calibrator, old, now))
+        ours = [replace(old, epoch=epoch.number) for old in blocks]
+        self.estimation.recall(ours, self._circumstances(self._host_s))
         self._action_queue.add(self.writeback.on_doubt("samples of an earlier run", self._host_s))
         unknown = np.concatenate([[np.nan], block.dt_s[1:]])
         return replace(block, dt_s=unknown, gap_before=True)
@@ -549,66 +495,51 @@ class Core:
             self._take_results(1)
 
     def _take_results(self, tasks: int, failure: str = "") -> None:
-        for found in self._estimation_queue.take(tasks, failure):
-            if found.calibrator is not self.calibrator:
-                continue  # another device or other quantities since
+        for found in self.estimation.results(tasks, failure):
             if isinstance(found, EstimationFailure):
                 self._estimator_failed(found.reason)
                 continue
-            self._proposed = found.proposed
             self._out += found.notes
             back, when = self.writeback, found.when
             if found.void:
                 self.warm.doubt()
                 self._action_queue.add(back.on_void(found.void, when.at_s, self._host_s))
-            if found.estimate is not None:
-                self._judged(found, found.estimate)
+            self._judged(found)
             self._action_queue.add(back.on_examined(when.host_s, self._host_s))
 
     def _estimator_failed(self, reason: str) -> None:
         """Drop the calibrator and what it proposed; a new one starts after a pause."""
-        self.estimator.broke_off(reason)
-        self.calibrator = Calibrator(self.settings.calibrator, *self._compared)
-        self._proposed = None
+        left_s = self.estimation.broke_off(reason)
         self.warm.over("the estimator failed")
-        left_s = self.estimator.left_s
         self._note("error", f"ESTIMATOR FAILED: {reason}; it begins anew in {left_s:.0f} s")
         self.decisions.add(self.at_s, "ESTIMATOR FAILED")
         self._action_queue.add(self.writeback.on_estimator_failed(self._host_s))
 
-    def _judged(self, found: EstimationResult, estimate: Estimate) -> None:
+    def _judged(self, found: EstimationResult) -> None:
         at_s, host_s, gates = found.when.at_s, found.when.host_s, found.gates
+        if (estimate := found.estimate) is None:
+            return
         self._out += [events.Estimated(at_s, host_s, estimate), events.Judged(at_s, host_s, gates)]
         self.decisions.judged(at_s, self.writeback.state.value, gates, estimate)
         if found.when.era != self._era():
             return  # it judged what is in force no more; nothing may be written by it
         if not self.warm.confirms(estimate):
             return  # it rests on an earlier run: nothing is written before this one agrees
+        for_write, for_flash = self.settings.gates_of(gates)
         self._action_queue.add(
             self.writeback.on_verdict(
                 estimate,
-                for_level(gates, self.settings.level),
+                for_write,
                 at_s,
                 self._host_s,
                 gyro_is_raw=not self.stream.compensated_gyro,
-                flash_gates=for_level(gates, Level.FLASH),
+                flash_gates=for_flash,
                 sampled_s=host_s,
             )
         )
 
     def _era(self) -> tuple[int, int]:
-        return self.epochs.now.number, self._breaks + self._judged_anew
-
-    def _basis(self) -> BasisFacts:
-        """What is known of where the samples come from."""
-        identity, applied = self.device_session.identity, self.epochs.now.compensation
-        return BasisFacts(
-            registers_read=bool(self.registers),
-            changed=applied is None,
-            hsi_applied=applied is not None and applied.hsi is not None,
-            compensated_only=self.stream.compensated_mag,
-            firmware_known=identity is not None and identity.profile.writable,
-        )
+        return self.source.epochs.now.number, self._breaks + self._judged_anew
 
     def _note(self, level: str, text: str) -> None:
         self._out.append(events.Noted(self.at_s, self._host_s, level, text))

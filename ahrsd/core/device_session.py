@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from ahrsd.core.kept_settings import ClientSettings, KeptOutputs
-from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.transaction import JournalRecord
+from ahrsd.writeback.journal_history import JournalRecord, RecordKind
+from ahrsd.writeback.permissions import CALIBRATION, permitted
+from ahrsd.writeback.states import Mode, Purpose
 from drivers.vn100.calibration_stream import (
     CalibrationStream,
     DoesNotFit,
@@ -35,25 +35,18 @@ from drivers.vn100.calibration_stream import (
 from drivers.vn100.commands import (
     RESUME,
     Command,
+    Identity,
     LinkGone,
     NoReply,
     Pause,
     Procedure,
     Read,
+    Seen,
     SessionError,
     Speech,
     TooLate,
     Word,
     Write,
-)
-from drivers.vn100.decode import Measurement
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import (
-    SESSION_SETTINGS,
-    Identity,
-    Seen,
-    Unit,
     differences,
     identify,
     look,
@@ -64,13 +57,12 @@ from drivers.vn100.procedures import (
     restore,
     resume,
 )
-from drivers.vn100.registers import Values, format_command, same
+from drivers.vn100.decode import Measurement
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.messages import Reply
+from drivers.vn100.registers import SESSION_SETTINGS, Unit, Values, format_command, same
 from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
-ECHOES = (
-    "the line sends back what is sent (an adapter or terminal that echoes): echoes are told from "
-    "answers and left out"
-)
 ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
 RESTORE_AGAIN_S = 0.1
 BEHIND_TRIES = 5  # to have the answers and the command right behind them

@@ -21,12 +21,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ahrsd.writeback.actions import Action, AppendToJournal, SetUpStream
-from ahrsd.writeback.composition import register_lines
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.transaction import JournalRecord
+from ahrsd.writeback.journal_history import JournalRecord, RecordKind
 from drivers.vn100.calibration_stream import left_by_session
-from drivers.vn100.procedures import SESSION_SETTINGS
-from drivers.vn100.registers import Values, same
+from drivers.vn100.registers import SESSION_SETTINGS, Values, register_lines, same
 
 # -- Outputs of the session ------------------------------------------------------------------------
 

@@ -4,12 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ahrsd.core.calibration_pipeline import CalibratorSettings
-from ahrsd.gates import Level
+from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.events import GateResult
+from ahrsd.gates import GateLimits, Level, for_level
 from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.world_field import WorldField
 from ahrsd.writeback.policy import WriteBackPolicy
 
 BESIDE_KEY = "examined"  # in a capture's header where `beside` was set
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratorSettings:
+    """What the calibration needs from the configuration."""
+
+    estimator: EstimatorParameters
+    limits: GateLimits
+    world_field: WorldField | None = None
+    held_out: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +37,7 @@ class CoreSettings:
     columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
     warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
     shares: the ports on which other programs find the device
-    beside: the slow part of the work is done beside the core (`estimation_queue`), not at once
+    beside: the slow part of the work is done beside the core (`estimation`), not at once
     """
 
     calibrator: CalibratorSettings
@@ -44,3 +56,9 @@ class CoreSettings:
     def level(self) -> Level:
         """Which gates must hold before RAM is written; those of the flash are asked at the save."""
         return Level.UNATTENDED if self.policy.approval == "auto" else Level.RAM
+
+    def gates_of(
+        self, gates: tuple[GateResult, ...]
+    ) -> tuple[tuple[GateResult, ...], tuple[GateResult, ...]]:
+        """Those that must hold before RAM is written, and before flash is."""
+        return for_level(gates, self.level), for_level(gates, Level.FLASH)

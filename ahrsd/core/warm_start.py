@@ -24,9 +24,8 @@ from ahrsd.calibration import Estimate
 from ahrsd.inputs import EarlierRun, EarlierSamples, WallClock
 from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.clocks import Stamp, plausible, same_boot_s
-from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import COMPENSATING, Values, same
+from ahrsd.writeback.journal_history import Stamp, plausible, same_boot_s
+from drivers.vn100.registers import COMPENSATING, Unit, Values, same
 
 CONFIRM_S = 60.0  # of samples of this run before a candidate
 CONFIRM_TURN_DEG = 90.0  # and so much turning in them

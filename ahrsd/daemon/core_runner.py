@@ -1,4 +1,4 @@
-"""What surrounds the core: the record of every input, the journal, the viewer, the summary.
+"""What surrounds the core: the record of every input, the journal, the viewer, the log.
 
 `Shell.feed` is the only way into the core, for the daemon and for a replay. It records the input
 before the core sees it, carries out what the core answers, and returns the bytes to send.
@@ -10,20 +10,25 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
 from ahrsd import events
+from ahrsd.config.core_settings import core_settings
+from ahrsd.config.loading import CONFIG_KEY, Config
+from ahrsd.config.text import print_config
 from ahrsd.core.core import Core
+from ahrsd.core.settings import BESIDE_KEY
 from ahrsd.daemon import host_clock
-from ahrsd.daemon.estimation_worker import Worker
+from ahrsd.daemon.background import Worker
+from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.journal import Journal
-from ahrsd.errors import JournalError
+from ahrsd.errors import CaptureError, JournalError
 from ahrsd.inputs import Input, Journalled, JournalOpened
-from ahrsd.recording.capture import CaptureWriter
-from ahrsd.viewer.sink import RerunSink
-from ahrsd.writeback.transaction import of_another_device
+from ahrsd.recording.capture import CaptureWriter, make_private_folder
+from ahrsd.viewer.sink import RerunLimits, RerunSink
+from ahrsd.writeback.journal_history import of_another_device
 
 log = logging.getLogger("ahrsd")
 
@@ -32,6 +37,7 @@ _CLOSE_S = 8.0  # where nobody waits for the end
 _LEAST_S = 0.2
 _FOLD_S = 60.0
 _FOLD_TEXTS = 64
+DAEMON_KEEPS = 64  # decisions and gaps in memory; the capture has them all
 
 
 class Viewer(Protocol):
@@ -156,6 +162,13 @@ class Shell:
             name = logging.getLevelName(level).lower()
             self.capture.write_event(host_ns, {"note": text, "level": name})
 
+    @property
+    def viewer_losses(self) -> tuple[int, str]:
+        """How many events the viewer dropped, and its newest fault."""
+        if not isinstance(self.viewer, RerunSink):
+            return 0, ""
+        return self.viewer.counters.dropped, self.viewer.counters.last_fault
+
     def _carry_out(self, event: events.Event, host_ns: int, waiting: list[Input]) -> bytes:
         if self.viewer is not None:
             self.viewer.push(event, host_ns * 1e-9)
@@ -217,6 +230,37 @@ def journal_in(directory: Path) -> Callable[[int], Journal]:
         return Journal.open(journal_path(directory, serial))
 
     return opener
+
+
+def open_shell(config: Config, clock: HostClock, capture: Path | None) -> Shell:
+    """The core with its capture, journal and viewer, as the configuration says.
+
+    Raises CaptureError where there can be no capture.
+    """
+    core = Core(replace(core_settings(config), keep=DAEMON_KEEPS, beside=True))
+    writer = None if capture is None else _open_capture(config, capture)
+    viewer = None
+    if config.rerun.file is not None or config.rerun.serve:
+        limits = RerunLimits(server_bytes=config.rerun.memory_megabytes * 1_000_000)
+        viewer = RerunSink(config.rerun.file, config.rerun.serve, config.rerun.port, limits=limits)
+    keeper = JournalKeeper(journal_in(config.state), clock.now_ns)
+    return Shell(core, writer, keeper, viewer, worker=Worker())
+
+
+def _open_capture(config: Config, path: Path) -> CaptureWriter:
+    try:
+        make_private_folder(path.parent)
+    except OSError as error:
+        raise CaptureError(
+            f"{path.parent}: the folder of the captures cannot be made: {error.strerror}; set "
+            "capture.directory, or capture.enabled = false"
+        ) from error
+    return CaptureWriter(
+        path,
+        {"program": "ahrsd run", CONFIG_KEY: print_config(config), BESIDE_KEY: "beside"},
+        part_bytes=config.capture.part_megabytes * 1_000_000,
+        keep_bytes=config.capture.keep_megabytes * 1_000_000,
+    )
 
 
 def close_shell(shell: Shell, until_s: float | None = None) -> None:

@@ -10,29 +10,26 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
-from ahrsd import events, inputs
+from ahrsd import inputs
 from ahrsd.config.loading import Config
+from ahrsd.core.core import Core
+from ahrsd.daemon.background import Recall
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
 from ahrsd.daemon.host_clock import HostClock
-from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorInbox
-from ahrsd.daemon.recall import Recall
+from ahrsd.daemon.ports.serial_link import Bytes, Item, Lost, SerialLink
 from ahrsd.daemon.reloading import Change, Reloader
-from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink, find_device
-from ahrsd.daemon.vehicle_files import ColumnsFile
-from ahrsd.telemetry.public import Public
+from ahrsd.daemon.vehicle_files import VehicleFiles
+from ahrsd.telemetry.feeds import Outlet
 from ahrsd.telemetry.status import LinkFacts
-from ahrsd.viewer.sink import RerunSink
-from drivers.serial_port import PortError, PortLost, latency_timer_ms, spelled
-from drivers.vn100.device import Device
-from drivers.vn100.errors import DriverError
+from drivers.serial_port import PortError, PortLost, find_device, latency_timer_ms, spelled
 
 log = logging.getLogger("ahrsd")
 
@@ -42,8 +39,6 @@ _BEHIND_S = 0.05
 _SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
 _STOP_S = 1.6  # for putting things back; a service manager's patience is limited
 _CLEANUP_S = 2.0
-_INTERLOCK_S = 0.2
-_COLUMNS_S = 0.04
 _WATCH_S = 1.0
 _WALL_STEP_S = 1.0
 _SUSPENDED_S = 0.5
@@ -58,20 +53,28 @@ def _asleep_s() -> float:
             return boot_s - before_s
 
 
-class Vehicle(Protocol):
-    """Who says whether a write is safe now."""
+class Telemetry(Protocol):
+    """Who tells the world how the daemon stands."""
 
-    def safe(self) -> bool:
-        """The word; anything that goes wrong is no."""
+    def feed(self, outlets: Iterable[Outlet]) -> None:
+        """Send what these shares are for."""
+
+    def turn(self, core: Core, now_s: float, *, well: bool) -> None:
+        """The loop turned once; all is `well`, or the watchdog must know."""
+
+    def look(self, core: Core, link: LinkFacts, now_s: float) -> None:
+        """About once a second: the newest status."""
+
+    def stopping(self) -> None:
+        """The daemon ends."""
 
 
 class Daemon:
     """Runs one device until `stop` is called. `listeners` on the shell see every event.
 
     baud: of the port where it was found already, else as the configuration says
-    terms: text of a repaired model; columns: what the vehicle measures, for its terms
+    files: what the vehicle and a person say; terms: text of a repaired model
     recall: reads what earlier runs left
-    complaints: each is asked once a second what is wrong with a file of somebody else's
     """
 
     def __init__(
@@ -80,14 +83,11 @@ class Daemon:
         shell: Shell,
         port_path: Path,
         clock: HostClock,
-        interlock: Vehicle | None = None,
+        files: VehicleFiles | None = None,
         *,
         baud: int | None = None,
-        words: OperatorInbox | None = None,
-        public: Public | None = None,
+        telemetry: Telemetry | None = None,
         terms: str = "",
-        columns: ColumnsFile | None = None,
-        complaints: Iterable[Callable[[], str]] = (),
         reloader: Reloader | None = None,
         recall: Recall | None = None,
     ) -> None:
@@ -99,21 +99,16 @@ class Daemon:
         self._inbox = self._link.inbox
         if shell.worker is not None:
             shell.worker.woken = self._inbox.wake
-        self._interlock, self._words, self._public = interlock, words, public
-        if words is not None:
-            words.woken = self._inbox.wake
-            shell.listeners.append(self._answer)
-        self._terms, self._columns = terms, columns
-        self._complaints = dict.fromkeys(complaints, "")  # what each said last
+        self._files = VehicleFiles() if files is None else files
+        self._telemetry, self._terms = telemetry, terms
+        if self._files.words is not None:
+            self._files.words.woken = self._inbox.wake
+            shell.listeners.append(self._files.answer)
         self._reloader, self._recall = reloader, recall
-        self.on_change: Callable[[Change], None] = lambda change: None  # who made the files
-        self._safe = False
         self._latency_timer_ms: int | None = None
-        self._interlock_s = min(_INTERLOCK_S, config.interlock.max_age_s / 3)
         self._stop_reason = ""
         self.stopped_s: float | None = None  # when `stop` was called, monotonic
         self._operator: SimpleQueue[inputs.Operator] = SimpleQueue()
-        self._next_interlock_ns = self._next_columns_ns = 0
         self._offsets_s = [float("inf")] * 2  # of wall clock and boottime, as last told
         self._asleep_s = _asleep_s()
         self._watch = Watch(time.monotonic())
@@ -158,8 +153,8 @@ class Daemon:
         """Other programs find the device at places of their own."""
         shares = self._link.share(self.config.share)
         self.shell.to_client = shares.send
-        if self._public is not None:
-            self._public.feed(shares.outlets())
+        if self._telemetry is not None:
+            self._telemetry.feed(shares.outlets())
         for level, text in shares.announced():
             self.shell.say(level, text, self.clock.now_ns())
 
@@ -191,9 +186,9 @@ class Daemon:
         if self._recall is not None and (earlier := self._recall.take(now_ns)) is not None:
             self._feed(earlier)
         self._look()
-        if self._public is not None:
+        if self._telemetry is not None:
             well = self.shell.worker is None or not self.shell.worker.stuck
-            self._public.turn(self.shell.core, time.monotonic(), well=well)
+            self._telemetry.turn(self.shell.core, time.monotonic(), well=well)
 
     def _wait(self, longest_s: float) -> Item | None:
         """The next bytes; while the estimator is behind they wait, and the rest goes on."""
@@ -231,15 +226,9 @@ class Daemon:
     def _around(self) -> None:
         """Vehicle, operators and the wall clock: before bytes are judged by what they say."""
         now = self.clock.now_ns()
-        if self._interlock is not None and now >= self._next_interlock_ns:
-            self._next_interlock_ns = now + int(self._interlock_s * 1e9)
-            self._safe = self._interlock.safe()
-            self._feed(inputs.Interlock(now, self._safe))
-        if self._columns is not None and now >= self._next_columns_ns:
-            self._next_columns_ns = now + int(_COLUMNS_S * 1e9)
-            if (values := self._columns.news()) is not None:
-                self._feed(inputs.Columns(now, values))
-        for word in self._words.take() if self._words is not None else ():
+        for item in self._files.heard(now):
+            self._feed(item)
+        for word in self._files.commands():
             self.operate(word.verb, word.argument, word.name)
         while not self._operator.empty():
             self._feed(self._operator.get())
@@ -283,15 +272,13 @@ class Daemon:
         error = "" if capture is None else capture.status.error
         for remark in self._watch.look(self.shell.core, now_s, error, self._link.is_open):
             self.shell.say(remark.level, remark.text, now_ns)
-        for complaint, before in self._complaints.items():
-            if (text := complaint()) != before:
-                self._complaints[complaint] = text
-                self.shell.say(logging.WARNING, text or f"over: {before}", now_ns)
+        for text in self._files.news_of_faults():
+            self.shell.say(logging.WARNING, text, now_ns)
         for well, text in () if self._reloader is None else self._reloader.take(self._change):
             self.shell.say(logging.INFO if well else logging.WARNING, text, now_ns)
         self.shell.folded.settle(now_ns * 1e-9)
-        if self._public is not None:
-            self._public.look(self.shell.core, self._link_facts(error), now_s)
+        if self._telemetry is not None:
+            self._telemetry.look(self.shell.core, self._link_facts(error), now_s)
         device = self.config.device
         if self._watch.garbage and device.baud == "auto":
             self._link.doubt()
@@ -299,20 +286,10 @@ class Daemon:
         elif self._watch.silent and device.configure_stream and self._may_query:
             self._lost(now_ns, "silence: asking the device again for its output")
 
-    def watch_files(
-        self,
-        interlock: Vehicle | None,
-        columns: ColumnsFile | None,
-        complaints: Iterable[Callable[[], str]],
-    ) -> None:
-        """Other files of the vehicle from now on; the word begins anew with them."""
-        self._interlock, self._columns = interlock, columns
-        self._complaints = dict.fromkeys(complaints, "")
-
     def _change(self, change: Change) -> None:
         """What a person changed in the configuration takes effect."""
         before, self.config = self.config, change.config
-        self.on_change(change)
+        self._files.change(change.config)
         capture, gates = change.config.capture, change.config.gates
         if self.shell.capture is not None:
             sizes = capture.part_megabytes * 1_000_000, capture.keep_megabytes * 1_000_000
@@ -320,14 +297,8 @@ class Daemon:
         if gates != before.gates:
             self._feed(inputs.LimitsChanged(self.clock.now_ns(), asdict(gates.limits())))
 
-    def _answer(self, event: events.Event) -> None:
-        """Tell a person what became of the word."""
-        if isinstance(event, events.Answered) and event.word and self._words is not None:
-            self._words.answer(event.word, OperatorAnswer(event.accepted, event.text))
-
     def _link_facts(self, capture_error: str) -> LinkFacts:
-        capture, viewer = self.shell.capture, self.shell.viewer
-        counters = viewer.counters if isinstance(viewer, RerunSink) else None
+        capture, (dropped, viewer_fault) = self.shell.capture, self.shell.viewer_losses
         return LinkFacts(
             port=spelled(self._link.path),
             baud=self._link.baud,
@@ -335,10 +306,10 @@ class Daemon:
             latency_timer_ms=self._latency_timer_ms,
             capture="" if capture is None else str(capture.path),
             capture_error=capture_error,
-            viewer_dropped=0 if counters is None else counters.dropped,
-            viewer_fault="" if counters is None else counters.last_fault,
-            interlock="none" if self._interlock is None else "safe" if self._safe else "not safe",
-            complaints=tuple(text for text in self._complaints.values() if text),
+            viewer_dropped=dropped,
+            viewer_fault=viewer_fault,
+            interlock=self._files.word,
+            complaints=self._files.faults,
             shares=() if self._link.shared is None else self._link.shared.facts(),
             estimator_stuck=self.shell.worker is not None and self.shell.worker.stuck,
         )
@@ -392,8 +363,8 @@ class Daemon:
     def _finish(self) -> None:
         """Let the core put back what it changed; bounded in time."""
         until = (self.stopped_s or time.monotonic()) + _STOP_S
-        if self._public is not None:
-            self._public.stopping()
+        if self._telemetry is not None:
+            self._telemetry.stopping()
         self._feed(inputs.Stop(self.clock.now_ns(), self._stop_reason))
         while not self.shell.finished and time.monotonic() < until:
             self._turn(0.05)
@@ -405,12 +376,5 @@ class Daemon:
         """After a bug of ours: the device streams again as before, whatever the core believes."""
         log.error("internal error; putting the device's output back", exc_info=bug)
         talk = self.shell.core.device_session
-        procedure, port = talk.cleanup(), self._link.take_port()
-        if port is None:
-            return
-        try:
-            with Device(port, talk.allows_cleanup) as device:
-                if procedure is not None:
-                    device.run(procedure, _CLEANUP_S)
-        except DriverError as error:
-            log.error("the device's output is not as it was: %s", error)
+        if text := self._link.put_back(talk.cleanup(), talk.allows_cleanup, _CLEANUP_S):
+            log.error("the device's output is not as it was: %s", text)

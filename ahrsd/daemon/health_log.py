@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 
+from ahrsd.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.core.core import Core
 from ahrsd.printable import counted
-from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 
 STATUS_S = 60.0
 _AMISS_S = 5.0  # something must be amiss for so long before it is said

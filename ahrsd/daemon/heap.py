@@ -6,7 +6,7 @@ final size and touched before the first sample, and glibc is told to give nothin
 temporaries (the judgement of an hour of evidence) are mapped and unmapped one by one, so they leave
 no holes in it.
 
-What must not grow is watched elsewhere: tests/benchmarks/bench_soak.py counts live bytes.
+What must not grow is watched elsewhere: tests/benchmarks/daemon/bench_soak.py counts live bytes.
 """
 
 from __future__ import annotations

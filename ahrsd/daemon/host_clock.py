@@ -23,7 +23,7 @@ def boot_s() -> float:
 
 
 def stamp() -> dict[str, object]:
-    """What a journal record says of the time it was made, as `writeback.clocks.Stamp` reads it."""
+    """What a journal record says of the time it was made, as `journal_history.Stamp` reads it."""
     return {"wall_s": time.time(), "boot_id": boot_id(), "boot_s": boot_s()}
 
 

@@ -13,6 +13,7 @@ side whatever the umask of who made them: the folder keeps everybody else out.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import logging
@@ -29,7 +30,7 @@ from queue import SimpleQueue
 from typing import Final
 
 from ahrsd.foreign_file import ForeignFileError, boot_s, kind_of, read_regular
-from ahrsd.recording.retention import make_private_folder
+from ahrsd.recording.capture import make_private_folder
 
 VERBS: Final = ("arm", "disarm", "approve", "lock", "unlock", "rollback")
 LONGEST_S: Final = 30.0
@@ -164,6 +165,14 @@ class OperatorInbox:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="operator", daemon=True)
         self._thread.start()
+
+    @staticmethod
+    def in_state(state_directory: Path) -> OperatorInbox:
+        """That of a daemon with this state directory."""
+        box = OperatorBox(state_directory)
+        with contextlib.suppress(OSError):  # the inbox says why, and when it is over
+            box.prepare()
+        return OperatorInbox(box)
 
     def take(self) -> list[OperatorCommand]:
         """The words since the last time, oldest first."""

@@ -22,6 +22,7 @@ from ahrsd.daemon.core_runner import JournalKeeper, Shell, close_shell
 from ahrsd.daemon.daemon import Daemon
 from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.journal import Journal
+from ahrsd.daemon.vehicle_files import VehicleFiles
 from ahrsd.demo.emulated import (
     BAUD,
     UNREAD_BYTES,
@@ -104,7 +105,8 @@ def run_demo(
         with emulated_device(setup, link, speed) as emulated:
             clock = WorldClock(speed, patient_bytes=UNREAD_BYTES, world_s=emulated.device_s)
             shell = _shell(directory, config, clock, scene)
-            daemon = Daemon(config, shell, link, clock, AlwaysSafe())
+            files = VehicleFiles(AlwaysSafe(), max_age_s=config.interlock.max_age_s)
+            daemon = Daemon(config, shell, link, clock, files)
             scene.stop, scene.operate = daemon.stop, daemon.operate
             scene.candidate = lambda: shell.core.writeback.proposal
             scene.registers = lambda: shell.core.registers

@@ -13,11 +13,11 @@ from typing import Protocol
 from ahrsd.daemon.host_clock import HostClock
 from ahrsd.errors import EXIT_BUSY, DeviceError
 from drivers.serial_port import PortError, SerialPort
+from drivers.vn100.commands import read_registers
 from drivers.vn100.device import Device
 from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 from drivers.vn100.errors import DriverError
-from drivers.vn100.procedures import read_registers
 
 BAUD = 115200
 UNREAD_BYTES = 512  # then the world waits: some messages

@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
+from ahrsd.calibration_json import calibration_json
 from ahrsd.core.core import Core
 from ahrsd.demo.scene import DemoScene, live_samples
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.report import EventCollector, HeadingError, KeyFigure, write_report
-from ahrsd.report.calibration_json import calibration_json
 from ahrsd.report.summary import heading_errors, serial_of
 from ahrsd.samples import Array
 from ahrsd.writeback.states import State

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ahrsd.calibration import Estimate
+from ahrsd.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.events import (
     Estimated,
     Event,
@@ -26,7 +27,6 @@ from ahrsd.events import (
 from ahrsd.gates import Level, for_level, guards_a_write
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.report import EventCollector
-from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.report.contents import RunTime
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.composition import Proposal

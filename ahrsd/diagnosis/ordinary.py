@@ -104,7 +104,7 @@ class Table:
     beside: Row
 
 
-#: of `python tests/benchmarks/bench_ordinary.py`, which prints it
+#: of `python tests/benchmarks/diagnosis/bench_ordinary.py`, which prints it
 TABLE = Table(
     recordings=19,
     components={

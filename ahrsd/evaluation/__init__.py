@@ -1,15 +1,15 @@
 """What a calibration is worth on a recording: before and after, judged by what can be known.
 
-`track` is the recording as arrays, with which way is up; `stored` the calibration; `heading`
-compares with references, `dead_reckoning` with fixes; `judging` has the figures of the field and
-all of them together, as JSON and as a table.
+`track` is the recording as arrays, with which way is up; `heading` compares with references, and
+dead reckoning with fixes; `judging` has the figures of the field and all of them together, as JSON
+and as a table. The calibration is read by `calibration_json`.
 
 Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """
 
+from ahrsd.calibration_json import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.heading import Fixes, HeadingReference
 from ahrsd.evaluation.judging import Evaluation, judge
-from ahrsd.evaluation.stored import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, tracked
 
 __all__ = [

@@ -13,17 +13,20 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from ahrsd.baselines.data import field_spread
-from ahrsd.evaluation import dead_reckoning
-from ahrsd.evaluation.dead_reckoning import ReckoningFigures
+from ahrsd.calibration_json import StoredCalibration
 from ahrsd.evaluation.heading import (
     FOLDS,
     Fixes,
     HeadingFigures,
     HeadingReference,
+    ReckoningFigures,
     compare,
+    distance_m,
+    reckon,
     rms_difference,
+    velocity_of,
+    within,
 )
-from ahrsd.evaluation.stored import StoredCalibration
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
 from ahrsd.printable import counted
 from ahrsd.samples import Array
@@ -204,12 +207,12 @@ def _up(
 def _reckoned(
     track: EvaluationTrack, fields: Pair[Array], up_b: Array, fixes: Fixes, said: list[str]
 ) -> Reckoned | None:
-    inside = dead_reckoning.within(track, fixes)
+    inside = within(track, fixes)
     if inside is None:
         said.append(f"{fixes.source}: too few fixes within the recording for dead reckoning")
         return None
-    velocity = dead_reckoning.velocity_of(track, fixes)
-    way_m = dead_reckoning.distance_m(track, velocity, inside)
+    velocity = velocity_of(track, fixes)
+    way_m = distance_m(track, velocity, inside)
     if way_m is None:
         said.append("hardly any way was travelled: no dead reckoning")
         return None
@@ -220,9 +223,7 @@ def _reckoned(
             f"{counted(int(np.count_nonzero(gaps > _LONG_GAP_S)), 'gap')} of more than "
             f"{_LONG_GAP_S:g} s"
         )
-    figures = _both(
-        fields, lambda b: dead_reckoning.reckon(track, b, up_b, velocity, inside, way_m)
-    )
+    figures = _both(fields, lambda b: reckon(track, b, up_b, velocity, inside, way_m))
     return Reckoned(velocity.source, fixes.source, way_m, inside, figures)
 
 

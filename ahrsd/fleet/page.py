@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet import told
 from ahrsd.fleet.drift import DeviceDrift, Trend
 from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Store
+from ahrsd.fleet.words import change_words, date, trend_words
 from ahrsd.printable import LINE, counted, printable
 from ahrsd.report.fleet_page import (
     DeviceLine,
@@ -73,7 +73,7 @@ def _line(one: DeviceDrift, mismatches: str) -> DeviceLine:
         device=printable(one.device),
         vehicle=printable(one.vehicle or "–"),
         calibrations=one.recordings,
-        newest=told.date(one.last_day),
+        newest=date(one.last_day),
         heading_sigma_deg=one.heading_sigma_deg,
         heading_kept_deg=one.heading_kept_deg,
         iron_drift_mg=1e3 * float(np.linalg.norm(slope)) if np.isfinite(slope).all() else None,
@@ -84,9 +84,9 @@ def _line(one: DeviceDrift, mismatches: str) -> DeviceLine:
 
 def _drawing(one: DeviceDrift) -> Drawing:
     series = one.series
-    words = [f"hard iron {told.trend_words(one.iron, 'mG')}"]
-    words += [f"hard iron {told.change_words(change, 'mG')}" for change in one.iron.changes]
-    words += [f"gyro bias {told.change_words(change, 'mrad/s')}" for change in one.bias.changes]
+    words = [f"hard iron {trend_words(one.iron, 'mG')}"]
+    words += [f"hard iron {change_words(change, 'mG')}" for change in one.iron.changes]
+    words += [f"gyro bias {change_words(change, 'mrad/s')}" for change in one.bias.changes]
     return Drawing(
         printable(one.device),
         series.day,

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from ahrsd.baselines import METHODS, MethodResult, calibrate_with
 from ahrsd.baselines.data import stuck
 from ahrsd.baselines.registry import ComparisonRow, halves, spread_of
+from ahrsd.calibration_json import calibration_json
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import SamplesSeen
-from ahrsd.offline.calibrate import BatchResult
-from ahrsd.report.calibration_json import calibration_json
+from ahrsd.offline.batch_result import BatchResult
 from ahrsd.samples import Array, SampleBlock
 
 OURS = "magyc"

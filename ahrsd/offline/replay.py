@@ -24,8 +24,8 @@ from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import GARBAGE_BYTES, on_one_thread, refuse_beyond
 from ahrsd.recording.opening import Recording, RecordingKind, open_recording
 from ahrsd.stream.assembler import NoSamplesError
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.deframer import Cause
 from drivers.vn100.errors import NO_CHECKSUM
 

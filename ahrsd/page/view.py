@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.evidence.coverage import CELLS, cells_of, centres
 from ahrsd.evidence.values import Bools
 from ahrsd.gates import GATES, guards_a_write
 from ahrsd.printable import counted, line
-from ahrsd.report.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.samples import Array
 from ahrsd.telemetry.driving import (
     LEVEL,
@@ -31,8 +31,7 @@ from ahrsd.telemetry.driving import (
     shown_of,
     tilt_is_wanted,
 )
-from ahrsd.telemetry.explain import STATES, explain_json, holding
-from ahrsd.telemetry.lines import old_reading, turned_deg
+from ahrsd.telemetry.words import STATES, explain_json, holding, old_reading, turned_deg
 
 # -- Words and numbers -----------------------------------------------------------------------------
 

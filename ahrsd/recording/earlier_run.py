@@ -37,12 +37,11 @@ from ahrsd.recording.blocks import SEQUENCES, Damage, Entry, read_entries, read_
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.writeback.clocks import Stamp
+from ahrsd.writeback.journal_history import Stamp
 from drivers.vn100.decode import Measurement, Undecodable, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import COMPENSATING, Values, parse, same
+from drivers.vn100.registers import COMPENSATING, Unit, Values, parse, same
 
 RUNS = 4  # captures that are looked at
 FIRST_S = 2.0  # of a capture that is read for its clocks, however long ago it began

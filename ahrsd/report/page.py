@@ -9,7 +9,7 @@ import numpy as np
 from ahrsd.gates import guards_a_write
 from ahrsd.report.contents import EstimateHistory, HeadingError, RegisterChange, ReportData
 from ahrsd.report.template import Picture, number, picture, render
-from ahrsd.writeback.composition import register_lines
+from drivers.vn100.registers import register_lines
 
 HEADING_TITLE = "Heading error before and after, on data that the estimate has not seen"
 

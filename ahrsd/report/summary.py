@@ -8,16 +8,16 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.core.core import Core
-from ahrsd.events import GateResult
-from ahrsd.gates import Level, guards_a_write
-from ahrsd.printable import counted
-from ahrsd.report.calibration_json import (
+from ahrsd.calibration_json import (
     HeadingErrors,
     calibration_json,
     heading_words,
     why_not_converged,
 )
+from ahrsd.core.core import Core
+from ahrsd.events import GateResult
+from ahrsd.gates import Level, guards_a_write
+from ahrsd.printable import counted
 from ahrsd.stream.decompensation import Compensation
 
 _TABLE_IS_RAW = (
@@ -38,7 +38,7 @@ def summary_json(core: Core, recording: str, warnings: Sequence[str] = ()) -> di
         "bytes": counters.fed_bytes,
         "packets": {
             "valid": counters.valid,
-            "rejected": counters.rejected + core.undecodable,
+            "rejected": counters.rejected + core.source.undecodable,
             "by_type": dict(core.stream.by_layout),
         },
         "skipped_bytes": counters.skipped_bytes,
@@ -106,7 +106,7 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
         f"({rate}{source})"
     ]
     if counters.fed_bytes:
-        rejected = counters.rejected + core.undecodable
+        rejected = counters.rejected + core.source.undecodable
         lines.append(
             f"  messages: {counters.valid} valid, {rejected} rejected, "
             f"{counted(counters.skipped_bytes, 'byte')} skipped"

@@ -25,11 +25,10 @@ from ahrsd.sharing.client_commands import (
     SharePolicy,
     understand,
 )
-from drivers.vn100.commands import Read, Write
+from drivers.vn100.commands import Identity, Read, Write
 from drivers.vn100.deframer import Cause, Deframer
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.messages import Reply, encode
-from drivers.vn100.procedures import Identity
 from drivers.vn100.registers import Values, format_reply
 
 PATIENCE_S = 2.5  # the longest that a known driver waits for an answer

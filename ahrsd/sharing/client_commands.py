@@ -17,7 +17,7 @@ read like the device reads them, so what goes out on its behalf is always a comm
 | any other write, VNKMD, VNKAD | the device's for the owner; VNERR 09 for everybody else |
 
 Sources: UM001 "System Commands"; what drivers send at their start
-(tests/support/drivers_at_start.py).
+(tests/support/devices/drivers_at_start.py).
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Literal
 
-from ahrsd.writeback.permissions import GUARDED, PASSABLE, Purpose
+from ahrsd.writeback.permissions import GUARDED, PASSABLE
+from ahrsd.writeback.states import Purpose
 from drivers.vn100.commands import Read, Speech, Word, Write
 from drivers.vn100.registers import REGISTERS, RegisterValueError, parse
 

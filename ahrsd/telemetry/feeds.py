@@ -26,8 +26,8 @@ from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.sharing.nmea import Tilt, attitude, has_heading, hdm, pitch_deg, roll_deg, xdr
 from ahrsd.stream.decompensation import Compensation
-from ahrsd.telemetry.explain import STATES, estimator_trouble, stream_trouble
 from ahrsd.telemetry.protocol import Record, line_of
+from ahrsd.telemetry.words import STATES, estimator_trouble, stream_trouble
 from ahrsd.writeback.composition import GYRO, MAG, Proposal, correction, heading_change_deg
 from ahrsd.writeback.states import State
 from drivers.vn100.registers import Values
@@ -373,6 +373,7 @@ def _known(core: Core) -> ChoiceFacts:
         core.writeback.state,
         core.writeback.proposal,
         estimate,
-        trusted=not (calibrator.step_open or core.estimator.failed or core.sensors.findings)
+        trusted=not (calibrator.step_open or core.estimation.state.failed)
+        and not core.source.sensors.findings
         and (estimate is None or estimate.contradicted_s is None),
     )

@@ -16,7 +16,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from ahrsd.sharing.arbiter import COUNTED
-from ahrsd.telemetry.explain import STATES
+from ahrsd.telemetry.words import STATES
 
 Status = Mapping[str, Any]
 Samples = list[tuple[tuple[str, ...], float]]  # values of the labels, value

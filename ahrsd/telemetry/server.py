@@ -17,7 +17,6 @@ from pathlib import Path
 
 import ahrsd
 from ahrsd import events
-from ahrsd.telemetry.explain import explain_json
 from ahrsd.telemetry.protocol import (
     LIMIT_BYTES,
     LONGEST_REQUEST,
@@ -32,6 +31,7 @@ from ahrsd.telemetry.protocol import (
     record_of,
     stream_of,
 )
+from ahrsd.telemetry.words import explain_json
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.calibration import Estimate
-from ahrsd.core.calibration_pipeline import Calibrator
 from ahrsd.core.core import Core
+from ahrsd.core.estimation import Calibrator
 from ahrsd.events import GateResult, SamplesSeen
 from ahrsd.evidence.values import Evidence
 from ahrsd.heading import tilt_compensated_heading
@@ -120,7 +120,7 @@ class StatusMaker:
             "stream": self._stream(core),
             "readings": None if self._seen is None else readings(self._seen, now_s),
             "motion": _motion(core.calibrator.evidence),
-            "sensors": list(core.sensors.findings.values()),
+            "sensors": list(core.source.sensors.findings.values()),
             "estimator": _estimator(core, link.estimator_stuck),
             "warm_start": core.warm.text,
             "estimate": _estimate(core.calibrator.estimate),
@@ -151,15 +151,15 @@ class StatusMaker:
             "rate_hz": facts.rate_hz,
             "rate_source": facts.rate_source,
             "messages": counters.valid,
-            "rejected": counters.rejected + core.undecodable,
+            "rejected": counters.rejected + core.source.undecodable,
             "skipped_bytes": counters.skipped_bytes,
             "by_type": dict(core.stream.by_layout),
             "gaps": core.stream.all_gaps.count,
             "restarts": core.stream.restarts,
             "faults": core.faults,
-            "strays": core.strays,
+            "strays": core.source.strays,
             "refused": [str(error) for error in core.stream.refused.values()],
-            "waits_for": list(core.vehicle.waits_for),
+            "waits_for": list(core.source.vehicle.waits_for),
         }
 
 
@@ -196,7 +196,7 @@ def _motion(evidence: Evidence | None) -> dict[str, object] | None:
 
 def _estimator(core: Core, stuck: bool) -> dict[str, object]:
     """Whether the estimator works, and how it broke off last."""
-    state = core.estimator
+    state = core.estimation.state
     return {
         "state": "FAILED" if state.failed else "STUCK" if stuck else "RUNNING",
         "reason": state.reason,

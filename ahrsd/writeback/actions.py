@@ -16,13 +16,17 @@ from typing import Any
 
 from ahrsd.events import Event, Noted, RegisterWritten, StateChanged
 from ahrsd.printable import counted
-from ahrsd.writeback.clocks import Now, Stamp, plausible
-from ahrsd.writeback.permissions import Purpose
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.transaction import JournalHistory, JournalRecord
+from ahrsd.writeback.journal_history import (
+    JournalHistory,
+    JournalRecord,
+    Now,
+    RecordKind,
+    Stamp,
+    plausible,
+)
+from ahrsd.writeback.states import Purpose
 from drivers.vn100.commands import Command, Procedure
-from drivers.vn100.procedures import Unit
-from drivers.vn100.registers import Values
+from drivers.vn100.registers import Unit, Values
 
 # -- Actions ---------------------------------------------------------------------------------------
 

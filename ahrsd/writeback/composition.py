@@ -30,8 +30,7 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.samples import Array
-from drivers.vn100.messages import encode
-from drivers.vn100.registers import Values, as_stored, format_command
+from drivers.vn100.registers import Values, as_stored, register_lines
 
 MAG, GYRO = 23, 84
 MAX_CONDITION: Final = 8.0  # daemon.md 4.3 G9: hard limits, not a person's to loosen
@@ -96,16 +95,6 @@ def compose(
         lines=lines,
         heading_change_deg=heading_change_deg(present, written, estimate) if MAG in new else 0.0,
         gyro_change_rad_s=_gyro_change(present_gyro, new),
-    )
-
-
-def register_lines(values: Mapping[int, Values]) -> tuple[str, ...]:
-    """`$VNWRG,23,...*XX`: what is sent, and what a person may type into a terminal."""
-    return tuple(
-        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]), held=True)}")
-        .decode()
-        .strip()
-        for number in sorted(values)
     )
 
 

@@ -11,7 +11,7 @@ silence, readings or a time that jump), because another device may have the cabl
 its time.
 
 A suspicion has the device read again at once. Only a proof confirms what is in flash: its time
-since start-up against the journal's newest record (`clocks.restarted_since`); its time that fell in
+since start-up against the journal's newest record (`restarted_since`); its time that fell in
 this run, for a record of before this run; or a restart that it reported, where it tells no time.
 
 While it is doubtful whose the stream is, nothing that it shows is a proof: in a procedure, when
@@ -27,7 +27,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from ahrsd.writeback.clocks import CLOCK_RATE, LATENCY_S, Stamp, restarted_since
+from ahrsd.writeback.journal_history import CLOCK_RATE, LATENCY_S, Stamp, restarted_since
 
 # -- Recheck ---------------------------------------------------------------------------------------
 

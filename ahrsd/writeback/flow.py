@@ -37,31 +37,26 @@ from typing import Final
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.actions import ActionOutbox, CalibrateAnew, IdentifyAgain, SetUpStream
-from ahrsd.writeback.composition import (
-    GYRO,
-    MAG,
-    Proposal,
-    UnwritableError,
-    apart_deg,
-    compose,
-    register_lines,
-)
-from ahrsd.writeback.permissions import Mode, Purpose
+from ahrsd.writeback.composition import GYRO, MAG, Proposal, UnwritableError, apart_deg, compose
+from ahrsd.writeback.journal_history import RecordKind, Transaction
+from ahrsd.writeback.permissions import permitted
 from ahrsd.writeback.policy import Safeguards, WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
-from ahrsd.writeback.reconcile import RecordKind, found
+from ahrsd.writeback.reconcile import found
 from ahrsd.writeback.states import (
     LIVED_WITH,
     ON_TIMEOUT,
     TABLE,
     WITHOUT_TRANSACTION,
+    Mode,
+    Purpose,
     Signal,
     State,
 )
-from ahrsd.writeback.transaction import ProcedureOutcome, Transaction, check, roll_back, save, stage
+from ahrsd.writeback.transaction import ProcedureOutcome, check, roll_back, save, stage
 from ahrsd.writeback.trial import Trial, TrialVerdict
-from drivers.vn100.procedures import Identity, Unit, VerifyFailed
-from drivers.vn100.registers import Values, same
+from drivers.vn100.commands import Command, Identity, VerifyFailed
+from drivers.vn100.registers import Unit, Values, register_lines, same
 
 # -- What programs on shared ports bring about -----------------------------------------------------
 
@@ -126,7 +121,7 @@ class Flow:
     def __init__(self, policy: WriteBackPolicy) -> None:
         self.policy = policy
         self.safe = Safeguards(policy)
-        self.outbox = ActionOutbox(self.safe.allow)
+        self.outbox = ActionOutbox(self._allowed)
         self.state = State.RECONCILING
         self.deadline_s: float | None = None
         self.identity: Identity | None = None
@@ -165,6 +160,13 @@ class Flow:
             State.ROLLED_BACK: self._enter_rest,
             State.FAULT: self._enter_fault,
         }
+
+    def _allowed(self, command: Command, purpose: Purpose, host_s: float) -> bool:
+        """The gate in front of every command of the write-back: the table, then the safeguards."""
+        mode, changes = self.safe.mode_for(purpose), self.policy.configure_stream
+        if not permitted(command, mode, changes, purpose, self.safe.client_registers):
+            return False
+        return self.safe.allow(command, purpose, host_s)
 
     # -- moving ------------------------------------------------------------------------------------
 

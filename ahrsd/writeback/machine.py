@@ -25,20 +25,20 @@ from ahrsd.writeback.actions import Action, IdentifyAgain, Look
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
 from ahrsd.writeback.device_watch import Recheck, RestartWatch
 from ahrsd.writeback.flow import Answer, Flow
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.journal_history import JournalHistory, JournalRecord, RecordKind
 from ahrsd.writeback.policy import WriteBackPolicy, margin
-from ahrsd.writeback.reconcile import RecordKind
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     LIVED_WITH,
     ON_TIMEOUT,
     WITHOUT_TRANSACTION,
+    Mode,
     Signal,
     State,
 )
-from ahrsd.writeback.transaction import HSI_RESULT, JournalHistory, JournalRecord, ProcedureOutcome
+from ahrsd.writeback.transaction import HSI_RESULT, ProcedureOutcome
 from ahrsd.writeback.trial import TrialMetrics, TrialVerdict
-from drivers.vn100.procedures import Identity, Seen, differences
+from drivers.vn100.commands import Identity, Seen, differences
 from drivers.vn100.registers import COMPENSATING, Values, same
 
 RESTS = frozenset(  # states in which a proven restart since the newest record has it read again

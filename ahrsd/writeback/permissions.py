@@ -19,38 +19,15 @@ the interlock is asked there. This function is total: a command that no row name
 from __future__ import annotations
 
 from collections.abc import Collection
-from enum import Enum, IntEnum
 from typing import Final
 
+from ahrsd.writeback.states import Mode, Purpose
 from drivers.vn100.commands import Command, Pause, Read, Word, Write
-from drivers.vn100.procedures import SESSION_SETTINGS
-from drivers.vn100.registers import REGISTERS
+from drivers.vn100.registers import REGISTERS, SESSION_SETTINGS
 
 CALIBRATION: Final = (23, 84)
 GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # for no client: line rate and calibration
 PASSABLE: Final = tuple(n for n in GUARDED if n != 5)  # but for one whose share says so
-
-
-class Mode(IntEnum):
-    """How much a person allows; the order is the order of harm."""
-
-    PASSIVE = 0
-    OBSERVE = 1
-    STAGE = 2
-    COMMIT = 3
-
-
-class Purpose(Enum):
-    """Why a command is sent."""
-
-    READ = "read"
-    STREAM = "stream"
-    STAGE = "stage"
-    ROLL_BACK = "roll back"
-    SAVE = "save"
-    CLIENT = "client"
-    CLIENT_CALIBRATION = "client's calibration"
-
 
 NEEDS: Final[dict[Purpose, Mode]] = {
     Purpose.READ: Mode.OBSERVE,

@@ -17,13 +17,11 @@ import numpy as np
 from ahrsd.calibration import Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.clocks import Now, passed_s
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
-from ahrsd.writeback.permissions import Mode, Purpose, permitted
-from ahrsd.writeback.transaction import JournalHistory
+from ahrsd.writeback.journal_history import JournalHistory, Now, passed_s
+from ahrsd.writeback.states import Mode, Purpose
 from ahrsd.writeback.trial import TrialPolicy
-from drivers.vn100.commands import Command, Word, Write
-from drivers.vn100.procedures import Identity
+from drivers.vn100.commands import Command, Identity, Word, Write
 from drivers.vn100.registers import Values, same
 
 # -- What a person sets, and what holds a write back -----------------------------------------------
@@ -127,7 +125,7 @@ def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate)
 def ram_budget(
     policy: WriteBackPolicy, history: JournalHistory, now: Now, *, again: bool = False
 ) -> list[str]:
-    """Why RAM must not be written now; empty where it may. Times as `clocks.passed_s` reads them:
+    """Why RAM must not be written now; empty where it may. Times as `passed_s` reads them:
     no clock that was wrong, or was set, makes one longer.
 
     again: the values were in RAM just now and were undone for a client's save, so the pause between
@@ -472,17 +470,17 @@ class Safeguards:
             return []
         return [f"the newest {late_s:.0f} s of samples are not judged yet"]
 
+    def mode_for(self, purpose: Purpose) -> Mode:
+        """The mode by which a command is judged: a rollback on our own device needs no journal."""
+        if purpose is Purpose.ROLL_BACK and self._is_ours:
+            return self.policy.mode
+        return self.mode
+
     def allow(self, command: Command, purpose: Purpose, host_s: float) -> bool:
-        """The gate in front of every command of the write-back.
+        """Whether vehicle, journal and verdict let a command of the write-back out now.
 
         A rollback asks neither the vehicle nor the journal: the old values are what it lived with.
         """
-        mode = self.mode
-        if purpose is Purpose.ROLL_BACK and self._is_ours:
-            mode = self.policy.mode
-        changes = self.policy.configure_stream
-        if not permitted(command, mode, changes, purpose, self.client_registers):
-            return False
         if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
             return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_holds(host_s)
         if isinstance(command, Word) and command.word == "VNWNV":

@@ -15,52 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum, StrEnum
+from enum import Enum
 from typing import Final
 
+from ahrsd.writeback.journal_history import RecordKind
 from ahrsd.writeback.states import Signal
 from drivers.vn100.registers import Values, same
-
-
-class RecordKind(StrEnum):
-    """Records of the journal. The first group leaves a transaction open, the second ends it."""
-
-    PREPARED = "PREPARED"  # J1: what the device holds, what it shall hold; nothing sent yet
-    RAM_FAILED = "RAM_FAILED"  # J3: a write was refused or did not verify; old values follow
-    RAM_VERIFIED = "RAM_VERIFIED"  # J3: read back, equal
-    PROVEN = "PROVEN"  # J4: the trial passed
-    ROLLBACK = "ROLLBACK"  # J4: the old values are about to be written
-    FLASH_SENT = "FLASH_SENT"  # J5: VNWNV is about to be sent
-    FLASH_ACKED = "FLASH_ACKED"  # J6: the device said yes
-
-    ABORTED = "ABORTED"  # nothing was changed
-    ROLLED_BACK = "ROLLED_BACK"  # the old values were read back
-    REVERTED = "REVERTED"  # the old values are back, by whom is not known
-    LOST = "LOST"  # the device restarted with the old values
-    NOT_SAVED = "NOT_SAVED"  # VNWNV was sent, a restart brought the old values
-    CONFIRMED = "CONFIRMED"  # J7: a restart brought the new values
-    FOREIGN = "FOREIGN"  # the device holds what nobody here wrote
-    FLASH_TORN = "FLASH_TORN"  # VNWNV was interrupted, the flash holds neither
-
-    LOCKED = "LOCKED"  # not part of a transaction
-    UNLOCKED = "UNLOCKED"
-    OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
-    OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
-    CLIENT_SAVED = "CLIENT_SAVED"  # a program on a shared port saved all of RAM
-    CLIENT_WRITES = "CLIENT_WRITES"  # one is about to write what calibrates, in RAM
-
-
-OPEN: Final = (
-    RecordKind.PREPARED,
-    RecordKind.RAM_FAILED,
-    RecordKind.RAM_VERIFIED,
-    RecordKind.PROVEN,
-    RecordKind.ROLLBACK,
-    RecordKind.FLASH_SENT,
-    RecordKind.FLASH_ACKED,
-)
-OF_OUTPUTS: Final = (RecordKind.OUTPUTS_KEPT, RecordKind.OUTPUTS_BACK)
-OF_OTHERS: Final = (*OF_OUTPUTS, RecordKind.CLIENT_SAVED)  # says nothing about a transaction
 
 
 class DeviceContents(Enum):

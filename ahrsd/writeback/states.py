@@ -1,4 +1,7 @@
-"""The states of the write-back and every way from one to another, as a table.
+"""The write-back's vocabulary: modes, purposes, states, and every way from one state to another.
+
+`Mode` is how much a person allows, `Purpose` is why a command is sent (`permissions` is the table
+of both); the rest is the state machine.
 
 Theory of operation
 ===================
@@ -33,8 +36,34 @@ Power may go at any point; `reconcile` lists what is found then.
 
 from __future__ import annotations
 
-from enum import StrEnum
+from enum import Enum, IntEnum, StrEnum
 from typing import Final
+
+# -- How much is allowed, and what for -------------------------------------------------------------
+
+
+class Mode(IntEnum):
+    """How much a person allows; the order is the order of harm."""
+
+    PASSIVE = 0
+    OBSERVE = 1
+    STAGE = 2
+    COMMIT = 3
+
+
+class Purpose(Enum):
+    """Why a command is sent."""
+
+    READ = "read"
+    STREAM = "stream"
+    STAGE = "stage"
+    ROLL_BACK = "roll back"
+    SAVE = "save"
+    CLIENT = "client"
+    CLIENT_CALIBRATION = "client's calibration"
+
+
+# -- States, signals, and the table ----------------------------------------------------------------
 
 
 class State(StrEnum):

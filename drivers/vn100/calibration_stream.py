@@ -17,10 +17,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.vn100.commands import NoReply, Pause, Procedure, SessionError
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.procedures import (
-    SESSION_SETTINGS,
+from drivers.vn100.commands import (
+    NoReply,
+    Pause,
+    Procedure,
+    SessionError,
     differences,
     quiet,
     read,
@@ -28,10 +29,12 @@ from drivers.vn100.procedures import (
     restore,
     write_verified,
 )
+from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.registers import (
     BINARY_OUTPUT_OFF,
     BINARY_OUTPUTS,
     SAMPLE_RATE_HZ,
+    SESSION_SETTINGS,
     Values,
     same,
 )
@@ -98,7 +101,7 @@ def configure_stream(
 ) -> Procedure[CalibrationStream]:
     """Stream the calibration packet at `rate_hz` on the port in use, in RAM; ASCII output off.
 
-    Changes registers 6 and 75 to 77, all of `procedures.SESSION_SETTINGS`; puts them back itself
+    Changes registers 6 and 75 to 77, all of `registers.SESSION_SETTINGS`; puts them back itself
     where it fails. Raises DoesNotFit before anything is sent, NoStream, DeviceRefused, NoReply, and
     NotPutBack.
 

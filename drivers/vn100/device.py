@@ -21,8 +21,8 @@ from drivers.vn100.commands import (
     SessionError,
     Word,
     reply_time_s,
+    resume,
 )
-from drivers.vn100.procedures import resume
 from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
 
 T = TypeVar("T")

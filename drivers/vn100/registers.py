@@ -8,14 +8,35 @@ Commands and replies, as the device speaks them::
 
     $VNWRG,23,1.02,0.01,...*6F   format_command(23, values), written behind "VNWRG,"
     $VNRRG,23,1.02,0.01,...      format_reply(23, values), printed behind "VNRRG," or "VNWRG,"
+
+**Firmware generations** (`Profile`, chosen by register 4):
+
+| | 2.x (2.0, 2.1) | 3.x (3.0.0.0, 3.1.0.0) |
+|---|---|---|
+| on-board hard/soft iron, register 44 | ``1,3,5``: running and applied | ``0,1,5``: off |
+| gyro bias at start-up, what VNSGB fills | register 74 | register 43 |
+| VNTAR | yes | no (error 04) |
+| register numbers in replies | 8 or 08 | 08 |
+
+Any other firmware is unknown, and so is any other model: `Profile.writable` is false,
+`observed_for` says why, and nothing may be changed on the device. The same holds for a device that
+lacks a register which a VN-100 of its firmware has.
+
+**The gyro bias goes to register 84, on both generations, and to no other.** Register 84 is
+``out = C (in - B)`` at the sensor, acts at once, on every output, and can be read back and taken
+back. Registers 43 and 74 only hold where the attitude filter starts its own bias estimate after a
+power-up; writing the same bias there too would have it corrected twice until the filter notices.
+VNSGB copies the filter's estimate, not ours.
 """
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
-from drivers.vn100.messages import SYNC, packet_size
+from drivers.vn100.messages import SYNC, encode, packet_size
 from drivers.vn100.register_codec import (
     OUT_OF_RANGE,
     TOO_FEW,
@@ -39,16 +60,21 @@ __all__ = [
     "COMPENSATING",
     "REGISTERS",
     "SAMPLE_RATE_HZ",
+    "SESSION_SETTINGS",
     "SUPPORTED_BAUD",
+    "Profile",
     "Register",
     "RegisterField",
     "RegisterValueError",
+    "Unit",
     "Values",
     "as_stored",
     "check",
     "format_command",
     "format_reply",
     "parse",
+    "profile_of",
+    "register_lines",
     "same",
 ]
 
@@ -140,6 +166,7 @@ SUPPORTED_BAUD = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921
 ASYNC_OUTPUT_TYPES = (0, 1, 2, 8, 10, 11, 12, 13, 14, 16, 17, 19, 30, 34)  # 34: firmware 3 only
 ASYNC_OUTPUT_RATES_HZ = (0, 1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
 BINARY_OUTPUTS = (75, 76, 77)
+SESSION_SETTINGS = (*BINARY_OUTPUTS, 7, 6)  # in the order in which `restore` puts them back
 BINARY_OUTPUT_OFF: Values = (0, 1, 0)
 
 
@@ -646,6 +673,16 @@ def same(register_id: int, sent: Values, read_back: Values) -> bool:
     return same_values(_row(register_id), sent, read_back)
 
 
+def register_lines(values: Mapping[int, Values]) -> tuple[str, ...]:
+    """`$VNWRG,23,...*XX`: what is sent, and what a person may type into a terminal."""
+    return tuple(
+        encode(f"VNWRG,{format_command(number, as_stored(number, values[number]), held=True)}")
+        .decode()
+        .strip()
+        for number in sorted(values)
+    )
+
+
 def as_stored(register_id: int, values: Values) -> Values:
     """`values` as the device would hold them: f32, numerical dust below 1e-12 set to zero."""
     return as_stored_values(_row(register_id), values)
@@ -656,3 +693,79 @@ def _row(register_id: int) -> Register:
     if row is None:
         raise RegisterValueError(f"the VN-100 has no register {register_id}", 0x08)
     return row
+
+
+# -- Firmware generations, and one device among all ------------------------------------------------
+
+
+_VN100 = re.compile(r"VN-?100(?![0-9])", re.IGNORECASE)
+_VERSION = re.compile(r"([0-9]{1,3})(?:\.([0-9]{1,5}))?(?:\.([0-9]{1,5}))?(?:\.([0-9]{1,5}))?")
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One firmware generation.
+
+    generation:     2 or 3; 0 where the firmware is unknown
+    version:        as register 4 says it
+    writable:       false for unknown firmware and other models: observe only
+    startup_bias:   register that VNSGB fills, None where unknown
+    tare:           whether VNTAR exists
+    observed_for:   why nothing may be changed, for a person; empty where it may
+    """
+
+    generation: int
+    version: str
+    writable: bool
+    startup_bias: int | None
+    tare: bool
+    observed_for: str = ""
+
+    def observed(self, why: str) -> Profile:
+        """The same where nothing may be changed, for one reason more."""
+        reasons = f"{self.observed_for}; {why}" if self.observed_for else why
+        return replace(self, writable=False, observed_for=reasons)
+
+    def has(self, register_id: int) -> bool:
+        """Whether this firmware has the register; for unknown firmware, whether any has it."""
+        row = REGISTERS.get(register_id)
+        if row is None:
+            return False
+        return self.generation == 0 or self.generation in row.generations
+
+    @property
+    def registers(self) -> tuple[int, ...]:
+        """Numbers of all registers of this firmware, ascending."""
+        return tuple(number for number in REGISTERS if self.has(number))
+
+    def default(self, register_id: int) -> Values | None:
+        """The factory value, None where each unit has its own or it is not documented."""
+        return REGISTERS[register_id].defaults.get(self.generation)
+
+
+def profile_of(version: str, model: str = "VN-100") -> Profile:
+    """The profile of a device from what registers 4 and 1 say: ``3.1.0.0``, ``VN-100S-CR``."""
+    match = _VERSION.fullmatch(version.strip())
+    generation = int(match[1]) if match else 0
+    if generation == 2:
+        profile = Profile(2, version, True, 74, True)
+    elif generation == 3:
+        profile = Profile(3, version, True, 43, False)
+    else:
+        why = f"firmware {version} is unknown (known are 2.x and 3.x)"
+        profile = Profile(0, version, False, None, False, why)
+    if _VN100.match(model.strip()):
+        return profile
+    return profile.observed(f"the model is {model or 'not said'}, and only a VN-100 is written")
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """One device and no other, from registers 1, 3 and 4."""
+
+    model: str
+    serial: int
+    firmware: str
+
+    def __str__(self) -> str:
+        return f"{self.model} serial {self.serial} firmware {self.firmware}"

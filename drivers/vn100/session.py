@@ -142,6 +142,12 @@ class LineEchoes:
     """What is sent comes back before the answer; told once per link."""
 
 
+ECHOES = (
+    "the line sends back what is sent (an adapter or terminal that echoes): echoes are told from "
+    "answers and left out"
+)
+
+
 Event = (
     Measurement
     | Unused

@@ -12,13 +12,15 @@ from ahrsd.baselines.data import MethodError
 from ahrsd.baselines.graph_methods import (
     SIGMA,
     Kinematics,
+    cholesky,
     custom_factor,
     factors,
     residual,
+    triangle,
+    unit_volume,
     values_of,
     variable,
 )
-from ahrsd.baselines.soft_iron import cholesky, triangle, unit_volume
 
 RNG = np.random.default_rng(7)
 KIN = Kinematics(*(RNG.normal(size=(6, 3)) for _ in range(3)))

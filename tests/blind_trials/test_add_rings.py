@@ -6,7 +6,7 @@ import csv
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks" / "diagnosis"))
 from add_rings import SCORES, shares
 
 TABLE = """round,tool,score,value,interval_95,cases,wanted,met

@@ -218,7 +218,7 @@ def test_a_folder_that_takes_no_file_is_told_before_any_work(run, capsys, comman
 
 def test_a_viewer_file_that_could_not_be_written_is_told(run, tmp_path, capsys, monkeypatch):
     path = FOLDER / "tumble_binary_restart.vnbin.gz"
-    monkeypatch.setattr("ahrsd.cli.replay.refuse_unwritable", lambda target: None)
+    monkeypatch.setattr("ahrsd.cli.recordings.replay.refuse_unwritable", lambda target: None)
     assert run("replay", path, "--rerun", tmp_path / "none" / "run.rrd") == 2
     assert (
         capsys.readouterr()

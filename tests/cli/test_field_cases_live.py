@@ -262,7 +262,7 @@ def emulated(firmware: int) -> Iterator[Callable[[str], str]]:
 
 
 def test_the_emulator_answers_as_devices_did_in_public_reports() -> None:
-    """f38; in more ways in `vn100/test_emulator.py`."""
+    """f38; in more ways in `vn100/emulator/test_emulator.py`."""
     ros2 = "VNWRG,75,3,40,29,7FFF,0210,000C"
     with emulated(2) as ask:
         assert ask("VNRRG,04").startswith("VNRRG,04,2.")

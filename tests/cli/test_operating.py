@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from ahrsd.cli import COMMANDS
-from ahrsd.telemetry.explain import STATES
+from ahrsd.telemetry.words import STATES
 from drivers.vn100.errors import ERRORS
 
 PROJECT = Path(__file__).parents[2]

@@ -304,7 +304,7 @@ def test_a_lock_that_the_journal_did_not_take_is_refused(core):
 
 
 def test_the_command_says_that_nobody_listens(run, tmp_path, box, capsys, monkeypatch):
-    monkeypatch.setattr("ahrsd.cli.running_daemon._WAIT_S", 0.1)
+    monkeypatch.setattr("ahrsd.cli.running.daemon._WAIT_S", 0.1)
     assert run("operator", "lock", "--state-directory", tmp_path) == 75
     assert capsys.readouterr().err == "ahrsd: no daemon took the word within 0 s\n"
     assert list(box.folder.iterdir()) == []  # nothing is left that a later daemon might take

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from ahrsd.cli.progress import byte_progress, count_progress
+from ahrsd.cli.long_work import byte_progress, count_progress
 from ahrsd.config.loading import Config
 from ahrsd.offline.replay import replay
 

@@ -45,7 +45,7 @@ def test_the_two_commands_need_nothing_but_python():
 
 
 def test_the_benchmarks_that_are_quoted_exist():
-    scripts = re.findall(r"python (tests/benchmarks/\w+\.py)", README)
+    scripts = re.findall(r"python (tests/benchmarks/\w+/\w+\.py)", README)
     assert scripts
     assert all((PROJECT / name).exists() for name in scripts)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.cli.registers import described
+from ahrsd.cli.device.registers import described
 from drivers.vn100.registers import REGISTERS
 
 

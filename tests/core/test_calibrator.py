@@ -11,14 +11,15 @@ from streams import binary_device, emitted, inputs
 from ahrsd.calibration import Affine
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core.calibration_pipeline import Calibrator, CalibratorSettings
 from ahrsd.core.core import Core
+from ahrsd.core.estimation import Calibrator
+from ahrsd.core.settings import CalibratorSettings
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.samples import SampleBlock
 from ahrsd.world_field import world_field
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 
 HEALTH = HealthFacts(crc_error_rate=0.0, drop_rate=0.0, saturated=0, negative_dt=0, rate_hz=40.0)
 BASIS = BasisFacts(

@@ -18,19 +18,19 @@ import pytest
 
 from ahrsd.config.loading import Config, check_config
 from ahrsd.config.sections import GatesSection
-from ahrsd.daemon.core_runner import close_shell
+from ahrsd.daemon.core_runner import close_shell, open_shell
 from ahrsd.daemon.daemon import Daemon
 from ahrsd.daemon.host_clock import HostClock
-from ahrsd.daemon.service import open_shell
+from ahrsd.daemon.vehicle_files import VehicleFiles
 from ahrsd.events import SamplesSeen, StateChanged
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.writeback.states import State
 from drivers.serial_port import SerialPort
+from drivers.vn100.commands import read_registers
 from drivers.vn100.device import Device
 from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
-from drivers.vn100.procedures import read_registers
 
 SPEED = 15.0  # a disk that takes 0.3 s to sync must not look like one that hangs
 BAUD, RATE_HZ = 115200, 50
@@ -83,7 +83,8 @@ class Run:
         self.reasons: list[str] = []
         self._end = end
         self.shell.listeners.append(self._listen)
-        self.daemon = Daemon(config, self.shell, port, clock, AlwaysSafe())
+        files = VehicleFiles(AlwaysSafe(), max_age_s=config.interlock.max_age_s)
+        self.daemon = Daemon(config, self.shell, port, clock, files)
 
     def _listen(self, event):
         if isinstance(event, StateChanged):

@@ -20,12 +20,11 @@ from ahrsd.core.device_session import (
     WrongDevice,
 )
 from ahrsd.writeback.actions import SetUpStream
-from ahrsd.writeback.permissions import Mode, Purpose
-from ahrsd.writeback.reconcile import RecordKind
-from ahrsd.writeback.transaction import StoredRecord
-from drivers.vn100.commands import LinkGone, Read, Word, Write
+from ahrsd.writeback.journal_history import RecordKind, StoredRecord
+from ahrsd.writeback.states import Mode, Purpose
+from drivers.vn100.commands import LinkGone, Read, Word, Write, quiet, read, write_verified
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.procedures import SESSION_SETTINGS, quiet, read, write_verified
+from drivers.vn100.registers import SESSION_SETTINGS
 
 STEP_S = 0.01
 

@@ -15,14 +15,15 @@ import pytest
 from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.samples import Array
 from ahrsd.stream.decompensation import Compensation
-from ahrsd.writeback.composition import (
-    UnwritableError,
-    apart_deg,
-    compose,
-    heading_change_deg,
+from ahrsd.writeback.composition import UnwritableError, apart_deg, compose, heading_change_deg
+from drivers.vn100.registers import (
+    Values,
+    format_command,
+    format_reply,
+    parse,
     register_lines,
+    same,
 )
-from drivers.vn100.registers import Values, format_command, format_reply, parse, same
 
 DETERMINED = Observability(np.full(12, 0.01), (), 10.0)
 SEEDS = range(100)

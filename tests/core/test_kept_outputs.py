@@ -19,9 +19,9 @@ from ahrsd.core.device_session import Phase
 from ahrsd.core.kept_settings import KeptOutputs, open_record
 from ahrsd.events import Send
 from ahrsd.offline.replay import replay
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.journal_history import StoredRecord
 from ahrsd.writeback.policy import WriteBackPolicy
-from ahrsd.writeback.transaction import StoredRecord
+from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.calibration_stream import left_by_session
 from drivers.vn100.emulator.scenarios import Setup, build

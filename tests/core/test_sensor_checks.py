@@ -17,11 +17,10 @@ from ahrsd.inputs import RegistersKnown, Samples
 from ahrsd.recording.capture import to_json
 from ahrsd.samples import SampleBlock
 from ahrsd.so3 import exp
-from ahrsd.telemetry.explain import explain_json, explain_lines
-from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
-from ahrsd.writeback.permissions import Mode
+from ahrsd.telemetry.words import explain_json, explain_lines, status_lines
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 
 RATE_HZ = 40.0
 FIELD = np.array([0.22, 0.02, 0.42])

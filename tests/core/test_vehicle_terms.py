@@ -24,8 +24,8 @@ from ahrsd.errors import ConfigError
 from ahrsd.inputs import Columns, RegistersKnown, Samples, Stop, TermsKnown
 from ahrsd.samples import SampleBlock
 from ahrsd.simulation import ScenarioSettings, simulate
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 
 K = np.array([0.004, -0.003, 0.002])  # gauss per ampere
 CURRENT = {"covariate": "motor_current_a", "reference": 0.0}

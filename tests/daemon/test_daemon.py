@@ -212,7 +212,7 @@ def test_a_bug_in_the_estimator_is_a_state_and_the_run_goes_on(live, caplog):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         daemon.core.calibrator.take = None
-        daemon.until(lambda: daemon.core.estimator.failures)
+        daemon.until(lambda: daemon.core.estimation.state.failures)
         assert daemon.noted("ESTIMATOR FAILED: TypeError: 'NoneType' object is not callable")
         second = daemon.core.calibrator
         daemon.flowing()

@@ -20,10 +20,9 @@ from ahrsd.errors import JournalError
 from ahrsd.events import JournalAppend
 from ahrsd.inputs import Received, WallClock
 from ahrsd.recording.capture import input_from_json, input_to_json
-from ahrsd.writeback.clocks import Stamp
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.journal_history import Stamp
 from ahrsd.writeback.policy import WriteBackPolicy
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.emulator.physics import draw_truth
 from drivers.vn100.emulator.scenarios import Setup, build

@@ -118,4 +118,4 @@ def test_it_is_said_and_the_daemon_runs_on(emulated, tmp_path, change, words):
     if change is saturated_axis:
         return  # not one sample is left, which a replay refuses in one line
     again = replay(capture, Config())
-    assert any(words in text for text in again.core.sensors.findings.values())
+    assert any(words in text for text in again.core.source.sensors.findings.values())

@@ -42,7 +42,7 @@ def disk():
 def test_a_reader_that_hangs_for_ever_ends_the_trial_and_undoes_the_values(live, disk, tmp_path):
     with live({"output": "imu"}, mode="stage") as daemon:
         word = InterlockFile(tmp_path / "safe", 1.0, read=disk.read)
-        daemon.daemon._interlock = word
+        daemon.files.interlock = word
         daemon.until(word.safe)
         Operator(daemon, "TRIAL", disk.hangs.set)
         daemon.until(lambda: "ROLLED_BACK" in daemon.states, 30.0)

@@ -16,17 +16,16 @@ from ahrsd import events, inputs
 from ahrsd.config.loading import check_config
 from ahrsd.core.decision_log import DecisionLog
 from ahrsd.core.warm_start import CONFIRM_S, Present, WarmStart, too_old
-from ahrsd.daemon.recall import Recall
+from ahrsd.daemon.background import Recall
 from ahrsd.offline.replay import replay
 from ahrsd.recording import capture
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.samples import SampleBlock
-from ahrsd.telemetry.explain import explain_json, explain_lines
-from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
-from ahrsd.writeback.clocks import Stamp
+from ahrsd.telemetry.words import explain_json, explain_lines, status_lines
+from ahrsd.writeback.journal_history import Stamp
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.procedures import Unit
+from drivers.vn100.registers import Unit
 
 SCENE = Setup(
     "rov",

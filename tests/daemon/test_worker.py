@@ -19,14 +19,14 @@ from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
-from ahrsd.core.estimation_queue import EstimationTask, EstimatorState
-from ahrsd.daemon.estimation_worker import MOST_WAITING, Worker
+from ahrsd.core.estimation import EstimationTask, EstimatorState
+from ahrsd.daemon.background import MOST_WAITING, Worker
 from ahrsd.events import Examine
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
 from ahrsd.samples import SampleBlock
 from ahrsd.telemetry.public import Public
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 
 
@@ -78,7 +78,7 @@ def test_giving_never_waits_and_who_gives_too_much_is_told(worker):
 
 
 def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch):
-    monkeypatch.setattr("ahrsd.daemon.estimation_worker._STUCK_S", 0.05)
+    monkeypatch.setattr("ahrsd.daemon.background._STUCK_S", 0.05)
     gate = threading.Event()
     assert not worker.stuck
     worker.put(lambda: gate.wait() and None)
@@ -105,12 +105,12 @@ def test_a_thread_that_ended_is_told(worker, monkeypatch):
 
 
 def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch):
-    monkeypatch.setattr("ahrsd.daemon.estimation_worker._STUCK_S", 0.2)
+    monkeypatch.setattr("ahrsd.daemon.background._STUCK_S", 0.2)
     gate, fed = threading.Event(), []
     with live({"output": "imu"}) as daemon:
         public = Public(time.monotonic())
         public.notifier.feed = lambda: fed.append(time.monotonic())
-        daemon.daemon._public = public
+        daemon.daemon._telemetry = public
         daemon.until(lambda: len(fed) > 20)
         daemon.core.calibrator.take = lambda _: gate.wait(PATIENCE_S)
         daemon.until(lambda: daemon.shell.worker.stuck)
@@ -268,8 +268,8 @@ def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
     run.work()
     first = run.core.calibrator
     break_off(run)
-    assert run.core.estimator.failed
-    assert (run.core.estimator.reason, run.core.estimator.failures) == (REASON, 1)
+    assert run.core.estimation.state.failed
+    assert (run.core.estimation.state.reason, run.core.estimation.state.failures) == (REASON, 1)
     assert ("error", f"ESTIMATOR FAILED: {REASON}; it begins anew in 5 s") in run.notes
     assert len(failures(run)) == 1
     second, samples = run.core.calibrator, run.core.stream.facts.samples
@@ -280,7 +280,7 @@ def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
     assert not second.started
     run.run(4.0)
     run.work()
-    assert not run.core.estimator.failed
+    assert not run.core.estimation.state.failed
     assert second.started
 
 
@@ -296,7 +296,7 @@ def test_a_replay_fails_at_the_same_place_without_failing_itself():
         again.handle(item)
     assert len(failures(run)) == 1
     assert again.decisions.sha256 == run.core.decisions.sha256
-    assert again.estimator.failures == 1
+    assert again.estimation.state.failures == 1
 
 
 def test_soon_again_means_a_longer_pause():

@@ -12,8 +12,9 @@ from tracks import RECORDINGS, experiment
 from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core.calibration_pipeline import Calibrator, CalibratorSettings
 from ahrsd.core.core import Core
+from ahrsd.core.estimation import Calibrator
+from ahrsd.core.settings import CalibratorSettings
 from ahrsd.estimator.step_detector import (
     KEPT,
     ReferenceCalibration,
@@ -29,11 +30,10 @@ from ahrsd.inputs import Samples
 from ahrsd.recording.table import read_table
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.simulation import Experiment
-from ahrsd.telemetry.explain import explain_json, explain_lines
-from ahrsd.telemetry.lines import mismatch_line
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
-from ahrsd.writeback.permissions import Mode
+from ahrsd.telemetry.words import explain_json, explain_lines, mismatch_line
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 
 MAGNET = np.array([0.018, -0.009, 0.022])  # 30 mG
 BLOCK_S = 128 * 2 / 25.0
@@ -339,7 +339,7 @@ def gate_of(calibrator: Calibrator) -> bool:
 
 def test_a_step_shuts_the_gate_until_the_estimate_is_made_anew(monkeypatch):
     """An estimator that does not begin anew by itself, here kept from it: it is begun anew."""
-    monkeypatch.setattr("ahrsd.core.calibration_pipeline._PATIENCE_S", 20.0)
+    monkeypatch.setattr("ahrsd.core.estimation._PATIENCE_S", 20.0)
     monkeypatch.setattr("ahrsd.estimator.online._CHANGED", 1_000)
     made = stepped(experiment("mam", samples=18000, rate_hz=40.0, seed=5), 300.0, 0.27 * MAGNET)
     config = Config()

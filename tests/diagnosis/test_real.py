@@ -1,6 +1,6 @@
 """Real recordings with known causes: what is named, where, and how large.
 
-The whole table is printed by `tests/benchmarks/bench_diagnose_real.py`.
+The whole table is printed by `tests/benchmarks/diagnosis/bench_diagnose_real.py`.
 """
 
 from __future__ import annotations

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
+from ahrsd.calibration_json import why_not_converged
 from ahrsd.config.loading import Config
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch_data import delayed, rates
 from ahrsd.estimator.online import Estimator
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.offline.calibrate import calibrate
-from ahrsd.report.calibration_json import why_not_converged
 
 BROAD = Path(__file__).parents[3] / "shared" / "recordings" / "broad"
 WALK = BROAD.parent / "vn100" / "walk_square_2024_sazgar.vnraw.gz"
@@ -25,7 +25,7 @@ UPPER = np.triu_indices(3)
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     return importlib.import_module("bench_estimator")
 
 

@@ -1,4 +1,4 @@
-"""Cost and memory of a long run: the short form of `tests/benchmarks/bench_long.py`."""
+"""Cost and memory of a long run: the short form of `tests/benchmarks/estimator/bench_long.py`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def test_the_hundred_thousandth_sample_costs_what_the_first_did(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     points, error = importlib.import_module("bench_long").measure(100_000)
     assert points[0].samples == 10_000
     assert points[-1].samples == 100_000

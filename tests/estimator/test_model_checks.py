@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
+from ahrsd.calibration_json import why_not_converged
 from ahrsd.config.loading import Config
 from ahrsd.estimator.model_checks import divided
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.table import read_table
-from ahrsd.report.calibration_json import why_not_converged
 
 BROAD = Path(__file__).parents[3] / "shared" / "recordings" / "broad"
 STEP_GAUSS = np.array([0.05, -0.04, 0.08])
@@ -24,7 +24,7 @@ STEP_GAUSS = np.array([0.05, -0.04, 0.08])
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     return importlib.import_module("bench_estimator")
 
 

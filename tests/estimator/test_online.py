@@ -25,7 +25,7 @@ SMALL = EstimatorParameters(epoch_steps=128)
 
 
 def _benchmark():
-    path = Path(__file__).parents[1] / "benchmarks" / "bench_estimator.py"
+    path = Path(__file__).parents[1] / "benchmarks" / "estimator" / "bench_estimator.py"
     spec = importlib.util.spec_from_file_location("bench_estimator", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -71,7 +71,7 @@ def same(a, b):
     ],
 )
 def test_errors_are_of_the_size_of_the_bound_and_of_the_covariance(kind, motion):
-    """The short form; `tests/benchmarks/bench_estimator.py --runs 100` is the full one."""
+    """The short form; `benchmarks/estimator/bench_estimator.py --runs 100` is the full one."""
     scores, excess = [], []
     for seed in range(3):
         run = bench.simulate(kind, motion, seed + 100)

@@ -1,6 +1,6 @@
 """Sigmas over changes of regime: what is announced at the end is what the whole data determine.
 
-The long form is tests/benchmarks/bench_regimes.py.
+The long form is tests/benchmarks/estimator/bench_regimes.py.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def test_fast_rows_and_readings_that_are_held_do_no_harm(name, hold):
 
 def test_motions_put_together_from_pieces(monkeypatch):
     """Numbers of the iron: hardly one below 0.9 times its bound, and rarely one above 1.5."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
     runs = [bench.run(seed, at_once=32) for seed in range(200, 230)]
     sure = [r for r in runs if r.converged and r.told]

@@ -1,4 +1,4 @@
-"""The vehicle of `tests/support/vehicle.py`, made once."""
+"""The vehicle of `tests/support/simulated/vehicle.py`, made once."""
 
 from __future__ import annotations
 

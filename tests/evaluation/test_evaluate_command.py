@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from vehicle import HARD_IRON, SOFT_IRON
 
-from ahrsd.evaluation.stored import CalibrationFileError, parse_calibration
+from ahrsd.calibration_json import CalibrationFileError, parse_calibration
 
 GOOD = {
     "schema": "ahrsd.calibration/1", "method": "magyc", "recording": "circles.csv",

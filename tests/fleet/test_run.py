@@ -13,7 +13,7 @@ from fleet_kills import write_archive
 from fleet_rows import row, store_of
 from ros_files import sensor
 
-from ahrsd.cli.fleet.examiner import EXAMINER, LOADS
+from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
 from ahrsd.config.loading import Config
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive

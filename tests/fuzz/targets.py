@@ -24,7 +24,7 @@ from ahrsd.inputs import Received, Stop
 from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.report.summary import summary_json
 from ahrsd.telemetry.protocol import BadRequest, parse_request
-from ahrsd.writeback.transaction import JournalHistory
+from ahrsd.writeback.journal_history import JournalHistory
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 

@@ -16,7 +16,7 @@ from ahrsd.montecarlo.accuracy import (
     unit_volume,
 )
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
-from ahrsd.simulation.experiment import measured
+from ahrsd.simulation.scenarios import measured
 
 EXPERIMENT = simulate(ScenarioSettings("mam", samples=500))
 TRUTH = EXPERIMENT.truth

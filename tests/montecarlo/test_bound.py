@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from ahrsd.estimator.online import Estimator
 from ahrsd.montecarlo.cramer_rao import Trajectory, UnobservableError, cramer_rao
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
-from ahrsd.simulation.experiment import measured
+from ahrsd.simulation.scenarios import measured
 
 SM, SG = 1e-3, 5e-3
 UPPER = np.triu_indices(3)

@@ -2,7 +2,7 @@
 
 Counts, gates, states and the hash of all decisions are compared everywhere, whatever the Python and
 the processor; the bytes of the streams only where the arithmetic is the one on which they were made
-(tests/support/golden.py says why).
+(tests/support/files/golden.py says why).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def test_the_decisions_are_the_same_with_the_kernels_of_another_processor(kernel
     names = ["clean_rov_binary", "clean_narrow", "fault_iron"]
     code = "import golden, sys; print(*(golden.found_in(name)['sha256'] for name in sys.argv[1:]))"
     folder = Path(golden.__file__).parent
-    paths = [str(folder), str(folder.parents[1]), os.environ.get("PYTHONPATH", "")]
+    paths = [str(folder), str(folder.parents[2]), os.environ.get("PYTHONPATH", "")]
     ended = subprocess.run(
         [sys.executable, "-c", code, *names],
         env=os.environ

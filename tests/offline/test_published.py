@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS
-from ahrsd.cli.calibrate import _METHODS
+from ahrsd.cli.recordings.calibrate import _METHODS
 from ahrsd.config.loading import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.offline.calibrate import calibrate

@@ -19,7 +19,7 @@ from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import Replayed, replay
 from ahrsd.report.summary import summary_json, summary_lines, warnings_of
 
-BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "bench_replay.py"
+BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "daemon" / "bench_replay.py"
 FACTS = tomllib.loads(
     (Path(__file__).parents[2] / "fixtures" / "replays" / "recordings.toml").read_text()
 )
@@ -174,7 +174,7 @@ def test_tables_replay(recordings, name):
 def test_a_replay_costs_little_more_than_its_parsing(recordings):
     """Measured: 17 times the cost of parsing alone, which is 3,200 times real time at 40 Hz.
 
-    Both are measured here (tests/benchmarks/bench_replay.py), so a busy machine does not matter.
+    Both are measured here (benchmarks/daemon/bench_replay.py), so a busy machine does not matter.
     """
     path = recordings / "vn100" / "hand_2023_thumatti.vnraw.gz"
     spec = importlib.util.spec_from_file_location("bench_replay", BENCHMARK)

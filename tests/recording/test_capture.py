@@ -45,8 +45,14 @@ from ahrsd.inputs import (
     WallClock,
 )
 from ahrsd.recording import capture
-from ahrsd.recording.capture import CaptureReader, CaptureWriter, Sent, part_path
-from ahrsd.recording.retention import make_private_folder, new_capture_path
+from ahrsd.recording.capture import (
+    CaptureReader,
+    CaptureWriter,
+    Sent,
+    make_private_folder,
+    new_capture_path,
+    part_path,
+)
 from ahrsd.samples import SampleBlock
 
 EVERY_INPUT: list[Input] = [

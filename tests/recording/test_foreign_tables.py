@@ -16,6 +16,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.__main__ import main
+from ahrsd.cli import module_of
 from ahrsd.config.loading import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.calibrate import calibrate
@@ -651,7 +652,7 @@ def test_a_slower_magnetometer_leaves_cells_empty(tmp_path, hold, first):
 
 @pytest.mark.parametrize("name", ["calibrate", "replay", "diagnose", "evaluate", "simulate"])
 def test_every_command_that_takes_a_recording_takes_names_of_columns(name):
-    command = importlib.import_module(f"ahrsd.cli.{name}").command
+    command = importlib.import_module(module_of(name)).command
     assert "--columns" in [text for option in command.params for text in option.opts]
 
 

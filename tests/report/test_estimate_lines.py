@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from cabled_run import estimate
 
-from ahrsd.report.calibration_json import calibration_json
+from ahrsd.calibration_json import calibration_json
 from ahrsd.report.summary import estimate_lines
 
 ADVICE = "the gyro's scales may be off by a percent: turn about every axis, and back again"

@@ -10,7 +10,7 @@ import pytest
 from contract import CALIBRATION, faults
 
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.report.calibration_json import HeadingErrors, calibration_json, why_not_converged
+from ahrsd.calibration_json import HeadingErrors, calibration_json, why_not_converged
 
 A = np.array([[1.05, 0.02, -0.01], [0.02, 0.97, 0.03], [-0.01, 0.03, 0.99]])
 A = A / np.cbrt(np.linalg.det(A))

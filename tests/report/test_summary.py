@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from streams import emitted, inputs
 
-from ahrsd.cli.watch import gates_table
+from ahrsd.cli.running.watch import gates_table
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
 from ahrsd.core.core import Core
@@ -26,8 +26,8 @@ from ahrsd.report.summary import (
 )
 from ahrsd.telemetry.driving import Pace
 from ahrsd.viewer.process import gate_table
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 
 

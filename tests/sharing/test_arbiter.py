@@ -9,11 +9,10 @@ from cabled_units import sentence
 from ahrsd.events import SendToClient
 from ahrsd.sharing.arbiter import MOST_WAITING, PATIENCE_S, Arbiter
 from ahrsd.sharing.client_commands import SharePolicy
-from drivers.vn100.commands import NoReply, Read, Write
+from drivers.vn100.commands import Identity, NoReply, Read, Write
 from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.firmware import profile_of
 from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import Identity
+from drivers.vn100.registers import profile_of
 
 IDENTITY = Identity("VN-100S-CR", 8, 100130608, "3.1.0.0", profile_of("3.1.0.0"))
 

@@ -13,7 +13,7 @@ from ahrsd import inputs
 from ahrsd.core.core import Core
 from ahrsd.events import SamplesSeen
 from ahrsd.sharing.client_commands import SharePolicy
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.states import Mode
 
 OWNER = SharePolicy("owner", owner=True, calibration_writes="pass")
 SHARES = (OWNER, SharePolicy("log"))

@@ -12,7 +12,8 @@ from ahrsd.sharing.client_commands import (
     SharePolicy,
     understand,
 )
-from ahrsd.writeback.permissions import Mode, Purpose, permitted
+from ahrsd.writeback.permissions import permitted
+from ahrsd.writeback.states import Mode, Purpose
 from drivers.vn100.commands import Read, Word, Write
 from drivers.vn100.registers import REGISTERS, format_reply
 

@@ -1,4 +1,4 @@
-"""Two clients at random moments of a write-back; the long form is tests/benchmarks/clients.py."""
+"""Two clients at random moments of a write-back; the long form is clients.py."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from ahrsd.sharing import client_commands
 from ahrsd.sharing.arbiter import Arbiter
 from ahrsd.writeback import flow
 from ahrsd.writeback.machine import WriteBack
-from ahrsd.writeback.permissions import WRITES, Purpose
+from ahrsd.writeback.permissions import WRITES
+from ahrsd.writeback.states import Purpose
 
 
 @pytest.mark.parametrize("seed", range(8))

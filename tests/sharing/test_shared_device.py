@@ -19,8 +19,8 @@ from planted_calibrator import PlantedCalibrator
 from ahrsd import inputs
 from ahrsd.core.core import Core
 from ahrsd.sharing.client_commands import SharePolicy
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import StillPolicy
+from ahrsd.writeback.states import Mode
 
 OWNER, LOG = SharePolicy("owner", owner=True), SharePolicy("log")
 ONE = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2

@@ -2,8 +2,15 @@
 
 import pytest
 
-from ahrsd.telemetry.explain import NO_INTERLOCK, STATES, explain_json, explain_lines
-from ahrsd.telemetry.lines import candidate_lines, estimator_line, write_back_line
+from ahrsd.telemetry.words import (
+    NO_INTERLOCK,
+    STATES,
+    candidate_lines,
+    estimator_line,
+    explain_json,
+    explain_lines,
+    write_back_line,
+)
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import State

@@ -18,7 +18,7 @@ from ahrsd import inputs
 from ahrsd.config.sections import ShareSection
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.status import LinkFacts
-from ahrsd.writeback.permissions import Mode
+from ahrsd.writeback.states import Mode
 
 LINK = LinkFacts("cable", 115200, is_open=True)
 

@@ -13,8 +13,9 @@ import click
 import pytest
 
 import ahrsd
-from ahrsd.cli import COMMANDS, running_daemon
-from ahrsd.cli.running_daemon import _HINT, DaemonPlace
+from ahrsd.cli import COMMANDS
+from ahrsd.cli.running import daemon as running_daemon
+from ahrsd.cli.running.daemon import _HINT, DaemonPlace
 from ahrsd.config.loading import Config
 
 TALK = ("status", "explain", "watch", "bundle", "operator")

@@ -6,9 +6,9 @@ import pytest
 from ahrsd.calibration import Affine
 from ahrsd.events import SamplesSeen
 from ahrsd.samples import SampleBlock
-from ahrsd.telemetry.lines import heading_line, reading_lines, turned_deg
 from ahrsd.telemetry.protocol import plain
 from ahrsd.telemetry.status import readings
+from ahrsd.telemetry.words import heading_line, reading_lines, turned_deg
 
 NORTH, DOWN = 0.25, 0.43
 IRON = np.array([0.05, -0.03, 0.1])

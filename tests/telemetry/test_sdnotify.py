@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from ahrsd.telemetry.sd_notify import Notifier
+from ahrsd.telemetry.public import Notifier
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.telemetry.lines import share_lines
+from ahrsd.telemetry.words import share_lines
 
 NOTHING = dict.fromkeys(
     ("commands", "answered", "refused", "absorbed", "dropped", "unanswered", "lost_bytes",

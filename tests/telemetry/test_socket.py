@@ -12,10 +12,10 @@ from patience import PATIENCE_S
 
 from ahrsd.errors import DeviceError
 from ahrsd.telemetry.client import DaemonConnection
-from ahrsd.telemetry.lines import status_lines
 from ahrsd.telemetry.protocol import SCHEMA, line_of
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.server import MOST_CLIENTS, SocketServer
+from ahrsd.telemetry.words import status_lines
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def served(live, tmp_path):
     public = Public(time.monotonic())
     public.open_socket(tmp_path / "socket", tmp_path)
     daemon.shell.listeners.append(public.event)
-    daemon.daemon._public = public
+    daemon.daemon._telemetry = public
     with daemon:
         yield daemon, tmp_path / "socket"
     public.close()

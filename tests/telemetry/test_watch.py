@@ -5,9 +5,9 @@ from collections import deque
 from rich.console import Console
 from shown_status import cells, level_ring, motion
 
-from ahrsd.cli.watch import Scroll, countdown, event_line, screen
+from ahrsd.cli.running.watch import Scroll, countdown, event_line, screen
 from ahrsd.telemetry.driving import Pace
-from ahrsd.telemetry.lines import motion_line
+from ahrsd.telemetry.words import motion_line
 
 
 def gate(name, ok=False):

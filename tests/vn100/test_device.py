@@ -12,10 +12,19 @@ import pytest
 from patience import PATIENCE_S
 
 from drivers.serial_port import PortLost, SerialPort
-from drivers.vn100.commands import NoReply, NotPermitted, Pause, Word, Write
+from drivers.vn100.commands import (
+    NoReply,
+    NotPermitted,
+    Pause,
+    Word,
+    Write,
+    identify,
+    quiet,
+    read,
+    write_verified,
+)
 from drivers.vn100.decode import Measurement
 from drivers.vn100.device import Device, TookTooLong
-from drivers.vn100.procedures import identify, quiet, read, write_verified
 from drivers.vn100.session import DeviceFault
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.vn100.commands import NoReply, Read, Word, Write
+from drivers.vn100.commands import (
+    NoReply,
+    Read,
+    Word,
+    Write,
+    identify,
+    read_registers,
+    save_settings,
+    write_verified,
+)
 from drivers.vn100.messages import encode
-from drivers.vn100.procedures import identify, read_registers, save_settings, write_verified
 from drivers.vn100.session import LineEchoes, ProcedureFailed, ProcedureFinished, Session
 
 NEW = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.0, 0.0)

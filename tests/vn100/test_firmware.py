@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.vn100.firmware import profile_of
+from drivers.vn100.registers import profile_of
 
 
 @pytest.mark.parametrize("version", ["2.1.0.0", "2.0.0.1", "2.1"])

@@ -17,10 +17,10 @@ from drivers.serial_port import (
     detect_baud,
     spelled,
 )
+from drivers.vn100.commands import identify
 from drivers.vn100.device import Device
 from drivers.vn100.emulator.pty import PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.procedures import identify
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:setDaemon:DeprecationWarning", "ignore:setName:DeprecationWarning"

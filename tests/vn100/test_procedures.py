@@ -12,15 +12,14 @@ from drivers.vn100.calibration_stream import (
     configure_stream,
     rate_divisor,
 )
-from drivers.vn100.commands import NoReply, Read, Word
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.firmware import profile_of
-from drivers.vn100.procedures import (
+from drivers.vn100.commands import (
     CONFIGURATION,
-    SESSION_SETTINGS,
     Identity,
+    NoReply,
+    Read,
     RestoreFailed,
     VerifyFailed,
+    Word,
     differences,
     identify,
     missing,
@@ -31,6 +30,8 @@ from drivers.vn100.procedures import (
     save_settings,
     write_verified,
 )
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.registers import SESSION_SETTINGS, profile_of
 from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 NO_CALIBRATION = "1,0,0,0,1,0,0,0,1,0,0,0"

@@ -18,11 +18,14 @@ from drivers.vn100.commands import (
     TooLate,
     Word,
     Write,
+    quiet,
+    read,
+    save_settings,
+    write_verified,
 )
 from drivers.vn100.decode import Measurement
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.messages import Reply
-from drivers.vn100.procedures import quiet, read, save_settings, write_verified
 from drivers.vn100.session import DeviceFault, ProcedureFinished, Session, Stray
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

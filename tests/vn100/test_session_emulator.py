@@ -9,15 +9,8 @@ import pytest
 
 from drivers.serial_port import SerialPort, detect_baud
 from drivers.vn100.calibration_stream import configure_stream
-from drivers.vn100.commands import SessionError
-from drivers.vn100.decode import Measurement, decode
-from drivers.vn100.deframer import Deframer
-from drivers.vn100.device import Device
-from drivers.vn100.emulator.pty import PtyEmulator
-from drivers.vn100.emulator.scenarios import Setup, build
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.procedures import (
-    SESSION_SETTINGS,
+from drivers.vn100.commands import (
+    SessionError,
     identify,
     missing,
     quiet,
@@ -27,6 +20,13 @@ from drivers.vn100.procedures import (
     save_settings,
     write_verified,
 )
+from drivers.vn100.decode import Measurement, decode
+from drivers.vn100.deframer import Deframer
+from drivers.vn100.device import Device
+from drivers.vn100.emulator.pty import PtyEmulator
+from drivers.vn100.emulator.scenarios import Setup, build
+from drivers.vn100.errors import DeviceRefused
+from drivers.vn100.registers import SESSION_SETTINGS
 from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 NEW_23 = (1.0021, 0.0123456, 0.0, 0.0123456, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 7.1384e-05)

@@ -9,9 +9,8 @@ from __future__ import annotations
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.commands import NoReply
+from drivers.vn100.commands import NoReply, VerifyFailed, quiet, read, write_verified
 from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.procedures import VerifyFailed, quiet, read, write_verified
 from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

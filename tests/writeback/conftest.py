@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from writeback_rig import Device, Rig
 
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy
 
 

@@ -10,9 +10,9 @@ from virtual_run import VirtualRun
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import Config
-from ahrsd.core.action_queue import DeviceRecord
-from ahrsd.writeback.permissions import Mode
+from ahrsd.core.write_back import DeviceRecord
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.clocks import Now, Stamp
-from ahrsd.writeback.permissions import Mode, Purpose
+from ahrsd.writeback.journal_history import JournalHistory, Now, Stamp
 from ahrsd.writeback.policy import Stillness, StillPolicy, WriteBackPolicy, flash_budget, ram_budget
-from ahrsd.writeback.states import State
-from ahrsd.writeback.transaction import JournalHistory
+from ahrsd.writeback.states import Mode, Purpose, State
 from drivers.vn100.commands import Word, Write
 
 DAY_S = 86400.0

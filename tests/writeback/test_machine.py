@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ahrsd.events import RegisterWritten
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import NOT_ARMED
-from ahrsd.writeback.states import State
+from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Word, Write
 
@@ -91,8 +90,8 @@ def test_stage_proves_in_ram_and_never_saves(make_rig):
     ],
 )
 def test_a_doubtful_device_is_observed_only(make_rig, limit, reason):
-    from drivers.vn100.firmware import profile_of
-    from drivers.vn100.procedures import Identity
+    from drivers.vn100.commands import Identity
+    from drivers.vn100.registers import profile_of
 
     rig = make_rig(serial=limit.get("serial"))
     changes = {key: limit[key] for key in limit if key == "journal"}

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ahrsd.writeback.permissions import CALIBRATION, Mode, Purpose, permitted
+from ahrsd.writeback.permissions import CALIBRATION, permitted
+from ahrsd.writeback.states import Mode, Purpose
 from drivers.vn100.commands import WORDS, Command, Pause, Read, Word, Write
-from drivers.vn100.procedures import SESSION_SETTINGS
-from drivers.vn100.registers import REGISTERS
+from drivers.vn100.registers import REGISTERS, SESSION_SETTINGS
 
 WRITES = [
     Write(row.id, row.defaults[generation])

@@ -22,8 +22,8 @@ from ahrsd.config.loading import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.samples import Array
 from ahrsd.so3 import exp
-from ahrsd.writeback.permissions import Mode
 from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.physics import EmulatedTruth, draw_truth
 from drivers.vn100.emulator.scenarios import Setup, build
 

@@ -7,11 +7,9 @@ import pytest
 from writeback_rig import Record
 
 from ahrsd.writeback.actions import IdentifyAgain
-from ahrsd.writeback.clocks import Stamp, restarted_since
-from ahrsd.writeback.permissions import Mode
-from ahrsd.writeback.reconcile import TABLE, DeviceContents, RecordKind
-from ahrsd.writeback.states import State
-from ahrsd.writeback.transaction import JournalHistory
+from ahrsd.writeback.journal_history import JournalHistory, RecordKind, Stamp, restarted_since
+from ahrsd.writeback.reconcile import TABLE, DeviceContents
+from ahrsd.writeback.states import Mode, State
 from drivers.vn100.commands import Read, Word, Write
 
 OTHER = (2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3)

@@ -12,7 +12,7 @@ from planted_calibrator import PlantedCalibrator
 
 from ahrsd.config.core_settings import core_settings
 from ahrsd.config.loading import check_config
-from ahrsd.core.calibration_pipeline import Calibrator
+from ahrsd.core.estimation import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES
 from ahrsd.writeback.policy import Safeguards, WriteBackPolicy

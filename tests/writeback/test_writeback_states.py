@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from ahrsd.writeback.journal_history import RecordKind
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
-from ahrsd.writeback.reconcile import DeviceContents, RecordKind
+from ahrsd.writeback.reconcile import DeviceContents
 from ahrsd.writeback.states import (
     CHANGED_IN_RAM,
     ON_TIMEOUT,

@@ -26,22 +26,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.vn100.emulator.motion import (
-    Array,
-    conjugate,
-    euler_angles,
-    matrices,
-    product,
-    quaternion_of,
-    quaternions,
-)
 from drivers.vn100.emulator.physics import (
     BLOCK_TICKS,
     GRAVITY_M_S2,
     GYRO_RANGE_RAD_S,
     MAG_RANGE_GAUSS,
     TICK_HZ,
+    Array,
     SensorBlock,
+    conjugate,
+    euler_angles,
+    matrices,
+    product,
+    quaternion_of,
+    quaternions,
 )
 
 # -- Real-time hard and soft iron ------------------------------------------------------------------

@@ -32,13 +32,18 @@ from typing import Protocol
 import numpy as np
 
 from drivers.vn100.deframer import Cause, Deframer, Sentence
-from drivers.vn100.emulator.commands import CommandReply, Interpreter, SideEffect
 from drivers.vn100.emulator.faults import Fault, FaultPlan
 from drivers.vn100.emulator.memory import Memory
-from drivers.vn100.emulator.motion import Motion
-from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, EmulatedWorld, Further
+from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, EmulatedWorld, Further, Motion
 from drivers.vn100.emulator.sensor import Sensor
-from drivers.vn100.emulator.streams import OutputStream, Transmitter, streams
+from drivers.vn100.emulator.streams import (
+    CommandReply,
+    Interpreter,
+    OutputStream,
+    SideEffect,
+    Transmitter,
+    streams,
+)
 from drivers.vn100.messages import encode
 from drivers.vn100.register_codec import RegisterValueError, Values
 from drivers.vn100.registers import REGISTERS, format_reply

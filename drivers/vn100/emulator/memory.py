@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.vn100.emulator.chain import ChainSettings, OnBoardHsi, affine
-from drivers.vn100.emulator.motion import Array
+from drivers.vn100.emulator.physics import Array
 from drivers.vn100.register_codec import Register, RegisterValueError, Values, float32
 from drivers.vn100.registers import REGISTERS, check, parse
 

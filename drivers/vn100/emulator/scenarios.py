@@ -11,8 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.vn100.emulator.emulator import Emulator
-from drivers.vn100.emulator.motion import Motion, make_motion
-from drivers.vn100.emulator.physics import TICK_HZ, EmulatedTruth, Further, draw_truth
+from drivers.vn100.emulator.physics import (
+    TICK_HZ,
+    EmulatedTruth,
+    Further,
+    Motion,
+    draw_truth,
+    make_motion,
+)
 from drivers.vn100.emulator.streams import fits
 from drivers.vn100.registers import ASYNC_OUTPUT_RATES_HZ
 

@@ -17,8 +17,7 @@ import numpy as np
 
 from drivers.vn100.emulator.chain import SAMPLE_TICKS, FilterState, OnBoardHsi, SensorOutputs
 from drivers.vn100.emulator.memory import Memory
-from drivers.vn100.emulator.motion import Array
-from drivers.vn100.emulator.physics import BLOCK_TICKS, HISTORY_TICKS, TICK_HZ, EmulatedWorld
+from drivers.vn100.emulator.physics import BLOCK_TICKS, HISTORY_TICKS, TICK_HZ, Array, EmulatedWorld
 from drivers.vn100.messages import MESSAGES, Columns
 
 # -- Quantities of a message -----------------------------------------------------------------------

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from ahrsd.cli.files import refuse_unwritable
-from ahrsd.cli.progress import count_progress
+from ahrsd.cli.long_work import count_progress
 from ahrsd.errors import EXIT_DONE, EXIT_NO
 from ahrsd.printable import counted
 

@@ -1,0 +1,204 @@
+"""Where sets of registers come from: a device, a JSON file, a record of a journal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ahrsd.cli.device.access import open_device, read_all
+from ahrsd.cli.device.registers.changes import Changes, to_write
+from ahrsd.daemon.journal import Journal, Record, journal_path, register_values
+from ahrsd.errors import AhrsdError, JournalError
+from ahrsd.foreign_file import ForeignFileError, read_regular
+from ahrsd.writeback.composition import GYRO, MAG, UnwritableError, refuse_unsafe
+from drivers.vn100.commands import Identity, read_registers
+from drivers.vn100.device import Device
+from drivers.vn100.registers import REGISTERS, RegisterValueError, format_command, parse
+
+_LARGEST_BYTES = 4 << 20
+_SERIAL, _HSI_CONTROL, _HSI_APPLIED = 3, 44, 3
+
+
+def journals(state: Path, file: Path | None, serial: int | None) -> list[Path]:
+    """The journals that are meant, at least one.  Raises JournalError."""
+    if file is not None:
+        return [file]
+    pattern = "journal-*.jsonl" if serial is None else journal_path(state, serial).name
+    found = sorted(state.glob(pattern))
+    if not found:
+        which = "" if serial is None else f" of the device with the serial number {serial}"
+        raise JournalError(f"{state}: there is no journal{which}; nothing was written from here")
+    return found
+
+
+def find(journal: Journal, number: int) -> Record:
+    """The record of a change.  Raises JournalError where there is none with this number."""
+    changes = {record.seq: record for record in journal.records() if "old" in record.facts}
+    if number not in changes:
+        known = ", ".join(map(str, changes)) or "none"
+        raise JournalError(f"{journal.path}: record {number} is no change; changes are: {known}")
+    return changes[number]
+
+
+def newest_in_force(journal: Journal, read: Callable[[Iterable[int]], Changes]) -> Record:
+    """The newest change that is in the device and was not undone; undoing is no change itself.
+
+    Raises JournalError where there is none: then a person must say which record is meant.
+    """
+    records = journal.records()
+    done = {record.facts.get("txn") for record in records if record.kind == "HAND_VERIFIED"}
+    undone = {record.facts.get("undoes") for record in records if record.seq in done}
+    for record in reversed(records):
+        new = register_values(record, "new")
+        if not new or record.seq in undone or "undoes" in record.facts:
+            continue
+        present = read(new)
+        if not to_write(present, new) and to_write(present, register_values(record)):
+            return record
+    raise JournalError(
+        f"{journal.path}: the device holds the values of none of the journal's changes; "
+        "name the record (ahrsd registers history)"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Reads a set by its name. A journal's number means the journal of the device beside it."""
+
+    state: Path
+    journal_file: Path | None
+    baud: int | None
+
+    def read_pair(self, first: str, second: str) -> tuple[Changes, Changes]:
+        """Both sets of registers.  Raises AhrsdError, JournalError or DeviceError."""
+        serial: int | None = None
+        sets: dict[str, Changes] = {}
+        for name in (first, second):
+            if _is_port(name):
+                identity, sets[name] = self._device(name)
+                serial = identity.serial
+        for name in (first, second):
+            if name not in sets:
+                sets[name] = self._stored(name, serial)
+        return sets[first], sets[second]
+
+    def read(self, name: str) -> tuple[Identity | None, Changes]:
+        """One set, and the device where it is one.  Raises the same."""
+        return self._device(name) if _is_port(name) else (None, self._stored(name, None))
+
+    def _device(self, name: str) -> tuple[Identity, Changes]:
+        with open_device(Path(name), self.baud) as device:
+            return read_all(device)
+
+    def _stored(self, name: str, serial: int | None) -> Changes:
+        is_number = name.partition(":")[0].isdecimal()
+        return self._record(name, serial) if is_number else _read_json(Path(name))
+
+    def _record(self, name: str, serial: int | None) -> Changes:
+        number, _, which = name.partition(":")
+        if which not in ("", "old", "new"):
+            raise AhrsdError(f"{name}: behind the colon is old or new")
+        paths = journals(self.state, self.journal_file, serial)
+        if len(paths) > 1:
+            names = ", ".join(path.name for path in paths)
+            raise JournalError(f"{self.state}: several journals ({names}); say which by --journal")
+        return register_values(find(Journal.open(paths[0]), int(number)), which or "old")
+
+
+def calibrated(
+    path: Path, serial: int | None
+) -> Callable[[Device, Journal], tuple[Changes, Mapping[str, object]]]:
+    """What `registers write --from` wants of a device: the registers of a calibration.json.
+
+    Raises AhrsdError here where the file may not be written to any device, and later, from what is
+    returned, where it may not be written to this one.
+    """
+    body = _calibration(path)
+    new, in_force = (_registers_in(path, body, key) for key in ("registers", "registers_in_force"))
+    try:
+        refuse_unsafe({**in_force, **new})
+        for number, values in new.items():
+            format_command(number, values)
+    except (UnwritableError, RegisterValueError) as error:
+        raise AhrsdError(f"{path}: {error}") from error
+    device = body.get("device")
+    recorded = device.get("serial") if isinstance(device, dict) else None
+    if recorded is not None and serial not in (None, recorded):
+        raise AhrsdError(f"{path}: is of the device {recorded}, not of {serial}")
+    meant = serial if recorded is None else recorded
+    if meant is None:
+        raise AhrsdError(f"{path}: does not say of which device it is; give --serial NUMBER")
+
+    def wanted(device: Device, _journal: Journal) -> tuple[Changes, Mapping[str, object]]:
+        (found,) = device.run(read_registers((_SERIAL,)))[_SERIAL]
+        if found != meant:
+            raise AhrsdError(f"{path}: is of the device {meant}, and this one is {found}")
+        if device.run(read_registers((_HSI_CONTROL,)))[_HSI_CONTROL][1] == _HSI_APPLIED:
+            raise AhrsdError("the on-board estimator is applied; set register 44 to 0,1,5")
+        present = device.run(read_registers(in_force))
+        for number in to_write(present, in_force):
+            if number not in new or to_write(present, {number: new[number]}):
+                raise AhrsdError(
+                    f"{path}: register {number} of the device is not what was in force when it was "
+                    "recorded; record again and calibrate anew"
+                )
+        return new, {"reason": "write", "calibration": path.name}
+
+    return wanted
+
+
+def _calibration(path: Path) -> dict[str, object]:
+    """A calibration that determines something. Raises AhrsdError."""
+    try:
+        body = json.loads(read_regular(path, _LARGEST_BYTES).data)
+    except ForeignFileError as error:
+        raise AhrsdError(f"{path}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise AhrsdError(f"{path}: is not JSON: {error}") from error
+    if not isinstance(body, dict) or body.get("schema") != "ahrsd.calibration/1":
+        raise AhrsdError(f"{path}: is no calibration.json of `ahrsd calibrate`")
+    if body.get("converged") is not True or not body.get("registers"):
+        warnings = body.get("warnings")
+        why = "; ".join(map(str, warnings)) if isinstance(warnings, list) else ""
+        raise AhrsdError(f"{path}: nothing that may be written: {why or 'it has not converged'}")
+    if not body.get("registers_in_force"):
+        raise AhrsdError(
+            f"{path}: nobody knows which registers were in force when it was recorded; record with "
+            "`ahrsd capture` or `ahrsd run`, which read them"
+        )
+    return body
+
+
+def _registers_in(path: Path, body: Mapping[str, object], key: str) -> Changes:
+    found, values = body[key], {}
+    for number in (MAG, GYRO):
+        row = found.get(str(number)) if isinstance(found, dict) else None
+        if row is not None:
+            try:
+                values[number] = parse(number, [str(value) for value in row])
+            except (RegisterValueError, TypeError) as error:
+                raise AhrsdError(f"{path}: {key} {number}: {error}") from error
+    missing = [n for n in (MAG, GYRO) if n not in values]
+    if not values or (key == "registers_in_force" and missing):
+        raise AhrsdError(f"{path}: {key} has no register {missing[0]}")
+    return values
+
+
+def _is_port(name: str) -> bool:
+    return Path(name).is_char_device() or (name.startswith("/dev/") and not Path(name).exists())
+
+
+def _read_json(path: Path) -> Changes:
+    """The registers in a file of `registers read --json` or in a calibration.json."""
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))["registers"]
+        values = {int(number): tuple(row) for number, row in body.items()}
+    except OSError as error:
+        raise AhrsdError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise AhrsdError(f'{path}: has no "registers" of a device or a calibration') from error
+    if unknown := sorted(values.keys() - REGISTERS.keys()):
+        raise AhrsdError(f"{path}: register {unknown[0]} is no register of the VN-100")
+    return values

@@ -1,0 +1,1 @@
+"""Commands with recordings, measured or simulated: one of them, or whole archives."""

@@ -1,0 +1,1 @@
+"""Commands that talk with the running daemon: status, explain, watch, page, operator, bundle."""

@@ -1,0 +1,443 @@
+"""What a device's journal amounts to: kinds and times of its records, transactions, the summary.
+
+`JournalHistory` is the summary: the open transaction, the budget, the locks. It is built record by
+record, in the same way from a file at the start and from each new record later, so a restart can
+never change what the write-back believes.
+
+**Times** (`Stamp`): a proven restart, a time that passed. A record is stamped by three clocks. The
+wall clock can be wrong by any amount and can be set at any moment. The time since the host's boot
+(CLOCK_BOOTTIME) cannot be set, but only means something within one boot, which the boot id names.
+The device's own time since its start-up falls when, and only when, the device restarts.
+
+* A restart of the device is proven within one boot of the host by boottime and the device's time,
+  across boots by the device's time alone. The wall clock is never asked.
+* How long ago a budgeted write was is read cautiously: the least that the clocks leave possible.
+  Within one boot boottime says it, and a wall clock that shows less makes it less. Across boots the
+  host has been up at least since its boot, and the wall clock counts less `WALL_ERROR_S`, and only
+  where both of its readings are of this age (a computer without a battery starts in 1970 or 2000).
+
+A record without boot id is of another boot: old journals and recordings have none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any, Final, Protocol
+
+from drivers.vn100.registers import Profile, Unit, Values, profile_of, register_lines, same
+
+# -- Times of records ------------------------------------------------------------------------------
+
+
+PLAUSIBLE_FROM_S: Final = 1577836800.0  # 2020: an earlier wall clock was never set
+WALL_ERROR_S: Final = 7500.0  # an hour behind then and an hour ahead now, and some minutes
+LATENCY_S: Final = 0.5  # what a message of the device may take to get here
+CLOCK_RATE: Final = 1e-3  # how much slower or faster than the host a device's clock may run
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """One moment by every clock that was there; None or "": not known.
+
+    boot_s:   time since the host's boot `boot_id`
+    device_s: the device's own time since its start-up, at most: its newest sample
+    """
+
+    wall_s: float | None = None
+    boot_id: str = ""
+    boot_s: float | None = None
+    device_s: float | None = None
+
+    @staticmethod
+    def of(facts: Mapping[str, Any]) -> Stamp:
+        """From a journal record, whatever is in it."""
+        boot_id = facts.get("boot_id")
+        return Stamp(
+            wall_s=_number(facts.get("wall_s")),
+            boot_id=boot_id if isinstance(boot_id, str) else "",
+            boot_s=_number(facts.get("boot_s")),
+            device_s=_number(facts.get("device_s")),
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """For a journal record."""
+        return {
+            "wall_s": self.wall_s,
+            "boot_id": self.boot_id,
+            "boot_s": self.boot_s,
+            "device_s": self.device_s,
+        }
+
+
+UNKNOWN: Final = Stamp()
+
+
+@dataclass(frozen=True, slots=True)
+class Now:
+    """The present by the same clocks, and how long ago this run last read the whole journal."""
+
+    stamp: Stamp
+    run_s: float = 0.0
+
+
+def _number(value: object) -> float | None:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if plain and math.isfinite(value) else None  # type: ignore[arg-type]
+
+
+def same_boot_s(record: Stamp, now: Stamp) -> float | None:
+    """The age of the record by boottime; None where it is of another boot, or claims to be ahead"""
+    if not record.boot_id or record.boot_id != now.boot_id:
+        return None
+    if record.boot_s is None or now.boot_s is None or now.boot_s < record.boot_s:
+        return None
+    return now.boot_s - record.boot_s
+
+
+def restarted_since(record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
+    """Whether a device with this time since its start-up must have restarted after the record.
+
+    A device whose clock is a thousandth slow is not taken for one that restarted. A time that fell
+    to more than has passed since the record is a clock that jumped, and no restart.
+    """
+    if uptime_s is None or not math.isfinite(uptime_s) or uptime_s < 0.0:
+        return False
+    fell = record.device_s is not None and uptime_s < record.device_s - LATENCY_S
+    if not record.boot_id or record.boot_id != now.boot_id:
+        return fell
+    age_s = same_boot_s(record, now)
+    if age_s is None:
+        return False
+    started_later = uptime_s < age_s * (1.0 - CLOCK_RATE) - LATENCY_S
+    return started_later or (fell and uptime_s <= age_s * (1.0 + CLOCK_RATE) + LATENCY_S)
+
+
+def passed_s(records: Sequence[Stamp], now: Now) -> list[float]:
+    """For each record, oldest first, the least time that must have passed since; at least 0.
+
+    A record is at least as old as every record behind it.
+    """
+    least: list[float] = []
+    newest_s = 0.0
+    for record in reversed(records):
+        newest_s = max(newest_s, _passed_s(record, now))
+        least.append(newest_s)
+    return least[::-1]
+
+
+def _passed_s(record: Stamp, now: Now) -> float:
+    wall_s = None
+    if plausible(record.wall_s) and plausible(now.stamp.wall_s):
+        wall_s = (now.stamp.wall_s or 0.0) - (record.wall_s or 0.0)
+    if record.boot_id and record.boot_id == now.stamp.boot_id:
+        age_s = same_boot_s(record, now.stamp)
+        known = [s for s in (age_s, wall_s) if s is not None]
+        return min(known) if age_s is not None else 0.0
+    up_s = 0.0
+    if now.stamp.boot_id:  # what this run writes has its boot id: this was there before
+        up_s = now.run_s if not record.boot_id else now.stamp.boot_s or 0.0
+    return max(up_s, 0.0 if wall_s is None else wall_s - WALL_ERROR_S)
+
+
+def plausible(wall_s: float | None) -> bool:
+    """Whether somebody has set this wall clock."""
+    return wall_s is not None and wall_s >= PLAUSIBLE_FROM_S
+
+
+# -- Kinds of records ------------------------------------------------------------------------------
+
+
+class RecordKind(StrEnum):
+    """Records of the journal. The first group leaves a transaction open, the second ends it."""
+
+    PREPARED = "PREPARED"  # J1: what the device holds, what it shall hold; nothing sent yet
+    RAM_FAILED = "RAM_FAILED"  # J3: a write was refused or did not verify; old values follow
+    RAM_VERIFIED = "RAM_VERIFIED"  # J3: read back, equal
+    PROVEN = "PROVEN"  # J4: the trial passed
+    ROLLBACK = "ROLLBACK"  # J4: the old values are about to be written
+    FLASH_SENT = "FLASH_SENT"  # J5: VNWNV is about to be sent
+    FLASH_ACKED = "FLASH_ACKED"  # J6: the device said yes
+
+    ABORTED = "ABORTED"  # nothing was changed
+    ROLLED_BACK = "ROLLED_BACK"  # the old values were read back
+    REVERTED = "REVERTED"  # the old values are back, by whom is not known
+    LOST = "LOST"  # the device restarted with the old values
+    NOT_SAVED = "NOT_SAVED"  # VNWNV was sent, a restart brought the old values
+    CONFIRMED = "CONFIRMED"  # J7: a restart brought the new values
+    FOREIGN = "FOREIGN"  # the device holds what nobody here wrote
+    FLASH_TORN = "FLASH_TORN"  # VNWNV was interrupted, the flash holds neither
+
+    LOCKED = "LOCKED"  # not part of a transaction
+    UNLOCKED = "UNLOCKED"
+    OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
+    OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
+    CLIENT_SAVED = "CLIENT_SAVED"  # a program on a shared port saved all of RAM
+    CLIENT_WRITES = "CLIENT_WRITES"  # one is about to write what calibrates, in RAM
+
+
+OPEN: Final = (
+    RecordKind.PREPARED,
+    RecordKind.RAM_FAILED,
+    RecordKind.RAM_VERIFIED,
+    RecordKind.PROVEN,
+    RecordKind.ROLLBACK,
+    RecordKind.FLASH_SENT,
+    RecordKind.FLASH_ACKED,
+)
+
+
+OF_OUTPUTS: Final = (RecordKind.OUTPUTS_KEPT, RecordKind.OUTPUTS_BACK)
+
+
+OF_OTHERS: Final = (*OF_OUTPUTS, RecordKind.CLIENT_SAVED)  # says nothing about a transaction
+
+
+# -- What the records amount to --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Transaction:
+    """What a write changes. `old` and `new` have the same registers.
+
+    snapshot: every configuration register as the user has it, before the daemon touched anything
+    approver: who said yes: "operator" or "auto"
+    model:    of the device; empty in records from before it was kept
+    """
+
+    id: str
+    serial: int
+    firmware: str
+    old: dict[int, Values]
+    new: dict[int, Values]
+    snapshot: dict[int, Values]
+    heading_change_deg: float
+    approver: str
+    model: str = ""
+
+    def is_of(self, unit: Unit) -> bool:
+        """Whether this is the device that was judged."""
+        return unit == Unit(self.model or unit.model, self.serial, self.firmware)
+
+    @property
+    def profile(self) -> Profile:
+        """The firmware's profile."""
+        return profile_of(self.firmware)
+
+    def facts(self) -> dict[str, Any]:
+        """As the journal holds it, with lines that a person can type to go back."""
+        return {
+            "txn": self.id,
+            "serial": self.serial,
+            "model": self.model,
+            "firmware": self.firmware,
+            "old": _to_json(self.old),
+            "new": _to_json(self.new),
+            "snapshot": _to_json(self.snapshot),
+            "heading_change_deg": self.heading_change_deg,
+            "approver": self.approver,
+            "lines_old": list(register_lines(self.old)),
+            "lines_new": list(register_lines(self.new)),
+        }
+
+    @staticmethod
+    def from_facts(facts: Mapping[str, Any]) -> Transaction:
+        """Back from a PREPARED record; KeyError, TypeError or ValueError where it is not one."""
+        return Transaction(
+            id=str(facts["txn"]),
+            serial=int(facts["serial"]),
+            firmware=str(facts["firmware"]),
+            old=_from_json(facts["old"]),
+            new=_from_json(facts["new"]),
+            snapshot=_from_json(facts["snapshot"]),
+            heading_change_deg=float(facts["heading_change_deg"]),
+            approver=str(facts["approver"]),
+            model=str(facts.get("model", "")),
+        )
+
+
+def _to_json(registers: Mapping[int, Values]) -> dict[str, list[float | int | str]]:
+    return {str(number): list(values) for number, values in sorted(registers.items())}
+
+
+def _from_json(registers: Mapping[str, list[float | int | str]]) -> dict[int, Values]:
+    return {int(number): tuple(values) for number, values in registers.items()}
+
+
+TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
+
+
+BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
+
+
+_TOUCHED_RAM: Final = (RecordKind.RAM_VERIFIED, RecordKind.RAM_FAILED, RecordKind.ROLLBACK)
+
+
+_HOLDS_NEW: Final = (RecordKind.FLASH_ACKED, RecordKind.CONFIRMED)
+
+
+_HOLDS_OLD: Final = (
+    RecordKind.ABORTED,
+    RecordKind.ROLLED_BACK,
+    RecordKind.REVERTED,
+    RecordKind.LOST,
+    RecordKind.NOT_SAVED,
+)
+
+
+class JournalRecord(Protocol):
+    """One record, as the journal gives it back."""
+
+    @property
+    def kind(self) -> str:
+        """One of `RecordKind`; others (of other commands) are passed over."""
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """What was recorded; `Stamp` reads the time from it."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRecord:
+    """A journal record out of `JournalOpened`."""
+
+    kind: str
+    facts: dict[str, Any]
+
+    @staticmethod
+    def of(body: Mapping[str, Any]) -> StoredRecord:
+        """From `JournalOpened.records`."""
+        return StoredRecord(str(body["kind"]), dict(body["facts"]))
+
+
+@dataclass(frozen=True, slots=True)
+class JournalHistory:
+    """A journal, summed up.
+
+    open:      the transaction that no record ended yet, the kind and time of its newest record
+    newest_at: the time of the newest record of any kind
+    rollbacks: since the last proven write or unlock; each says that a calibration was bad
+    holds:     what the device must hold after the newest transaction, where that is known
+    values:    registers and values that a write found or meant, also one by hand
+    broken:    the kind of a record that could not be understood; then nothing may be written
+    """
+
+    open: Transaction | None = None
+    last: RecordKind | None = None
+    last_at: Stamp = UNKNOWN
+    newest_at: Stamp = UNKNOWN
+    ram_writes_at: tuple[Stamp, ...] = ()
+    flashes_at: tuple[Stamp, ...] = ()
+    flashes: int = 0
+    rollbacks: int = 0
+    rollback_at: Stamp | None = None
+    locked: str | None = None
+    torn: bool = False
+    holds: dict[int, Values] | None = None
+    values: tuple[tuple[int, Values], ...] = ()
+    broken: str | None = None
+
+    @staticmethod
+    def of(records: Iterable[JournalRecord]) -> JournalHistory:
+        """The history that these records tell, oldest first."""
+        history = JournalHistory()
+        for record in records:
+            if record.kind in RecordKind.__members__:
+                history = history.with_record(RecordKind(record.kind), record.facts)
+            elif record.kind == BY_HAND:
+                history = history._with_values(record.facts)
+        return history
+
+    def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
+        """The history after one more record."""
+        if kind in OF_OTHERS:
+            return self
+        at = Stamp.of(facts)
+        now = replace(self, newest_at=at)
+        if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
+            return now._with_values(facts)._not_sure_of(facts)
+        if kind is RecordKind.LOCKED:
+            return replace(now, locked=str(facts.get("reason", "no reason given")))
+        if kind is RecordKind.UNLOCKED:
+            return replace(now, locked=None, torn=False, rollbacks=0)
+        if kind is RecordKind.PREPARED:
+            try:
+                transaction = Transaction.from_facts(facts)
+            except (KeyError, TypeError, ValueError):
+                return replace(now, broken=kind.value)
+            begun = replace(now, open=transaction, last=kind, last_at=at, holds=None)
+            return begun._with_values(facts)
+        return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
+
+    def knows(self, number: int, values: Values) -> bool:
+        """Whether a record has these values of this register, as found or as meant."""
+        return any(n == number and same(n, known, values) for n, known in self.values)
+
+    def _with_values(self, facts: Mapping[str, Any]) -> JournalHistory:
+        try:
+            found = [
+                (int(number), tuple(row))
+                for which in ("old", "new")
+                for number, row in facts[which].items()
+            ]
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return self
+        return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
+
+    def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
+        written = {str(number) for number in facts.get("new", ())}
+        left = {n: v for n, v in (self.holds or {}).items() if str(n) not in written}
+        return replace(self, holds=left or None)
+
+    def _counted(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
+        """Budgets and rollbacks."""
+        changes: dict[str, Any] = {}
+        if kind in _TOUCHED_RAM and self.last is RecordKind.PREPARED:
+            changes["ram_writes_at"] = (*self.ram_writes_at, at)[-TIMES_KEPT:]
+        if kind is RecordKind.FLASH_SENT:
+            changes["flashes_at"] = (*self.flashes_at, at)[-TIMES_KEPT:]
+            changes["flashes"] = self.flashes + 1
+        if kind is RecordKind.PROVEN:
+            changes["rollbacks"] = 0
+        if (
+            kind is RecordKind.PROVEN and self.last is RecordKind.FLASH_SENT
+        ):  # it was not sent after all
+            changes["flashes_at"] = self.flashes_at[:-1]
+            changes["flashes"] = self.flashes - 1
+        if kind is RecordKind.ROLLBACK and facts.get("counts"):
+            changes["rollbacks"] = self.rollbacks + 1
+            changes["rollback_at"] = at
+        return replace(self, **changes)
+
+    def _with_transaction_at(
+        self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp
+    ) -> JournalHistory:
+        """Where the open transaction stands; a record of another one says nothing about it."""
+        if self.open is None or facts.get("txn", self.open.id) != self.open.id:
+            return self
+        holds = self.holds
+        if kind in _HOLDS_NEW:
+            holds = self.open.new
+        elif kind in _HOLDS_OLD:
+            saved = kind is RecordKind.REVERTED and self.last in (
+                RecordKind.FLASH_SENT,
+                RecordKind.FLASH_ACKED,
+            )
+            holds = None if saved else self.open.old  # the next start may bring either
+        torn = self.torn or kind is RecordKind.FLASH_TORN
+        still_open = self.open if kind in OPEN else None
+        return replace(self, open=still_open, last=kind, last_at=at, holds=holds, torn=torn)
+
+
+def of_another_device(records: Iterable[JournalRecord], serial: int) -> str:
+    """Which record is of a device with another serial number; empty where none is."""
+    for number, record in enumerate(records, start=1):
+        device = record.facts.get("device")
+        theirs = record.facts.get(
+            "serial", device.get("serial") if isinstance(device, dict) else None
+        )
+        if theirs is not None and str(theirs) != str(serial):
+            return f"record {number} is of the device {theirs}, and this is {serial}"
+    return ""

@@ -1,0 +1,319 @@
+"""Real recordings: what every method is worth where something can be known.
+
+    python tests/benchmarks/estimator/bench_real.py
+        [--json FILE] [--short] [--only drive optical punch rest]
+
+drive:   circles_2022_rahul calibrates, drive_2022_rahul judges: heading against GPS course above
+         4 m/s, one constant removed, and dead reckoning by the receiver's speed
+optical: broad/01, 02 and 21, each calibrated by itself and by each other, against optical attitude,
+         the magnetometer's lag of 11.5 ms taken out; "oracle" is the linear calibration with the
+         least heading error there, fitted with the optical attitude on the very recording
+punch:   one sensor on two people's fists: the hard iron must repeat
+rest:    nothing is observable: no answer is the right one
+
+It reads the recordings beside the project and prints tables; the right answer is in no file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from ahrsd.baselines import METHODS
+from ahrsd.baselines.registry import ComparisonRow
+from ahrsd.calibration import Affine
+from ahrsd.config.loading import Config
+from ahrsd.config.sections import LocationSection
+from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
+from ahrsd.evaluation.heading import QUATERNION, course, optical
+from ahrsd.heading import wrapped
+from ahrsd.offline.batch_result import BatchResult
+from ahrsd.offline.calibrate import calibrate
+from ahrsd.offline.compare_methods import our_row, row_of, run_published
+from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
+from ahrsd.samples import Array
+
+RECORDINGS = Path(__file__).parents[4] / "shared" / "recordings"
+# Boston, where the car drove. The day is not known: a year moves |H| there by 1 mG.
+BOSTON = Config(
+    location=LocationSection(latitude_deg=42.34, longitude_deg=-71.09, date=date(2022, 10, 15))
+)
+QUICK = ("magical-ls", "magyc-bfg", "ellipsoid", "fnp")
+LEAST_SPEED_M_S = 4.0
+ORACLE_EVERY = 10  # samples at 286 Hz
+BROAD_LAG_S = 0.0115  # the magnetometer trails the gyro by this in every trial
+BROAD = ("01_undisturbed_slow_rotation_A", "02_undisturbed_slow_rotation_B",
+         "21_undisturbed_fast_combined")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A method judged on a recording. Without an answer the figures are None."""
+
+    method: str
+    made_from: str
+    judged_on: str
+    converged: bool
+    reason: str
+    before_deg: float | None = None
+    after_deg: float | None = None
+    worst_deg: float | None = None
+    fold_spread_deg: float | None = None
+    reckoning_before_percent: float | None = None
+    reckoning_after_percent: float | None = None
+    spread_before: float | None = None
+    spread_after: float | None = None
+
+
+def rows_of(
+    path: Path, methods: tuple[str, ...], config: Config
+) -> tuple[list[ComparisonRow], BatchResult]:
+    """Ours and these methods on a recording."""
+    result = calibrate(path, config)
+    theirs = [row_of(result, run_published(result, name), held_out=False) for name in methods]
+    return [our_row(result, held_out=False), *theirs], result
+
+
+def stored(row: ComparisonRow, recording: str) -> StoredCalibration | None:
+    """A row as a calibration; None where it has no answer."""
+    if row.hard_iron_gauss is None:
+        return None
+    C = np.eye(3) if row.soft_iron is None else np.linalg.inv(row.soft_iron)
+    correction = Affine(C, row.hard_iron_gauss)
+    return StoredCalibration("", row.method, recording, row.converged, correction)
+
+
+def judged(row: ComparisonRow, made_from: str, judged_on: str, found: Evaluation | None) -> Judged:
+    """The figures of an evaluation in one line."""
+    base = (row.method, made_from, judged_on, row.converged, row.reason)
+    if found is None or not found.headings:
+        return Judged(*base)
+    pair = found.headings[0].figures
+    reckoned = found.reckoned
+    return Judged(
+        *base,
+        pair.before.rms_deg,
+        pair.after.rms_deg,
+        pair.after.worst_deg,
+        pair.after.fold_spread_deg,
+        None if reckoned is None else reckoned.figures.before.rms_percent,
+        None if reckoned is None else reckoned.figures.after.rms_percent,
+        found.field.before.spread,
+        found.field.after.spread,
+    )
+
+
+def drive(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Judged]:
+    """Calibrated on the circles, judged on the drive."""
+    circles = folder / "vn100" / "circles_2022_rahul.csv.gz"
+    path = folder / "vn100" / "drive_2022_rahul.csv.gz"
+    rows, _ = rows_of(circles, methods, BOSTON)
+    track, _ = read_track(path, Config())
+    gps = gps_beside(path)
+    assert gps is not None
+    fixes, _ = read_fixes(gps)
+    references = [course(fixes, LEAST_SPEED_M_S)]
+    lines = []
+    for row in rows:
+        calibration = stored(row, circles.name)
+        found = calibration and judge(path.name, track, calibration, references, fixes=fixes)
+        lines.append(judged(row, circles.name, path.name, found))
+    return lines
+
+
+def against_optics(
+    folder: Path,
+    methods: tuple[str, ...] = ("ellipsoid", "magyc-bfg"),
+    names: tuple[str, ...] = BROAD,
+) -> list[Judged]:
+    """Each trial calibrates, all of them judge."""
+    paths = [folder / "broad" / f"{name}.csv.gz" for name in names]
+    tracks = [without_lag(read_track(path, Config())[0], BROAD_LAG_S) for path in paths]
+    lines = []
+    for path, track in zip(paths, tracks, strict=True):
+        reference = optical(track)
+        assert reference is not None
+        row = oracle(track)
+        found = judge(path.name, track, stored(row, path.name), [reference])  # type: ignore[arg-type]
+        lines.append(judged(row, path.name[:2], path.name[:2], found))
+    for path in paths:
+        rows, _ = rows_of(path, methods, Config())
+        for row in rows:
+            calibration = stored(row, path.name)
+            for other, track in zip(paths, tracks, strict=True):
+                reference = optical(track)
+                assert reference is not None
+                found = calibration and judge(other.name, track, calibration, [reference])
+                lines.append(judged(row, path.name[:2], other.name[:2], found))
+    return lines
+
+
+def without_lag(track: EvaluationTrack, lag_s: float) -> EvaluationTrack:
+    """The same with each reading of the field as it was at its own instant."""
+    steps = round(lag_s / float(np.median(np.diff(track.time_s))))
+    kept = len(track) - steps
+    raw = track.raw_b_gauss[steps:]
+    return EvaluationTrack(
+        track.time_s[:kept],
+        raw,
+        raw,
+        track.gyro_b_rad_s[:kept],
+        track.accel_b_m_s2[:kept],
+        covariates={name: values[:kept] for name, values in track.covariates.items()},
+    )
+
+
+def oracle(track: EvaluationTrack) -> ComparisonRow:
+    """C and b with the least RMS of heading error that any linear calibration has here.
+
+    Start: C m - c = R_wb^T H is linear in C, c and H together up to scale, the least singular
+    vector. Then the azimuth of R_wb (C m - c) itself is made as constant as it can be.
+    """
+    q = np.column_stack([track.covariates[name] for name in QUATERNION])
+    known = np.flatnonzero(np.isfinite(q).all(axis=1))[::ORACLE_EVERY]
+    R_wb = Rotation.from_quat(q[known], scalar_first=True).as_matrix()
+    up_w = np.mean(np.einsum("kij,kj->ki", R_wb, track.accel_b_m_s2[known]), axis=0)
+    m = track.raw_b_gauss[known]
+    rows = np.zeros((len(m), 3, 15))
+    for i in range(3):
+        rows[:, i, 3 * i : 3 * i + 3] = m
+        rows[:, i, 9 + i] = -1.0
+    rows[:, :, 12:] = -np.swapaxes(R_wb, 1, 2)
+    flat = rows.reshape(-1, 15)
+    least = np.linalg.eigh(flat.T @ flat)[1][:, 0]
+    least *= np.sign(np.linalg.det(least[:9].reshape(3, 3)))
+    level = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up_w])[0].as_matrix() @ R_wb
+
+    def error_rad(x: Array) -> Array:
+        h = np.einsum("kij,kj->ki", level, m @ x[:9].reshape(3, 3).T - x[9:12])
+        azimuth = np.arctan2(h[:, 1], h[:, 0])
+        return wrapped(azimuth - np.angle(np.mean(np.exp(1j * azimuth))))
+
+    found = least_squares(error_rad, least[:12]).x
+    C, c = found[:9].reshape(3, 3), found[9:12]
+    A = np.linalg.inv(C / np.cbrt(np.linalg.det(C)))
+    return ComparisonRow("oracle", A, np.linalg.solve(C, c), None, True, "")
+
+
+def punch(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[dict[str, object]]:
+    """Hard iron (mG) of two people with the same sensor, and how far apart they are."""
+    names = ("punch_2024_shaked", "punch_2024_satish")
+    both = [rows_of(folder / "vn100" / f"{n}.csv.gz", methods, BOSTON)[0] for n in names]
+    lines = []
+    for one, other in zip(*both, strict=True):
+        known = one.hard_iron_gauss is not None and other.hard_iron_gauss is not None
+        lines.append(
+            {
+                "method": one.method,
+                "shaked_mG": None
+                if one.hard_iron_gauss is None
+                else list(1e3 * one.hard_iron_gauss),
+                "satish_mG": None
+                if other.hard_iron_gauss is None
+                else list(1e3 * other.hard_iron_gauss),
+                "apart_mG": 1e3 * float(np.linalg.norm(one.hard_iron_gauss - other.hard_iron_gauss))
+                if known
+                else None,
+                "converged": [one.converged, other.converged],
+                "reasons": [one.reason, other.reason],
+            }
+        )
+    return lines
+
+
+def at_rest(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[ComparisonRow]:
+    """What every method says about a sensor at rest."""
+    return rows_of(folder / "vn100" / "static_2025_kiran_5min.csv.gz", methods, BOSTON)[0]
+
+
+def print_judged(title: str, lines: list[Judged]) -> None:
+    """The table of one experiment."""
+    print(f"\n{title}")
+    print(f"{'method':20}{'from':>5}{'on':>5}{'before':>9}{'after':>8}{'worst':>8}{'folds':>8}"
+          f"{'XY before':>11}{'after':>8}{'spread':>9}{'after':>8}")  # fmt: skip
+    for line in lines:
+        head = f"{line.method:20}{line.made_from[:2]:>5}{line.judged_on[:2]:>5}"
+        if line.after_deg is None:
+            print(f"{head}  no answer: {line.reason}")
+            continue
+        figures = (
+            (line.before_deg, 9, 1, 1), (line.after_deg, 8, 2, 1), (line.worst_deg, 8, 1, 1),
+            (line.fold_spread_deg, 8, 2, 1), (line.reckoning_before_percent, 11, 1, 1),
+            (line.reckoning_after_percent, 8, 2, 1), (line.spread_before, 9, 2, 100),
+            (line.spread_after, 8, 2, 100),
+        )  # fmt: skip
+        text = "".join(
+            f"{'-':>{width}}" if value is None else f"{value * scale:{width}.{digits}f}"
+            for value, width, digits, scale in figures
+        )
+        print(f"{head}{text}  {'' if line.converged else 'not converged'}")
+    print("deg; XY: RMS in % of the distance; spread: std |h| / mean |h| in %")
+
+
+def print_punch(lines: list[dict[str, object]]) -> None:
+    """Two hard irons and their difference."""
+    print("\npunch: hard iron of one sensor on two fists, mG")
+    for line in lines:
+        apart = line["apart_mG"]
+        one, other = (
+            "no answer" if v is None else ", ".join(f"{x:+.1f}" for x in v)  # type: ignore[attr-defined]
+            for v in (line["shaked_mG"], line["satish_mG"])
+        )
+        words = "" if all(line["converged"]) else f"  converged: {line['converged']}"  # type: ignore[arg-type]
+        told = "     -" if apart is None else f"{apart:6.1f}"
+        print(f"{line['method']:20}{one:>26}{other:>26}  apart {told}{words}")
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--short", action="store_true", help="fewer methods")
+    parser.add_argument("--only", nargs="*", default=["drive", "optical", "punch", "rest"])
+    arguments = parser.parse_args()
+    methods = QUICK if arguments.short else tuple(METHODS)
+    body: dict[str, object] = {"schema": "ahrsd.bench_real/1"}
+    logging.getLogger("ahrsd").setLevel(logging.ERROR)  # what a daemon would warn of on the way
+    began = time.process_time()
+    if "drive" in arguments.only:
+        lines = drive(RECORDINGS, methods)
+        print_judged(
+            "drive: calibrated on circles (ci), judged on a drive (dr), against GPS", lines
+        )
+        body["drive"] = [_as_json(line) for line in lines]
+    if "optical" in arguments.only:
+        lines = against_optics(RECORDINGS)
+        print_judged("broad: against optical attitude", lines)
+        body["optical"] = [_as_json(line) for line in lines]
+    if "punch" in arguments.only:
+        pairs = punch(RECORDINGS, methods)
+        print_punch(pairs)
+        body["punch"] = pairs
+    if "rest" in arguments.only:
+        rows = at_rest(RECORDINGS, methods)
+        print("\nat rest")
+        for row in rows:
+            print(f"{row.method:20}{'ANSWERED' if row.converged else 'refused'}: {row.reason}")
+        body["rest"] = [{"method": r.method, "refused": not r.converged} for r in rows]
+    print(f"\n{time.process_time() - began:.0f} s of processor time")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(body, indent=1))
+
+
+def _as_json(line: Judged) -> dict[str, object]:
+    return {name: getattr(line, name) for name in line.__slots__}
+
+
+if __name__ == "__main__":
+    main()
