@@ -40,7 +40,8 @@ def command(
     FILE may be any recording: a ROS 1 bag, a ROS 2 recording, the log of an autopilot, a foreign
     CSV (with --columns), or one of ours. Every other command opens these files directly, too.
     """
-    from ahrsd.offline.convert import converted, listed, save
+    from ahrsd.offline.convert import converted, save
+    from ahrsd.offline.listing import listed
     from ahrsd.recording.foreign.sensors import Choice
 
     if only_list:
