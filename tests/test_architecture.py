@@ -47,7 +47,7 @@ SHELL = (
     "ahrsd.telemetry.client",
     "ahrsd.telemetry.metrics",
     "ahrsd.telemetry.public",
-    "ahrsd.telemetry.public",
+    "ahrsd.telemetry.sd_notify",
     "ahrsd.telemetry.server",
     "ahrsd.viewer",
     "drivers.serial_port",

@@ -24,7 +24,8 @@ from ahrsd.daemon.vehicle_files import VehicleFiles
 from ahrsd.errors import EXIT_DONE, ConfigError
 from ahrsd.recording.capture import new_capture_path
 from ahrsd.report.summary import summary_lines
-from ahrsd.telemetry.public import Notifier, Public
+from ahrsd.telemetry.public import Public
+from ahrsd.telemetry.sd_notify import Notifier
 from drivers.serial_port import BaudFound, PortError, find_device, spelled
 
 log = logging.getLogger("ahrsd")

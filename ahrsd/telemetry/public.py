@@ -1,19 +1,12 @@
 """Everything that the daemon tells the world, behind one object: socket, metrics, systemd.
 
 None of it is needed for the work: where one cannot be had, that is logged and the daemon goes on.
-
-**systemd** (`Notifier`, sd_notify(3)): one datagram a word, never an error. The main loop feeds the
-watchdog after each turn, but not while the estimator is stuck: then it is killed and restarted,
-while one that waits for an unplugged device turns on and is left alone.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
-import os
-import socket
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -27,65 +20,10 @@ from ahrsd.telemetry.client import default_socket_path
 from ahrsd.telemetry.feeds import Feed, Outlet
 from ahrsd.telemetry.metrics import MetricsServer
 from ahrsd.telemetry.protocol import Newest, samples_record
+from ahrsd.telemetry.sd_notify import Notifier
 from ahrsd.telemetry.server import SocketServer
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
 from ahrsd.telemetry.words import service_line
-
-# -- systemd ---------------------------------------------------------------------------------------
-
-
-class Notifier:
-    """Speaks to $NOTIFY_SOCKET; does nothing where the service manager gave none."""
-
-    def __init__(self) -> None:
-        self._address = os.environ.get("NOTIFY_SOCKET", "")
-        if self._address.startswith("@"):  # Linux's abstract namespace
-            self._address = "\0" + self._address[1:]
-        for_us = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        asked_us = int(os.environ.get("WATCHDOG_USEC", "0")) if for_us else 0
-        #: how often the watchdog is fed, seconds; 0 where there is none
-        self.period_s = asked_us * 1e-6 / 3.0
-        self._next_s = 0.0
-        self._status_sent = ""
-        self._is_ready = False
-
-    def ready(self, status: str) -> None:
-        """The service is up: it hears a device, or waits for one. Later only the status counts."""
-        if self._is_ready:
-            self.status(status)
-            return
-        self._is_ready, self._status_sent = True, status
-        self._send(f"READY=1\nSTATUS={status}")
-
-    def status(self, status: str) -> None:
-        """One line for `systemctl status`; the same line is not sent twice."""
-        if status != self._status_sent:
-            self._status_sent = status
-            self._send(f"STATUS={status}")
-
-    def stopping(self) -> None:
-        """The service is going down and may take its time for what it puts back."""
-        self._send("STOPPING=1")
-
-    def feed(self) -> None:
-        """The loop turned once more."""
-        if self.period_s and (now_s := time.monotonic()) >= self._next_s:
-            self._next_s = now_s + self.period_s
-            self._send("WATCHDOG=1")
-
-    def _send(self, text: str) -> None:
-        if not self._address:
-            return
-        with (
-            contextlib.suppress(OSError),  # a manager that is gone cannot be told
-            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as datagram,
-        ):
-            datagram.connect(self._address)
-            datagram.send(text.encode())
-
-
-# -- Socket, metrics, systemd ----------------------------------------------------------------------
-
 
 _PACE_S = 0.004  # samples are told so often at most; a look at those that wait takes 0.3 ms
 

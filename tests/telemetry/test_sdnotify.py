@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from ahrsd.telemetry.public import Notifier
+from ahrsd.telemetry.sd_notify import Notifier
 
 
 @pytest.fixture
