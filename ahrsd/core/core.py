@@ -254,7 +254,9 @@ class Core:
             self._note("warning", text)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
-            self._device_reset("its time fell", self.at_s)
+            uptime_s = self.at_s if self.stream.newest_s is None else self.stream.newest_s
+            client = self.clients.reset_by(self._host_s - uptime_s)
+            self._device_reset("its time fell", uptime_s, client)
 
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
         """From now on samples may be of another device, for this reason; empty: for none."""
@@ -275,14 +277,14 @@ class Core:
         if code in (_WATCHDOG_RESET, _HARD_FAULT):
             self._device_reset(f"VNERR {code:02X}")
 
-    def _device_reset(self, why: str, uptime_s: float | None = None) -> None:
+    def _device_reset(self, why: str, uptime_s: float | None = None, client: str = "") -> None:
         self._note("warning", f"the device restarted ({why})")
         self._breaks += 1
         self.unconfirmed.drop()
         if self.device_session.identity is None:
             return
         self.epochs.begin(self._host_s, None)
-        self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s))
+        self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s, client))
         self._action_queue.forget_procedure()
         self.take(self.device_session.identify_again(self._host_s))
 
@@ -415,7 +417,7 @@ class Core:
             self.stream.forget()
         self._action_queue.add(served.actions)
         if served.reset_by:
-            self._device_reset(f"{served.reset_by} reset it")
+            self._device_reset(f"{served.reset_by} reset it", client=served.reset_by)
 
     def emit(self, event: events.Event) -> None:
         """A fact of the write-back."""

@@ -130,9 +130,16 @@ class WriteBack:
         foreign = history.locked is not None and history.last is RecordKind.FOREIGN
         if foreign or self.state in (State.FAULT, State.FLASH_TORN):
             return False
-        if self.state in _BETWEEN or self._outbox.running:
-            return None
-        return True
+        return None if self.client_may_reset is None or self.state is State.RECONCILING else True
+
+    @property
+    def client_may_reset(self) -> bool | None:
+        """Whether the device may be reset for a client; None: not yet, what is there is undone.
+
+        Where nobody knows what it holds a reset does no harm.
+        """
+        between = self.state in _BETWEEN and self.state is not State.RECONCILING
+        return None if between or self._outbox.running else True
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
@@ -222,14 +229,20 @@ class WriteBack:
         self._flow.signal(Signal.LINK_LOST, "the link was lost")
         return self._answer()
 
-    def on_reset(self, host_s: float, uptime_s: float | None = None) -> list[Action]:
+    def on_reset(
+        self, host_s: float, uptime_s: float | None = None, client: str = ""
+    ) -> list[Action]:
         """The device restarted: its RAM is what its flash holds. `on_device` must follow.
 
         uptime_s: its time since then, where that is what tells; then it must agree with the journal
+        client:   whose VNRST it was, where it was one
         """
         self._outbox.host_s = host_s
         self._restarts.seen(self.history.last_at, self._outbox.stamp, host_s, uptime_s)
-        self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
+        if client:
+            self._flow.signal(Signal.CLIENT_RESET, f"{client} reset the device")
+        else:
+            self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
     def on_uptime(
@@ -440,16 +453,26 @@ class WriteBack:
         self._safe.client_registers = clients
         return self._answer()
 
-    def on_client_wants_save(self, client: str, host_s: float) -> list[Action]:
-        """All of RAM is to be saved for a client: what is on trial is undone first."""
+    def on_client_wants(self, client: str, does: str, host_s: float) -> list[Action]:
+        """A client "saves" all of RAM or "resets" the device: what is on trial is undone first."""
         self._outbox.host_s = host_s
-        self._flow.set_aside(client)
+        self._flow.set_aside(client, does)
         return self._answer()
 
-    def on_client_save_failed(self, why: str, host_s: float) -> list[Action]:
-        """The device refused it, or nobody knows whether it was carried out."""
+    def on_client_failed(self, does: str, why: str, host_s: float) -> list[Action]:
+        """The device refused that, or nobody knows whether it was carried out."""
         self._outbox.host_s = host_s
-        self._flow.client_save_ended(why)
+        self._flow.client_command_ended(does, why)
+        return self._answer()
+
+    def on_client_reset(self, client: str, host_s: float) -> list[Action]:
+        """The device acknowledged a client's VNRST; `on_reset` follows."""
+        self._outbox.host_s = host_s
+        if self._flow.identity is not None:
+            self._outbox.record(
+                RecordKind.CLIENT_RESET, client=client, serial=self._flow.identity.serial
+            )
+        self._flow.client_command_ended("resets")
         return self._answer()
 
     @property
@@ -514,7 +537,7 @@ class WriteBack:
             self._outbox.record(
                 RecordKind.CLIENT_SAVED, client=client, serial=self._flow.identity.serial
             )
-        self._flow.client_save_ended()
+        self._flow.client_command_ended("saves")
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:

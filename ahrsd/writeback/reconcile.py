@@ -47,6 +47,7 @@ class RecordKind(StrEnum):
     OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
     OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
     CLIENT_SAVED = "CLIENT_SAVED"  # a program on a shared port saved all of RAM
+    CLIENT_RESET = "CLIENT_RESET"  # or reset the device: its RAM is what its flash holds
     CLIENT_WRITES = "CLIENT_WRITES"  # one is about to write what calibrates, in RAM
 
 
@@ -60,7 +61,11 @@ OPEN: Final = (
     RecordKind.FLASH_ACKED,
 )
 OF_OUTPUTS: Final = (RecordKind.OUTPUTS_KEPT, RecordKind.OUTPUTS_BACK)
-OF_OTHERS: Final = (*OF_OUTPUTS, RecordKind.CLIENT_SAVED)  # says nothing about a transaction
+OF_OTHERS: Final = (  # say nothing about a transaction
+    *OF_OUTPUTS,
+    RecordKind.CLIENT_SAVED,
+    RecordKind.CLIENT_RESET,
+)
 
 
 class DeviceContents(Enum):

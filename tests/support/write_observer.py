@@ -42,7 +42,7 @@ KINDS = (
 )  # fmt: skip
 _LINE = re.compile(r"\$VNWRG,0?(23|84),([^*]*)\*")
 _REGISTERS = (23, 84)
-_OF_NO_WRITE = ("LOCKED", "UNLOCKED", "CLIENT_SAVED", "CLIENT_WRITES")
+_OF_NO_WRITE = ("LOCKED", "UNLOCKED", "CLIENT_SAVED", "CLIENT_RESET", "CLIENT_WRITES")
 
 
 @dataclass
