@@ -230,7 +230,9 @@ def _client_comes(world: World, draw: np.random.Generator, act: Act) -> None:
 
 
 ASIDE_FOR = (("VNWNV",), ("VNWNV", "VNRST"), ("VNRST",))
-ASIDE_MOMENTS = 240  # from the record of the rollback to the second RAM_VERIFIED, and some more
+ASIDE_MOMENTS = (
+    240  # not of seven; from the record of the rollback to the second RAM_VERIFIED, and some more
+)
 
 
 def aside_moments() -> int:
@@ -241,12 +243,12 @@ def aside_moments() -> int:
 def run_aside(number: int, seed: int, tally: HistoriesTally) -> World:
     """A client saves, resets or does both in a trial, and an event at one moment of what follows.
 
-    What it does goes on with the number, behind every event and every moment.
+    The first numbers are spread over all moments: the moments go on in steps of seven.
     """
     acts = {**{name: act for name, (act, _) in EVENTS.items()}, **CLIENT_EVENTS}
-    does, rest = divmod(number, len(acts) * ASIDE_MOMENTS)
-    after, event = divmod(rest, len(acts))
-    lines = ASIDE_FOR[does % len(ASIDE_FOR)]
+    rest, does = divmod(number, len(ASIDE_FOR))
+    turn, event = divmod(rest, len(acts))
+    after, lines = 7 * turn % ASIDE_MOMENTS, ASIDE_FOR[does]
     name, draw = list(acts)[event], np.random.default_rng([seed, number, 3])
     with folder() as at:
         stream = STREAMS[number % 2]

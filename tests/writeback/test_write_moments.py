@@ -38,8 +38,8 @@ def wrong(event: str, places: list[str], **options: object) -> list[str]:
     return tally.wrong
 
 
-#: of what follows from a client's save in a trial, as far as the trial has begun again
-BEHIND_A_SAVE = range(0, 180, 12)
+#: of what follows from a client's save in a trial: 15 moments of the 240 that there are
+BEHIND_A_SAVE = range(0, 240, 16)
 
 
 @pytest.mark.parametrize("event", ["kill", "kill and other writes", "host reboots", "swap",
@@ -48,9 +48,9 @@ BEHIND_A_SAVE = range(0, 180, 12)
 def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event):
     names = [*write_histories.NAMES, *write_histories.CLIENT_EVENTS]
     tally, does = write_histories.HistoriesTally(), write_histories.ASIDE_FOR
-    for k, after in enumerate(BEHIND_A_SAVE):
-        moment = k % len(does) * write_histories.ASIDE_MOMENTS + after + names.index(event) % 12
-        write_histories.run_aside(moment * len(names) + names.index(event), 2, tally)
+    for k, turn in enumerate(BEHIND_A_SAVE):
+        number = (turn + names.index(event) % 16) * len(names) + names.index(event)
+        write_histories.run_aside(number * len(does) + k % len(does), 2, tally)
     assert tally.wrong == []
     assert tally.events == {event: len(BEHIND_A_SAVE)}
     assert tally.seen["client saves"] > 0
