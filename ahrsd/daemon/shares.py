@@ -22,7 +22,7 @@ import stat
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -69,11 +69,13 @@ class _Port:
         with self.lock:
             if not self.open:
                 return
+            if not self.unread:
+                data = data[self._put(data) :]  # all of it, mostly
             if len(self.unread) + len(data) > _MOST_UNREAD_BYTES:
                 self.lost_bytes += len(data)
-                return
-            self.unread += data
-            self._flush()
+            elif data:
+                self.unread += data
+                self._flush()
 
     def flush(self) -> None:
         """What waits, as far as the port takes it."""
@@ -81,9 +83,14 @@ class _Port:
             self._flush()
 
     def _flush(self) -> None:
-        with contextlib.suppress(BlockingIOError, OSError):  # a program that is gone is seen later
-            while self.unread:
-                del self.unread[: os.write(self.master, self.unread)]
+        while self.unread and (taken := self._put(self.unread)):
+            del self.unread[:taken]
+
+    def _put(self, data: bytes | bytearray) -> int:
+        try:
+            return os.write(self.master, data)
+        except OSError:  # full; or a program that is gone, which is seen later
+            return 0
 
 
 class SharedPorts:
@@ -110,11 +117,14 @@ class SharedPorts:
         self._thread = threading.Thread(target=self._work, name="shared-ports", daemon=True)
         self._thread.start()
 
-    def measured(self, data: bytes) -> None:
-        """Whole messages of the device that answer nobody."""
+    def measured(self, data: bytes) -> bool:
+        """Whole messages of the device that answer nobody; whether a program has them."""
+        taken = False
         for port in self._ports.values():
-            if port.streams:
+            if port.streams and port.open:
                 port.write(data)
+                taken = True
+        return taken
 
     def send(self, item: SendToClient) -> None:
         """An answer for the program on one port."""
@@ -273,12 +283,19 @@ class Shares:
         """Those that send more than the device's own messages: they are written from outside."""
         return [place for place in self._network.places if place.share.send != "raw"]
 
-    def heard(self, data: bytes) -> None:
-        """Bytes of the device; none where nothing came for a while. Of the thread that reads it."""
+    def heard(self, data: bytes) -> bool:
+        """Bytes of the device; none where nothing came for a while. Of the thread that reads it.
+
+        Whether a program was handed any of it.
+        """
+        ahead = self._splitter.ahead(data)
+        taken = bool(ahead) and self._measured([ahead])
         messages = self._splitter.feed(data) if data else self._splitter.silence()
-        if messages:
-            self._ports.measured(b"".join(messages))
-            self._network.raw(messages)
+        return (bool(messages) and self._measured(messages)) or taken
+
+    def _measured(self, messages: Sequence[bytes]) -> bool:
+        taken = self._ports.measured(b"".join(messages))
+        return self._network.raw(messages) or taken
 
     def send(self, item: SendToClient) -> None:
         """An answer for the program on one port."""
