@@ -32,7 +32,7 @@ from drivers.vn100.messages import Reply
 from drivers.vn100.procedures import Seen
 from drivers.vn100.registers import Values
 
-_UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"
+_NOT_SAVED = "nothing is saved for a client"
 _DOES = {Kind.SAVE: "saves", Kind.RESET: "resets"}
 RESTARTS_S = 2.5  # from the acknowledgement of VNRST to the device's start, at most
 
@@ -104,11 +104,11 @@ class Clients:
             return [], None
         if (does := _DOES.get(waiting.asked.kind)) is not None:
             back = self._writeback
-            may = back.client_may_save if does == "saves" else back.client_may_reset
-            if may is None:
+            why_not = back.no_client_save if does == "saves" else back.no_client_reset
+            if why_not is None:
                 return back.on_client_wants(waiting.client, does, host_s), None
-            if not may:
-                self.arbiter.refuse_first(Refusal(UNAUTHORIZED, _UNKNOWN))
+            if why_not:
+                self.arbiter.refuse_first(Refusal(UNAUTHORIZED, f"{_NOT_SAVED}: {why_not}"))
                 return [], None
         if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
             return self._calibrate(waiting.client, waiting.asked.command, host_s)

@@ -155,6 +155,7 @@ class Flow:
         self.waits_for_look = False  # all that is lacking is that the device is asked again
         self.aside: SetAside | None = None  # what is undone for a client
         self.client_write: ClientWrite | None = None  # of what calibrates
+        self.staging_s = float("-inf")  # when this run wrote something new last
         self._cause = "device"
         self._left: dict[int, Values] = {}  # by register, what the device made of ours
         self._from_fault = self._resumed = False
@@ -601,7 +602,7 @@ class Flow:
         )
 
     def _enter_staging(self, reason: str) -> None:
-        self._cause, self._left = "device", {}
+        self._cause, self._left, self.staging_s = "device", {}, self.outbox.host_s
         self.outbox.in_force(None)
         self.outbox.run("write", Purpose.STAGE, partial(stage, self.transaction()))
 

@@ -59,6 +59,8 @@ _AWAITED = {
     State.SAVE_PREPARING: RecordKind.FLASH_SENT,
 }
 _BETWEEN = CHANGED_IN_RAM | {State.RECONCILING, State.PREPARING, State.CHECKING}
+_SWITCH = "switch the device off and on"
+_MAY_HOLD = f"the device may hold values of a trial: {_SWITCH}"
 _NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
 
@@ -72,6 +74,7 @@ class WriteBack:
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._restarts = RestartWatch()
+        self._read_restarted_s = float("-inf")  # when it was read last behind a proven restart
         self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
         self._recheck = Recheck(policy.recheck_s)
         self._sampled_to_s = float("-inf")  # when the device was asked
@@ -121,25 +124,36 @@ class WriteBack:
         return not self._outbox.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
 
     @property
-    def client_may_save(self) -> bool | None:
-        """Whether all of RAM may be saved for a client; None: not yet, or what is there is undone.
+    def no_client_save(self) -> str | None:
+        """Why all of RAM is not saved for a client; "" where it may be; None: not yet, or what is
+        there is undone first.
 
-        Never while nobody knows what the device holds.
+        Never while it may hold what nobody has proven. A restart that is proven shows what is in
+        flash, and a save of that changes nothing.
         """
         history = self.history
         foreign = history.locked is not None and history.last is RecordKind.FOREIGN
         if foreign or self.state in (State.FAULT, State.FLASH_TORN):
-            return False
-        return None if self.client_may_reset is None or self.state is State.RECONCILING else True
+            return "the device's registers are in doubt"
+        if self.no_client_reset is None or self.state is State.RECONCILING:
+            return None
+        restarted_s = max(self._restarts.fell_s, self._read_restarted_s)
+        if self._flow.identity is None or restarted_s > self._flow.staging_s:
+            return ""
+        if not self._safe.journal_read:
+            return f"the journal cannot be read, so {_MAY_HOLD}"
+        registers = self._flow.registers
+        tried = [n for n in (MAG, GYRO) if n in registers and history.tried(n, registers[n])]
+        which = ", ".join(map(str, tried))
+        return (
+            f"register {which} holds a value of a trial that was undone: {_SWITCH}" if which else ""
+        )
 
     @property
-    def client_may_reset(self) -> bool | None:
-        """Whether the device may be reset for a client; None: not yet, what is there is undone.
-
-        Where nobody knows what it holds a reset does no harm.
-        """
+    def no_client_reset(self) -> str | None:
+        """The same of a reset, which does no harm where nobody knows what the device holds."""
         between = self.state in _BETWEEN and self.state is not State.RECONCILING
-        return None if between or self._outbox.running else True
+        return None if between or self._outbox.running else ""
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
@@ -199,6 +213,9 @@ class WriteBack:
         theirs = self._changed_by_others(identity, registers, session_keys, restarted)
         if flow.identity is None or flow.identity.serial != identity.serial:
             self._safe.client_wrote = {}
+            self._read_restarted_s = float("-inf")
+        if restarted:
+            self._read_restarted_s = host_s
         self._theirs[identity.serial] = self._safe.read_again(theirs, registers)
         self._safe.bind(identity, registers, journal is not None)
         self._safe.client_registers = clients

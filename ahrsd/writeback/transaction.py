@@ -431,6 +431,7 @@ class JournalHistory:
     rollbacks: since the last proven write or unlock; each says that a calibration was bad
     holds:     what the device must hold after the newest transaction, where that is known
     values:    registers and values that a write found or meant, also one by hand
+    trials:    registers and values that a write meant, and that no save of ours nor a person kept
     broken:    the kind of a record that could not be understood; then nothing may be written
     """
 
@@ -447,6 +448,7 @@ class JournalHistory:
     torn: bool = False
     holds: dict[int, Values] | None = None
     values: tuple[tuple[int, Values], ...] = ()
+    trials: tuple[tuple[int, Values], ...] = ()
     broken: str | None = None
 
     @staticmethod
@@ -457,7 +459,7 @@ class JournalHistory:
             if record.kind in RecordKind.__members__:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
-                history = history._with_values(record.facts)
+                history = history._with_values(record.facts)._without_trials(record.facts)
         return history
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
@@ -467,19 +469,23 @@ class JournalHistory:
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
         if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
-            return now._with_values(facts)._not_sure_of(facts)
+            return now._with_values(facts)._not_sure_of(facts)._without_trials(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
-            return replace(now, locked=None, torn=False, rollbacks=0)
+            return replace(now, locked=None, torn=False, rollbacks=0, trials=())
         if kind is RecordKind.PREPARED:
             try:
                 transaction = Transaction.from_facts(facts)
             except (KeyError, TypeError, ValueError):
                 return replace(now, broken=kind.value)
             begun = replace(now, open=transaction, last=kind, last_at=at, holds=None)
-            return begun._with_values(facts)
+            return begun._with_values(facts)._with_trial(transaction)
         return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
+
+    def tried(self, number: int, values: Values) -> bool:
+        """Whether a write meant this register to have these values, and nothing kept them."""
+        return any(n == number and same(n, known, values) for n, known in self.trials)
 
     def knows(self, number: int, values: Values) -> bool:
         """Whether a record has these values of this register, as found or as meant."""
@@ -495,6 +501,19 @@ class JournalHistory:
         except (KeyError, TypeError, ValueError, AttributeError):
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
+
+    def _with_trial(self, transaction: Transaction) -> JournalHistory:
+        changed = [(n, v) for n, v in transaction.new.items() if not same(n, v, transaction.old[n])]
+        fresh = [(n, v) for n, v in changed if not self.tried(n, v)]
+        return replace(self, trials=(*self.trials, *fresh)[-TIMES_KEPT:])
+
+    def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
+        """Somebody wrote these values: they are that person's, or program's."""
+        try:
+            theirs = _from_json(facts["new"])
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return self
+        return replace(self, trials=_without(self.trials, theirs))
 
     def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
         written = {str(number) for number in facts.get("new", ())}
@@ -527,9 +546,10 @@ class JournalHistory:
         """Where the open transaction stands; a record of another one says nothing about it."""
         if self.open is None or facts.get("txn", self.open.id) != self.open.id:
             return self
-        holds = self.holds
+        holds, trials = self.holds, self.trials
         if kind in _HOLDS_NEW:
             holds = self.open.new
+            trials = _without(trials, self.open.new)
         elif kind in _HOLDS_OLD:
             saved = kind is RecordKind.REVERTED and self.last in (
                 RecordKind.FLASH_SENT,
@@ -538,7 +558,15 @@ class JournalHistory:
             holds = None if saved else self.open.old  # the next start may bring either
         torn = self.torn or kind is RecordKind.FLASH_TORN
         still_open = self.open if kind in OPEN else None
-        return replace(self, open=still_open, last=kind, last_at=at, holds=holds, torn=torn)
+        return replace(
+            self, open=still_open, last=kind, last_at=at, holds=holds, trials=trials, torn=torn
+        )
+
+
+def _without(
+    trials: Iterable[tuple[int, Values]], kept: Mapping[int, Values]
+) -> tuple[tuple[int, Values], ...]:
+    return tuple((n, v) for n, v in trials if n not in kept or not same(n, kept[n], v))
 
 
 def of_another_device(records: Iterable[JournalRecord], serial: int) -> str:

@@ -435,6 +435,56 @@ def test_registers_that_the_owner_saved_are_the_users_in_the_second_write():
     assert run.cable.unit.flash[7] == "40"
 
 
+def opened_again(run: CabledRun) -> None:
+    run.feed(inputs.LinkLost(run.now_ns, "unplugged"))
+    run.feed(inputs.LinkOpened(run.now_ns, "cable", 115200))
+    run.run(5.0)
+
+
+def test_where_the_journal_was_lost_in_a_trial_nothing_is_saved_before_a_restart():
+    cable = on_trial().cable  # and killed there
+    run = CabledRun(cable, shares=SHARES, planted=False, journal_error="it is gone")
+    run.say("owner", "VNWNV")
+    run.run(2.0)
+    assert run.answers("owner") == ["VNERR,09"]
+    assert run.told("nothing is saved for a client", "the journal cannot be read", "off and on")
+    assert (run.cable.unit.held(), run.cable.unit.saves) == (NEW, [])
+    run.cable.unit.restart()
+    run.run(6.0)
+    assert run.cable.unit.held() == ONE
+    save(run)
+    assert run.cable.unit.held("flash") == ONE
+
+
+def test_values_of_a_trial_that_come_back_by_themselves_are_not_saved_for_a_client():
+    """A device that told of the old values and still holds a new one, as it shows later."""
+    run = on_trial()
+    unit = run.cable.unit
+    run.feed(inputs.Operator(run.now_ns, "rollback", ""))
+    assert run.until("ROLLED_BACK", 10.0)
+    run.run(2.0)
+    unit.ram[84] = "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005"
+    opened_again(run)
+    run.say("owner", "VNWNV")
+    run.run(2.0)
+    assert run.answers("owner") == ["VNERR,09"]
+    assert run.told("nothing is saved for a client", "register 84", "a trial that was undone")
+    unit.restart()
+    run.run(6.0)
+    save(run)
+    assert unit.held("flash") == ONE
+
+
+def test_what_was_proven_and_saved_may_be_saved_for_a_client_again():
+    run = on_trial()
+    assert run.until("PROVEN"), run.notes
+    run.park(30.0)
+    assert run.state == "COMMITTED", run.notes
+    opened_again(run)
+    save(run)
+    assert [held(one) for one in run.cable.unit.saves] == [NEW, NEW]
+
+
 def test_a_replay_takes_the_same_decisions():
     run = on_trial()
     save(run)
