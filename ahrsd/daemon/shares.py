@@ -251,12 +251,13 @@ def _open_pty(share: ShareSection, before: str = "") -> tuple[int, str]:
         scratch.unlink(missing_ok=True)
         scratch.symlink_to(target)
         scratch.replace(path)
-    except (OSError, KeyError) as error:
+    except KeyError as error:
         os.close(master)
-        why = f"there is no group {share.group}" if isinstance(error, KeyError) else error.strerror
-        raise ConfigError(
-            [f"share.pty = {path}: {why}; the folder must exist and be the daemon's to write"]
-        ) from error
+        raise ConfigError([f"share.group: {path}: there is no group {share.group}"]) from error
+    except OSError as error:
+        os.close(master)
+        why = f"{error.strerror}; the folder must exist and be the daemon's to write"
+        raise ConfigError([f"share.pty = {path}: {why}"]) from error
     finally:
         os.close(slave)  # held open it would keep TIOCEXCL of a program that died
     return master, target
