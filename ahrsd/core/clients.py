@@ -162,13 +162,19 @@ class Clients:
             self._changed(done, registers, host_s, effects)
         return effects
 
+    @property
+    def resetting(self) -> bool:
+        """Whether a client's VNRST is on the wire, or its answer not looked at."""
+        under_way = self.arbiter.under_way
+        return under_way is not None and under_way.asked.kind is Kind.RESET
+
     def reset_by(self, started_s: float) -> str:
         """Whose VNRST it was that the device started up at about this host time; empty: nobody's.
 
         The stream may tell it before the answer was looked at.
         """
         under_way = self.arbiter.under_way
-        if under_way is not None and under_way.asked.kind is Kind.RESET:
+        if under_way is not None and self.resetting:
             return under_way.client
         client, acknowledged_s = self._reset
         early_s = acknowledged_s - LATENCY_S

@@ -254,9 +254,9 @@ class Core:
             self._note("warning", text)
         if self.stream.restarts > self._restarts:
             self._restarts = self.stream.restarts
-            uptime_s = self.at_s if self.stream.newest_s is None else self.stream.newest_s
-            client = self.clients.reset_by(self._host_s - uptime_s)
-            self._device_reset("its time fell", uptime_s, client)
+            newest_s = self.stream.newest_s  # nobody knows whose it is: no proof of a restart
+            started_s = self._host_s - (self.at_s if newest_s is None else newest_s)
+            self._device_reset("its time fell", self.at_s, self.clients.reset_by(started_s))
 
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
         """From now on samples may be of another device, for this reason; empty: for none."""
@@ -283,6 +283,8 @@ class Core:
         self.unconfirmed.drop()
         if self.device_session.identity is None:
             return
+        if client:  # the vehicle goes on turning meanwhile: its readings do not jump
+            self._watch.resumed(self._host_s)
         self.epochs.begin(self._host_s, None)
         self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s, client))
         self._action_queue.forget_procedure()
@@ -479,6 +481,8 @@ class Core:
             self.calibrator = self.calibrator.anew()
             self._begin_task(self._estimation_queue.compare(self.calibrator, *self._compared))
             self.warm.again()
+        if self.clients.resetting:  # its answer may have come with these readings
+            self._watch.resumed(self._host_s)
         reason, jumped = self._watch.block(block, self.stream.facts.rate_hz)
         self._doubt(reason, jumped=jumped)
         block, present = self.vehicle.with_columns(block), user_compensation(self.registers)[0]
