@@ -476,11 +476,9 @@ class JournalHistory:
             return replace(now, locked=None, torn=False, rollbacks=0, trials=())
         if kind is RecordKind.PREPARED:
             try:
-                transaction = Transaction.from_facts(facts)
+                return now._begun(Transaction.from_facts(facts), at)._with_values(facts)
             except (KeyError, TypeError, ValueError):
                 return replace(now, broken=kind.value)
-            begun = replace(now, open=transaction, last=kind, last_at=at, holds=None)
-            return begun._with_values(facts)._with_trial(transaction)
         return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
 
     def tried(self, number: int, values: Values) -> bool:
@@ -502,18 +500,21 @@ class JournalHistory:
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
 
-    def _with_trial(self, transaction: Transaction) -> JournalHistory:
+    def _begun(self, transaction: Transaction, at: Stamp) -> JournalHistory:
+        """With this transaction open. KeyError or ValueError where its values are no registers'."""
         changed = [(n, v) for n, v in transaction.new.items() if not same(n, v, transaction.old[n])]
-        fresh = [(n, v) for n, v in changed if not self.tried(n, v)]
-        return replace(self, trials=(*self.trials, *fresh)[-TIMES_KEPT:])
+        trials = (*self.trials, *((n, v) for n, v in changed if not self.tried(n, v)))
+        return replace(
+            self, open=transaction, last=RecordKind.PREPARED, last_at=at, holds=None,
+            trials=trials[-TIMES_KEPT:],
+        )  # fmt: skip
 
     def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
         """Somebody wrote these values: they are that person's, or program's."""
         try:
-            theirs = _from_json(facts["new"])
+            return replace(self, trials=_without(self.trials, _from_json(facts["new"])))
         except (KeyError, TypeError, ValueError, AttributeError):
             return self
-        return replace(self, trials=_without(self.trials, theirs))
 
     def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
         written = {str(number) for number in facts.get("new", ())}
