@@ -247,10 +247,10 @@ class SerialPort:
         """Rate that the host side uses."""
         return int(self._serial.baudrate)
 
-    def read(self) -> bytes:
-        """What has arrived, b"" if nothing; never waits. Raises PortLost."""
+    def read(self, wait_s: float = 0.0) -> bytes:
+        """What has arrived, or arrives within `wait_s`; b"" if nothing. Raises PortLost."""
         try:
-            if not self._wire.readable(0.0):
+            if not self._wire.readable(wait_s):
                 return b""
             data = self._wire.read()
         except BlockingIOError:

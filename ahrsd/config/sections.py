@@ -157,7 +157,8 @@ class ShareSection(Section):
     """What becomes of VNWNV of the owner; clean: sent once nothing unproven is in the device's RAM
     (a calibration on trial is undone first and written again behind it)."""
     reset: Literal["refuse", "announce"] = "announce"
-    """What becomes of VNRST of the owner."""
+    """What becomes of VNRST of the owner; announce: sent and known of (a calibration on trial is
+    undone first and written again behind it)."""
     calibration_writes: Literal["guard", "pass"] = "guard"
     """What becomes of the owner's writes of registers 23, 25, 26, 43, 44, 74 and 84; guard: VNERR
     09; pass: journaled and sent, in mode stage and commit, while no calibration of ahrsd's is under

@@ -1,9 +1,10 @@
 """Programs on shared ports, and the rest of the core: when their commands go out, what follows.
 
 `sharing.arbiter` knows whose command is next and to whom an answer goes; here is what it means for
-the device session and the write-back: a save waits until nothing unproven is in the device's RAM,
-a write changes what is the user's, a reset is a restart that is known of, and a write of what
-calibrates, where the share lets it pass, is somebody's change that is journaled before it is sent.
+the device session and the write-back: a save or a reset waits until nothing unproven is in the
+device's RAM, a write changes what is the user's, a reset is a restart that is known of, and a write
+of what calibrates, where the share lets it pass, is somebody's change that is journaled before it
+is sent.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ahrsd.sharing.client_commands import (
     SharePolicy,
 )
 from ahrsd.writeback.actions import Action
+from ahrsd.writeback.journal_history import LATENCY_S
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import PASSABLE
 from ahrsd.writeback.states import Mode
@@ -30,7 +32,9 @@ from drivers.vn100.commands import NoReply, Seen, TooLate, Write
 from drivers.vn100.messages import Reply
 from drivers.vn100.registers import Values
 
-_UNKNOWN = "the device's registers are in doubt, nothing is saved for a client"
+_NOT_SAVED = "nothing is saved for a client"
+_DOES = {Kind.SAVE: "saves", Kind.RESET: "resets"}
+RESTARTS_S = 2.5  # from the acknowledgement of VNRST to the device's start, at most
 
 
 @dataclass(slots=True)
@@ -59,6 +63,7 @@ class Clients:
         shares = tuple(policies)
         self.arbiter = Arbiter(shares)
         self._session, self._writeback = session, writeback
+        self._reset = ("", float("-inf"))  # who reset the device last, and when it was acknowledged
         self._notes = [_passing(s.name, writeback) for s in shares if any(map(s.passes, PASSABLE))]
 
     @property
@@ -97,11 +102,14 @@ class Clients:
         waiting = self.arbiter.first(host_s)
         if waiting is None or not free or not self._session.idle:
             return [], None
-        if waiting.asked.kind is Kind.SAVE and not (may := self._writeback.client_may_save):
-            if may is None:
-                return self._writeback.on_client_wants_save(waiting.client, host_s), None
-            self.arbiter.refuse_first(Refusal(UNAUTHORIZED, _UNKNOWN))
-            return [], None
+        if (does := _DOES.get(waiting.asked.kind)) is not None:
+            back = self._writeback
+            why_not = back.no_client_save if does == "saves" else back.no_client_reset
+            if why_not is None:
+                return back.on_client_wants(waiting.client, does, host_s), None
+            if why_not:
+                self.arbiter.refuse_first(Refusal(UNAUTHORIZED, f"{_NOT_SAVED}: {why_not}"))
+                return [], None
         if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
             return self._calibrate(waiting.client, waiting.asked.command, host_s)
         lasts = waiting.asked.kind is Kind.SAVE
@@ -142,14 +150,35 @@ class Clients:
         if (done := self.arbiter.ended(result, error)) is None:
             return effects
         if done.asked.kind is Kind.RESET and (isinstance(result, Reply) or _silent(error)):
-            effects.reset_by = done.client
-        elif done.asked.kind is Kind.CALIBRATE:
+            effects.reset_by, self._reset = done.client, (done.client, host_s)
+        does = _DOES.get(done.asked.kind)
+        if done.asked.kind is Kind.CALIBRATE:
             effects.actions = self._writeback.on_client_wrote(host_s)
-        elif done.asked.kind is Kind.SAVE and not isinstance(result, Reply):
-            effects.actions = self._writeback.on_client_save_failed(str(error), host_s)
+        elif does is not None and not isinstance(result, Reply):
+            effects.actions = self._writeback.on_client_failed(does, str(error), host_s)
+        elif done.asked.kind is Kind.RESET:
+            effects.actions = self._writeback.on_client_reset(done.client, host_s)
         elif isinstance(result, Reply):
             self._changed(done, registers, host_s, effects)
         return effects
+
+    @property
+    def resetting(self) -> bool:
+        """Whether a client's VNRST is on the wire, or its answer not looked at."""
+        under_way = self.arbiter.under_way
+        return under_way is not None and under_way.asked.kind is Kind.RESET
+
+    def reset_by(self, started_s: float) -> str:
+        """Whose VNRST it was that the device started up at about this host time; empty: nobody's.
+
+        The stream may tell it before the answer was looked at.
+        """
+        under_way = self.arbiter.under_way
+        if under_way is not None and self.resetting:
+            return under_way.client
+        client, acknowledged_s = self._reset
+        early_s = acknowledged_s - LATENCY_S
+        return client if early_s <= started_s <= acknowledged_s + RESTARTS_S else ""
 
     def _changed(
         self,

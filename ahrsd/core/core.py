@@ -227,7 +227,9 @@ class Core:
                 case DeviceFault(code):
                     self._fault(code)
         if self.source.take_restart():
-            self._device_reset("its time fell", self.at_s)
+            newest_s = self.stream.newest_s  # nobody knows whose it is: no proof of a restart
+            started_s = self._host_s - (self.at_s if newest_s is None else newest_s)
+            self._device_reset("its time fell", self.at_s, self.clients.reset_by(started_s))
 
     def _doubt(self, reason: str, *, jumped: bool = False) -> None:
         """From now on samples may be of another device, for this reason; empty: for none."""
@@ -248,14 +250,16 @@ class Core:
         if code in (_WATCHDOG_RESET, _HARD_FAULT):
             self._device_reset(f"VNERR {code:02X}")
 
-    def _device_reset(self, why: str, uptime_s: float | None = None) -> None:
+    def _device_reset(self, why: str, uptime_s: float | None = None, client: str = "") -> None:
         self._note("warning", f"the device restarted ({why})")
         self._breaks += 1
         self.source.unconfirmed.drop()
         if self.device_session.identity is None:
             return
+        if client:  # the vehicle goes on turning meanwhile: its readings do not jump
+            self.source.output_resumed(self._host_s)
         self.source.in_doubt(self._host_s)
-        self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s))
+        self._action_queue.add(self.writeback.on_reset(self._host_s, uptime_s, client))
         self._action_queue.forget_procedure()
         self.take(self.device_session.identify_again(self._host_s))
 
@@ -379,7 +383,7 @@ class Core:
             self.source.paused(self._host_s)
         self._action_queue.add(served.actions)
         if served.reset_by:
-            self._device_reset(f"{served.reset_by} reset it")
+            self._device_reset(f"{served.reset_by} reset it", client=served.reset_by)
 
     def emit(self, event: events.Event) -> None:
         """A fact of the write-back."""
@@ -422,6 +426,8 @@ class Core:
             self.source.unconfirmed.drop()
             self.estimation.begin_anew()
             self.warm.again()
+        if self.clients.resetting:  # its answer may have come with these readings
+            self.source.output_resumed(self._host_s)
         reason, jumped = self.source.suspicion(block)
         self._doubt(reason, jumped=jumped)
         block, present = self.source.vehicle.with_columns(block), self.source.present_correction

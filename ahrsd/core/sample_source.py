@@ -121,6 +121,10 @@ class SampleSource(Generic[T]):
         self._watch.resumed(host_s)
         self.stream.forget()
 
+    def output_resumed(self, host_s: float) -> None:
+        """The output was away for a while that is known of, a client's reset: that is no jump."""
+        self._watch.resumed(host_s)
+
     def in_force(self, values: dict[int, Values], host_s: float) -> None:
         """The device applies these registers from now on: they are taken out of the samples."""
         self.registers = values

@@ -92,9 +92,11 @@ class Arbiter:
         if client is None:
             return
         found = client.lines.feed(data)
-        damaged = [s for s in client.lines.take_skipped() if s.cause is Cause.CHECKSUM]
-        for _ in damaged:
-            self._refuse(name, Refusal(BAD_CHECKSUM))
+        for piece in client.lines.take_skipped():
+            if piece.cause is Cause.CHECKSUM:
+                self._refuse(name, Refusal(BAD_CHECKSUM))
+            if piece.data.strip():
+                self._notes.append(f"{name} sends what is no command of a VN-100")
         for sentence in found:
             asked = understand(getattr(sentence, "body", ""), client.policy)
             self.counts[name, "commands"] += 1

@@ -5,7 +5,8 @@
 A driver needs a whole message before it can use any of it, so handing messages on when their last
 byte is there costs no time, and an answer of ours fits between any two of them. Every byte comes
 out, in order and once: in a message, as damage or noise where it stood, or as a reply, which is for
-whoever asked.
+whoever asked. A message that is the next one and ends with what was read, as nearly all are, comes
+out before the rest of the work (`ahead`).
 """
 
 from __future__ import annotations
@@ -34,6 +35,18 @@ class MessageSplitter:
         self._deframer = Deframer()
         self._held = b""  # bytes that did not come out yet
         self._base = 0  # offset of the first of them in the stream
+        self._ahead = False  # the next message has come out already
+
+    def ahead(self, chunk: bytes) -> bytes:
+        """The message for the clients that these bytes complete, where that is all they do.
+
+        `feed` must be given the same bytes next, and leaves it out. Empty says nothing.
+        """
+        body = self._deframer.completes(chunk)
+        if body is None or is_reply(body):
+            return b""
+        self._ahead = True
+        return self._held + chunk if self._held else chunk
 
     def feed(self, chunk: bytes) -> list[bytes]:
         """Take bytes, cut anywhere; whole messages, and what is none, for the clients."""
@@ -47,8 +60,9 @@ class MessageSplitter:
             self._base += length
             if isinstance(piece, Sentence) and is_reply(piece.body):
                 self.replies += 1
-            else:
+            elif not self._ahead:
                 out.append(data)
+            self._ahead = False
         return out
 
     def silence(self) -> list[bytes]:

@@ -164,6 +164,11 @@ class Stream:
         return self._timeline.restarts
 
     @property
+    def newest_s(self) -> float | None:
+        """The device's newest time, also of a message that nobody could un-map."""
+        return self._timeline.newest_s
+
+    @property
     def carries_time(self) -> bool:
         """Whether the messages have the device's own time."""
         return self._extractor is not None and self._extractor.has_time

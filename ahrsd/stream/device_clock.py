@@ -210,6 +210,11 @@ class StreamTimeline:
         self._period_s = float("nan") if self._nominal_s is None else self._nominal_s
 
     @property
+    def newest_s(self) -> float | None:
+        """The newest time, also of a sample that could not be used; None: none since `forget`."""
+        return self._last_seen_s
+
+    @property
     def period_s(self) -> float:
         """Median step of late; nan before two samples."""
         return self._period_s

@@ -36,7 +36,7 @@ STATES: dict[str, str] = {
     "CONFIRMED": "saved, and read back after a restart of the device",
     "ROLLING_BACK": "the old values are being put back",
     "ROLLED_BACK": "the old values are in force again",
-    "SET_ASIDE": "the old values are in force while a program saves; then the trial goes on",
+    "SET_ASIDE": "the old values are in force while a program saves or resets; then it goes on",
     "FAULT": "ALARM: the device is in a state that this program cannot mend alone",
     "FLASH_TORN": "ALARM: the flash holds neither the old nor the new values",
     "LOCKED": "locked: nothing is written until a person unlocks",

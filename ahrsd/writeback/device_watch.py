@@ -81,7 +81,7 @@ class RestartWatch:
         self._serial: int | None = None
         self._bound = False
         self._seen: int | None = None
-        self._in_run = False  # its time fell since this run knows it
+        self.fell_s = -math.inf  # when its time fell last since this run knows it
         self._read_from_s = math.inf
         self._doubt_s: float | None = None  # since when nobody knows whose the messages are
         self._asked_s = self._answered_s = -math.inf  # who it is, the newest time
@@ -98,7 +98,7 @@ class RestartWatch:
             self._bound = False
             return
         if uptime_s is not None:
-            self._in_run |= self._fell(uptime_s) and self._may_have_restarted(uptime_s, host_s)
+            self._note_fall(uptime_s, host_s)
         untimed = uptime_s is None and self._first_s is None
         if untimed or self._proves(record, now, uptime_s):
             self._seen = self._serial
@@ -126,13 +126,13 @@ class RestartWatch:
         """Another device has the cable: what was seen may be of that one, until one is read."""
         self.doubt()
         self._bound = False
-        self._seen, self._in_run, self._newest_s = None, False, math.nan
+        self._seen, self.fell_s, self._newest_s = None, -math.inf, math.nan
 
     def bind(self, serial: int, read_from_s: float) -> bool:
         """A device was identified and read; whether this one was seen to restart before."""
         restarted = self._seen == serial
         if serial != self._serial:
-            self._in_run, self._newest_s = False, math.nan
+            self.fell_s, self._newest_s = -math.inf, math.nan
         self._serial, self._seen, self._bound, self._doubt_s = serial, None, True, None
         self._read_from_s = math.inf if restarted else read_from_s
         self._first_s, self._started_s = None, math.inf
@@ -148,7 +148,7 @@ class RestartWatch:
         if fell and not first:
             return "the device restarted: its time fell"
         if not self.doubtful(host_s):
-            self._in_run |= fell and self._may_have_restarted(uptime_s, host_s)
+            self._note_fall(uptime_s, host_s)
         self._newest_s, self._newest_at_s = uptime_s, host_s
         self._started_s = min(self._started_s, host_s - uptime_s)
         stale = first and uptime_s < host_s - self._read_from_s - LATENCY_S
@@ -164,12 +164,16 @@ class RestartWatch:
     def _proves(self, record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
         """A record of another boot of the host is older than this run."""
         of_before = bool(now.boot_id) and record.boot_id != now.boot_id
-        return (self._in_run and of_before) or restarted_since(record, now, uptime_s)
+        return (self.fell_s > -math.inf and of_before) or restarted_since(record, now, uptime_s)
 
     def doubtful(self, host_s: float) -> bool:
         """Whether it is, and was before now: a restart itself makes readings jump."""
         asking = self._asked_s < host_s < self._answered_s
         return asking or (self._doubt_s is not None and self._doubt_s < host_s)
+
+    def _note_fall(self, uptime_s: float, host_s: float) -> None:
+        if self._fell(uptime_s) and self._may_have_restarted(uptime_s, host_s):
+            self.fell_s = host_s
 
     def _fell(self, uptime_s: float) -> bool:
         return uptime_s < self._newest_s - LATENCY_S

@@ -2,7 +2,8 @@
 
 `states.TABLE` says where a signal leads; this module says what is asked of the core on arrival.
 
-**Set aside.** What was on trial, while a program on a shared port saves all of RAM.
+**Set aside.** What was on trial, while a program on a shared port saves all of RAM or resets the
+device.
 
 Only what is proven may get to flash, so the trial's registers are undone before that save: with the
 record of every rollback, and so with all that follows from it where the power goes. Behind the save
@@ -11,9 +12,12 @@ read back, and tried from the beginning, for nothing that came in between is of 
 The approval is carried over, and with it all that a write needs (`Flow.aside_holds`). It counts as
 a write of the day's budget; only the pause between two writes is not waited for.
 
-The second write needs the save's acknowledgement and, `SETTLE_S` behind it, an answer of the device
-that it is the same one and holds what it held: a driver that saves at its start may reset the
-device next, and a save that failed is reported up to 1.5 s late.
+The second write needs the acknowledgement of what the program asked for and, `SETTLE_S` behind it,
+an answer of the device that it is the same one and holds what it held: a save that failed is
+reported up to 1.5 s late. A reset is undone for in the same way, so that no transaction is open
+when the device restarts; then it is identified and read as after any restart, and only where it is
+the same one with what it held does its trial stay set aside. Any other way out of sight ends it: a
+restart that no program asked for, a link that was lost, a device in doubt.
 
 **Client's write.** A client's write of what calibrates, where its share says `calibration_writes =
 "pass"`.
@@ -31,7 +35,7 @@ the trial first. A transaction that begins later has that person's values as its
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final
 
@@ -55,8 +59,8 @@ from ahrsd.writeback.states import (
 )
 from ahrsd.writeback.transaction import ProcedureOutcome, check, roll_back, save, stage
 from ahrsd.writeback.trial import Trial, TrialVerdict
-from drivers.vn100.commands import Command, Identity, VerifyFailed
-from drivers.vn100.registers import Unit, Values, register_lines, same
+from drivers.vn100.commands import Command, Identity, VerifyFailed, differences
+from drivers.vn100.registers import COMPENSATING, Unit, Values, register_lines, same
 
 # -- What programs on shared ports bring about -----------------------------------------------------
 
@@ -66,17 +70,27 @@ SETTLE_S: Final = 2.0
 
 @dataclass(slots=True)
 class SetAside:
-    """What was undone, for whom; host times of the save's end and of the newest good answer."""
+    """What was undone, and for whom.
+
+    does:    what the client does: "saves" or "resets"
+    holds:   what the device must hold until the second write, of what its readings pass
+    until_s: the end of all waiting, host time like the others
+    done_s:  when the device acknowledged what the client asked for
+    confirmed_s: when it was asked for its newest good answer
+    """
 
     transaction: Transaction
     client: str
-    saved_s: float | None = None
-    confirmed_s: float = float("-inf")  # when the device was asked
+    does: str
+    holds: dict[int, Values] = field(default_factory=dict)
+    until_s: float | None = None
+    done_s: float | None = None
+    confirmed_s: float = float("-inf")
 
     @property
     def settled_s(self) -> float | None:
-        """When the device may be asked; None while the save is not acknowledged."""
-        return None if self.saved_s is None else self.saved_s + SETTLE_S
+        """When the device may be asked; None while nothing is acknowledged."""
+        return None if self.done_s is None else self.done_s + SETTLE_S
 
     def settled(self, host_s: float) -> bool:
         """Whether it may be asked now."""
@@ -87,7 +101,7 @@ class SetAside:
         return self.settled(host_s) and not self.confirmed(doubt_s)
 
     def confirmed(self, doubt_s: float) -> bool:
-        """Whether the device has shown, behind the save and any doubt, that it is as it was."""
+        """Whether the device has shown, behind that and any doubt, that it is as it was."""
         settled_s = self.settled_s
         return settled_s is not None and self.confirmed_s >= max(settled_s, doubt_s)
 
@@ -113,6 +127,7 @@ RETRY_SAVE_S = 600.0  # after a save that was not sent
 Answer = tuple[bool, str]  # to a person: whether it is accepted, and what follows or why not
 COUNTED = frozenset({"trial", "interlock", "operator"})  # rollbacks that speak against the values
 _ASIDE = (State.ROLLING_BACK, State.SET_ASIDE, State.PREPARING)  # states that remember what was
+_OUT_OF_SIGHT = (Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT)
 
 
 class Flow:
@@ -133,8 +148,9 @@ class Flow:
         self.passed = ""  # why the trial is passed, until the device was asked again
         self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
         self.waits_for_look = False  # all that is lacking is that the device is asked again
-        self.aside: SetAside | None = None  # what is undone for a client's save
+        self.aside: SetAside | None = None  # what is undone for a client
         self.client_write: ClientWrite | None = None  # of what calibrates
+        self.staging_s = float("-inf")  # when this run wrote something new last
         self._cause = "device"
         self._left: dict[int, Values] = {}  # by register, what the device made of ours
         self._from_fault = self._resumed = False
@@ -158,6 +174,7 @@ class Flow:
             State.CONFIRMED: self._enter_rest,
             State.ROLLING_BACK: self._enter_rolling_back,
             State.ROLLED_BACK: self._enter_rest,
+            State.SET_ASIDE: self._enter_set_aside,
             State.FAULT: self._enter_fault,
         }
 
@@ -172,11 +189,18 @@ class Flow:
 
     def signal(self, signal: Signal, reason: str) -> None:
         """Something happened: move where the table says; what it does not name is ignored."""
-        target = TABLE[self.state].get(signal)
+        target, aside = TABLE[self.state].get(signal), self.aside
         if target is None:
             self.outbox.note("debug", f"{signal.value} is ignored in {self.state.value}: {reason}")
         elif target is not self.state:
+            set_aside = self.state is State.SET_ASIDE
             self.enter(target, reason)
+            if set_aside and signal is Signal.CLIENT_RESET:
+                self.aside = aside
+            elif set_aside and target is State.RECONCILING:
+                self._not_again(reason)
+        elif signal in _OUT_OF_SIGHT:
+            self.forget_aside(reason)
 
     def enter(self, state: State, reason: str) -> None:
         """Arrive in a state. A procedure of the old one ends."""
@@ -219,8 +243,9 @@ class Flow:
     @property
     def watches_interlock(self) -> bool:
         """Whether the vehicle's word is needed all the time now."""
-        on_trial = (State.STAGED, State.TRIAL, State.SET_ASIDE)
-        return self.policy.trial.interlock and self.state in on_trial
+        on_trial = self.state in (State.STAGED, State.TRIAL, State.SET_ASIDE)
+        on_trial |= self.state is State.RECONCILING and self.aside is not None
+        return self.policy.trial.interlock and on_trial
 
     def on_timeout(self) -> None:
         """What was waited for did not come."""
@@ -238,6 +263,8 @@ class Flow:
     def roll_back(self, cause: str, reason: str) -> None:
         """Back to the old values, where the state allows it at all; out of FAULT only by hand."""
         by_hand = cause == "operator"
+        if self.state is State.RECONCILING:  # they are back, if anything was set aside
+            self.forget_aside(reason)
         if Signal.ROLL_BACK in TABLE[self.state] and (by_hand or self.state is not State.FAULT):
             self._cause = cause
             self.signal(Signal.TRIAL_FAILED if cause == "trial" else Signal.ROLL_BACK, reason)
@@ -368,7 +395,7 @@ class Flow:
             self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
             self.passed, self.proven_to_s = "", None
             self.safe.proof_waits = f"{reason}: what is in force is on trial again"
-        elif self.state is State.SET_ASIDE:
+        elif self.aside is not None:
             self.roll_back("client", f"{reason}: what was set aside is not written again")
 
     def judge_proof(self, finding: TrialVerdict, reason: str) -> None:
@@ -378,26 +405,36 @@ class Flow:
         elif finding is TrialVerdict.PASSED:
             self.safe.proof_waits = ""
 
-    # -- a client saves ----------------------------------------------------------------------------
+    # -- a client saves or resets ------------------------------------------------------------------
 
-    def set_aside(self, client: str) -> None:
-        """A client saves all of RAM: what is on trial is undone first.
+    def set_aside(self, client: str, does: str) -> None:
+        """A client saves all of RAM, or resets the device: what is on trial is undone first.
 
-        It is written again behind the save, unless something speaks against it already.
+        It is written again behind that, unless something speaks against it already.
         """
         against = self.safe.void or self.safe.disagrees or self.trial.in_question
         if self.state in (State.TRIAL, State.PROVEN) and not against:
-            self.aside = SetAside(self.transaction(), client)
-        self.roll_back("client", f"{client} saves, and nothing unproven is saved along")
+            self.aside = SetAside(self.transaction(), client, does)
+        self.roll_back("client", f"{client} {does}, and the old values are in force before that")
 
-    def client_save_ended(self, why_not: str = "") -> None:
+    def client_command_ended(self, does: str, why_not: str = "") -> None:
         """The device acknowledged it, or why it did not."""
-        if self.aside is None or self.state is not State.SET_ASIDE:
+        if self.aside is None or self.state not in (State.SET_ASIDE, State.RECONCILING):
             return
+        self.aside.does = does
         if why_not:
-            self.roll_back("client", f"the save of {self.aside.client} failed: {why_not}")
+            self.roll_back("client", f"{self.aside.client} {does}, and that failed: {why_not}")
         else:
-            self.aside.saved_s = self.outbox.host_s
+            self.aside.done_s = self.outbox.host_s
+
+    def forget_aside(self, reason: str) -> None:
+        """What was set aside is not written again; the old values are in RAM already."""
+        if self.aside is not None:
+            self.aside = None
+            self._not_again(reason)
+
+    def _not_again(self, reason: str) -> None:
+        self.outbox.note("info", f"what was on trial is not written again: {reason}")
 
     def judge_aside(self, estimate: Estimate, gyro_is_raw: bool) -> None:
         """Does the present estimate still ask for what was set aside?"""
@@ -409,8 +446,8 @@ class Flow:
 
     def aside_holds(self) -> list[str]:
         """Why what was set aside is not written again now; while the trial lasts it may be."""
-        if self.aside is None or self.aside.saved_s is None:
-            return ["the client's save is not acknowledged"]
+        if self.aside is None or self.aside.done_s is None:
+            return ["what the client asked for is not acknowledged"]
         if not self.aside.confirmed(self.safe.doubt_s):
             return ["the device did not say again what it holds"]
         return self.safe.again_holds(self.outbox.history, self.outbox.host_s, self.outbox.now)
@@ -421,7 +458,22 @@ class Flow:
             return
         self.waits_for_look = self.aside.waits_for_look(self.safe.doubt_s, self.outbox.host_s)
         if not self.aside_holds():
-            self.signal(Signal.GO_ON, f"{self.aside.client} has saved; what was on trial is again")
+            done = {"saves": "has saved", "resets": "has reset the device"}[self.aside.does]
+            self.signal(Signal.GO_ON, f"{self.aside.client} {done}; what was on trial is again")
+
+    def _still_set_aside(self) -> bool:
+        """A client reset the device, and it was read: whether it is the one that was left."""
+        if self.aside is None:
+            return False
+        changed = sorted(differences(self.aside.holds, self.expected(self.aside.holds)))
+        if not self.aside.transaction.is_of(self._the_identity().unit):
+            self.forget_aside("another device answers")
+        elif changed:
+            which = ", ".join(map(str, changed))
+            self.forget_aside(f"after the reset register {which} is not as it was before")
+        elif (why := self.outbox.history.locked) is not None:
+            self.forget_aside(f"locked: {why}")
+        return self.aside is not None
 
     # -- a client writes what calibrates -----------------------------------------------------------
 
@@ -476,7 +528,7 @@ class Flow:
     def lock(self, reason: str) -> Answer:
         """No writes from now on; what is only in RAM is undone first."""
         self.outbox.record(RecordKind.LOCKED, reason=reason)
-        if Signal.ROLL_BACK in TABLE[self.state] and self.state is not State.FAULT:
+        if self.state is not State.FAULT:
             self.roll_back("operator", reason)
         self.signal_if(Signal.LOCK, reason)
         return True, f"locked: {reason}"
@@ -552,7 +604,7 @@ class Flow:
         )
 
     def _enter_staging(self, reason: str) -> None:
-        self._cause, self._left = "device", {}
+        self._cause, self._left, self.staging_s = "device", {}, self.outbox.host_s
         self.outbox.in_force(None)
         self.outbox.run("write", Purpose.STAGE, partial(stage, self.transaction()))
 
@@ -577,6 +629,16 @@ class Flow:
         if self.outbox.history.last is RecordKind.FLASH_SENT:
             self._save_from_s = self.outbox.host_s + RETRY_SAVE_S
             self.outbox.record(RecordKind.PROVEN, reason=reason, unsent=True)
+
+    def _enter_set_aside(self, reason: str) -> None:
+        """The second time behind a reset; the waiting has one end, counted from the first."""
+        if self.aside is None:
+            raise AssertionError("nothing is set aside")
+        if self.aside.until_s is None:
+            self.aside.until_s = self.deadline_s
+            compensating = {n: v for n, v in self.registers.items() if n in COMPENSATING}
+            self.aside.holds = compensating
+        self.deadline_s = self.aside.until_s
 
     def _enter_saving(self, reason: str) -> None:
         self.safe.save_from_s = self.outbox.host_s
@@ -712,7 +774,7 @@ class Flow:
         if self.aside is None:
             self.signal(Signal.DONE, "the old values were read back")
         else:
-            self.signal(Signal.SET_ASIDE, "the old values were read back, for the save alone")
+            self.signal(Signal.SET_ASIDE, "the old values were read back, for a client alone")
 
     def _lock_after_rollbacks(self) -> None:
         history = self.outbox.history
@@ -728,7 +790,10 @@ class Flow:
             self.signal(Signal.TORN, "the flash was torn and nobody unlocked it yet")
         elif history.open is None or history.last is None:
             self._compare_with_the_last()
-            self.signal(Signal.NOTHING_OPEN, "no transaction is open")
+            if self._still_set_aside():
+                self.signal(Signal.SET_ASIDE, "a client reset the device, which is as it was")
+            else:
+                self.signal(Signal.NOTHING_OPEN, "no transaction is open")
         else:
             holds = found(history.open.old, history.open.new, self.registers, restarted)
             resolution = RECONCILE[history.last][holds]

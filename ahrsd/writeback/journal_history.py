@@ -175,6 +175,7 @@ class RecordKind(StrEnum):
     OUTPUTS_KEPT = "OUTPUTS_KEPT"  # nor these: the user's outputs, before the session changes them
     OUTPUTS_BACK = "OUTPUTS_BACK"  # they are in the device again
     CLIENT_SAVED = "CLIENT_SAVED"  # a program on a shared port saved all of RAM
+    CLIENT_RESET = "CLIENT_RESET"  # or reset the device: its RAM is what its flash holds
     CLIENT_WRITES = "CLIENT_WRITES"  # one is about to write what calibrates, in RAM
 
 
@@ -192,7 +193,11 @@ OPEN: Final = (
 OF_OUTPUTS: Final = (RecordKind.OUTPUTS_KEPT, RecordKind.OUTPUTS_BACK)
 
 
-OF_OTHERS: Final = (*OF_OUTPUTS, RecordKind.CLIENT_SAVED)  # says nothing about a transaction
+OF_OTHERS: Final = (  # say nothing about a transaction
+    *OF_OUTPUTS,
+    RecordKind.CLIENT_SAVED,
+    RecordKind.CLIENT_RESET,
+)
 
 
 # -- What the records amount to --------------------------------------------------------------------
@@ -321,6 +326,7 @@ class JournalHistory:
     rollbacks: since the last proven write or unlock; each says that a calibration was bad
     holds:     what the device must hold after the newest transaction, where that is known
     values:    registers and values that a write found or meant, also one by hand
+    trials:    registers and values that a write meant, and that no save of ours nor a person kept
     broken:    the kind of a record that could not be understood; then nothing may be written
     """
 
@@ -337,6 +343,7 @@ class JournalHistory:
     torn: bool = False
     holds: dict[int, Values] | None = None
     values: tuple[tuple[int, Values], ...] = ()
+    trials: tuple[tuple[int, Values], ...] = ()
     broken: str | None = None
 
     @staticmethod
@@ -347,7 +354,7 @@ class JournalHistory:
             if record.kind in RecordKind.__members__:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
-                history = history._with_values(record.facts)
+                history = history._with_values(record.facts)._without_trials(record.facts)
         return history
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
@@ -357,19 +364,21 @@ class JournalHistory:
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
         if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
-            return now._with_values(facts)._not_sure_of(facts)
+            return now._with_values(facts)._not_sure_of(facts)._without_trials(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
-            return replace(now, locked=None, torn=False, rollbacks=0)
+            return replace(now, locked=None, torn=False, rollbacks=0, trials=())
         if kind is RecordKind.PREPARED:
             try:
-                transaction = Transaction.from_facts(facts)
+                return now._begun(Transaction.from_facts(facts), at)._with_values(facts)
             except (KeyError, TypeError, ValueError):
                 return replace(now, broken=kind.value)
-            begun = replace(now, open=transaction, last=kind, last_at=at, holds=None)
-            return begun._with_values(facts)
         return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
+
+    def tried(self, number: int, values: Values) -> bool:
+        """Whether a write meant this register to have these values, and nothing kept them."""
+        return any(n == number and same(n, known, values) for n, known in self.trials)
 
     def knows(self, number: int, values: Values) -> bool:
         """Whether a record has these values of this register, as found or as meant."""
@@ -385,6 +394,22 @@ class JournalHistory:
         except (KeyError, TypeError, ValueError, AttributeError):
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
+
+    def _begun(self, transaction: Transaction, at: Stamp) -> JournalHistory:
+        """With this transaction open. KeyError or ValueError where its values are no registers'."""
+        changed = [(n, v) for n, v in transaction.new.items() if not same(n, v, transaction.old[n])]
+        trials = (*self.trials, *((n, v) for n, v in changed if not self.tried(n, v)))
+        return replace(
+            self, open=transaction, last=RecordKind.PREPARED, last_at=at, holds=None,
+            trials=trials[-TIMES_KEPT:],
+        )  # fmt: skip
+
+    def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
+        """Somebody wrote these values: they are that person's, or program's."""
+        try:
+            return replace(self, trials=_without(self.trials, _from_json(facts["new"])))
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return self
 
     def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
         written = {str(number) for number in facts.get("new", ())}
@@ -417,9 +442,10 @@ class JournalHistory:
         """Where the open transaction stands; a record of another one says nothing about it."""
         if self.open is None or facts.get("txn", self.open.id) != self.open.id:
             return self
-        holds = self.holds
+        holds, trials = self.holds, self.trials
         if kind in _HOLDS_NEW:
             holds = self.open.new
+            trials = _without(trials, self.open.new)
         elif kind in _HOLDS_OLD:
             saved = kind is RecordKind.REVERTED and self.last in (
                 RecordKind.FLASH_SENT,
@@ -428,7 +454,15 @@ class JournalHistory:
             holds = None if saved else self.open.old  # the next start may bring either
         torn = self.torn or kind is RecordKind.FLASH_TORN
         still_open = self.open if kind in OPEN else None
-        return replace(self, open=still_open, last=kind, last_at=at, holds=holds, torn=torn)
+        return replace(
+            self, open=still_open, last=kind, last_at=at, holds=holds, trials=trials, torn=torn
+        )
+
+
+def _without(
+    trials: Iterable[tuple[int, Values]], kept: Mapping[int, Values]
+) -> tuple[tuple[int, Values], ...]:
+    return tuple((n, v) for n, v in trials if n not in kept or not same(n, kept[n], v))
 
 
 def of_another_device(records: Iterable[JournalRecord], serial: int) -> str:

@@ -59,6 +59,8 @@ _AWAITED = {
     State.SAVE_PREPARING: RecordKind.FLASH_SENT,
 }
 _BETWEEN = CHANGED_IN_RAM | {State.RECONCILING, State.PREPARING, State.CHECKING}
+_SWITCH = "switch the device off and on"
+_MAY_HOLD = f"the device may hold values of a trial: {_SWITCH}"
 _NOT_ASKED = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
 
 
@@ -72,6 +74,7 @@ class WriteBack:
         self._safe = self._flow.safe
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._restarts = RestartWatch()
+        self._read_restarted_s = float("-inf")  # when it was read last behind a proven restart
         self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
         self._recheck = Recheck(policy.recheck_s)
         self._sampled_to_s = float("-inf")  # when the device was asked
@@ -121,18 +124,36 @@ class WriteBack:
         return not self._outbox.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
 
     @property
-    def client_may_save(self) -> bool | None:
-        """Whether all of RAM may be saved for a client; None: not yet, or what is there is undone.
+    def no_client_save(self) -> str | None:
+        """Why all of RAM is not saved for a client; "" where it may be; None: not yet, or what is
+        there is undone first.
 
-        Never while nobody knows what the device holds.
+        Never while it may hold what nobody has proven. A restart that is proven shows what is in
+        flash, and a save of that changes nothing.
         """
         history = self.history
         foreign = history.locked is not None and history.last is RecordKind.FOREIGN
         if foreign or self.state in (State.FAULT, State.FLASH_TORN):
-            return False
-        if self.state in _BETWEEN or self._outbox.running:
+            return "the device's registers are in doubt"
+        if self.no_client_reset is None or self.state is State.RECONCILING:
             return None
-        return True
+        restarted_s = max(self._restarts.fell_s, self._read_restarted_s)
+        if self._flow.identity is None or restarted_s > self._flow.staging_s:
+            return ""
+        if not self._safe.journal_read:
+            return f"the journal cannot be read, so {_MAY_HOLD}"
+        registers = self._flow.registers
+        tried = [n for n in (MAG, GYRO) if n in registers and history.tried(n, registers[n])]
+        which = ", ".join(map(str, tried))
+        return (
+            f"register {which} holds a value of a trial that was undone: {_SWITCH}" if which else ""
+        )
+
+    @property
+    def no_client_reset(self) -> str | None:
+        """The same of a reset, which does no harm where nobody knows what the device holds."""
+        between = self.state in _BETWEEN and self.state is not State.RECONCILING
+        return None if between or self._outbox.running else ""
 
     def holds(self) -> list[str]:
         """Every reason why the next step is not taken now, each with what helps."""
@@ -192,6 +213,9 @@ class WriteBack:
         theirs = self._changed_by_others(identity, registers, session_keys, restarted)
         if flow.identity is None or flow.identity.serial != identity.serial:
             self._safe.client_wrote = {}
+            self._read_restarted_s = float("-inf")
+        if restarted:
+            self._read_restarted_s = host_s
         self._theirs[identity.serial] = self._safe.read_again(theirs, registers)
         self._safe.bind(identity, registers, journal is not None)
         self._safe.client_registers = clients
@@ -222,14 +246,20 @@ class WriteBack:
         self._flow.signal(Signal.LINK_LOST, "the link was lost")
         return self._answer()
 
-    def on_reset(self, host_s: float, uptime_s: float | None = None) -> list[Action]:
+    def on_reset(
+        self, host_s: float, uptime_s: float | None = None, client: str = ""
+    ) -> list[Action]:
         """The device restarted: its RAM is what its flash holds. `on_device` must follow.
 
         uptime_s: its time since then, where that is what tells; then it must agree with the journal
+        client:   whose VNRST it was, where it was one
         """
         self._outbox.host_s = host_s
         self._restarts.seen(self.history.last_at, self._outbox.stamp, host_s, uptime_s)
-        self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
+        if client:
+            self._flow.signal(Signal.CLIENT_RESET, f"{client} reset the device")
+        else:
+            self._flow.signal(Signal.DEVICE_RESET, "the device restarted")
         return self._answer()
 
     def on_uptime(
@@ -440,16 +470,26 @@ class WriteBack:
         self._safe.client_registers = clients
         return self._answer()
 
-    def on_client_wants_save(self, client: str, host_s: float) -> list[Action]:
-        """All of RAM is to be saved for a client: what is on trial is undone first."""
+    def on_client_wants(self, client: str, does: str, host_s: float) -> list[Action]:
+        """A client "saves" all of RAM or "resets" the device: what is on trial is undone first."""
         self._outbox.host_s = host_s
-        self._flow.set_aside(client)
+        self._flow.set_aside(client, does)
         return self._answer()
 
-    def on_client_save_failed(self, why: str, host_s: float) -> list[Action]:
-        """The device refused it, or nobody knows whether it was carried out."""
+    def on_client_failed(self, does: str, why: str, host_s: float) -> list[Action]:
+        """The device refused that, or nobody knows whether it was carried out."""
         self._outbox.host_s = host_s
-        self._flow.client_save_ended(why)
+        self._flow.client_command_ended(does, why)
+        return self._answer()
+
+    def on_client_reset(self, client: str, host_s: float) -> list[Action]:
+        """The device acknowledged a client's VNRST; `on_reset` follows."""
+        self._outbox.host_s = host_s
+        if self._flow.identity is not None:
+            self._outbox.record(
+                RecordKind.CLIENT_RESET, client=client, serial=self._flow.identity.serial
+            )
+        self._flow.client_command_ended("resets")
         return self._answer()
 
     @property
@@ -514,7 +554,7 @@ class WriteBack:
             self._outbox.record(
                 RecordKind.CLIENT_SAVED, client=client, serial=self._flow.identity.serial
             )
-        self._flow.client_save_ended()
+        self._flow.client_command_ended("saves")
         return self._answer()
 
     def on_stop(self, host_s: float) -> list[Action]:

@@ -261,6 +261,7 @@ class Safeguards:
         self.policy = policy
         self.stillness = Stillness(policy.still)
         self.journal_ok = False
+        self.journal_read = False  # that of the device that was read
         self.stopping = False
         self.armed = policy.armed_at_start
         self.gates: tuple[GateResult, ...] = ()
@@ -296,7 +297,7 @@ class Safeguards:
         self, identity: Identity, registers: Mapping[int, Values], journal_readable: bool
     ) -> None:
         """Judge a device that was identified and read; the first one is the one to write to."""
-        self.journal_ok = journal_readable
+        self.journal_ok = self.journal_read = journal_readable
         self.gates = self.flash_gates = ()  # what was judged before is of before
         self._asking_s.clear()
         hsi = registers.get(HSI_CONTROL)

@@ -19,7 +19,8 @@ before the device does: nothing is sent until the record of what the device held
     SAVE_PREPARING waits for the journal to say that the flash is about to be written
     SAVING        session settings put back, every register compared, then VNWNV: one procedure
     COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
-    SET_ASIDE     what was on trial is undone for a client's save, and is written again behind it
+    SET_ASIDE     what was on trial is undone for a client's save or reset, and is written again
+                  behind it; a reset leads through RECONCILING, where the device is read again
 
 "verified", "proven", "committed" and "confirmed" are different words on purpose.
 
@@ -114,6 +115,7 @@ class Signal(StrEnum):
     TIMEOUT = "timeout"
     LINK_LOST = "link lost"
     DEVICE_RESET = "device reset"
+    CLIENT_RESET = "reset by a client"
     IN_DOUBT = "device in doubt"
     LOCK = "lock"
     UNLOCK = "unlock"
@@ -133,6 +135,7 @@ S, E = State, Signal
 _AWAY: Final = {
     E.LINK_LOST: S.RECONCILING,
     E.DEVICE_RESET: S.RECONCILING,
+    E.CLIENT_RESET: S.RECONCILING,
     E.IN_DOUBT: S.RECONCILING,  # another device answers, or it holds what it should not
 }
 _WATCHING: Final = {**_AWAY, E.LOCK: S.LOCKED, E.WORTH_WRITING: S.CANDIDATE}
@@ -148,6 +151,7 @@ TABLE: Final[dict[State, dict[Signal, State]]] = {
         E.UNRESOLVED: S.FAULT,
         E.TORN: S.FLASH_TORN,
         E.FOREIGN: S.LOCKED,
+        E.SET_ASIDE: S.SET_ASIDE,  # a client reset the device, which is as it was
         E.TIMEOUT: S.RECONCILING,
         **_AWAY,
     },

@@ -194,6 +194,26 @@ class Deframer:
         self._parse(self._buffer + chunk, frames, final=False)
         return frames
 
+    def completes(self, chunk: bytes) -> str | None:
+        """Whether this chunk ends the next message, in sync: the line's body, "" of a packet.
+
+        Then that message is all that `feed` returns for the chunk. Told at a part of its cost, and
+        changes nothing; None says nothing.
+        """
+        if not (self._synced and chunk):
+            return None
+        data = self._buffer + chunk if self._buffer else chunk
+        if data[0] == SYNC:
+            layout = self._trusted[-1] if self._trusted else None
+            if layout is None or not data.startswith(layout.header):
+                return None
+            whole = layout.size_in(data, 0) == len(data) and packet_intact(data)
+            return "" if whole else None
+        match = self._line.match(data, 0, self._longest)
+        if match is None or match.end() != len(data) or not line_intact(match):
+            return None
+        return match[1].decode()
+
     def drop_pending(self) -> None:
         """The wire was silent or the port closed: what still waits for bytes is void.
 

@@ -48,7 +48,7 @@ def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
 
 
 def test_a_save_in_the_middle_of_a_trial_would_be_seen(monkeypatch):
-    monkeypatch.setattr(WriteBack, "client_may_save", True)
+    monkeypatch.setattr(WriteBack, "no_client_save", "")
     wrong = sum((played(seed).wrong for seed in range(4)), Counter())
     assert wrong["flash"] > 0
 

@@ -22,6 +22,38 @@ def cut(stream: bytes, rng: np.random.Generator) -> list[bytes]:
     return [stream[a:b] for a, b in zip([0, *at], [*at, len(stream)], strict=True)]
 
 
+def out(splitter: MessageSplitter, chunk: bytes) -> list[bytes]:
+    """As a share does it."""
+    ahead = splitter.ahead(chunk)
+    return [*([ahead] if ahead else []), *splitter.feed(chunk)]
+
+
+def test_the_next_message_comes_out_ahead_and_once():
+    splitter, one = MessageSplitter(), packet(bytes(range(8)))
+    assert splitter.ahead(TEXT) == b""  # nothing is known of the line yet
+    assert splitter.feed(TEXT) == [TEXT]
+    for message in (TEXT, one):
+        splitter.feed(message)
+        assert splitter.ahead(message) == message
+        assert splitter.feed(message) == []
+        assert splitter.ahead(message[:9]) == b""
+        assert splitter.feed(message[:9]) == []
+        assert splitter.ahead(message[9:]) == message
+        assert splitter.feed(message[9:]) == []
+        assert splitter.ahead(message + message[:1]) == b""  # more than one
+        assert splitter.feed(message + message[:1]) == [message]
+        splitter.feed(message[1:])
+
+
+@pytest.mark.parametrize("body", REPLIES)
+def test_a_reply_never_comes_out_ahead(body):
+    splitter = MessageSplitter()
+    splitter.feed(TEXT)
+    assert out(splitter, sentence(body)) == []
+    assert out(splitter, TEXT) == [TEXT]
+    assert splitter.replies == 1
+
+
 def test_a_message_comes_out_with_its_last_byte_and_not_before():
     splitter = MessageSplitter()
     assert splitter.feed(TEXT[:-1]) == []
@@ -61,7 +93,7 @@ def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
         piece = [TEXT, TEXT, packet(rng.bytes(8)), harmless][kind - 1]
         stream, wanted = stream + piece, wanted + piece
     splitter = MessageSplitter()
-    pieces = [piece for chunk in cut(stream, rng) for piece in splitter.feed(chunk)]
+    pieces = [piece for chunk in cut(stream, rng) for piece in out(splitter, chunk)]
     assert b"".join(pieces + splitter.silence()) == wanted
 
 
@@ -72,6 +104,6 @@ def test_how_the_bytes_are_cut_changes_nothing(seed):
     outs = []
     for _ in range(3):
         splitter = MessageSplitter()
-        pieces = [piece for chunk in cut(stream, rng) for piece in splitter.feed(chunk)]
+        pieces = [piece for chunk in cut(stream, rng) for piece in out(splitter, chunk)]
         outs.append(b"".join(pieces + splitter.silence()))
     assert outs[0] == outs[1] == outs[2] == stream

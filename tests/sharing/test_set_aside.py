@@ -1,4 +1,5 @@
-"""A client saves in the middle of a trial: undone, saved, written again. Judged by the units.
+"""A client saves or resets in the middle of a trial: undone, saved, written again. Judged by the
+units.
 
 `cabled_units` shares no code with the project; what is asserted is what a unit holds and was sent.
 """
@@ -8,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cabled_run import FIRST, IRON, SPARE, CabledRun, estimate, two_units
+from drivers_at_start import NTNU_BEHIND_THE_RESET, NTNU_UP_TO_THE_RESET
 from planted_calibrator import PlantedCalibrator
 
 from ahrsd import inputs
@@ -18,7 +20,10 @@ from ahrsd.sharing.client_commands import SharePolicy
 SHARES = (SharePolicy("owner", owner=True), SharePolicy("log"))
 ONE = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
 NEW = ("1,0,0,0,1,0,0,0,1,0.05,-0.03,0.04", "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005")
+SLOW = pytest.mark.slow
+TROUBLE = ("power", "swap", "theirs", "silent", "unsafe")
 UNDONE = ["ROLLBACK", "ROLLED_BACK", "CLIENT_SAVED"]
+RESTING = ("OBSERVING", "CANDIDATE", "QUALIFIED", "ROLLED_BACK", "LOCKED")
 AGAIN = ["PREPARED", "RAM_VERIFIED"]
 
 
@@ -151,16 +156,197 @@ def test_a_lock_in_between_stays():
     assert (run.state, run.cable.unit.held()) == ("LOCKED", ONE)
 
 
-def test_a_reset_behind_the_save_ends_it_before_anything_is_written_again():
-    """As ntnu's driver does at every start."""
-    run = on_trial()
-    writes = len(run.cable.unit.writes)
-    save(run)
+def reset(run: CabledRun) -> None:
     run.say("owner", "VNRST")
+    assert run.until(lambda: run.heard["owner"], 2.5), run.notes
+    assert run.answers("owner") == ["VNRST"]
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("saved_s", [None, 0.0, 1.5, 6.0])
+def test_a_reset_in_a_trial_alone_or_behind_a_save_and_the_trial_goes_on(binary, saved_s):
+    """As ntnu's driver saves and resets at every start; another one may only reset."""
+    run = on_trial(binary=binary)
+    unit = run.cable.unit
+    if saved_s is not None:
+        save(run)
+        run.run(saved_s)
+    reset(run)
+    assert (unit.held(), unit.held("flash")) == (ONE, ONE)
+    assert run.until("TRIAL", 20.0), run.notes
+    assert (unit.held(), unit.held("flash")) == (NEW, ONE)
+    assert run.kinds()[-3:] == ["CLIENT_RESET", *AGAIN]
+    assert run.states[-6:] == ["SET_ASIDE", "PREPARING", "CHECKING", "STAGING", "STAGED", "TRIAL"]
+    begun_s = run.now_s
+    run.safe = False
+    assert run.until("PROVEN"), run.notes
+    assert run.now_s - begun_s > 25.0  # a whole trial, from zero
+    run.park(30.0)
+    assert run.state == "COMMITTED", run.notes
+    assert unit.held("flash") == NEW
+    unit.restart()
+    assert not binary or run.until("CONFIRMED", 20.0), run.notes  # a text stream tells no time
+
+
+def test_behind_a_reset_nothing_is_written_before_the_device_was_read_and_judged_again():
+    run = on_trial()
+    save(run)
+    since = len(run.cable.unit.log)
+    reset(run)
+    assert run.until("TRIAL", 20.0), run.notes
+    lines = run.cable.unit.log[since:]
+    lines = lines[lines.index("VNRST") + 1 :]
+    first = next(k for k, line in enumerate(lines) if line.startswith("VNWRG,23"))
+    asked = [line for line in lines[:first] if line.startswith("VNRRG")]
+    assert asked.count("VNRRG,23") >= 4  # the reading twice, the look, the check before the write
+    assert {f"VNRRG,{n}" for n in ("01", "03", "04", 26, 44, 84)} <= set(asked)
+    assert lines[first - 1] == "VNRRG,03"
+
+
+@pytest.mark.parametrize("starts", [10, pytest.param(100, marks=SLOW)])
+def test_a_driver_that_saves_and_resets_at_each_of_its_starts_in_trials(starts):
+    """Six writes a day; then the old values stay, whatever the driver does."""
+    run = on_trial(rollbacks_to_lock=10**6)
+    unit = run.cable.unit
+    for _ in range(starts):
+        for line in NTNU_UP_TO_THE_RESET:
+            run.say("owner", line)
+            assert run.until(lambda: run.heard["owner"], 2.5), run.notes
+            answer = run.answers("owner")
+            assert [one.split(",")[0] for one in answer] == [line.split(",")[0]]
+        assert (unit.held(), unit.held("flash")) == (ONE, ONE)
+        run.run(1.0)
+        for line in NTNU_BEHIND_THE_RESET:
+            run.say("owner", line)
+        run.feed(inputs.ClientLeft(run.now_ns, "owner"))
+        run.run(9.0)  # the trial goes on
+        run.answers("owner")
+    kinds = run.kinds()
+    assert kinds.count("CLIENT_SAVED") == kinds.count("CLIENT_RESET") == len(unit.saves) == starts
+    assert kinds.count("RAM_VERIFIED") == kinds.count("ROLLED_BACK") == 6
+    assert [held(one) for one in unit.saves] == [ONE] * starts
+    assert unit.held() == unit.held("flash") == ONE
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["unsafe", "disarm", "lock", "rollback", "stop", "link", "power", "void", "swap", "frame"],
+)
+@pytest.mark.parametrize(
+    "after_s", [pytest.param(0.05, marks=SLOW), 0.4, pytest.param(1.2, marks=SLOW)]
+)
+def test_what_ends_a_trial_that_a_reset_set_aside(what, after_s):
+    run = on_trial()
+    unit = run.cable.unit
+    save(run)
+    if what == "frame":  # in flash, and not what was in RAM
+        unit.flash[26] = "0,1,0,-1,0,0,0,0,1"
+    reset(run)
+    run.run(after_s)
+    if what == "unsafe":
+        run.safe = False
+    elif what in ("disarm", "lock", "rollback"):
+        run.feed(inputs.Operator(run.now_ns, what, ""))
+    elif what == "stop":
+        run.feed(inputs.Stop(run.now_ns, "SIGTERM"))
+    elif what == "link":
+        run.feed(inputs.LinkLost(run.now_ns, "unplugged"))
+        run.feed(inputs.LinkOpened(run.now_ns, "cable", 115200))
+    elif what == "power":
+        run.run(3.0)  # later than the device's own start behind VNRST
+        unit.restart()
+    elif what == "void":
+        run.core.take([])
+        more = run.core.writeback.on_void("something stepped", run.core.at_s, run.now_s)
+        run.core._action_queue.add(more)
+    elif what == "swap":
+        run.cable.swap(SPARE, silent_s=0.1)
+    run.run(45.0)
+    first = run.cable.units[FIRST]
+    assert (first.held(), first.held("flash")) == (ONE, ONE), run.notes
+    assert first.writes.count((23, NEW[0])) == 1
+    assert run.cable.units[SPARE].writes == []
+    assert run.kinds().count("PREPARED") == 1
+    assert what == "stop" or run.state in RESTING, run.state
+
+
+@pytest.mark.parametrize("answer", [b"", b"$VNERR,05*74\r\n"])
+@pytest.mark.parametrize("saved", [True, False])
+def test_a_reset_that_the_device_refuses_or_does_not_answer_ends_the_trial(saved, answer):
+    run = on_trial()
+    unit, usual = run.cable.unit, run.cable.unit.answer
+    unit.answer = lambda line: answer if line.startswith(b"$VNRST") else usual(line)
+    if saved:
+        save(run)
+    run.say("owner", "VNRST")
+    run.run(45.0)
+    assert (unit.held(), unit.held("flash")) == (ONE, ONE)
+    assert run.kinds().count("PREPARED") == 1
+    assert "CLIENT_RESET" not in run.kinds()
+
+
+def test_a_device_that_does_not_come_back_from_its_reset_has_thirty_seconds():
+    run = on_trial()
+    save(run)
+    reset(run)
+    run.cable.fall_silent(40.0)
+    run.run(60.0)
+    assert run.cable.unit.held() == ONE
+    assert run.kinds().count("PREPARED") == 1
+
+
+def test_a_driver_in_a_loop_of_resets_keeps_nothing_set_aside_for_ever():
+    run = on_trial()
+    save(run)
+    for _ in range(20):
+        reset(run)
+        run.run(2.0)
     run.run(20.0)
     assert run.cable.unit.held() == ONE
-    assert len(run.cable.unit.writes) == writes + 2  # the two that undid it
-    assert run.state in ("OBSERVING", "CANDIDATE", "QUALIFIED")
+    assert run.kinds().count("PREPARED") == 1
+    assert run.state in RESTING
+
+
+@pytest.mark.parametrize(
+    ("what", "at"),
+    [
+        pytest.param(what, at, marks=[] if (at - k) % 15 == 6 else SLOW)
+        for k, what in enumerate(TROUBLE)
+        for at in range(1 + k, 75, 5)
+    ],
+)
+def test_anything_at_any_command_behind_a_save_and_a_reset(what, at):
+    """Never a write of other than the journaled values, and nothing unproven in any flash."""
+    run, heard, done = on_trial(), [], []
+    unit = run.cable.unit
+    theirs = "1.02,0,0,0,1.01,0,0,0,1,0.11,0.01,0.02"
+
+    def before(line: str) -> None:
+        heard.append(line)
+        if len(heard) != at:
+            return
+        done.append(line)
+        if what == "power":
+            unit.restart()
+        elif what == "swap":
+            run.cable.swap(SPARE, silent_s=0.5)
+        elif what == "theirs":
+            unit.ram[23] = theirs
+        elif what == "silent":
+            run.cable.fall_silent(1.0)
+        else:
+            run.safe = False
+
+    unit.before = before
+    run.say("owner", "VNWNV", "VNRST")
+    written = len(unit.writes)
+    run.run(60.0)
+    assert done
+    assert {values for n, values in unit.writes[written:] if n == 23} <= {NEW[0], ONE[0]}
+    assert run.cable.units[SPARE].writes == []
+    assert all(held(one)[1] == ONE[1] for one in unit.saves if held(one) != NEW)
+    if what == "theirs" and run.kinds().count("PREPARED") == 1:
+        assert unit.ram[23] in (theirs, ONE[0])
 
 
 def test_another_program_that_writes_in_between_is_not_written_over():
@@ -248,6 +434,56 @@ def test_registers_that_the_owner_saved_are_the_users_in_the_second_write():
     run.park(30.0)
     assert run.state == "COMMITTED", run.notes
     assert run.cable.unit.flash[7] == "40"
+
+
+def opened_again(run: CabledRun) -> None:
+    run.feed(inputs.LinkLost(run.now_ns, "unplugged"))
+    run.feed(inputs.LinkOpened(run.now_ns, "cable", 115200))
+    run.run(5.0)
+
+
+def test_where_the_journal_was_lost_in_a_trial_nothing_is_saved_before_a_restart():
+    cable = on_trial().cable  # and killed there
+    run = CabledRun(cable, shares=SHARES, planted=False, journal_error="it is gone")
+    run.say("owner", "VNWNV")
+    run.run(2.0)
+    assert run.answers("owner") == ["VNERR,09"]
+    assert run.told("nothing is saved for a client", "the journal cannot be read", "off and on")
+    assert (run.cable.unit.held(), run.cable.unit.saves) == (NEW, [])
+    run.cable.unit.restart()
+    run.run(6.0)
+    assert run.cable.unit.held() == ONE
+    save(run)
+    assert run.cable.unit.held("flash") == ONE
+
+
+def test_values_of_a_trial_that_come_back_by_themselves_are_not_saved_for_a_client():
+    """A device that told of the old values and still holds a new one, as it shows later."""
+    run = on_trial()
+    unit = run.cable.unit
+    run.feed(inputs.Operator(run.now_ns, "rollback", ""))
+    assert run.until("ROLLED_BACK", 10.0)
+    run.run(2.0)
+    unit.ram[84] = "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005"
+    opened_again(run)
+    run.say("owner", "VNWNV")
+    run.run(2.0)
+    assert run.answers("owner") == ["VNERR,09"]
+    assert run.told("nothing is saved for a client", "register 84", "a trial that was undone")
+    unit.restart()
+    run.run(6.0)
+    save(run)
+    assert unit.held("flash") == ONE
+
+
+def test_what_was_proven_and_saved_may_be_saved_for_a_client_again():
+    run = on_trial()
+    assert run.until("PROVEN"), run.notes
+    run.park(30.0)
+    assert run.state == "COMMITTED", run.notes
+    opened_again(run)
+    save(run)
+    assert [held(one) for one in run.cable.unit.saves] == [NEW, NEW]
 
 
 def test_a_replay_takes_the_same_decisions():

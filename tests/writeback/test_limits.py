@@ -354,6 +354,51 @@ def test_the_history_of_the_file_is_the_history_that_was_lived(make_rig):
     assert JournalHistory.of(rig.journal) == rig.wb.history
 
 
+def row(value: float) -> list[float]:
+    """Of register 23 or 84, the last value."""
+    return [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, value]
+
+
+def writes(value: float) -> dict[str, object]:
+    return {"old": {"23": row(0)}, "new": {"23": row(value)}}
+
+
+@pytest.mark.parametrize(
+    ("more", "tried"),
+    [
+        ([], True),
+        ([("FLASH_SENT", {}), ("FLASH_ACKED", {})], False),
+        ([("ROLLBACK", {}), ("ROLLED_BACK", {})], True),
+        ([("ROLLBACK", {}), ("ROLLED_BACK", {}), ("UNLOCKED", {})], False),
+        ([("ROLLED_BACK", {}), ("HAND_PREPARED", writes(2))], False),
+        ([("ROLLED_BACK", {}), ("CLIENT_WRITES", writes(2))], False),
+        ([("ROLLED_BACK", {}), ("CLIENT_WRITES", writes(3))], True),
+        ([("ROLLED_BACK", {}), ("CLIENT_WRITES", {"new": {"23": ["x"]}})], True),
+    ],
+)
+def test_which_values_were_only_tried(more, tried):
+    """Those that nobody saved, wrote by hand or had for right; a value that stays is none."""
+    facts = {
+        "txn": "x", "serial": 1, "firmware": "3.1.0.0", "old": {"23": row(1), "84": row(5)},
+        "new": {"23": row(2), "84": row(5)}, "snapshot": {}, "heading_change_deg": 1.0,
+        "approver": "auto",
+    }  # fmt: skip
+    records = [("PREPARED", facts), ("RAM_VERIFIED", {}), *more]
+    history = JournalHistory.of(SimpleNamespace(kind=k, facts=f) for k, f in records)
+    assert history.tried(23, tuple(row(2))) == tried
+    assert not history.tried(23, tuple(row(1)))
+    assert not history.tried(84, tuple(row(5)))
+
+
+@pytest.mark.parametrize("old", [{"23": [1]}, {}])
+def test_a_transaction_whose_values_are_no_registers_forbids_writing(old):
+    facts = {
+        "txn": "x", "serial": 1, "firmware": "3.1.0.0", "old": old, "new": {"23": [2]},
+        "snapshot": {}, "heading_change_deg": 1.0, "approver": "auto",
+    }  # fmt: skip
+    assert JournalHistory.of([SimpleNamespace(kind="PREPARED", facts=facts)]).broken == "PREPARED"
+
+
 def test_a_record_that_cannot_be_understood_forbids_writing(make_rig):
     record = SimpleNamespace(kind="PREPARED", facts={"txn": "x"})
     history = JournalHistory.of([record])

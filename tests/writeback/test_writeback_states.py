@@ -17,6 +17,7 @@ from ahrsd.writeback.states import (
     after,
 )
 
+AWAY = {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.CLIENT_RESET, Signal.IN_DOUBT}
 DOCUMENT = Path(__file__).parents[2] / "docs" / "design" / "write-back.md"
 
 # States that end by themselves only by a person, the device or a verdict, and may last for ever.
@@ -68,6 +69,7 @@ def test_every_waiting_state_handles_silence() -> None:
 def test_link_loss_reset_and_doubt_lead_to_reconciling_everywhere(state: State) -> None:
     assert TABLE[state][Signal.LINK_LOST] is State.RECONCILING
     assert TABLE[state][Signal.DEVICE_RESET] is State.RECONCILING
+    assert TABLE[state][Signal.CLIENT_RESET] is State.RECONCILING
     assert TABLE[state][Signal.IN_DOUBT] is State.RECONCILING
 
 
@@ -94,13 +96,12 @@ def test_only_an_approval_leads_into_a_transaction() -> None:
     assert into == {(State.QUALIFIED, Signal.APPROVED), (State.SET_ASIDE, Signal.GO_ON)}
     # and what is set aside had one, for values that the device held and that were undone
     aside = {s for s, row in TABLE.items() if State.SET_ASIDE in row.values()}
-    assert aside == {State.ROLLING_BACK}
+    assert aside == {State.ROLLING_BACK, State.RECONCILING}  # the second: behind a client's reset
 
 
 @pytest.mark.parametrize("state", [State.FAULT, State.FLASH_TORN, State.LOCKED])
 def test_only_a_person_or_the_device_ends_an_alarm(state: State) -> None:
-    away = {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT}
-    assert set(TABLE[state]) - away <= {Signal.ROLL_BACK, Signal.UNLOCK}
+    assert set(TABLE[state]) - AWAY <= {Signal.ROLL_BACK, Signal.UNLOCK}
 
 
 def test_flash_is_reached_only_from_proven_through_the_journal() -> None:
@@ -121,7 +122,7 @@ def mermaid() -> str:
     for state, row in TABLE.items():
         edges: dict[State, list[str]] = {}
         for signal, target in row.items():
-            if signal not in {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT}:
+            if signal not in AWAY:
                 edges.setdefault(target, []).append(signal.value)
         for target, signals in edges.items():
             lines.append(f"    {state.value} --> {target.value}: {', '.join(signals)}")

@@ -278,11 +278,14 @@ class NetworkShares:
         """Each share; all that is not `raw` is written from outside."""
         return list(self._places.values())
 
-    def raw(self, messages: Sequence[bytes]) -> None:
-        """The device's own messages, for those that want these."""
+    def raw(self, messages: Sequence[bytes]) -> bool:
+        """The device's own messages, for those that want these; whether anybody does."""
+        wanted = False
         for place in self._places.values():
             if place.share.send == "raw":
                 place.write(messages, 0, b"")
+                wanted |= place.wanted
+        return wanted
 
     def facts(self) -> list[ShareFacts]:
         """How each stands."""

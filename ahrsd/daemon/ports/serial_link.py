@@ -36,6 +36,9 @@ BACKLOG_BYTES = 4 << 20  # what waits costs this much memory at most: minutes at
 _READ_BYTES = 128  # what one read costs besides its data
 _POLL_S = 0.2
 _PATIENT_POLL_S = 0.001
+# To other programs: the system hands their bytes over in a thread of its own, and what the core
+# does with the same bytes takes longer than that, on a machine that may have two cores
+_GIVE_WAY_S = 0.00015
 _JOIN_S = 2.0
 
 
@@ -119,7 +122,8 @@ class Inbox:
 class SerialReader:
     """Reads an open port into an inbox until it is lost or `stop` is called.
 
-    share: is given all that is read at once, and nothing (b"") where nothing came for a while
+    share: is given all that is read at once, and nothing (b"") where nothing came for a while;
+           whether somebody else was handed any of it, and so goes first
     """
 
     def __init__(
@@ -127,7 +131,7 @@ class SerialReader:
         port: SerialPort,
         inbox: Inbox,
         now_ns: Callable[[], int],
-        share: Callable[[bytes], None] | None = None,
+        share: Callable[[bytes], bool] | None = None,
     ) -> None:
         self._port, self._inbox, self._now_ns, self._share = port, inbox, now_ns, share
         self._stopping = False
@@ -144,11 +148,12 @@ class SerialReader:
                 if self._inbox.patient_bytes is not None and waiting > self._inbox.patient_bytes:
                     time.sleep(_PATIENT_POLL_S)
                     continue
-                data = self._port.read() if self._port.wait_readable(_POLL_S) else b""
-                if self._share is not None:  # other programs first: they wait for nothing else
-                    self._share(data)
+                data = self._port.read(_POLL_S)
+                item = Bytes(self._now_ns(), data)
+                if self._share is not None and self._share(data):
+                    time.sleep(_GIVE_WAY_S)
                 if data:
-                    self._inbox.put(Bytes(self._now_ns(), data))
+                    self._inbox.put(item)
         except PortLost as error:
             reason = str(error)
         finally:  # also after a bug: a daemon that hears nothing must know it

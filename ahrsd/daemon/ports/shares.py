@@ -14,15 +14,17 @@ same name, but only after a while, for drivers close and open again at once.
 from __future__ import annotations
 
 import contextlib
+import errno
 import grp
 import logging
 import os
 import select
 import stat
+import termios
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,6 +46,7 @@ _MOST_UNREAD_BYTES = 1 << 16
 _LINE_BYTES_PER_S = 11_520.0  # of a line at 115200 baud
 _BURST_BYTES = 4096
 _MODE = 0o660
+_LOCAL_FLAGS = 3  # of what tcgetattr returns
 _JOIN_S = 2.0
 
 
@@ -60,6 +63,7 @@ class _Port:
     used: bool = False
     streams: bool = True
     left_s: float = 0.0
+    fault: str = ""
     lost_bytes: int = 0
     allowance: float = float(_BURST_BYTES)
     allowed_s: float = 0.0
@@ -69,11 +73,13 @@ class _Port:
         with self.lock:
             if not self.open:
                 return
+            if not self.unread:
+                data = data[self._put(data) :]  # all of it, mostly
             if len(self.unread) + len(data) > _MOST_UNREAD_BYTES:
                 self.lost_bytes += len(data)
-                return
-            self.unread += data
-            self._flush()
+            elif data:
+                self.unread += data
+                self._flush()
 
     def flush(self) -> None:
         """What waits, as far as the port takes it."""
@@ -81,9 +87,14 @@ class _Port:
             self._flush()
 
     def _flush(self) -> None:
-        with contextlib.suppress(BlockingIOError, OSError):  # a program that is gone is seen later
-            while self.unread:
-                del self.unread[: os.write(self.master, self.unread)]
+        while self.unread and (taken := self._put(self.unread)):
+            del self.unread[:taken]
+
+    def _put(self, data: bytes | bytearray) -> int:
+        try:
+            return os.write(self.master, data)
+        except OSError:  # full; or a program that is gone, which is seen later
+            return 0
 
 
 class SharedPorts:
@@ -110,11 +121,14 @@ class SharedPorts:
         self._thread = threading.Thread(target=self._work, name="shared-ports", daemon=True)
         self._thread.start()
 
-    def measured(self, data: bytes) -> None:
-        """Whole messages of the device that answer nobody."""
+    def measured(self, data: bytes) -> bool:
+        """Whole messages of the device that answer nobody; whether a program has them."""
+        taken = False
         for port in self._ports.values():
-            if port.streams:
+            if port.streams and port.open:
                 port.write(data)
+                taken = True
+        return taken
 
     def send(self, item: SendToClient) -> None:
         """An answer for the program on one port."""
@@ -126,7 +140,7 @@ class SharedPorts:
     def facts(self) -> list[ShareFacts]:
         """Each port: whether a program has it open, and what it did not read."""
         return [
-            ShareFacts(name, readers=int(port.open), lost_bytes=port.lost_bytes)
+            ShareFacts(name, readers=int(port.open), lost_bytes=port.lost_bytes, fault=port.fault)
             for name, port in self._ports.items()
         ]
 
@@ -179,10 +193,19 @@ class SharedPorts:
             with port.lock:
                 port.open = port.used = port.streams = True
         elif port.used and now_s - port.left_s > _RENEW_S:
-            old = port.master
-            port.master, port.target = _open_pty(port.share)
-            port.used = False
-            os.close(old)
+            self._renew(port, now_s)
+
+    def _renew(self, port: _Port, now_s: float) -> None:
+        """A fresh pty; where the name is somebody else's by now it is tried again and again."""
+        try:
+            master, target = _open_pty(port.share, port.target)
+        except ConfigError as error:
+            if port.fault != (fault := error.lines[0]):
+                log.warning("%s", fault)
+            port.fault, port.left_s = fault, now_s
+            return
+        os.close(port.master)
+        port.master, port.target, port.used, port.fault = master, target, False, ""
 
     def _read(self, port: _Port) -> None:
         try:
@@ -206,10 +229,13 @@ def _may_say(port: _Port, now_s: float) -> bool:
     return port.allowance >= 1.0
 
 
-def _open_pty(share: ShareSection) -> tuple[int, str]:
-    """A raw pty under the share's name; its master and its own name. Raises ConfigError."""
+def _open_pty(share: ShareSection, before: str = "") -> tuple[int, str]:
+    """A raw pty under the share's name; its master and its own name. Raises ConfigError.
+
+    before: the pty of ours that has the name until now
+    """
     path = Path(share.name)
-    if _is_somebodys(path):
+    if _is_somebodys(path, before):
         raise ConfigError(
             [f"share.pty = {path}: there is something of that name; remove it or choose another"]
         )
@@ -225,24 +251,44 @@ def _open_pty(share: ShareSection) -> tuple[int, str]:
         scratch.unlink(missing_ok=True)
         scratch.symlink_to(target)
         scratch.replace(path)
-    except (OSError, KeyError) as error:
+    except KeyError as error:
         os.close(master)
-        why = f"there is no group {share.group}" if isinstance(error, KeyError) else error.strerror
-        raise ConfigError(
-            [f"share.pty = {path}: {why}; the folder must exist and be the daemon's to write"]
-        ) from error
+        raise ConfigError([f"share.group: {path}: there is no group {share.group}"]) from error
+    except OSError as error:
+        os.close(master)
+        why = f"{error.strerror}; the folder must exist and be the daemon's to write"
+        raise ConfigError([f"share.pty = {path}: {why}"]) from error
     finally:
         os.close(slave)  # held open it would keep TIOCEXCL of a program that died
     return master, target
 
 
-def _is_somebodys(path: Path) -> bool:
-    """Whether the name is taken by anything but a link to a pty, such as a killed run left."""
+def _is_somebodys(path: Path, ours: str) -> bool:
+    """Whether the name is taken by anything but a link to a pty of ours, or of a killed run."""
     try:
         kind = path.lstat().st_mode
     except OSError:
         return False  # not there, or told when the link is made
-    return not (stat.S_ISLNK(kind) and str(path.readlink()).startswith("/dev/pts/"))
+    if not stat.S_ISLNK(kind) or not (target := str(path.readlink())).startswith("/dev/pts/"):
+        return True
+    return target != ours and _is_port(target)
+
+
+def _is_port(pty: str) -> bool:
+    """Whether it is another program's port: there, and raw.
+
+    What a killed run left is gone with it; its number may be a person's terminal by now.
+    """
+    try:
+        slave = os.open(pty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        return error.errno == errno.EBUSY  # a port, and somebody has it for itself
+    try:
+        return not termios.tcgetattr(slave)[_LOCAL_FLAGS] & termios.ICANON
+    except termios.error:  # gone at this moment
+        return False
+    finally:
+        os.close(slave)
 
 
 # -- Every share of a run --------------------------------------------------------------------------
@@ -273,12 +319,19 @@ class Shares:
         """Those that send more than the device's own messages: they are written from outside."""
         return [place for place in self._network.places if place.share.send != "raw"]
 
-    def heard(self, data: bytes) -> None:
-        """Bytes of the device; none where nothing came for a while. Of the thread that reads it."""
+    def heard(self, data: bytes) -> bool:
+        """Bytes of the device; none where nothing came for a while. Of the thread that reads it.
+
+        Whether a program was handed any of it.
+        """
+        ahead = self._splitter.ahead(data)
+        taken = bool(ahead) and self._measured([ahead])
         messages = self._splitter.feed(data) if data else self._splitter.silence()
-        if messages:
-            self._ports.measured(b"".join(messages))
-            self._network.raw(messages)
+        return (bool(messages) and self._measured(messages)) or taken
+
+    def _measured(self, messages: Sequence[bytes]) -> bool:
+        taken = self._ports.measured(b"".join(messages))
+        return self._network.raw(messages) or taken
 
     def send(self, item: SendToClient) -> None:
         """An answer for the program on one port."""

@@ -1,13 +1,14 @@
 """What a shared port costs a driver: the time from the device's port to the driver's, and bytes.
 
     python tests/benchmarks/writeback/bench_sharing.py
-        [--rate HZ] [--seconds S] [--way NAME] [--wire socket]
+        [--rate HZ] [--seconds S] [--way NAME] [--wire socket] [--times N]
 
 A writer puts binary packets with the host's time into a pty, a reader stamps each when it is whole:
 directly, through `ahrsd run` (mode passive) with a shared port or with a raw share over tcp, and
-through socat where that is installed. `crowd`: over tcp with 15 readers more, one of which never
-reads; the losses are those of all that read. Median and 99 % of the delay in ms, messages lost, and
-the daemon's share of a core.
+through socat where that is installed. `alone` is the daemon without a share and `unread` one with a
+shared port that nobody opens: what their processor time differs by is what sharing costs. `crowd`:
+over tcp with 15 readers more, one of which never reads; the losses are those of all that read.
+Median and 99 % of the delay in ms, messages lost, and the daemon's share of a core.
 Run it on a quiet machine: the figures are those of the scheduler otherwise. A busy one can be made
 quiet for a while with `chrt -r 20 python ...bench_sharing.py --wire socket` (root): the
 kernel hands the bytes of a pty over in threads of ordinary priority, those of a socket it does not.
@@ -44,13 +45,14 @@ from cabled_units import crc16
 HEAD = bytes([0xFA, 0x01]) + struct.pack("<H", 0x0001 | 0x0008 | 0x0020 | 0x0400)
 PATIENCE_S = 30.0
 CROWD = 14
+SETTLE_S = 2.0
 
 
 @dataclass
 class Way:
     """Where to read, the process between, and what other readers lost by the end."""
 
-    reader: int
+    reader: int | None
     pid: int | None = None
     others_lost: int = 0
 
@@ -147,24 +149,25 @@ def write(wire: Pty | Server, rate_hz: float, stop: threading.Event, count: list
         count[0] += 1
 
 
-def read(reader: int, seconds: float) -> tuple[np.ndarray, int]:
+def read(reader: int | None, seconds: float) -> tuple[np.ndarray, int]:
     """Delay of each packet in ms, and how many were missing between the first and the last."""
+    if reader is None:
+        time.sleep(seconds)
+        return np.array([]), 0
     os.set_blocking(reader, False)
-    with contextlib.suppress(BlockingIOError):
-        while os.read(reader, 65536):
-            pass
     got, delays, numbers, end_s = b"", [], [], time.monotonic() + seconds
     while time.monotonic() < end_s:
         if not select.select([reader], [], [], 0.2)[0]:
             continue
-        got += os.read(reader, 65536)
+        with contextlib.suppress(BlockingIOError):
+            got += os.read(reader, 65536)
         now_ns = time.monotonic_ns()
         while (start := got.find(HEAD)) >= 0 and len(got) >= start + SIZE:
             sent_ns, number = struct.unpack_from("<Qf", got, start + 4)
             delays.append((now_ns - sent_ns) * 1e-6)
             numbers.append(int(number))
             got = got[start + SIZE :]
-    return np.array(delays), numbers[-1] - numbers[0] + 1 - len(numbers)
+    return np.array(delays), numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
 
 
 @contextlib.contextmanager
@@ -193,9 +196,25 @@ def ahrsd(device: str, folder: Path, share: str) -> list[str]:
     config = folder / "ahrsd.toml"
     config.write_text(
         f'mode = "passive"\nstate_directory = "{folder}"\n[device]\nport = "{device}"\n'
-        f"baud = 115200\n[[share]]\n{share}\n"
+        "baud = 115200\n" + (f"[[share]]\n{share}\n" if share else "")
     )
     return [sys.executable, "-m", "ahrsd", "run", "--config", str(config)]
+
+
+@contextlib.contextmanager
+def alone(device: str, folder: Path) -> Iterator[Way]:
+    """`ahrsd run` without a share."""
+    with running(ahrsd(device, folder, "")) as pid:
+        await_opened(device, pid)
+        yield Way(None, pid)
+
+
+@contextlib.contextmanager
+def unread(device: str, folder: Path) -> Iterator[Way]:
+    """A shared port that nobody opens."""
+    with running(ahrsd(device, folder, f'pty = "{folder / "shared"}"')) as pid:
+        await_opened(device, pid)
+        yield Way(None, pid)
 
 
 @contextlib.contextmanager
@@ -299,6 +318,22 @@ def opened(port: Path) -> int:
     return os.open(port, os.O_RDWR | os.O_NOCTTY)
 
 
+def await_opened(device: str, pid: int) -> None:
+    """Wait until the process has the device open."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not any(_link(entry) == device for entry in Path(f"/proc/{pid}/fd").iterdir()):
+        if time.monotonic() > end_s:
+            raise SystemExit(f"nobody opens {device}")
+        time.sleep(0.05)
+
+
+def _link(entry: Path) -> str:
+    try:
+        return str(entry.readlink())
+    except OSError:  # closed meanwhile
+        return ""
+
+
 def cpu_s(pid: int) -> float:
     """Processor time of a process until now."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
@@ -317,22 +352,26 @@ def measured(
             wire.taken()
         writer.start()
         with way(wire.name, Path(folder)) as there:
-            time.sleep(1.0)
+            read(there.reader, SETTLE_S)  # what waits since it was opened
             pid = there.pid
             used_s, begun_s = cpu_s(pid) if pid else 0.0, time.monotonic()
             delays, lost = read(there.reader, seconds)
             share = (cpu_s(pid) - used_s) / (time.monotonic() - begun_s) if pid else 0.0
             stop.set()
             writer.join()
-            os.close(there.reader)
+            if there.reader is not None:
+                os.close(there.reader)
     wire.close()
+    core = {"core_percent": round(100.0 * share, 1)}
+    if not len(delays):
+        return core
     return {
         "packets": len(delays),
         "median_ms": round(float(np.median(delays)), 3),
         "p99_ms": round(float(np.percentile(delays, 99)), 3),
         "worst_ms": round(float(delays.max()), 1),
         "lost": lost + there.others_lost,
-        "core_percent": round(100.0 * share, 1),
+        **core,
     }
 
 
@@ -341,7 +380,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--rate", type=float, action="append", help="Hz; default 200 and 800")
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--way", action="append", help="direct, shared, tcp, crowd, socat; all")
+    parser.add_argument(
+        "--way", action="append", help="direct, alone, unread, shared, tcp, crowd, socat; all"
+    )
+    parser.add_argument("--times", type=int, default=1, help="all of it, by turns")
     parser.add_argument("--wire", choices=["pty", "socket"], default="pty", help="of the device")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--drain", type=int, help=argparse.SUPPRESS)
@@ -349,19 +391,20 @@ def main() -> None:
     if options.drain:
         drain(options.drain)
         return
-    ways: dict[str, Opened] = {"direct": direct, "shared": shared, "tcp": tcp, "crowd": crowd}
+    ways: dict[str, Opened] = {"direct": direct, "alone": alone, "unread": unread}
+    ways |= {"shared": shared, "tcp": tcp, "crowd": crowd}
     if shutil.which("socat"):
         ways["socat"] = socat
     if options.wire == "socket":
-        del ways["shared"]  # a pty again
-    found = {}
+        del ways["shared"], ways["unread"]  # a pty again
+    found: dict[str, list[dict[str, float]]] = {}
+    kind = Server if options.wire == "socket" else Pty
     for rate_hz in options.rate or (200.0, 800.0):
-        for name, way in ways.items():
+        for name, way in [*ways.items()] * options.times:
             if options.way and name not in options.way:
                 continue
-            found[f"{name} {rate_hz:.0f} Hz"] = row = measured(
-                way, rate_hz, options.seconds, Server if options.wire == "socket" else Pty
-            )
+            row = measured(way, rate_hz, options.seconds, kind)
+            found.setdefault(f"{name} {rate_hz:.0f} Hz", []).append(row)
             print(f"{name:8} {rate_hz:4.0f} Hz", row, flush=True)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import termios
 import time
+import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -201,6 +202,43 @@ def test_a_name_that_is_somebodys_is_refused_and_kept(tmp_path, what):
     with pytest.raises(ConfigError, match="something of that name"):
         SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns)
     assert os.path.lexists(path)
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_a_link_to_a_pty_that_lives_is_somebodys_port_or_only_has_its_number(tmp_path, raw):
+    """Such as a device on a pty; a person's terminal may have the number of what was killed."""
+    master, slave = os.openpty()
+    if raw:
+        tty.setraw(slave)
+    path = tmp_path / "vn100"
+    path.symlink_to(os.ttyname(slave))
+    os.close(slave)
+    if raw:
+        with pytest.raises(ConfigError, match="something of that name"):
+            SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns)
+    else:
+        SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns).close()
+    assert os.path.lexists(path) == raw
+    os.close(master)
+
+
+def test_a_name_that_is_taken_while_it_runs_is_told_and_the_other_ports_go_on(shared, caplog):
+    one = shared.opened(0)
+    shared.paths[0].unlink()
+    shared.paths[0].write_text("theirs")
+    one.close()
+    until(lambda: shared.ports.facts()[0].fault)
+    assert "something of that name" in shared.ports.facts()[0].fault
+    two = shared.opened(1)
+    shared.ports.heard(TEXT)
+    assert two.read(len(TEXT)) == TEXT
+    os.write(two.fd, b"$VNRRG,01*72\r\n")
+    until(lambda: shared.text(1))
+    shared.paths[0].unlink()
+    until(lambda: not shared.ports.facts()[0].fault)
+    shared.opened(0).close()
+    two.close()
+    assert caplog.text.count("something of that name") == 1
 
 
 @pytest.mark.parametrize("taker", ["another run", "a file", "nobody"])

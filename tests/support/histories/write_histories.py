@@ -229,18 +229,26 @@ def _client_comes(world: World, draw: np.random.Generator, act: Act) -> None:
         world.at_label(f"after {label}", now, 1 + int(draw.integers(3)))
 
 
-ASIDE_MOMENTS = 240  # from the record of the rollback to the second RAM_VERIFIED, and some more
+ASIDE_FOR = (("VNWNV",), ("VNWNV", "VNRST"), ("VNRST",))
+ASIDE_MOMENTS = (
+    240  # not of seven; from the record of the rollback to the second RAM_VERIFIED, and some more
+)
 
 
 def aside_moments() -> int:
     """How many there are of `run_aside`."""
-    return (len(NAMES) + len(CLIENT_EVENTS)) * ASIDE_MOMENTS
+    return len(ASIDE_FOR) * (len(NAMES) + len(CLIENT_EVENTS)) * ASIDE_MOMENTS
 
 
 def run_aside(number: int, seed: int, tally: HistoriesTally) -> World:
-    """A client's save in a trial, and an event at one moment of what follows from it."""
+    """A client saves, resets or does both in a trial, and an event at one moment of what follows.
+
+    The first numbers are spread over all moments: the moments go on in steps of seven.
+    """
     acts = {**{name: act for name, (act, _) in EVENTS.items()}, **CLIENT_EVENTS}
-    after, event = divmod(number, len(acts))
+    rest, does = divmod(number, len(ASIDE_FOR))
+    turn, event = divmod(rest, len(acts))
+    after, lines = 7 * turn % ASIDE_MOMENTS, ASIDE_FOR[does]
     name, draw = list(acts)[event], np.random.default_rng([seed, number, 3])
     with folder() as at:
         stream = STREAMS[number % 2]
@@ -251,12 +259,18 @@ def run_aside(number: int, seed: int, tally: HistoriesTally) -> World:
             where = len(world.moments) + after
             world.at_moment(where, lambda: acts[name](world, draw))
 
-        world.at_label("after RAM_VERIFIED", lambda: world.later(0.7, lambda: world.say("VNWNV")))
+        for line in lines:
+            world.at_label("after RAM_VERIFIED", lambda say=line: _says_later(world, say))
         world.at_label("before ROLLBACK", begin)
         error = attempt(world, LONG_S)
-        judge(world, f"{name} {after} moments on, seed {seed}, number {number}", tally, error)
+        where = f"{name} {after} moments on, for {' and '.join(lines)}"
+        judge(world, f"{where}, seed {seed}, number {number}", tally, error)
         tally.events[name] += 1
     return world
+
+
+def _says_later(world: World, line: str) -> None:
+    world.later(0.7, lambda: world.say(line))
 
 
 def run_at(

@@ -5,7 +5,8 @@ has each unit's own log. It imports nothing of the project. What it counts:
 
 not_judged_here    a value in a unit that was not judged on that unit: neither its own (what it held
                    or somebody else put there) nor a candidate announced while it was on the cable
-                   and right for the iron that it felt
+                   and right for the iron that it felt; but for a unit that told before to hold a
+                   value of this register which it does not apply: its samples cannot be un-mapped
 other_journal      a value of a candidate, journaled under another unit's number
 void_save          a save of values that the iron had made wrong, as `GRACE_S` of readings showed:
                    iron that leaves a field's length as it was shows in no reading at rest
@@ -42,7 +43,7 @@ KINDS = (
 )  # fmt: skip
 _LINE = re.compile(r"\$VNWRG,0?(23|84),([^*]*)\*")
 _REGISTERS = (23, 84)
-_OF_NO_WRITE = ("LOCKED", "UNLOCKED", "CLIENT_SAVED", "CLIENT_WRITES")
+_OF_NO_WRITE = ("LOCKED", "UNLOCKED", "CLIENT_SAVED", "CLIENT_RESET", "CLIENT_WRITES")
 
 
 @dataclass
@@ -189,7 +190,13 @@ class Observer:
                 self._wrong("foreign_replaced", change.at_s, f"register {number}: {change.before}")
         if text in seen.own[number]:
             return
-        judged = text in seen.judged[number] and self._was_right(unit, number, text, change.at_s)
+        announced = text in seen.judged[number]
+        lied = any(
+            one.what == "write" and one.register == number and one.asked != one.after
+            for one in unit.log
+            if one.at_s < change.at_s
+        )
+        judged = announced and (lied or self._was_right(unit, number, text, change.at_s))
         where = f"unit {unit.serial} register {number}: {text}"
         if not judged:
             self._wrong("not_judged_here", change.at_s, where)

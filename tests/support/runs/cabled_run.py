@@ -62,7 +62,8 @@ class CabledRun:
 
     def __init__(
         self, cable: Cable, *, planted: bool = True, shares: tuple[Any, ...] = (),
-        journal: dict[int, list[dict[str, Any]]] | None = None, **policy: Any,
+        journal: dict[int, list[dict[str, Any]]] | None = None, journal_error: str = "",
+        **policy: Any,
     ) -> None:  # fmt: skip
         given: dict[str, Any] = {
             "mode": Mode.COMMIT, "trial": TRIAL, "still": StillPolicy(gyro_rad_s=0.02),
@@ -72,7 +73,7 @@ class CabledRun:
         settings = core_settings(Config(), policy=WriteBackPolicy(**given))
         self.core = Core(replace(settings, shares=shares))
         self.heard: dict[str, bytes] = {share.name: b"" for share in shares}
-        self.safe = True
+        self.safe, self.journal_error = True, journal_error
         self.journal = {} if journal is None else journal  # of a run before, by serial number
         self.notes: list[tuple[str, str]] = []
         self.states: list[str] = []
@@ -111,7 +112,11 @@ class CabledRun:
                     case events.OpenJournal(serial):
                         self._serial = serial
                         records: list[Any] = list(self.journal.setdefault(serial, []))
-                        waiting.append(inputs.JournalOpened(self.now_ns, serial, records))
+                        error = self.journal_error
+                        opened = inputs.JournalOpened(
+                            self.now_ns, serial, [] if error else records, error
+                        )
+                        waiting.append(opened)
                     case events.JournalAppend(kind, facts):
                         record = {"kind": kind, "facts": dict(facts)}
                         self.journal[self._serial].append(record)

@@ -125,6 +125,40 @@ def test_noise_between_messages_loses_none(stream: list[tuple[bytes, bytes]], ta
 mixtures = st.lists(st.tuples(noise, messages | nested), max_size=6)
 
 
+@given(mixtures, st.randoms(use_true_random=False))
+@settings(max_examples=300, deadline=None)
+def test_what_a_chunk_completes_is_all_that_it_gives(
+    stream: list[tuple[bytes, bytes]], rng: random.Random
+) -> None:
+    """Cut behind each message, or anywhere: what is told before is what comes."""
+    deframer = Deframer()
+    for dirt, message in stream:
+        data = dirt + message
+        at = sorted(rng.sample(range(len(data)), min(rng.choice((0, 0, 1, 3)), len(data))))
+        for start, stop in zip([0, *at], [*at, len(data)], strict=True):
+            told = deframer.completes(data[start:stop])
+            frames = deframer.feed(data[start:stop])
+            bodies_told = [f.body if isinstance(f, Sentence) else "" for f in frames]
+            assert told is None or bodies_told == [told]
+
+
+def test_what_a_chunk_completes_is_told_once_the_wire_is_in_sync() -> None:
+    deframer = Deframer()
+    for message in (PACKET, LINE):
+        deframer.feed(message)
+        assert deframer.completes(message[:-1]) is None
+        body = body_of(message)
+        assert deframer.completes(message) == (body if isinstance(body, str) else "")
+        assert deframer.completes(message + b"\xfa") is None
+        deframer.feed(message[:5])
+        assert deframer.completes(message[5:]) == (body if isinstance(body, str) else "")
+        deframer.feed(message[5:])
+    deframer.feed(b"?")
+    assert deframer.completes(PACKET) is None
+    deframer.drop_pending()
+    assert deframer.completes(PACKET) is None
+
+
 @given(mixtures, noise, st.randoms(use_true_random=False))
 @settings(max_examples=300, deadline=None)
 def test_how_the_stream_is_cut_changes_nothing(

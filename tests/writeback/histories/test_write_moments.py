@@ -38,22 +38,23 @@ def wrong(event: str, places: list[str], **options: object) -> list[str]:
     return tally.wrong
 
 
-#: of what follows from a client's save in a trial, as far as the trial has begun again
-BEHIND_A_SAVE = range(0, 180, 12)
+#: of what follows from a client's save in a trial: 15 moments of the 240 that there are
+BEHIND_A_SAVE = range(0, 240, 16)
 
 
 @pytest.mark.parametrize("event", ["kill", "kill and other writes", "host reboots", "swap",
     "other writes", "restart", "unsafe for a while", "disk full", "lie", "bad line",
     "client saves", "client saves and resets", "client calibrates"])  # fmt: skip
-def test_anything_at_every_moment_behind_a_clients_save_in_a_trial(event):
+def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event):
     names = [*write_histories.NAMES, *write_histories.CLIENT_EVENTS]
-    tally = write_histories.HistoriesTally()
-    for after in BEHIND_A_SAVE:
-        number = (after + names.index(event) % 12) * len(names) + names.index(event)
-        write_histories.run_aside(number, 2, tally)
+    tally, does = write_histories.HistoriesTally(), write_histories.ASIDE_FOR
+    for k, turn in enumerate(BEHIND_A_SAVE):
+        number = (turn + names.index(event) % 16) * len(names) + names.index(event)
+        write_histories.run_aside(number * len(does) + k % len(does), 2, tally)
     assert tally.wrong == []
     assert tally.events == {event: len(BEHIND_A_SAVE)}
     assert tally.seen["client saves"] > 0
+    assert tally.seen["CLIENT_RESET"] > 0
 
 
 @pytest.mark.parametrize("stream", ["binary", "imu"])
