@@ -356,4 +356,5 @@ def _facts(estimate: Estimate) -> EstimateFacts:
         estimate.observability.unobservable,
         float(estimate.observability.score),
         float(estimate.heading_sigma_deg),
+        estimate.widened_by,
     )

@@ -12,6 +12,8 @@ matrix in the directions (2 each), bordered by M, b and w_b, and its Schur compl
 Cholesky factorisation, is the information on M, b and w_b. From there to A with det A = 1, or to
 A = M / |h| where |h| is known, is a change of variables.
 
+Nuisances (`nuisances.py`) are further columns of the border, known beforehand to one unit each.
+
 Independent of the estimator on purpose. Tested against a dense Fisher matrix, against two smoothers
 over many seeds, and against figures published elsewhere (tests/montecarlo/test_bound.py).
 """
@@ -53,6 +55,18 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Nuisances:
+    """What the readings hold besides the model, linear in numbers known beforehand to one unit.
+
+    field_gauss: (N, 3, p) what one sigma of each adds to the reading of the field
+    rate_rad_s:  (N, 3, q) the same of the gyro's reading; row 0 is not used
+    """
+
+    field_gauss: Array
+    rate_rad_s: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Bound:
     """Smallest covariance of an unbiased estimate.
 
@@ -91,15 +105,15 @@ def cramer_rao(
     field_known: bool = False,
     full_matrix: bool = False,
     believed: Array | None = None,
-    lag_sigma_s: float | None = None,
+    nuisances: Nuisances | None = None,
 ) -> Bound:
     """The bound for A (3, 3) and the gyro bias, det A = 1 and |h| unknown.
 
     field_known: |h| is given and det A is free; full_matrix: A need not be symmetric, which is the
     misalignment between magnetometer and gyro. `soft_iron` is A in the units of `field_b`.
     believed: information on [M, b, w_b] that is there without data; with it the bound is that of
-    the mean square error averaged over what is believed. lag_sigma_s: the field is late against the
-    gyro by a time that is known to this much, and is one more nuisance; None: it is not late.
+    the mean square error averaged over what is believed, as it is with `nuisances`, which are what
+    the readings hold besides.
     Raises UnobservableError where the motion determines nothing, ValueError for a noise of zero.
     """
     for name, sigma in (("magnetometer", noise_mag_gauss), ("gyro", noise_gyro_rad_s)):
@@ -108,47 +122,51 @@ def cramer_rao(
     entries = FULL if full_matrix else TRIANGLE
     size = float(np.mean(np.linalg.norm(trajectory.field_b, axis=1)))
     M = soft_iron * size
-    information = _information(trajectory, M, entries, noise_mag_gauss, noise_gyro_rad_s)
+    information = _information(
+        trajectory, M, entries, (noise_mag_gauss, noise_gyro_rad_s), nuisances
+    )
+    asked = len(entries) + 6
     if believed is not None:
-        information[:-1, :-1] += believed
-    if lag_sigma_s is None:
-        covariance = _inverse(information[:-1, :-1])
-    else:
-        information[-1, -1] += 1 / lag_sigma_s**2
-        covariance = _inverse(information)[:-1, :-1]
+        information[:asked, :asked] += believed
+    information[asked:, asked:] += np.eye(len(information) - asked)
+    covariance = _inverse(information)[:asked, :asked]
     J = np.eye(len(covariance))
     J[:-6, :-6] = _matrix_jacobian(M, entries, size if field_known else None)
     return Bound(J @ covariance @ J.T, entries)
 
 
 def _information(
-    trajectory: Trajectory, M: Array, entries: tuple[tuple[int, int], ...], sm: float, sg: float
+    trajectory: Trajectory,
+    M: Array,
+    entries: tuple[tuple[int, int], ...],
+    noise: tuple[float, float],
+    nuisances: Nuisances | None,
 ) -> Array:
-    """Schur complement of the directions: (m + 7, m + 7) on [M (m), b, w_b, lag].
-
-    A field that is late by tau is that of the direction u(t - tau), and du/dt = -w x u.
-    """
+    """Schur complement of the directions on [M (m), b, w_b, nuisances of field and of rate]."""
+    (sm, sg), n = noise, len(trajectory.field_b)
+    extra = nuisances or Nuisances(np.zeros((n, 3, 0)), np.zeros((n, 3, 0)))
     u = trajectory.field_b / np.linalg.norm(trajectory.field_b, axis=1, keepdims=True)
     T = so3.tangent_basis(u)
     own = M @ T / sm
-    shared = np.concatenate([_matrix_columns(u, entries), _tiled(np.eye(3), len(u))], axis=2) / sm
-    here, there, bias = _motion(trajectory, u, T, sg)
-    swept = np.cross(np.nan_to_num(trajectory.rate_b_rad_s), u) @ M.T / sm
-    m = shared.shape[2]
-    seen, linked = np.r_[0:m, m + 3], slice(m, m + 3)
-    shared = np.concatenate([shared, swept[:, :, None]], axis=2)
+    columns = [_matrix_columns(u, entries), _tiled(np.eye(3), n), extra.field_gauss]
+    shared = np.concatenate(columns, axis=2) / sm
+    here, there, by_rate = _motion(trajectory, u, T, sg)
+    turned = np.concatenate([by_rate, by_rate @ extra.rate_rad_s[1:]], axis=2)
+    m, p = len(entries), extra.field_gauss.shape[2]
+    size = m + 6 + p + extra.rate_rad_s.shape[2]
+    seen, linked = np.r_[0 : m + 3, m + 6 : m + 6 + p], np.r_[m + 3 : m + 6, m + 6 + p : size]
     diag = np.swapaxes(own, 1, 2) @ own
     diag[1:] += np.swapaxes(here, 1, 2) @ here
     diag[:-1] += np.swapaxes(there, 1, 2) @ there
-    border = np.zeros((len(u), 2, m + 4))
+    border = np.zeros((n, 2, size))
     border[:, :, seen] = np.swapaxes(own, 1, 2) @ shared
-    border[1:, :, linked] += np.swapaxes(here, 1, 2) @ bias
-    border[:-1, :, linked] += np.swapaxes(there, 1, 2) @ bias
-    information = np.zeros((m + 4, m + 4))
-    flat = shared.reshape(-1, m + 1)
-    information[np.ix_(seen, seen)] = flat.T @ flat
-    information[linked, linked] = bias.reshape(-1, 3).T @ bias.reshape(-1, 3)
-    flat = border.reshape(-1, m + 4)
+    border[1:, :, linked] += np.swapaxes(here, 1, 2) @ turned
+    border[:-1, :, linked] += np.swapaxes(there, 1, 2) @ turned
+    information = np.zeros((size, size))
+    for which, rows in ((seen, shared), (linked, turned)):
+        flat = rows.reshape(-1, len(which))
+        information[np.ix_(which, which)] = flat.T @ flat
+    flat = border.reshape(-1, size)
     off = np.swapaxes(here, 1, 2) @ there
     return np.asarray(information - flat.T @ solveh_banded(_banded(diag, off), flat, lower=True))
 

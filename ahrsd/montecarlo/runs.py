@@ -23,6 +23,7 @@ from ahrsd.baselines import METHODS, MethodError, MethodSettings, calibrate_with
 from ahrsd.errors import AhrsdError
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.montecarlo import nuisances
 from ahrsd.montecarlo.accuracy import (
     HEADINGS,
     MethodAnswer,
@@ -30,7 +31,7 @@ from ahrsd.montecarlo.accuracy import (
     figures,
     unit_volume,
 )
-from ahrsd.montecarlo.cramer_rao import Trajectory, UnobservableError, cramer_rao
+from ahrsd.montecarlo.cramer_rao import Bound, Trajectory, UnobservableError, cramer_rao
 from ahrsd.montecarlo.summary import BOUNDED
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, Iron, ScenarioSettings, simulate
@@ -116,7 +117,7 @@ def _published(name: str, experiment: Experiment) -> MethodAnswer:
 Record = dict[str, Any]  # one run, as it stands in the file: see `run_one`
 
 _CHUNK = 25  # samples handed to the stream at a time
-_FORMAT = 2  # of a record: bounds hold `sigma` and headings
+_FORMAT = 3  # of a record: bounds hold `sigma`, headings and what is ordinary
 
 
 # -- Runs ------------------------------------------------------------------------------------------
@@ -200,7 +201,7 @@ def run_one(plan: Plan, seed: int) -> Record:
 def lost_record(plan: Plan, seed: int, words: str) -> Record:
     """The record of a seed whose process gave no answer: no figure, and the same failure in each
     result. It is counted and not kept: `resume` runs the seed again."""
-    unknown = dict.fromkeys((*BOUNDED, *HEADINGS, "sigma"))
+    unknown = dict.fromkeys((*BOUNDED, *HEADINGS, "sigma", "ordinary"))
     return {
         "seed": seed,
         "bounds": [{"at_s": at_s} | unknown for at_s in plan.at_s],
@@ -216,21 +217,29 @@ def lost_record(plan: Plan, seed: int, words: str) -> Record:
 def bound_at(plan: Plan, experiment: Experiment, at_s: float) -> Record:
     """The bound from the samples up to a time; every figure None where the motion leaves it open.
 
-    sigma (12,): of each parameter, in the order of `Truth.parameters`
+    sigma (12,): of each parameter, in the order of `Truth.parameters`; ordinary: the same figures
+    but for sigma, of an instrument with the imperfections that are ordinary, at an ordinary place
     """
     truth = experiment.truth
     whole = Trajectory(experiment.field_b, experiment.rate_b_rad_s, experiment.samples.dt_s)
     part = whole.before(plan.samples(at_s))
+    noise = plan.noise_mag_gauss, plan.noise_gyro_rad_s
     try:
-        bound = cramer_rao(part, truth.soft_iron, plan.noise_mag_gauss, plan.noise_gyro_rad_s)
+        plain = cramer_rao(part, truth.soft_iron, *noise)
+        extra = nuisances.ordinary(part, truth.soft_iron, plan.noise_mag_gauss)
+        wider = cramer_rao(part, truth.soft_iron, *noise, nuisances=extra)
     except UnobservableError:
-        return {"at_s": at_s} | dict.fromkeys((*BOUNDED, *HEADINGS, "sigma"))
+        return {"at_s": at_s} | dict.fromkeys((*BOUNDED, *HEADINGS, "sigma", "ordinary"))
+    sigma = np.sqrt(np.diag(plain.covariance).clip(min=0.0)).tolist()
+    own = {"at_s": at_s, "sigma": sigma, "ordinary": _bounded(experiment, wider)}
+    return own | _bounded(experiment, plain)
+
+
+def _bounded(experiment: Experiment, bound: Bound) -> Record:
     return {
-        "at_s": at_s,
         "hard_iron_gauss": bound.hard_iron_gauss,
         "soft_iron": bound.soft_iron,
         "gyro_bias_rad_s": bound.gyro_bias_rad_s,
-        "sigma": np.sqrt(np.diag(bound.covariance).clip(min=0.0)).tolist(),
     } | {
         name: expected_heading_deg(experiment, bound.covariance, noise_gauss)
         for name, noise_gauss in HEADINGS.items()

@@ -47,6 +47,8 @@ class SummaryRow:
     not trust; failures: how often which words
     mean, spread: of each of `PARAMETERS`, over the answers; None where not estimated
     bound_sigma: RMS over the runs of the bound's standard deviation of each of `PARAMETERS`
+    ordinary_bound: RMS over the runs of the bound with an ordinary instrument's and an ordinary
+        place's imperfections, by name of `BOUNDED` and `HEADINGS`
     against_bound: by name of `BOUNDED` and `HEADINGS`; rms: of the other figures
     nees: mean per degree of freedom
     """
@@ -60,6 +62,7 @@ class SummaryRow:
     mean: list[float | None]
     spread: list[float | None]
     bound_sigma: list[float | None]
+    ordinary_bound: dict[str, float | None]
     against_bound: dict[str, Ratio]
     rms: dict[str, float | None]
     nees: float | None
@@ -103,6 +106,7 @@ def _row(results: Sequence[Record], bounds: Sequence[Record]) -> SummaryRow:
         mean=_numbers(parameters.mean(axis=0)) if answers else [None] * len(PARAMETERS),
         spread=_numbers(parameters.std(axis=0)) if answers else [None] * len(PARAMETERS),
         bound_sigma=_bound_sigma(bounds),
+        ordinary_bound=_ordinary(bounds),
         against_bound={name: _ratio(good, name) for name in (*BOUNDED, *HEADINGS)},
         rms={
             name: _rms(_column(answers, name)) for name in FIGURES if name not in (*BOUNDED, "nees")
@@ -136,6 +140,11 @@ def _bound_sigma(bounds: Sequence[Record]) -> list[float | None]:
     entry[np.triu_indices(3)] = np.arange(6)
     entry = np.maximum(entry, entry.T)
     return _numbers(np.r_[rms[entry.ravel()], 1e3 * rms[6:]])
+
+
+def _ordinary(bounds: Sequence[Record]) -> dict[str, float | None]:
+    known = [b["ordinary"] for b in bounds if b["ordinary"] is not None]
+    return {name: _rms(np.array([b[name] for b in known])) for name in (*BOUNDED, *HEADINGS)}
 
 
 def _numbers(values: Array) -> list[float | None]:
@@ -202,18 +211,18 @@ def _text(value: float | None, factor: float = 1.0, digits: int = 3) -> str:
 
 
 def bound_lines(rows: Sequence[SummaryRow]) -> list[str]:
-    """The bound at each time, RMS over the runs."""
+    """The bound at each time, RMS over the runs; and that of an ordinary instrument and place."""
     out = []
     for at_s in dict.fromkeys(row.at_s for row in rows):
         row = next(r for r in rows if r.at_s == at_s)
-        hard, soft, gyro, heading, noisy = (
-            row.against_bound[name].bound for name in (*BOUNDED, *HEADINGS)
-        )
-        out.append(
-            f"{'bound':<19} {at_s:>5g} {'':>9} {_text(hard, 1e3):>13} {'':>13} {_text(soft):>12} "
-            f"{'':>8} {'':>9} {_text(gyro, 1e3):>12} {'':>8} {_text(heading):>12} "
-            f"{_text(noisy):>8}"
-        )
+        plain = {name: row.against_bound[name].bound for name in (*BOUNDED, *HEADINGS)}
+        for label, known in (("bound", plain), ("bound, ordinary", row.ordinary_bound)):
+            hard, soft, gyro, heading, noisy = (known[name] for name in (*BOUNDED, *HEADINGS))
+            out.append(
+                f"{label:<19} {at_s:>5g} {'':>9} {_text(hard, 1e3):>13} {'':>13} {_text(soft):>12} "
+                f"{'':>8} {'':>9} {_text(gyro, 1e3):>12} {'':>8} {_text(heading):>12} "
+                f"{_text(noisy):>8}"
+            )
     return out
 
 

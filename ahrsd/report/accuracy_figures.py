@@ -233,6 +233,10 @@ def _errors(axes: Axes, name: str, rows: Sequence[SummaryRow], colours: dict[str
     bound = [(r.at_s, r.against_bound[name].bound) for r in rows if r.method == first]
     known = [(at_s, value * unit) for at_s, value in bound if value is not None]
     axes.plot(*zip(*known, strict=True), color=TRUTH, linewidth=4, alpha=0.5, label="bound")
+    wider = [(r.at_s, r.ordinary_bound[name]) for r in rows if r.method == first]
+    told = [(at_s, value * unit) for at_s, value in wider if value is not None]
+    if told:
+        axes.plot(*zip(*told, strict=True), "--", color=TRUTH, label="bound, ordinary")
     for method, colour in colours.items():
         found = [(r.at_s, r.against_bound[name].rmse) for r in rows if r.method == method]
         shown = [(at_s, value * unit) for at_s, value in found if value is not None]

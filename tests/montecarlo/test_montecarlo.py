@@ -148,7 +148,7 @@ def test_the_summary_is_arithmetic():
             "errors": errors | {"hard_iron_gauss": error, "nees": nees},
             "soft_iron": None, "hard_iron_gauss": [error, 0.0, 0.0], "gyro_bias_rad_s": None,
         }  # fmt: skip
-        bounds = {"at_s": 9.0, "sigma": None} | dict.fromkeys((*BOUNDED, *HEADINGS))
+        bounds = {"at_s": 9.0, "sigma": None} | dict.fromkeys((*BOUNDED, *HEADINGS, "ordinary"))
         return {"seed": 0, "bounds": [bounds | {"hard_iron_gauss": bound}], "results": [result]}
 
     (row,) = summarise([record(3e-3, 1e-3, 0.5), record(4e-3, 2e-3, 1.5), record(0.0, 2e-3, 1.0)])
@@ -231,8 +231,24 @@ def test_the_tables_have_the_bound_of_every_parameter_and_of_the_heading():
     noisy_rms = f"{rows[1].rms['heading_10mg_deg']:#.4g}"
     assert text[2][1:3] == [noisy_rms, f"({rows[1].rms['heading_deg']:#.4g})"]
     assert text[3][1] == f"{noisy.bound:#.4g}"
-    (bound,) = bound_lines(rows)
-    assert f"{heading.bound:#.4g}" in bound
+    plain, wider = bound_lines(rows)
+    assert plain.split()[0] == "bound" and wider.startswith("bound, ordinary")
+    assert f"{heading.bound:#.4g}" in plain
+    assert f"{rows[0].ordinary_bound['heading_deg']:#.4g}" in wider
+
+
+def test_the_bound_of_an_ordinary_instrument_stands_beside_the_plain_one(run, tmp_path, capsys):
+    path, words = tmp_path / "m.json", ("--motion", "rov", "--runs", 2, "--jobs", 1)
+    methods = ("--method", "ellipsoid", "--at", "60,120")
+    assert run("montecarlo", "wam", *words, *methods, "--json", path) == 0
+    assert capsys.readouterr().out.count("\nbound, ordinary") == 2
+    first, last = json.loads(path.read_text())["sets"][0]["rows"]
+    for name in BOUNDED:
+        plain, wider = last["against_bound"][name]["bound"], last["ordinary_bound"][name]
+        assert plain < wider < first["ordinary_bound"][name]
+    assert (
+        last["ordinary_bound"]["hard_iron_gauss"] > 3 * last["against_bound"][BOUNDED[0]]["bound"]
+    )
 
 
 def test_sweeps_over_noise_and_hard_iron(run, tmp_path):

@@ -10,7 +10,8 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.calibration import Estimate
 from ahrsd.estimator.online import Estimator
-from ahrsd.estimator.parameters import EstimatorParameters
+from ahrsd.estimator.parameters import EstimatorParameters, Imperfections
+from ahrsd.montecarlo import nuisances
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.samples import Array, SampleBlock
@@ -128,17 +129,20 @@ def drive(
 IDEAL = EstimatorParameters(imperfections=())
 
 
-def answer(made: Drive, *, at_once: int = 1) -> Estimate | None:
+def answer(
+    made: Drive, *, at_once: int = 1, parameters: EstimatorParameters = IDEAL
+) -> Estimate | None:
     """Of the estimator over the whole recording."""
-    estimator = Estimator(IDEAL, at_once=at_once)
+    estimator = Estimator(parameters, at_once=at_once)
     estimator.add(made.block)
     return estimator.finish()
 
 
-def bound_sigmas(made: Drive, hold: int = 1) -> Array:
+def bound_sigmas(made: Drive, hold: int = 1, kind: Imperfections | None = None) -> Array:
     """Smallest possible sigmas (12,) of what the estimator believes and the whole data say.
 
     hold: rows for which a reading is held; it counts once, and the gyro's steps between add up.
+    kind: of an instrument that is not perfect; None: perfect, but late where the field is.
     """
     p = EstimatorParameters()
     M = SOFT_IRON * float(np.linalg.norm(FIELD_N_GAUSS))
@@ -156,9 +160,14 @@ def bound_sigmas(made: Drive, hold: int = 1) -> Array:
     information = np.zeros((12, 12))
     information[:9, :9] = np.linalg.inv(belief)
     information[9:, 9:] = np.eye(3) / p.prior_gyro_bias_rad_s**2
+    extra = None
+    if kind is not None:
+        extra = nuisances.instrument(trajectory, SOFT_IRON, kind)
+    elif made.lag_s:
+        extra = nuisances.lag(trajectory, SOFT_IRON, 0.05)
     found = cramer_rao(
         trajectory, SOFT_IRON, MAG_GAUSS, GYRO_RAD_S / np.sqrt(hold),
-        believed=information, lag_sigma_s=0.05 if made.lag_s else None,
+        believed=information, nuisances=extra,
     )  # fmt: skip
     return np.sqrt(np.diag(found.covariance))
 

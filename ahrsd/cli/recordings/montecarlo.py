@@ -93,6 +93,11 @@ def command(
 ) -> None:
     """Simulate SCENARIO (wam, mam, lam or all of them) for many seeds; compare with the bound.
 
+    "bound" is that of the simulated instrument, which is perfect but for iron, bias and white
+    noise. "bound, ordinary" is that of a real one on the same motion: a gyro with scales and axes
+    1 % off, axes turned by a degree, a field read 15 ms late, offsets that follow the temperature,
+    a field that differs by place and noise that is not white, each known to that much beforehand.
+
     A seed that takes too long or too much memory, or whose process crashes, is a failure of every
     method and not the end; --resume runs it again. Exit 1 where a method had no answer at the last
     time in some run.

@@ -1,7 +1,7 @@
 """Real recordings: what every method is worth where something can be known.
 
     python tests/benchmarks/estimator/bench_real.py
-        [--json FILE] [--short] [--only drive optical punch rest]
+        [--json FILE] [--short] [--only NAME ...]
 
 drive:   circles_2022_rahul calibrates, drive_2022_rahul judges: heading against GPS course above
          4 m/s, one constant removed, and dead reckoning by the receiver's speed
@@ -10,6 +10,9 @@ optical: broad/01, 02 and 21, each calibrated by itself and by each other, again
          least heading error there, fitted with the optical attitude on the very recording
 punch:   one sensor on two people's fists: the hard iron must repeat
 rest:    nothing is observable: no answer is the right one
+honest:  errors over what was announced: RMS heading error against GPS course or optical attitude
+         beyond that of the oracle, over the expected worst, the lag that was found taken out; and
+         hard irons of the two halves of a recording, in their sigmas
 
 It reads the recordings beside the project and prints tables; the right answer is in no file.
 """
@@ -30,17 +33,18 @@ from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS
 from ahrsd.baselines.registry import ComparisonRow
-from ahrsd.calibration import Affine
+from ahrsd.calibration import Affine, Estimate
 from ahrsd.config.loading import Config
 from ahrsd.config.sections import LocationSection
+from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
-from ahrsd.evaluation.heading import QUATERNION, course, optical
+from ahrsd.evaluation.heading import QUATERNION, HeadingReference, course, optical
 from ahrsd.heading import wrapped
 from ahrsd.offline.batch_result import BatchResult
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published
 from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
-from ahrsd.samples import Array
+from ahrsd.samples import Array, SampleBlock
 
 RECORDINGS = Path(__file__).parents[4] / "shared" / "recordings"
 # Boston, where the car drove. The day is not known: a year moves |H| there by 1 mG.
@@ -235,6 +239,149 @@ def at_rest(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Com
     return rows_of(folder / "vn100" / "static_2025_kiran_5min.csv.gz", methods, BOSTON)[0]
 
 
+@dataclass(frozen=True, slots=True)
+class Announced:
+    """An answer's RMS heading error on a recording beside the worst that it expects, deg.
+
+    oracle_deg: what the best linear calibration leaves there: the room, the attitude; nan where
+    there is no attitude to fit it to
+    """
+
+    made_from: str
+    judged_on: str
+    converged: bool
+    error_deg: float
+    oracle_deg: float
+    expected_deg: float
+
+    @property
+    def ratio(self) -> float:
+        """Of the error that the calibration adds over the expected worst."""
+        floor = 0.0 if np.isnan(self.oracle_deg) else self.oracle_deg
+        return float(np.sqrt(max(self.error_deg**2 - floor**2, 0.0))) / self.expected_deg
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """Hard irons of the two halves: largest difference in sigmas of both, and in mG."""
+
+    name: str
+    converged: tuple[bool, bool]
+    sigmas: float
+    apart_mg: float
+
+
+def estimated(track: EvaluationTrack) -> Estimate | None:
+    """Of the estimator over a track, cut where rows are missing."""
+    estimator = Estimator(at_once=WHOLE)
+    t = track.time_s
+    steps = np.diff(t)
+    cuts = np.flatnonzero((steps > 1.5 * np.median(steps)) | (steps <= 0)) + 1
+    for rows in np.split(np.arange(len(t)), cuts):
+        if len(rows) > 1:
+            own = t[rows]
+            estimator.add(
+                SampleBlock(
+                    own, np.r_[np.nan, np.diff(own)], own, track.raw_b_gauss[rows],
+                    track.gyro_b_rad_s[rows], track.accel_b_m_s2[rows], gap_before=True,
+                )
+            )  # fmt: skip
+    return estimator.finish()
+
+
+def part(track: EvaluationTrack, rows: slice) -> EvaluationTrack:
+    """These rows."""
+    raw = track.raw_b_gauss[rows]
+    return EvaluationTrack(
+        track.time_s[rows], raw, raw, track.gyro_b_rad_s[rows], track.accel_b_m_s2[rows],
+        covariates={name: values[rows] for name, values in track.covariates.items()},
+    )  # fmt: skip
+
+
+def honest(folder: Path) -> tuple[list[Announced], list[Halves]]:
+    """Errors over what was announced, and two halves of each recording."""
+    vn100, broad = folder / "vn100", [folder / "broad" / f"{n}.csv.gz" for n in BROAD]
+    drive_path, circles = vn100 / "drive_2022_rahul.csv.gz", vn100 / "circles_2022_rahul.csv.gz"
+    stick = folder / "repoimu" / "TStick_Test11_Trial1.csv.gz"
+    punches = [vn100 / f"punch_2024_{name}.csv.gz" for name in ("shaked", "satish")]
+    tracks = {
+        path: read_track(path, Config())[0]
+        for path in (circles, drive_path, *broad, stick, *punches)
+    }
+    gps = gps_beside(drive_path)
+    assert gps is not None
+    answers = {path: estimated(track) for path, track in tracks.items()}
+    references = {drive_path: [course(read_fixes(gps)[0], LEAST_SPEED_M_S)]}
+    shown, floors = dict(tracks), {drive_path: np.nan}
+    for path in (*broad, stick):
+        own = answers[path]
+        assert own is not None
+        shown[path] = without_lag(tracks[path], max(own.mag_lag_s, 0.0))
+        reference = optical(shown[path])
+        assert reference is not None
+        references[path] = [reference]
+        best = stored(oracle(shown[path]), path.name)
+        assert best is not None
+        floors[path] = _left_deg(path, shown[path], best, references[path])
+    pairs = [(circles, drive_path), (drive_path, drive_path), (stick, stick)]
+    pairs += [(one, other) for one in broad for other in broad]
+    announced = []
+    for made, on in pairs:
+        found = answers[made]
+        if found is None:
+            continue
+        calibration = StoredCalibration("", "magyc", made.name, found.converged, found.correction)
+        left = _left_deg(on, shown[on], calibration, references[on])
+        announced.append(
+            Announced(
+                made.stem, on.stem, found.converged, left, floors[on], found.heading_sigma_deg
+            )
+        )
+    halves = []
+    for path, track in tracks.items():
+        middle = len(track) // 2
+        both = [estimated(part(track, rows)) for rows in (slice(middle), slice(middle, None))]
+        one, other = both
+        if one is None or other is None:
+            continue
+        difference = one.hard_iron_gauss - other.hard_iron_gauss
+        sigma = np.hypot(one.sigma[6:9], other.sigma[6:9])
+        halves.append(
+            Halves(
+                path.stem, (one.converged, other.converged),
+                float(np.max(np.abs(difference) / sigma)), 1e3 * float(np.linalg.norm(difference)),
+            )
+        )  # fmt: skip
+    return announced, halves
+
+
+def _left_deg(
+    path: Path,
+    track: EvaluationTrack,
+    calibration: StoredCalibration,
+    references: list[HeadingReference],
+) -> float:
+    return judge(path.name, track, calibration, references).headings[0].figures.after.rms_deg
+
+
+def print_honest(announced: list[Announced], halves: list[Halves]) -> None:
+    """Both as tables for a document."""
+    print("\n| made from | judged on | converged | error, deg | oracle | expected | ratio |")
+    print("|---|---|---|---|---|---|---|")
+    for a in announced:
+        print(
+            f"| {a.made_from.split('.')[0]} | {a.judged_on.split('.')[0]} | "
+            f"{'yes' if a.converged else 'no'} | {a.error_deg:.2f} | {a.oracle_deg:.2f} | "
+            f"{a.expected_deg:.2f} | {a.ratio:.2f} |"
+        )
+    ratios = [a.ratio for a in announced]
+    print(f"median {np.median(ratios):.2f}, most {max(ratios):.2f}")
+    print("\n| halves of | converged | apart, mG | in sigmas |\n|---|---|---|---|")
+    for h in halves:
+        said = ", ".join("yes" if c else "no" for c in h.converged)
+        print(f"| {h.name.split('.')[0]} | {said} | {h.apart_mg:.1f} | {h.sigmas:.2f} |")
+
+
 def print_judged(title: str, lines: list[Judged]) -> None:
     """The table of one experiment."""
     print(f"\n{title}")
@@ -306,12 +453,19 @@ def main() -> None:
         for row in rows:
             print(f"{row.method:20}{'ANSWERED' if row.converged else 'refused'}: {row.reason}")
         body["rest"] = [{"method": r.method, "refused": not r.converged} for r in rows]
+    if "honest" in arguments.only:
+        announced, halves = honest(RECORDINGS)
+        print_honest(announced, halves)
+        body["honest"] = {
+            "announced": [_as_json(line) for line in announced],
+            "halves": [_as_json(line) for line in halves],
+        }
     print(f"\n{time.process_time() - began:.0f} s of processor time")
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(body, indent=1))
 
 
-def _as_json(line: Judged) -> dict[str, object]:
+def _as_json(line: Judged | Announced | Halves) -> dict[str, object]:
     return {name: getattr(line, name) for name in line.__slots__}
 
 
