@@ -1,0 +1,209 @@
+"""The search over sets of components at one linearisation.
+
+Every set is judged by one function of the set alone: its largest log likelihood with the priors of
+its hyperparameters, plus the prior odds of its members.  So it does not matter whether a set was
+reached by adding or by dropping.  A beam of a few sets moves by add, drop and swap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from ahrsd.diagnosis.evidence import SIZES
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.evidence import At, maximised
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
+from ahrsd.samples import Array
+
+BEAM, ASKED, MOST_MOVES, FINER = 3, 5, 12, 4
+
+Names = frozenset[str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A set of components and how likely it is.  keys: in the order of the coefficients."""
+
+    names: Names
+    keys: tuple[str, ...]
+    at: At
+    score: float
+
+
+@dataclass(eq=False)
+class Hypotheses:
+    """Sets of components at one linearisation, each judged once.
+
+    remainder: keys of what every real recording leaves, in or out together
+    start: noise (B,) and psi by key that the richest model has
+    """
+
+    made: Linearised
+    remainder: tuple[str, ...]
+    start_noise: Array
+    start_psi: Mapping[str, Array]
+    judged: dict[Names, Hypothesis] = field(default_factory=dict)
+
+    def component(self, key: str) -> Component:
+        """By its key."""
+        return self.made.seen[key].component
+
+    def judge(self, names: Iterable[str]) -> Hypothesis:
+        """The set with these members beside the calibration."""
+        members = frozenset(names)
+        if members not in self.judged:
+            keys = (CALIBRATION, *sorted(members))
+            products = self.made.products(keys)
+            laws = [self.component(key).law for key in keys]
+            psi = [self.start_psi.get(k, law.start) for k, law in zip(keys, laws, strict=True)]
+            start = (self.start_noise, np.concatenate([*psi, np.zeros(0)]))
+            at = maximised(products, laws, [start])
+            score = at.nats + sum(self.component(key).prior for key in members)
+            score += self._of_class(members)
+            self.judged[members] = Hypothesis(members, keys, at, score)
+        return self.judged[members]
+
+    def _of_class(self, members: Names) -> float:
+        real = any(key in members for key in self.remainder)
+        return float(np.log(priors.REAL if real else 1.0 - priors.REAL))
+
+
+def scanned(
+    made: Linearised, keys: Sequence[str], at: At, candidates: Sequence[str]
+) -> dict[str, float]:
+    """Log Bayes factor of each candidate beside a model, in its noise, sizes averaged."""
+    products = made.products(keys)
+    inverse = np.exp(-at.log_noise)
+    laws = [made.seen[key].component.law for key in keys]
+    phi, begin = [], 0
+    for law in laws:
+        width = len(law.start)
+        phi.append(law.log_variance(at.psi[begin : begin + width]))
+        begin += width
+    A = np.tensordot(inverse, products.G, 1)
+    A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
+    factor = cho_factor(A)
+    s = inverse @ products.s
+    solved = cho_solve(factor, s)
+    out = {}
+    made.gram_between(keys, candidates)
+    for key in candidates:
+        C = np.concatenate(
+            [np.tensordot(inverse, made.pair(one, key), 1) for one in keys], axis=0
+        )
+        own = np.tensordot(inverse, made.pair(key, key), 1)
+        G = own - C.T @ cho_solve(factor, C)
+        left = inverse @ made.cross(key) - C.T @ solved
+        out[key] = averaged(G, left, made.seen[key].component)
+    return out
+
+
+def averaged(G: Array, s: Array, component: Component) -> float:
+    """Log Bayes factor of a component with information G (p, p) and score s (p,)."""
+    variance = component.law.log_variance(np.zeros(len(component.law.start)))
+    deviation = np.exp(0.5 * variance)
+    scaled = G * deviation * deviation[:, None]
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    values = np.maximum(values, 0.0)
+    score = vectors.T @ (s * deviation)
+    k2 = np.square(np.array(SIZES))[:, None] if len(component.law.start) else np.ones((1, 1))
+    terms = 0.5 * np.sum(score**2 / (values + 1 / k2) - np.log1p(k2 * values), axis=1)
+    return float(np.logaddexp.reduce(terms) - np.log(len(k2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """What a search may put into a set: candidates by effect, and free courses."""
+
+    effects: dict[str, list[str]]
+    courses: Sequence[str]
+    finer: Callable[[Component, int], list[Component]]
+
+
+def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
+    """The likeliest sets, best first."""
+    beam = _best([all_sets.judge(one) for one in starts])
+    done: set[Names] = set()
+    for _ in range(MOST_MOVES):
+        todo = [one for one in beam if one.names not in done]
+        if not todo or todo[0].score < beam[0].score - 10 * priors.MOVE:
+            break
+        here = todo[0]
+        done.add(here.names)
+        reached = [all_sets.judge(names) for names in moves(all_sets, space, here)]
+        beam = _best([*beam, *reached])
+    return beam
+
+
+def _best(found: Iterable[Hypothesis]) -> list[Hypothesis]:
+    unique = {one.names: one for one in found}
+    return sorted(unique.values(), key=lambda one: -one.score)[:BEAM]
+
+
+def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
+    """Sets that are one step away: a course or an effect more, one less, one for another."""
+    names = here.names
+    own = [key for key in names if key not in all_sets.remainder]
+    out = [names - {key} for key in own]
+    courses = [key for key in space.courses if key not in names]
+    out += [names | {key} for key in courses]
+    rest = frozenset(all_sets.remainder)
+    out.append(names - rest if rest <= names else names | rest)
+    bare = names - set(space.courses)
+    for base in {names, bare}:
+        ranked = asked(all_sets, space, base, here)
+        out += [base | {key} for key in ranked]
+    return list(dict.fromkeys(out))
+
+
+def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
+    """The likeliest setting of each of the likeliest effects, beside a base in here's noise."""
+    model = all_sets.judge(base)
+    at = At(
+        model.at.nats, model.at.gradient, model.at.mean, model.at.root, model.at.residual,
+        np.minimum(here.at.log_noise, model.at.log_noise), model.at.psi,
+    )  # fmt: skip
+    had = {all_sets.component(key).effect for key in base}
+    steps = {name for name in had if name and name.endswith("_step")}
+    candidates = [
+        key for name, keys in space.effects.items() if name not in had or name in steps
+        for key in keys if key not in base
+    ]  # fmt: skip
+    worth = scanned(all_sets.made, model.keys, at, candidates)
+    best: dict[str, tuple[float, str]] = {}
+    for key, nats in worth.items():
+        one = all_sets.component(key)
+        total = nats + one.prior
+        if total > best.get(one.effect or key, (-np.inf, ""))[0]:
+            best[one.effect or key] = (total, key)
+    ranked = sorted(best.values(), reverse=True)[:ASKED]
+    return [
+        sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0
+    ]
+
+
+def sought(
+    all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str
+) -> str:
+    """The candidate with its onset and scale sought more and more finely."""
+    made = all_sets.made
+    worth = scanned(made, keys, at, [key])[key] + all_sets.component(key).prior
+    for round_ in range(FINER):
+        near = space.finer(all_sets.component(key), round_)
+        if not near:
+            break
+        made.add(near)
+        found = scanned(made, keys, at, [one.key for one in near])
+        total = {one: nats + all_sets.component(one).prior for one, nats in found.items()}
+        first = max(total, key=lambda one: total[one])
+        if total[first] > worth:
+            key, worth = first, total[first]
+    listed = space.effects[all_sets.component(key).effect or ""]
+    if key not in listed:
+        listed.append(key)
+    return key

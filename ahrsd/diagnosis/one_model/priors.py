@@ -1,0 +1,84 @@
+"""Every prior, loss and ordinary size of the model, each with its unit, meaning and source.
+
+Ordinary sizes are printed by `python tests/benchmarks/bench_remainder_priors.py`, which measures
+them on untouched real recordings: lognormal about a median, `spread` in the logarithm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """A deviation that is lognormal.  median in the component's unit, spread of its logarithm."""
+
+    median: float
+    spread: float
+
+    def up_to(self) -> float:
+        """What 95 % stay below, the component's unit."""
+        from math import exp
+
+        return self.median * exp(1.645 * self.spread)
+
+
+# --- what every real recording leaves: measured ----------------------------------------------
+#: deviation over the recording, gauss and rad/s; of `by_...` of the coefficient of unit functions
+ORDINARY: Mapping[str, Size] = {
+    "world_course": Size(8e-3, 1.0),  # gauss
+    "gyro_course": Size(1e-3, 1.0),  # rad/s
+    "by_direction": Size(2e-3, 1.0),  # gauss, harmonics of degree 2 and 3 of the field's direction
+    "by_change": Size(1e-3, 1.0),  # s, of the field's change: axes that are late by different times
+    "bending": Size(0.3, 1.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(1e-3, 1.0),  # rad/s at 1 rad/s
+    "field_by_rate": Size(1e-3, 1.0),  # gauss at 1 rad/s
+    "by_force": Size(1e-3, 1.0),  # rad/s at 1 g
+}
+#: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
+ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
+
+#: of a delay between the sensors, s: BROAD 11 ms, a VN-100 read by hand 25 to 40, a flight 50 to 100
+ORDINARY_LAG_S = 0.04
+#: how much of a delay is a filter's, 1 all of it
+LAG_IS_FILTER = 0.5
+
+# --- what may be there besides ------------------------------------------------------------------
+#: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
+EFFECT = 1.0 / 60.0
+#: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
+ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
+#: of a course in time that nothing names, in one frame
+COURSE = 1.0 / 20.0
+#: that a recording leaves what real ones do, and not what a simulation does: nothing
+REAL = 0.5
+#: sizes of a course in its unit (1 mG, 0.1 mrad/s), and its time constants as shares of it all
+COURSE_UNIT: Mapping[str, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
+COURSE_SIZES = (1e-2, 3e3)
+#: corner of a course's spectrum, in half waves a recording
+COURSE_CORNERS = (1.0, 40.0)
+#: how many times its usual scale an effect is, evenly in the logarithm
+EFFECT_SIZES = (1e-2, 10.0)
+#: relative size of what an effect leaves of its form, its second order
+FORM = 0.03
+
+# --- noise --------------------------------------------------------------------------------------
+#: deviation of a log power from that of the next octave;  of the highest one's from the filter's
+NOISE_STEP, NOISE_TOP = 1.0, 3.0
+#: log powers between which a band stays
+NOISE_RANGE = (-9.0, 9.0)
+#: deviations from which a reading counts no more, and rows that a level's prior counts for
+WILD, LEVEL_ROWS = 4.0, 20.0
+#: seconds for which a level of the noise holds
+LEVEL_S = 2.0
+#: octaves of the noise's spectrum, at most
+BANDS = 7
+
+# --- the decision -------------------------------------------------------------------------------
+#: log odds from which an effect is told; a false name costs more than a missed one
+NAME_ODDS = 3.0
+#: log odds from which something is called unknown
+UNKNOWN_ODDS = 3.0
+#: nats that a move of the search must gain
+MOVE = 2.0
