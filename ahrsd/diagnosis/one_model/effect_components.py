@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
 from ahrsd.diagnosis.delays import beyond_the_lag
 from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.values import Columns, Context
 
 #: the delay that stands for all delays: which of them it is, is asked at the end
 LAG = "mag_time_lag"
@@ -21,6 +24,8 @@ NOT_ASKED = (
     LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
     "rotor_field",
 )  # fmt: skip
+#: seconds round a step for which whatever makes it (a hand with a magnet) may be anywhere
+_TRANSITION_S, _TRANSITION_PIECES = 2.0, 4
 #: parts of a recording's length, and factors, to which onsets and scales are sought
 _FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
 
@@ -38,6 +43,17 @@ def library_components(
     return out
 
 
+def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
+    """Effects by a logged cause (a current, a temperature, ...), each in its first setting."""
+    out = []
+    for name, effect in library.items():
+        logged = [need for need in effect.needs if "accel" not in need]
+        settings = effect.settings(context) if logged and name not in NOT_ASKED else ()
+        if settings:
+            out.append(component(context, effect, settings[0], len(settings)))
+    return out
+
+
 def component(context: Context, effect: Effect, setting: Setting, tried: int) -> Component:
     """An effect in one setting.  tried: settings among which it is chosen."""
     searched = int(setting.get("searched", 1))
@@ -51,6 +67,14 @@ def component(context: Context, effect: Effect, setting: Setting, tried: int) ->
         effect.identifier,
         dict(setting),
     )
+
+
+def anew(known: Component, context: Context, library: Mapping[str, Effect]) -> Component:
+    """A named component, its columns made of another context."""
+    if known.effect is None or known.key == LAG:
+        return known
+    columns = library[known.effect].columns(context, known.setting)
+    return replace(known, columns=columns)
 
 
 def delay(context: Context, library: Mapping[str, Effect]) -> Component:
@@ -92,3 +116,27 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
             factor = 1.5 ** (1.0 / (1 + round_))
             out += [{**setting, name: float(setting[name]) * f} for f in (1 / factor, factor)]
     return out
+
+
+def form_of(known: Component, context: Context) -> Component | None:
+    """What an effect leaves of its form; None where nothing is known of that.
+
+    A step takes its time: within some seconds of its onset the source may be at any size.
+    """
+    frame = {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}.get(
+        known.effect or ""
+    )
+    if frame is None:
+        return None
+    onset_s, width_s = float(known.setting["onset_s"]), 2 * _TRANSITION_S / _TRANSITION_PIECES
+    edges = onset_s - _TRANSITION_S + width_s * np.arange(_TRANSITION_PIECES + 1)
+    piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
+    inside = (piece[:, None] == np.arange(_TRANSITION_PIECES)).astype(float)
+    axes = unit_columns(context, cast("Frame", frame))
+    flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
+    columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+    law = known.law
+    if not isinstance(law, Sized):
+        return None
+    sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
+    return Component(f"form of {known.key}", frame, columns, sized)

@@ -28,8 +28,10 @@ from ahrsd.diagnosis.one_model import noise_model
 from ahrsd.diagnosis.one_model.component import Law
 from ahrsd.samples import Array
 
-#: a maximum is reached where a step gains less, of the nats' own size and at the least
-_FLAT, _STEPS = 1e-8, 80
+#: relative: columns that are alike but for rounding would else leave no root
+_ROUNDED = 1e-10
+#: a maximum is reached where a step gains less, of the nats' own size
+_FLAT, _STEPS = 1e-7, 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,20 +72,25 @@ def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Ar
     phi, slopes, prior, slope_of_prior = _laws(laws, psi)
     inverse = np.exp(-log_noise)
     deviation = np.exp(0.5 * phi)
-    G = np.tensordot(inverse, products.G, 1) * deviation
+    bands = products.G.reshape(len(inverse), -1)
+    G = (inverse @ bands).reshape(products.G.shape[1:])
+    G *= deviation
     G *= deviation[:, None]
     s = deviation * (inverse @ products.s)
     A = G.copy()
-    A[np.diag_indices_from(A)] += 1.0
-    L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
+    diagonal = np.diag_indices_from(A)
+    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
+    L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
     root, _ = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)
     seen = root @ s
     m = seen @ root
     weighted = m * deviation
-    covariance = (root.T @ root) * deviation * deviation[:, None]
-    fitted = np.einsum("bij,j->bi", products.G, weighted)
+    covariance = root.T @ root
+    covariance *= deviation
+    covariance *= deviation[:, None]
+    fitted = products.G @ weighted
     square = products.square - 2 * products.s @ weighted + fitted @ weighted
-    unsure = np.einsum("bij,ij->b", products.G, covariance)
+    unsure = bands @ covariance.ravel()
     residual = square + unsure
     by_phi = 0.5 * (m**2 - 1.0 + np.einsum("ij,ij->j", root, root))
     by_noise = 0.5 * (residual * inverse - products.rows)
@@ -137,6 +144,6 @@ def _climbed(products: Products, laws: Sequence[Law], log_noise: Array, psi: Arr
 
     start = np.clip(np.concatenate([log_noise, psi]), low, high) / unit
     box = optimize.Bounds(low / unit, high / unit)
-    options = {"maxiter": _STEPS, "ftol": _FLAT, "gtol": 1e-3}
+    options = {"maxiter": _STEPS, "ftol": _FLAT, "gtol": 1e-3, "maxfun": 2 * _STEPS}
     optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=box, options=options)
     return best[0]

@@ -20,20 +20,21 @@ from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
 #: half waves of a course: one in so many seconds, and from few to many
-MODE_S, FEWEST, MOST = 4.0, 20, 40
+MODE_S, FEWEST, MOST = 5.0, 16, 28
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CourseLaw:
     """psi: logarithms of the size, in units of `unit`, and of the corner, in half waves.
 
-    order (q,): of each coefficient;  mean, spread: of the log size; spread 0: even
+    order (q,): of each coefficient;  mean, spread: of the log size; spread 0: even;  most: units
     """
 
     order: Array
     unit: float
     mean: float = 0.0
     spread: float = 0.0
+    most: float = priors.COURSE_SIZES[1]
 
     @property
     def start(self) -> Array:
@@ -45,7 +46,7 @@ class CourseLaw:
 
     @property
     def high(self) -> Array:
-        return np.log([priors.COURSE_SIZES[1], priors.COURSE_CORNERS[1]])
+        return np.log([self.most, priors.COURSE_CORNERS[1]])
 
     def _shape(self, psi: Array) -> tuple[Array, Array]:
         """Log shape (q,) before it is scaled, and its slope in the log corner (q,)."""
@@ -83,7 +84,8 @@ def course(context: Context, frame: Frame, ordinary: priors.Size | None = None) 
     law = CourseLaw(np.repeat(order, 3).astype(float), unit)
     key = f"free {frame}"
     if ordinary is not None:
-        law = CourseLaw(law.order, unit, float(np.log(ordinary.median / unit)), ordinary.spread)
+        middle = float(np.log(ordinary.median / unit))
+        law = CourseLaw(law.order, unit, middle, ordinary.spread, ordinary.most / unit)
         key = f"{frame}_course"
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     odds = 0.0 if ordinary is not None else float(np.log(priors.COURSE))

@@ -126,6 +126,13 @@ class Linearised:
         rows = np.array([(b - a) * used for a, b in self._bands()])
         return Products(G, s, square, rows)
 
+    @property
+    def log_whitening(self) -> float:
+        """By how much the rows are denser than readings, nats: makes points comparable."""
+        done, used = self.point.filtered, self.point.filtered.used
+        own = done.log_likelihood + 0.5 * np.sum(done.whitened**2, axis=1) + 1.5 * np.log(2 * np.pi)
+        return float(np.sum(own[used]) - 3.0 * np.sum(np.log(self.point.amplitude[used])))
+
     def gram_of(self, keys: Sequence[str]) -> None:
         """Fill in the pairs of many components at once, which is quicker than one by one."""
         X = np.concatenate([self.seen[key].rows for key in keys], axis=1)
@@ -208,13 +215,20 @@ def first_point(problem: Problem, filtered: Filtered) -> Point:
     return Point(problem, filtered, {}, None, None, np.ones(len(filtered.whitened)))
 
 
-def moved(made: Linearised, keys: Sequence[str], at: At) -> Point:
+def moved(made: Linearised, keys: Sequence[str], at: At, share: float = 1.0) -> Point:
     """The point at a model's likeliest coefficients, in noise estimated anew.
 
     A delay is taken out of the track exactly, all else out of the readings.
+    share: of the way there
     """
-    values = by_key(made, keys, at)
-    problem = made.point.problem
+    problem, before = made.point.problem, made.point.values
+    values = {
+        key: value + (1.0 - share) * (before.get(key, np.zeros(len(value))) - value)
+        for key, value in by_key(made, keys, at).items()
+    }
+    here = coefficients(made.point.filtered.model) - prior_of(problem.track).mean
+    found = by_key(made, [keys[0]], at)[CALIBRATION]
+    values[CALIBRATION] = here + share * (found - here)
     model = model_of(
         values[CALIBRATION] + prior_of(problem.track).mean, made.point.filtered.model
     )
@@ -224,11 +238,20 @@ def moved(made: Linearised, keys: Sequence[str], at: At) -> Point:
     if lag_s != problem.lag_s:
         problem = problem.lagging(lag_s)
     filtered = run_filter(problem.track, model, mag, gyro)
-    again = noise_fit.estimated(filtered, problem.spec, mag, gyro, walk=False)
+    again = _no_louder(noise_fit.estimated(filtered, problem.spec, mag, gyro, walk=False), model)
     filtered = run_filter(problem.track, again, mag, gyro)
     left = noise_model.amplitude(made.left_by(keys, at), made.point.filtered.used, problem.rate_hz)
     del values[CALIBRATION]
     return Point(problem, filtered, values, mag, gyro, left)
+
+
+def _no_louder(found: NullModel, before: NullModel) -> NullModel:
+    """The noise that was found, but for what is louder than before: that would be the misfit's."""
+    return replace(
+        found,
+        sigma_mag_gauss=min(found.sigma_mag_gauss, before.sigma_mag_gauss),
+        sigma_gyro_rad_s=min(found.sigma_gyro_rad_s, before.sigma_gyro_rad_s),
+    )
 
 
 def by_key(made: Linearised, keys: Sequence[str], at: At) -> dict[str, Array]:

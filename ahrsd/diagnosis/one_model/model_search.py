@@ -8,7 +8,7 @@ reached by adding or by dropping.  A beam of a few sets moves by add, drop and s
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -34,6 +34,11 @@ class Hypothesis:
     at: At
     score: float
 
+    def at_of(self, other: Hypothesis) -> At:
+        """Another hypothesis in the quieter noise of the two: what one lacks is no noise."""
+        quiet = np.minimum(self.at.log_noise, other.at.log_noise)
+        return replace(other.at, log_noise=quiet)
+
 
 @dataclass(eq=False)
 class Hypotheses:
@@ -41,12 +46,14 @@ class Hypotheses:
 
     remainder: keys of what every real recording leaves, in or out together
     start: noise (B,) and psi by key that the richest model has
+    forms: key of what a component leaves of its form, which comes and goes with it
     """
 
     made: Linearised
     remainder: tuple[str, ...]
     start_noise: Array
     start_psi: Mapping[str, Array]
+    forms: dict[str, str] = field(default_factory=dict)
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
 
     def component(self, key: str) -> Component:
@@ -57,7 +64,8 @@ class Hypotheses:
         """The set with these members beside the calibration."""
         members = frozenset(names)
         if members not in self.judged:
-            keys = (CALIBRATION, *sorted(members))
+            forms = [self.forms[key] for key in members if key in self.forms]
+            keys = (CALIBRATION, *sorted(members), *sorted(forms))
             products = self.made.products(keys)
             laws = [self.component(key).law for key in keys]
             psi = [self.start_psi.get(k, law.start) for k, law in zip(keys, laws, strict=True)]
@@ -123,6 +131,7 @@ class Space:
     effects: dict[str, list[str]]
     courses: Sequence[str]
     finer: Callable[[Component, int], list[Component]]
+    form: Callable[[Component], Component | None]
 
 
 def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
@@ -164,10 +173,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
 def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
     """The likeliest setting of each of the likeliest effects, beside a base in here's noise."""
     model = all_sets.judge(base)
-    at = At(
-        model.at.nats, model.at.gradient, model.at.mean, model.at.root, model.at.residual,
-        np.minimum(here.at.log_noise, model.at.log_noise), model.at.psi,
-    )  # fmt: skip
+    at = here.at_of(model)
     had = {all_sets.component(key).effect for key in base}
     steps = {name for name in had if name and name.endswith("_step")}
     candidates = [
@@ -203,6 +209,10 @@ def sought(
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:
             key, worth = first, total[first]
+    form = space.form(all_sets.component(key))
+    if form is not None and key not in all_sets.forms:
+        made.add([form])
+        all_sets.forms[key] = form.key
     listed = space.effects[all_sets.component(key).effect or ""]
     if key not in listed:
         listed.append(key)

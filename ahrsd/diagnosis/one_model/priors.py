@@ -8,33 +8,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import exp
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """A deviation that is lognormal.  median in the component's unit, spread of its logarithm."""
+    """A deviation that is lognormal.
+
+    median: in the component's unit;  spread: of its logarithm;  most: what physics allows
+    """
 
     median: float
     spread: float
+    most: float
 
     def up_to(self) -> float:
         """What 95 % stay below, the component's unit."""
-        from math import exp
-
         return self.median * exp(1.645 * self.spread)
 
 
 # --- what every real recording leaves: measured ----------------------------------------------
-#: deviation over the recording, gauss and rad/s; of `by_...` of the coefficient of unit functions
+#: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(8e-3, 1.0),  # gauss
-    "gyro_course": Size(1e-3, 1.0),  # rad/s
-    "by_direction": Size(2e-3, 1.0),  # gauss, harmonics of degree 2 and 3 of the field's direction
-    "by_change": Size(1e-3, 1.0),  # s, of the field's change: axes that are late by different times
-    "bending": Size(0.3, 1.0),  # of the library's usual flexible mount
-    "by_rate_squared": Size(1e-3, 1.0),  # rad/s at 1 rad/s
-    "field_by_rate": Size(1e-3, 1.0),  # gauss at 1 rad/s
-    "by_force": Size(1e-3, 1.0),  # rad/s at 1 g
+    "world_course": Size(8e-3, 1.0, 0.1),  # gauss
+    "gyro_course": Size(5e-4, 1.5, 0.05),  # rad/s
+    "by_direction": Size(1e-3, 1.0, 0.02),  # gauss: harmonics of degree 2 and 3 of the direction
+    "by_change": Size(1e-3, 1.0, 0.03),  # s, of the field's change: axes that are late differently
+    "bending": Size(0.3, 1.0, 3.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(3e-4, 1.5, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(3e-4, 1.0, 0.02),  # gauss at 1 rad/s
+    "by_force": Size(1e-3, 1.5, 0.03),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
@@ -55,7 +58,7 @@ COURSE = 1.0 / 20.0
 REAL = 0.5
 #: sizes of a course in its unit (1 mG, 0.1 mrad/s), and its time constants as shares of it all
 COURSE_UNIT: Mapping[str, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
-COURSE_SIZES = (1e-2, 3e3)
+COURSE_SIZES = (1e-2, 5e2)
 #: corner of a course's spectrum, in half waves a recording
 COURSE_CORNERS = (1.0, 40.0)
 #: how many times its usual scale an effect is, evenly in the logarithm

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.innovation import TRACELESS
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import course
@@ -18,6 +19,10 @@ from ahrsd.samples import Array
 
 _GRAVITY = 9.81
 _ASIDE = np.eye(3)
+_SKEW = np.array([
+    [[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+    [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
+])  # fmt: skip
 
 
 def ordinary_remainder(context: Context) -> list[Component]:
@@ -26,7 +31,7 @@ def ordinary_remainder(context: Context) -> list[Component]:
         course(context, "world", priors.ORDINARY["world_course"]),
         course(context, "gyro", priors.ORDINARY["gyro_course"]),
         _sized(context, "by_direction", "sensor", harmonics(context.smooth_b)),
-        _sized(context, "by_change", "sensor", context.field_dot_b),
+        by_change(context),
         _sized(context, "field_by_rate", "sensor", context.rate_b_rad_s),
         bending(context),
         _sized(context, "by_rate_squared", "gyro", squares(context.rate_b_rad_s)),
@@ -39,23 +44,31 @@ def ordinary_remainder(context: Context) -> list[Component]:
 
 def _sized(context: Context, key: str, frame: str, functions: Array) -> Component:
     """Each function (N, k) along each axis of the sensor, all coefficients of one size."""
-    size = priors.ORDINARY[key]
-    mean = float(np.log(size.median))
-    width = 3 * functions.shape[1]
-    reach = 5.0 * size.spread
-    law = Sized(np.ones(width), np.array([mean - reach]), np.array([mean + reach]), mean, size.spread)
+    law = ordinary(priors.ORDINARY[key], np.ones(3 * functions.shape[1]))
     flat = np.einsum("nk,ia->nika", functions, _ASIDE).reshape(len(functions), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     return Component(key, frame, columns, law)
 
 
+def ordinary(size: priors.Size, scale: Array) -> Sized:
+    """The law of an ordinary size, of coefficients in units of `scale` (q,)."""
+    mean = float(np.log(size.median))
+    low, high = mean - 4.0 * size.spread, float(np.log(size.most))
+    return Sized(scale, np.array([low]), np.array([high]), mean, size.spread)
+
+
+def by_change(context: Context) -> Component:
+    """A matrix on the field's change, without what is alike on all axes: that is the delay."""
+    matrix = np.concatenate([TRACELESS, _SKEW])
+    columns = np.einsum("aij,nj->nia", matrix, context.field_dot_b)
+    law = ordinary(priors.ORDINARY["by_change"], np.ones(len(matrix)))
+    return Component("by_change", "sensor", Columns(mag=columns), law)
+
+
 def bending(context: Context) -> Component:
     """A mount that gives: turned by what force and angular acceleration do to it."""
     found = EFFECTS["flexible_mount"]
-    size = priors.ORDINARY["bending"]
-    mean, reach = float(np.log(size.median)), 5.0 * size.spread
-    scale = np.array([one.scale for one in found.parameters])
-    law = Sized(scale, np.array([mean - reach]), np.array([mean + reach]), mean, size.spread)
+    law = ordinary(priors.ORDINARY["bending"], np.array([one.scale for one in found.parameters]))
     return Component("bending", "sensor", found.columns(context, {}), law)
 
 
