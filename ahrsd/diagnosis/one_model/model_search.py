@@ -72,9 +72,16 @@ class Hypotheses:
             start = (self.start_noise, np.concatenate([*psi, np.zeros(0)]))
             at = maximised(products, laws, [start])
             score = at.nats + sum(self.component(key).prior for key in members)
+            score += self._again(members)
             score += self._of_class(members)
             self.judged[members] = Hypothesis(members, keys, at, score)
         return self.judged[members]
+
+    def _again(self, members: Names) -> float:
+        """What was put on is taken off: a further step of one kind is no rare thing."""
+        steps = [e for key in members if (e := self.component(key).effect) and e.endswith("_step")]
+        more = len(steps) - len(set(steps))
+        return more * float(np.log(priors.AGAIN / priors.EFFECT))
 
     def _of_class(self, members: Names) -> float:
         real = any(key in members for key in self.remainder)

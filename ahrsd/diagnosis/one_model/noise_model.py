@@ -1,6 +1,6 @@
-"""The noise: a power per octave, a level per moment, and readings that are wild.
+"""The noise: a power per octave, a level per moment, and single readings that are wild.
 
-    e_n = a_n s_n,     s stationary, its power per octave v_b;  a_n known in each pass
+    e_n = a_n s_n,     s stationary, its power per octave v_b;  a_n a level, known in each pass
 
 The octaves are of cosines over the whole recording, of readings that were divided by a_n.  v is a
 smooth spectrum: octave to octave a step of its logarithm, so that the lowest, which has few
@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.samples import Array
 
-_ROUNDS = 4
+#: rows round one among which it is wild alone
+_AROUND = 9
 
 
 def octaves(count: int) -> NDArray[np.intp]:
@@ -44,26 +46,26 @@ def bounds(count: int) -> tuple[Array, Array]:
 
 
 def amplitude(residual: Array, used: NDArray[np.bool], rate_hz: float) -> Array:
-    """(N,) how much louder than usual each row is, from a residual (N, 3) without colour.
+    """(N,) how loud each row is, from a residual (N, 3) without colour.
 
-    A level per moment, drawn to the usual one; a row that is wild besides counts as one at the
-    edge of what is not.
+    The level is the moving median of the quick part alone: a step, a current or a course is slow or
+    short, and a level that followed it would leave no evidence of it.  A row that is wild alone
+    counts as one at the edge of what is not.
     """
-    square = np.sum(residual**2, axis=1) / 3.0
-    square = square / max(_usual(square, used), 1e-300)
+    quick = np.diff(residual, n=2, axis=0, prepend=residual[:1], append=residual[-1:])
+    rows = 2 * round(priors.LEVEL_S * rate_hz / 2) + 1
+    level = median_filter(_square(quick, used), size=min(rows, len(used)), mode="nearest")
+    level = np.clip(level / max(float(np.median(level)), 1e-300), *priors.LEVELS)
+    square = _square(residual, used) / level
+    square = square / max(float(np.median(square[used])) * 3.0 / 2.366, 1e-300)
     edge = priors.WILD**2 / 3.0
-    rows = max(1, round(priors.LEVEL_S * rate_hz))
-    moment = np.arange(len(square)) // rows
-    level = np.ones(int(moment[-1]) + 1)
-    for _ in range(_ROUNDS):  # what is wild is so beside its own moment
-        kept = np.minimum(square, edge * level[moment])
-        power = np.bincount(moment, np.where(used, kept, 0.0))
-        known = np.bincount(moment, used)
-        level = (power + priors.LEVEL_ROWS) / (known + priors.LEVEL_ROWS)
-    wild = np.maximum(square / (edge * level[moment]), 1.0)
-    return np.where(used, np.sqrt(level[moment] * wild), 1.0)
+    around = median_filter(square, size=_AROUND, mode="nearest")
+    alone = used & (square > edge) & (around < edge / 2)
+    wild = np.where(alone, np.maximum(square / edge, 1.0), 1.0)
+    return np.asarray(np.sqrt(level * wild))
 
 
-def _usual(square: Array, used: NDArray[np.bool]) -> float:
-    """Mean of the squares, from their median (chi-square of three)."""
-    return float(np.median(square[used])) * 3.0 / 2.366 if np.any(used) else 1.0
+def _square(values: Array, used: NDArray[np.bool]) -> Array:
+    """(N,) mean squares of rows; the median where there is no reading."""
+    square = np.sum(values**2, axis=1) / 3.0
+    return np.where(used, square, np.median(square[used]) if np.any(used) else 1.0)

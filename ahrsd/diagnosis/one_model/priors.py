@@ -52,6 +52,8 @@ LAG_IS_FILTER = 0.5
 EFFECT = 1.0 / 60.0
 #: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
 ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
+#: of a further step of a kind that is there: what was put on is taken off
+AGAIN = 0.3
 #: of a course in time that nothing names, in one frame
 COURSE = 1.0 / 20.0
 #: that a recording leaves what real ones do, and not what a simulation does: nothing
@@ -71,10 +73,10 @@ FORM = 0.03
 NOISE_STEP, NOISE_TOP = 1.0, 3.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
-#: deviations from which a reading counts no more, and rows that a level's prior counts for
-WILD, LEVEL_ROWS = 4.0, 20.0
-#: seconds for which a level of the noise holds
-LEVEL_S = 2.0
+#: deviations from which a reading that is off alone counts no more
+WILD = 4.0
+#: seconds over which the noise's level is taken;  powers between which it stays, of the median's
+LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 
