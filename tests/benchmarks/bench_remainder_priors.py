@@ -52,7 +52,8 @@ def profiles(path: Path) -> dict[str, list[list[float]]]:
     track, _ = without_jumps(roles.prepared(track)[0])
     problem, cold = problem_of(put_right(track, hygiene(track)), Spec(), {}, LIMITS)
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    made, remainder, keys = rich.base_of(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    base = rich.base_of(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    made, remainder, keys = base.made, base.remainder, base.whole
     at = rich.fitted(made, keys, None)
     products = made.products(keys)
     laws = [made.seen[key].component.law for key in keys]
@@ -90,7 +91,7 @@ def law_of(curves: list[list[list[float]]]) -> priors.Size:
         (minimize(cost, [middle + d, 0.7], method="Nelder-Mead") for d in (-1.0, 0.0, 1.0)),
         key=lambda one: one.fun,
     )
-    return priors.Size(float(np.exp(found.x[0])), LEAST_SPREAD + abs(float(found.x[1])))
+    return priors.Size(float(np.exp(found.x[0])), LEAST_SPREAD + abs(float(found.x[1])), np.inf)
 
 
 def main() -> None:
@@ -116,7 +117,8 @@ def main() -> None:
         known = json.loads(given.table.read_text())
         for key in priors.ORDINARY:
             found = law_of([one[key] for one in known.values() if key in one])
-            print(f'    "{key}": Size({found.median:.2e}, {found.spread:.2f}),')
+            most = priors.ORDINARY[key].most
+            print(f'    "{key}": Size({found.median:.2e}, {found.spread:.2f}, {most:g}),')
 
 
 if __name__ == "__main__":
