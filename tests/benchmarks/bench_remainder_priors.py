@@ -54,8 +54,8 @@ def profiles(path: Path) -> dict[str, list[list[float]]]:
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     base = rich.base_of(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
     made, remainder, keys = base.made, base.remainder, base.whole
-    at = rich.fitted(made, keys, None)
-    products = made.products(keys)
+    at = rich.fitted(made, keys)
+    products = made.products(keys, priors.NOISE_STEP_REAL)
     laws = [made.seen[key].component.law for key in keys]
     out, begin = {}, 0
     for key, law in zip(keys, laws, strict=True):

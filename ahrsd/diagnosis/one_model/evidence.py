@@ -36,12 +36,16 @@ _FLAT, _STEPS = 1e-7, 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Products:
-    """What the data say, band by band.  G (B, q, q), s (B, q), square (B,), rows (B,)."""
+    """What the data say, band by band.
+
+    G (B, q, q), s (B, q), square (B,), rows (B,);  step: of the noise's spectrum (`noise_model`)
+    """
 
     G: Array
     s: Array
     square: Array
     rows: Array
+    step: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +98,7 @@ def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Ar
     residual = square + unsure
     by_phi = 0.5 * (m**2 - 1.0 + np.einsum("ij,ij->j", root, root))
     by_noise = 0.5 * (residual * inverse - products.rows)
-    of_noise, slope_of_noise = noise_model.log_prior(log_noise)
+    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step)
     likelihood = 0.5 * float(seen @ seen) + float(np.sum(np.log(np.diag(root))))
     likelihood -= 0.5 * float(
         products.rows @ (log_noise + np.log(2 * np.pi)) + products.square @ inverse

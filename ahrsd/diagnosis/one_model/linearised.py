@@ -115,8 +115,8 @@ class Linearised:
     def _bands(self) -> list[tuple[int, int]]:
         return [(3 * int(a), 3 * int(b)) for a, b in zip(self.edges, self.edges[1:], strict=False)]
 
-    def products(self, keys: Sequence[str]) -> Products:
-        """All that the data say of these components."""
+    def products(self, keys: Sequence[str], step: float) -> Products:
+        """All that the data say of these components; step: prior of the noise's spectrum."""
         G = np.concatenate(
             [np.concatenate([self.pair(a, b) for b in keys], axis=2) for a in keys], axis=1
         )
@@ -124,7 +124,7 @@ class Linearised:
         square = np.array([float(self.y[a:b] @ self.y[a:b]) for a, b in self._bands()])
         used = float(np.mean(self.point.filtered.used))
         rows = np.array([(b - a) * used for a, b in self._bands()])
-        return Products(G, s, square, rows)
+        return Products(G, s, square, rows, step)
 
     @property
     def log_whitening(self) -> float:
@@ -211,8 +211,14 @@ def model_of(values: Array, like: NullModel) -> NullModel:
 
 
 def first_point(problem: Problem, filtered: Filtered) -> Point:
-    """The null, nothing taken out, all rows alike."""
-    return Point(problem, filtered, {}, None, None, np.ones(len(filtered.whitened)))
+    """The null's calibration in the sensors' own noise, nothing taken out, all rows alike.
+
+    Own noise is that of differences from reading to reading: the null's is the mismatch's as well.
+    """
+    own = noise_fit.first_guess(problem.track, problem.spec)
+    quiet = _no_louder(replace(filtered.model, sigma_mag_gauss=own.sigma_mag_gauss), filtered.model)
+    again = run_filter(problem.track, quiet)
+    return Point(problem, again, {}, None, None, np.ones(len(again.whitened)))
 
 
 def moved(made: Linearised, keys: Sequence[str], at: At, share: float = 1.0) -> Point:

@@ -66,7 +66,9 @@ class Hypotheses:
         if members not in self.judged:
             forms = [self.forms[key] for key in members if key in self.forms]
             keys = (CALIBRATION, *sorted(members), *sorted(forms))
-            products = self.made.products(keys)
+            real = any(key in members for key in self.remainder)
+            step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
+            products = self.made.products(keys, step)
             laws = [self.component(key).law for key in keys]
             psi = [self.start_psi.get(k, law.start) for k, law in zip(keys, laws, strict=True)]
             start = (self.start_noise, np.concatenate([*psi, np.zeros(0)]))
@@ -92,7 +94,7 @@ def scanned(
     made: Linearised, keys: Sequence[str], at: At, candidates: Sequence[str]
 ) -> dict[str, float]:
     """Log Bayes factor of each candidate beside a model, in its noise, sizes averaged."""
-    products = made.products(keys)
+    products = made.products(keys, priors.NOISE_STEP_REAL)
     inverse = np.exp(-at.log_noise)
     laws = [made.seen[key].component.law for key in keys]
     phi, begin = [], 0

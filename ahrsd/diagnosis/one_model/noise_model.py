@@ -29,15 +29,15 @@ def octaves(count: int) -> NDArray[np.intp]:
     return np.array([0, *edges[::-1]], dtype=np.intp)
 
 
-def log_prior(log_noise: Array) -> tuple[float, Array]:
-    """Log density of the bands' log powers (B,), and its gradient."""
-    step = np.diff(log_noise) / priors.NOISE_STEP
+def log_prior(log_noise: Array, deviation: float) -> tuple[float, Array]:
+    """Log density of the bands' log powers (B,), and its gradient; deviation: octave to octave."""
+    step = np.diff(log_noise) / deviation
     top = log_noise[-1] / priors.NOISE_TOP
     gradient = np.zeros(len(log_noise))
-    gradient[:-1] += step / priors.NOISE_STEP
-    gradient[1:] -= step / priors.NOISE_STEP
+    gradient[:-1] += step / deviation
+    gradient[1:] -= step / deviation
     gradient[-1] -= top / priors.NOISE_TOP
-    return -0.5 * float(step @ step + top**2), gradient
+    return -0.5 * float(step @ step + top**2) - len(step) * float(np.log(deviation)), gradient
 
 
 def bounds(count: int) -> tuple[Array, Array]:

@@ -69,8 +69,9 @@ EFFECT_SIZES = (1e-2, 10.0)
 FORM = 0.03
 
 # --- noise --------------------------------------------------------------------------------------
-#: deviation of a log power from that of the next octave;  of the highest one's from the filter's
-NOISE_STEP, NOISE_TOP = 1.0, 3.0
+#: deviation of a log power from that of the next octave: of a sensor's own noise, and of what a real
+#: recording leaves as well; free where only a delay is sought;  of the highest one's from the filter's
+NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
 #: deviations from which a reading that is off alone counts no more

@@ -16,6 +16,7 @@ import numpy as np
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation import Filtered
 from ahrsd.diagnosis.locate import FRAMES
+from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG, anew, causes, delay, delay_form
 from ahrsd.diagnosis.one_model.evidence import At, maximised
@@ -75,18 +76,17 @@ def base_of(point: Point, library: Mapping[str, Effect], named: Sequence[Compone
 
 
 def fitted(
-    made: Linearised, keys: Sequence[str], start: tuple[np.ndarray, Mapping[str, np.ndarray]] | None
+    made: Linearised, keys: Sequence[str], step: float = priors.NOISE_STEP_REAL
 ) -> At:
-    """The likeliest hyperparameters of a model, from the highest band's power, or from a start."""
-    products = made.products(keys)
+    """The likeliest hyperparameters of a model, from the highest band's power on.
+
+    That is the sensor's own: from there an effect is not noise before it was asked for.
+    """
+    products = made.products(keys, step)
     laws = [made.seen[key].component.law for key in keys]
     psi = np.concatenate([law.start for law in laws])
     top = float(np.log(products.square[-1] / products.rows[-1]))
     starts = [(np.full(len(products.rows), top), psi)]
-    if start is not None:
-        noise, known = start
-        warm = [known.get(key, law.start) for key, law in zip(keys, laws, strict=True)]
-        starts = [(noise, np.concatenate(warm))]
     return maximised(products, laws, starts)
 
 
@@ -150,5 +150,6 @@ def _judged(
 ) -> _Judged:
     base = base_of(point, library, named)
     keys = base.whole if whole else base.small
-    at = fitted(base.made, keys, None)
+    step = priors.NOISE_STEP_REAL if whole else priors.NOISE_STEP_FREE
+    at = fitted(base.made, keys, step)
     return _Judged(base.made, keys, at, at.nats + base.made.log_whitening)

@@ -59,7 +59,7 @@ def _space(
             forms[one.key] = form.key
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
-    at = rich.fitted(made, base.whole, None)
+    at = rich.fitted(made, base.whole)
     psi = rich.psi_by_key(made, base.whole, at)
     all_sets = Hypotheses(made, base.remainder, at.log_noise, psi, forms)
     length_s = context.track.duration_s

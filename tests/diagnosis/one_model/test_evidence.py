@@ -11,7 +11,7 @@ from ahrsd.diagnosis.one_model.component import Fixed, Sized
 from ahrsd.diagnosis.one_model.evidence import Products, evaluated, maximised
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
 
-ROWS = (20, 20, 40, 80)
+ROWS, STEP = (20, 20, 40, 80), 0.7
 
 
 def design(seed: int, widths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -32,6 +32,7 @@ def products(B: np.ndarray, y: np.ndarray) -> Products:
         np.stack([B[p].T @ y[p] for p in parts]),
         np.array([y[p] @ y[p] for p in parts]),
         np.array(ROWS, dtype=float),
+        STEP,
     )
 
 
@@ -58,7 +59,7 @@ def dense(B: np.ndarray, y: np.ndarray, log_noise: np.ndarray, psi: np.ndarray) 
         prior += law.log_prior(mine)[0]
     V = np.diag(np.repeat(np.exp(log_noise), ROWS)) + (B * np.concatenate(variance)) @ B.T
     readings = multivariate_normal(np.zeros(len(y)), V).logpdf(y)
-    return float(readings + prior + noise_model.log_prior(log_noise)[0])
+    return float(readings + prior + noise_model.log_prior(log_noise, STEP)[0])
 
 
 LOG_NOISE, PSI = np.array([0.4, 0.1, -0.2, 0.3]), np.array([-0.4, -0.9, 0.2, 0.8])
