@@ -16,7 +16,7 @@ from ahrsd.diagnosis.diagnosis import Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM
+from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, scanned
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
@@ -44,16 +44,44 @@ def decided(
 ) -> Answer:
     """The answer of a search."""
     best, odds = _borne_out(all_sets, space, best)
+    switching = _switching(all_sets, best)
     found, terms = [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
-        if all_sets.component(key).effect is None:
+        effect = all_sets.component(key).effect
+        if effect is None or effect == switching:
             continue
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
     left = _left(all_sets, space, best, odds)
+    if switching is not None and not left.detected:
+        left = _jumping(all_sets, best, switching, odds)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
     return Answer(best, tuple(found), tuple(terms), left, surest)
+
+
+def _switching(all_sets: Hypotheses, best: Hypothesis) -> str | None:
+    """The kind of step of which there are so many that they are one source that changes."""
+    kinds = [all_sets.component(key).effect for key in best.names]
+    many = [k for k in STEPS if kinds.count(k) >= priors.CHANGES]
+    return max(many, key=kinds.count) if many else None
+
+
+def _jumping(
+    all_sets: Hypotheses, best: Hypothesis, kind: str, odds: Mapping[str, float]
+) -> Unexplained:
+    """A source that goes in steps: its levels between the changes, along its direction."""
+    keys = [key for key in best.names if all_sets.component(key).effect == kind]
+    keys.sort(key=lambda key: float(all_sets.component(key).setting["onset_s"]))
+    changes = np.array([coefficients(all_sets, best, key)[0] for key in keys])
+    onsets = [float(all_sets.component(key).setting["onset_s"]) for key in keys]
+    time_s = all_sets.made.context.track.time_s
+    at = np.linspace(time_s[0], time_s[-1], _PIECES)
+    levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
+    course = levels[np.searchsorted(onsets, at, side="right")]
+    frame = STEPS[kind]
+    nats = sum(odds[key] for key in keys)
+    return _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
 
 def _borne_out(
@@ -228,19 +256,26 @@ def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Un
     order = np.arange(1, len(modes) + 1)
     phase = np.pi * (at - time_s[0]) / (time_s[-1] - time_s[0])
     course = np.cos(phase[:, None] * order) @ modes
-    direction, share = single_source(course, np.ones(_PIECES))
+    whole = ((float(time_s[0]), float(time_s[-1])),)
+    return _described(at, course, one.frame, odds, whole)
+
+
+def _described(
+    at: Array, course: Array, frame: str, nats: float, spans: tuple[tuple[float, float], ...]
+) -> Unexplained:
+    """A course (k, 3) at times (k,) as what no name explains."""
+    direction, share = single_source(course, np.ones(len(at)))
     source = course @ direction
     spread = course.std(axis=0)
     axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.3 * spread.max())
     x, y, z = (float(part) for part in direction)
-    whole = ((float(time_s[0]), float(time_s[-1])),)
     return Unexplained(
         detected=True,
-        where=Where(whole, axes, one.frame, direction=(x, y, z)),
+        where=Where(spans, axes, frame, direction=(x, y, z)),
         size=float(np.ptp(source)),
-        unit="rad/s" if one.frame == "gyro" else "gauss",
+        unit="rad/s" if frame == "gyro" else "gauss",
         single_source_share=share,
-        evidence_nats=float(odds),
+        evidence_nats=float(nats),
         course=tuple(zip(at.tolist(), source.tolist(), strict=True)),
     )
 

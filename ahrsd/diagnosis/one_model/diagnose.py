@@ -27,7 +27,7 @@ from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.track import Spec, Track
 
 #: linearisations with a search each, at most
-ROUNDS = 3
+ROUNDS = 2
 NOTE = "by the engine one-model, which is experimental"
 
 

@@ -19,6 +19,8 @@ from ahrsd.diagnosis.values import Columns, Context
 #: the delay that stands for all delays: which of them it is, is asked at the end
 LAG = "mag_time_lag"
 LAG_FORM = "form of the delay"
+#: what jumps, and in which frame
+STEPS = {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}
 #: delays and what only the recorded rate shows are not asked
 NOT_ASKED = (
     LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
@@ -123,9 +125,7 @@ def form_of(known: Component, context: Context) -> Component | None:
 
     A step takes its time: within some seconds of its onset the source may be at any size.
     """
-    frame = {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}.get(
-        known.effect or ""
-    )
+    frame = STEPS.get(known.effect or "")
     if frame is None:
         return None
     onset_s, width_s = float(known.setting["onset_s"]), 2 * _TRANSITION_S / _TRANSITION_PIECES

@@ -20,7 +20,9 @@ from ahrsd.diagnosis.one_model.evidence import At, maximised
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
 from ahrsd.samples import Array
 
-BEAM, ASKED, MOST_MOVES, FINER = 3, 5, 12, 4
+BEAM, ASKED, MOST_MOVES, FINER = 3, 4, 10, 3
+#: moments at which steps are proposed, and how far apart, of the recording's length
+MOMENTS, APART = 4, 0.02
 
 Names = frozenset[str]
 
@@ -135,12 +137,16 @@ def averaged(G: Array, s: Array, component: Component) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """What a search may put into a set: candidates by effect, and free courses."""
+    """What a search may put into a set: candidates by effect, and free courses.
+
+    finer: neighbours of a setting;  form: what a component leaves of its form;  steps_at: of a time
+    """
 
     effects: dict[str, list[str]]
     courses: Sequence[str]
     finer: Callable[[Component, int], list[Component]]
     form: Callable[[Component], Component | None]
+    steps_at: Callable[[float], list[Component]]
 
 
 def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
@@ -166,6 +172,7 @@ def _best(found: Iterable[Hypothesis]) -> list[Hypothesis]:
 def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     """Sets that are one step away: a course or an effect more, one less, one for another."""
     names = here.names
+    _propose_steps(all_sets, space, here)
     own = [key for key in names if key not in all_sets.remainder]
     out = [names - {key} for key in own]
     courses = [key for key in space.courses if key not in names]
@@ -177,6 +184,31 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
         ranked = asked(all_sets, space, base, here)
         out += [base | {key} for key in ranked]
     return list(dict.fromkeys(out))
+
+
+def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None:
+    """Put steps at the moments at which a set is most surprised among the candidates."""
+    made = all_sets.made
+    for time_s in surprises(made.left_by(here.keys, here.at), made.context.track.time_s):
+        new = [one for one in space.steps_at(time_s) if one.key not in made.seen]
+        made.add(new)
+        for one in new:
+            space.effects.setdefault(one.effect or one.key, []).append(one.key)
+
+
+def surprises(residual: Array, time_s: Array) -> list[float]:
+    """Moments of the largest squares of a residual (N, 3) without colour, apart from each other."""
+    power = np.sum(residual**2, axis=1)
+    power = power + np.roll(power, -1)  # the row of a jump, and the next
+    found: list[float] = []
+    near = APART * float(time_s[-1] - time_s[0])
+    for row in np.argsort(-power)[: 20 * MOMENTS]:
+        at = float(time_s[row])
+        if at > time_s[0] and all(abs(at - other) > near for other in found):
+            found.append(at)
+        if len(found) == MOMENTS:
+            break
+    return found
 
 
 def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:

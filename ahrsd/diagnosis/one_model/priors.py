@@ -30,14 +30,14 @@ class Size:
 # --- what every real recording leaves: measured ----------------------------------------------
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(8e-3, 1.0, 0.1),  # gauss
-    "gyro_course": Size(5e-4, 1.5, 0.05),  # rad/s
-    "by_direction": Size(1e-3, 1.0, 0.02),  # gauss: harmonics of degree 2 and 3 of the direction
-    "by_change": Size(1e-3, 1.0, 0.03),  # s, of the field's change: axes that are late differently
-    "bending": Size(0.3, 1.0, 3.0),  # of the library's usual flexible mount
-    "by_rate_squared": Size(3e-4, 1.5, 0.03),  # rad/s at 1 rad/s
-    "field_by_rate": Size(3e-4, 1.0, 0.02),  # gauss at 1 rad/s
-    "by_force": Size(1e-3, 1.5, 0.03),  # rad/s at 1 g
+    "world_course": Size(8.14e-03, 1.31, 0.1),  # gauss
+    "gyro_course": Size(6.86e-04, 1.66, 0.05),  # rad/s
+    "by_direction": Size(4.08e-03, 2.06, 0.02),  # gauss: harmonics of degree 2 and 3 of the direction
+    "by_change": Size(1.34e-03, 1.73, 0.03),  # s, of the field's change: axes that are late differently
+    "bending": Size(7.45e-01, 1.31, 3.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(6.63e-04, 1.96, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(7.51e-04, 1.75, 0.02),  # gauss at 1 rad/s
+    "by_force": Size(3.26e-03, 1.84, 0.03),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
@@ -54,6 +54,8 @@ EFFECT = 1.0 / 60.0
 ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
 #: of a further step of a kind that is there: what was put on is taken off
 AGAIN = 0.3
+#: steps of a kind from which on they are one source that changes, which has no name
+CHANGES = 3
 #: of a course in time that nothing names, in one frame
 COURSE = 1.0 / 20.0
 #: that a recording leaves what real ones do, and not what a simulation does: nothing

@@ -10,6 +10,7 @@ from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
     LAG_FORM,
+    STEPS,
     component,
     form_of,
     library_components,
@@ -21,6 +22,8 @@ from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names
 COURSES = ("free sensor", "free world", "free gyro")
 #: settings that an onset which was sought finely counts for at least
 _SOUGHT = 40
+#: onsets among which one that the data proposed was chosen
+_ONSETS = 200
 
 
 def best_at(
@@ -71,4 +74,10 @@ def _space(
         near = neighbours(one.setting, length_s, round_)
         return [component(context, library[one.effect], setting, tried) for setting in near]
 
-    return all_sets, Space(effects, COURSES, finer, lambda one: form_of(one, context))
+    def steps_at(time_s: float) -> list[Component]:
+        setting = {"onset_s": round(time_s, 3)}
+        asked = [name for name in STEPS if name in library]
+        return [component(context, library[name], setting, _ONSETS) for name in asked]
+
+    space = Space(effects, COURSES, finer, lambda one: form_of(one, context), steps_at)
+    return all_sets, space
