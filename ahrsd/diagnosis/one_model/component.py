@@ -73,12 +73,15 @@ class Fixed:
     high: Array = field(default_factory=lambda: np.zeros(0))
 
     def log_variance(self, psi: Array) -> Array:
+        """(q,) logarithms."""
         return np.log(self.variance)
 
     def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances."""
         return np.zeros((len(self.variance), 0))
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density and gradient (k,)."""
         return 0.0, np.zeros(0)
 
 
@@ -97,15 +100,19 @@ class Sized:
 
     @property
     def start(self) -> Array:
+        """Where a search begins."""
         return np.clip(np.array([self.mean]), self.low, self.high)
 
     def log_variance(self, psi: Array) -> Array:
+        """(q,) logarithms."""
         return np.asarray(2.0 * np.log(self.scale) + 2.0 * psi[0])
 
     def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances."""
         return np.full((len(self.scale), 1), 2.0)
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density and gradient (k,)."""
         return log_density(psi[0], self.mean, self.spread, self.low[0], self.high[0])
 
 

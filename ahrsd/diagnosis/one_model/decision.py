@@ -25,6 +25,8 @@ AXES = ("x", "y", "z")
 #: odds are told no surer than this
 _SUREST = 30.0
 _SMALLEST_SHARE = 0.01
+#: how near to all of a delay must be a filter's to be called one
+_NEARLY_ALL = 0.25
 _PIECES = 80
 
 
@@ -48,7 +50,7 @@ def decided(
     found, terms = [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
-        if effect is None or effect == switching:
+        if effect is None or effect == switching or _is_ordinary(all_sets, best, key):
             continue
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
@@ -92,15 +94,26 @@ def _borne_out(
         own = [key for key in best.names if key not in all_sets.remainder]
         rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        unsure = [key for key in own if odds[key] < _asked_odds(all_sets, key)]
+        real = any(key in all_sets.remainder for key in best.names)
+        unsure = [key for key in own if odds[key] < _asked_odds(all_sets, key, real)]
         if not unsure:
             return best, odds
         best = rivals[min(unsure, key=lambda one: odds[one])]
 
 
-def _asked_odds(all_sets: Hypotheses, key: str) -> float:
-    named = all_sets.component(key).effect is not None
-    return priors.NAME_ODDS if named else priors.UNKNOWN_ODDS
+def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
+    if all_sets.component(key).effect is None:
+        return priors.UNKNOWN_ODDS
+    return priors.NAME_ODDS_REAL if real and key != LAG else priors.NAME_ODDS
+
+
+def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
+    """Whether a named member is no larger than what real recordings ordinarily have of its kind."""
+    form = priors.ORDINARY_FORM_OF.get(all_sets.component(key).effect or "")
+    if form is None or form not in best.names:
+        return False
+    value, _ = coefficients(all_sets, best, key)
+    return float(np.max(np.abs(value))) < priors.ORDINARY[form].up_to()
 
 
 def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
@@ -165,9 +178,7 @@ def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Arra
     raise KeyError(key)
 
 
-def _shares(
-    all_sets: Hypotheses, space: Space, best: Hypothesis, key: str
-) -> dict[str, float]:
+def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> dict[str, float]:
     """Probabilities of the names that could be what a member is, in its place."""
     own = all_sets.component(key)
     fewer = all_sets.judge(best.names - {key})
@@ -194,7 +205,8 @@ def _delay_name(all_sets: Hypotheses, best: Hypothesis, lag_s: float) -> str:
         value, deviation = coefficients(all_sets, best, LAG_FORM)
         as_filter = -0.5 * ((value[0] - 1.0) / deviation[0]) ** 2
         as_lag = -0.5 * (value[0] / deviation[0]) ** 2
-        if as_filter - as_lag > priors.NAME_ODDS and value[0] > 0.5:
+        near = abs(value[0] - 1.0) < max(2.0 * deviation[0], _NEARLY_ALL)
+        if near and as_filter - as_lag > priors.NAME_ODDS_REAL:
             return "mag_low_pass"
     return "mag_time_lag"
 

@@ -1,4 +1,4 @@
-"""The library's effects as components: one for each setting worth trying, and what a form leaves."""
+"""The library's effects as components: one for each setting, and what a form leaves."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
         onset = float(setting["onset_s"])
         steps = (-2, -1, 1, 2)
         moved = [onset + k * share * duration_s / 2 for k in steps]
-        out += [{**setting, "onset_s": t} for t in moved if 0.0 < t]
+        out += [{**setting, "onset_s": t} for t in moved if t > 0.0]
     for name in ("length_s", "time_constant_s", "radius_gauss"):
         if name in setting:
             factor = 1.5 ** (1.0 / (1 + round_))

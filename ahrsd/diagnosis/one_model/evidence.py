@@ -123,9 +123,7 @@ def _laws(laws: Sequence[Law], psi: Array) -> tuple[Array, Array, float, Array]:
     return np.concatenate(phi), linalg.block_diag(*slopes), prior, flat
 
 
-def maximised(
-    products: Products, laws: Sequence[Law], starts: Sequence[tuple[Array, Array]]
-) -> At:
+def maximised(products: Products, laws: Sequence[Law], starts: Sequence[tuple[Array, Array]]) -> At:
     """The likeliest hyperparameters found from any of the starts (log noise, psi)."""
     return max((_climbed(products, laws, *start) for start in starts), key=lambda one: one.nats)
 

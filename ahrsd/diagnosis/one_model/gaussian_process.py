@@ -38,14 +38,17 @@ class CourseLaw:
 
     @property
     def start(self) -> Array:
+        """Where a search begins."""
         return np.array([self.mean, np.log(4.0)])
 
     @property
     def low(self) -> Array:
+        """Lowest psi."""
         return np.log([priors.COURSE_SIZES[0], priors.COURSE_CORNERS[0]])
 
     @property
     def high(self) -> Array:
+        """Highest psi."""
         return np.log([self.most, priors.COURSE_CORNERS[1]])
 
     def _shape(self, psi: Array) -> tuple[Array, Array]:
@@ -54,17 +57,20 @@ class CourseLaw:
         return -np.log1p(ratio), 2.0 * ratio / (1.0 + ratio)
 
     def log_variance(self, psi: Array) -> Array:
+        """(q,) logarithms."""
         shape, _ = self._shape(psi)
         axes = len(shape) / len(np.unique(self.order))
         whole = np.log(np.sum(np.exp(shape)) / axes / 2.0)  # a cosine has half of its square
         return np.asarray(2 * np.log(self.unit) + 2 * psi[0] + shape - whole)
 
     def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances."""
         shape, by_corner = self._shape(psi)
         share = np.exp(shape) / np.sum(np.exp(shape))
         return np.column_stack([np.full(len(shape), 2.0), by_corner - share @ by_corner])
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density and gradient (k,)."""
         low, high = self.low, self.high
         size, slope = log_density(psi[0], self.mean, self.spread, low[0], high[0])
         corner, flat = log_density(psi[1], 0.0, 0.0, low[1], high[1])

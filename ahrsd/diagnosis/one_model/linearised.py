@@ -235,9 +235,7 @@ def moved(made: Linearised, keys: Sequence[str], at: At, share: float = 1.0) -> 
     here = coefficients(made.point.filtered.model) - prior_of(problem.track).mean
     found = by_key(made, [keys[0]], at)[CALIBRATION]
     values[CALIBRATION] = here + share * (found - here)
-    model = model_of(
-        values[CALIBRATION] + prior_of(problem.track).mean, made.point.filtered.model
-    )
+    model = model_of(values[CALIBRATION] + prior_of(problem.track).mean, made.point.filtered.model)
     out = {key: value for key, value in values.items() if key not in (CALIBRATION, *made.exact)}
     mag, gyro = added(made, out)
     lag_s = sum(float(values[key][0]) for key in made.exact if key in values)

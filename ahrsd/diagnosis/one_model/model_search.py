@@ -112,9 +112,7 @@ def scanned(
     out = {}
     made.gram_between(keys, candidates)
     for key in candidates:
-        C = np.concatenate(
-            [np.tensordot(inverse, made.pair(one, key), 1) for one in keys], axis=0
-        )
+        C = np.concatenate([np.tensordot(inverse, made.pair(one, key), 1) for one in keys], axis=0)
         own = np.tensordot(inverse, made.pair(key, key), 1)
         G = own - C.T @ cho_solve(factor, C)
         left = inverse @ made.cross(key) - C.T @ solved
@@ -229,14 +227,10 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         if total > best.get(one.effect or key, (-np.inf, ""))[0]:
             best[one.effect or key] = (total, key)
     ranked = sorted(best.values(), reverse=True)[:ASKED]
-    return [
-        sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0
-    ]
+    return [sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0]
 
 
-def sought(
-    all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str
-) -> str:
+def sought(all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str) -> str:
     """The candidate with its onset and scale sought more and more finely."""
     made = all_sets.made
     worth = scanned(made, keys, at, [key])[key] + all_sets.component(key).prior

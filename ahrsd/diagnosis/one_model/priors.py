@@ -32,8 +32,12 @@ class Size:
 ORDINARY: Mapping[str, Size] = {
     "world_course": Size(8.14e-03, 1.31, 0.1),  # gauss
     "gyro_course": Size(6.86e-04, 1.66, 0.05),  # rad/s
-    "by_direction": Size(4.08e-03, 2.06, 0.02),  # gauss: harmonics of degree 2 and 3 of the direction
-    "by_change": Size(1.34e-03, 1.73, 0.03),  # s, of the field's change: axes that are late differently
+    "by_direction": Size(
+        4.08e-03, 2.06, 0.02
+    ),  # gauss: harmonics of degree 2 and 3
+    "by_change": Size(
+        1.34e-03, 1.73, 0.03
+    ),  # s: axes that are late by different times
     "bending": Size(7.45e-01, 1.31, 3.0),  # of the library's usual flexible mount
     "by_rate_squared": Size(6.63e-04, 1.96, 0.03),  # rad/s at 1 rad/s
     "field_by_rate": Size(7.51e-04, 1.75, 0.02),  # gauss at 1 rad/s
@@ -42,7 +46,7 @@ ORDINARY: Mapping[str, Size] = {
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
 
-#: of a delay between the sensors, s: BROAD 11 ms, a VN-100 read by hand 25 to 40, a flight 50 to 100
+#: of a delay between the sensors, s: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
 ORDINARY_LAG_S = 0.04
 #: how much of a delay is a filter's, 1 all of it
 LAG_IS_FILTER = 0.5
@@ -71,8 +75,8 @@ EFFECT_SIZES = (1e-2, 10.0)
 FORM = 0.03
 
 # --- noise --------------------------------------------------------------------------------------
-#: deviation of a log power from that of the next octave: of a sensor's own noise, and of what a real
-#: recording leaves as well; free where only a delay is sought;  of the highest one's from the filter's
+#: deviation of a log power from that of the next octave: of a sensor's own noise, of what a real
+#: recording leaves as well, and where only a delay is sought;  of the highest from the filter's
 NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
@@ -83,9 +87,25 @@ LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 
+#: effects that a component of the remainder may be, too: beside it they are findings only where
+#: they are larger than it ordinarily is
+ORDINARY_FORM_OF: Mapping[str, str] = {
+    "field_step": "world_course",
+    "field_anomaly": "world_course",
+    "geomagnetic_drift": "world_course",
+    "gyro_bias_step": "gyro_course",
+    "gyro_bias_drift": "gyro_course",
+    "gyro_startup": "gyro_course",
+    "eddy_current": "by_change",
+    "gyro_g_sensitivity": "by_force",
+    "mag_cross_axis": "by_direction",
+    "mag_nonlinearity": "by_direction",
+}
+
 # --- the decision -------------------------------------------------------------------------------
-#: log odds from which an effect is told; a false name costs more than a missed one
-NAME_ODDS = 3.0
+#: log odds from which an effect is told; a false name costs more than a missed one.  On a recording
+#: with an ordinary remainder the model's laws are not exact, and a few nats say nothing
+NAME_ODDS, NAME_ODDS_REAL = 3.0, 12.0
 #: log odds from which something is called unknown
 UNKNOWN_ODDS = 3.0
 #: nats that a move of the search must gain

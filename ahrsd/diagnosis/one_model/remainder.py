@@ -98,7 +98,9 @@ def harmonics(field_b: Array) -> Array:
         x * (x**2 - 3 * y**2) / np.sqrt(6),
         y * (3 * x**2 - y**2) / np.sqrt(6),
     ]
-    return np.column_stack([np.sqrt(15.0) * np.array(second).T, np.sqrt(105.0 / 4) * np.array(third).T])
+    return np.column_stack(
+        [np.sqrt(15.0) * np.array(second).T, np.sqrt(105.0 / 4) * np.array(third).T]
+    )
 
 
 def squares(rate: Array) -> Array:

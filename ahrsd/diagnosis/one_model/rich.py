@@ -75,9 +75,7 @@ def base_of(point: Point, library: Mapping[str, Effect], named: Sequence[Compone
     return Base(made, remainder, small, (*small, *remainder, *RICH_COURSES))
 
 
-def fitted(
-    made: Linearised, keys: Sequence[str], step: float = priors.NOISE_STEP_REAL
-) -> At:
+def fitted(made: Linearised, keys: Sequence[str], step: float = priors.NOISE_STEP_REAL) -> At:
     """The likeliest hyperparameters of a model, from the highest band's power on.
 
     That is the sensor's own: from there an effect is not noise before it was asked for.

@@ -66,7 +66,9 @@ def test_the_noise_prior_has_the_slope_of_its_differences():
     _, gradient = noise_model.log_prior(x, 0.6)
     for k in range(4):
         step = 1e-6 * np.eye(4)[k]
-        slope = (noise_model.log_prior(x + step, 0.6)[0] - noise_model.log_prior(x - step, 0.6)[0]) / 2e-6
+        slope = (
+            noise_model.log_prior(x + step, 0.6)[0] - noise_model.log_prior(x - step, 0.6)[0]
+        ) / 2e-6
         assert gradient[k] == pytest.approx(slope, abs=1e-6)
 
 

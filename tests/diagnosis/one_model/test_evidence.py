@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -26,7 +28,7 @@ def design(seed: int, widths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 def products(B: np.ndarray, y: np.ndarray) -> Products:
     edges = np.cumsum([0, *ROWS])
-    parts = [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+    parts = [slice(a, b) for a, b in itertools.pairwise(edges)]
     return Products(
         np.stack([B[p].T @ B[p] for p in parts]),
         np.stack([B[p].T @ y[p] for p in parts]),

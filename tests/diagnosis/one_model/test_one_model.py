@@ -34,12 +34,10 @@ def test_a_step_of_the_hard_iron_is_dated_and_sized():
 def test_a_current_that_nobody_logged_is_unknown_on_the_sensor():
     track = track_of(experiment("wam", seed=5, samples=4000))
     t = track.time_s - track.time_s[0]
-    rng = np.random.default_rng(1)
-    level = rng.uniform(0.0, 1.0, 12)[np.minimum((t / t[-1] * 12).astype(int), 11)]
+    level = sum(np.sin(2 * np.pi * t / period + k) for k, period in enumerate((23.0, 41.0, 71.0)))
     axis = np.array([0.6, -0.7, 0.39])
-    found = diagnose(
-        replace(track, mag_b_gauss=track.mag_b_gauss + 2e-2 * level[:, None] * axis)
-    )
+    added = 5e-3 * level[:, None] * axis
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     left = found.unexplained
     assert left.detected
     assert left.where is not None
