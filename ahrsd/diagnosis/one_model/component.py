@@ -23,9 +23,17 @@ class Law(Protocol):
     start, low, high (k,): where a search begins and between which it stays
     """
 
-    start: Array
-    low: Array
-    high: Array
+    @property
+    def start(self) -> Array:
+        """Where a search begins."""
+
+    @property
+    def low(self) -> Array:
+        """Lowest psi."""
+
+    @property
+    def high(self) -> Array:
+        """Highest psi."""
 
     def log_variance(self, psi: Array) -> Array:
         """(q,)."""
@@ -74,7 +82,7 @@ class Fixed:
 
     def log_variance(self, psi: Array) -> Array:
         """(q,) logarithms."""
-        return np.log(self.variance)
+        return np.asarray(np.log(self.variance))
 
     def slope(self, psi: Array) -> Array:
         """(q, k) of the log variances."""
@@ -101,7 +109,7 @@ class Sized:
     @property
     def start(self) -> Array:
         """Where a search begins."""
-        return np.clip(np.array([self.mean]), self.low, self.high)
+        return np.asarray(np.clip(np.array([self.mean]), self.low, self.high))
 
     def log_variance(self, psi: Array) -> Array:
         """(q,) logarithms."""

@@ -16,18 +16,14 @@ from ahrsd.diagnosis.diagnosis import Baseline, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.facts import Fact, matters
-from ahrsd.diagnosis.findings import of_fact
 from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null, unusable
-from ahrsd.diagnosis.one_model import decision, rich
-from ahrsd.diagnosis.one_model.search_space import best_at
+from ahrsd.diagnosis.one_model.search_rounds import answered
 from ahrsd.diagnosis.pauses import without_jumps
-from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
+from ahrsd.diagnosis.problem import model_at_rate, problem_of
 from ahrsd.diagnosis.track import Spec, Track
 
-#: linearisations with a search each, at most
-ROUNDS = 2
 NOTE = "by the engine one-model, which is experimental"
 
 
@@ -47,7 +43,7 @@ def diagnose(
     if why := unusable(track):
         raise ValueError(why)
     facts = hygiene(track)
-    said = [of_fact(fact, library) for fact in facts if matters(fact)]
+    said = [_of_fact(fact, library) for fact in facts if matters(fact)]
     notes = (NOTE, *jumped, *notes, *(fact.words for fact in facts if not matters(fact)))
     if any(fact.stops for fact in facts):
         return _stopped(recording, facts, library, notes)
@@ -69,28 +65,6 @@ def diagnose(
     )
 
 
-def answered(
-    problem: Problem, start: NullFit, library: Mapping[str, Effect]
-) -> tuple[decision.Answer, rich.Linearised]:
-    """Searched at the richest model, and again at what was found, until that stays."""
-    point = rich.richest(problem, start.filtered, library)
-    all_sets, space, best = best_at(point, library, (), was_real=True)
-    answer = decision.decided(all_sets, space, best, library)
-    for _ in range(ROUNDS - 1):
-        before = decision.names_of(all_sets, answer.best)
-        members = [all_sets.component(key) for key in answer.best.names]
-        named = [one for one in members if one.effect is not None and one.key != rich.LAG]
-        if not named:
-            break
-        real = any(key in all_sets.remainder for key in answer.best.names)
-        point = rich.settled(all_sets.made.point, library, named, whole=True)
-        all_sets, space, best = best_at(point, library, named, real)
-        answer = decision.decided(all_sets, space, best, library)
-        if decision.names_of(all_sets, answer.best) == before:
-            break
-    return answer, all_sets.made
-
-
 def _baseline(start: NullFit) -> Baseline:
     done = start.filtered
     rms = float(np.sqrt(np.mean(done.innovation[done.used] ** 2)))
@@ -102,7 +76,7 @@ def _stopped(
     recording: str, facts: Sequence[Fact], library: Mapping[str, Effect], notes: tuple[str, ...]
 ) -> Diagnosis:
     """The answer where nothing that is fitted would mean anything."""
-    found: list[Finding] = [of_fact(fact, library) for fact in facts if fact.stops]
+    found: list[Finding] = [_of_fact(fact, library) for fact in facts if fact.stops]
     return Diagnosis(
         recording=recording,
         baseline=None,
@@ -112,4 +86,22 @@ def _stopped(
         unexplained=Unexplained(False),
         posterior_predictive={},
         notes=(*notes, "put this right first, then ask again"),
+    )
+
+
+def _of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
+    """What was counted, not fitted, as a finding."""
+    effect = library.get(fact.effect)
+    return Finding(
+        effect=fact.effect,
+        confidence=fact.confidence,
+        alternatives=(),
+        where=fact.where,
+        parameters=fact.parameters,
+        heldout=None,
+        cost_if_left_out=None,
+        separate_from=None,
+        words=fact.words,
+        equation="" if effect is None else effect.equation,
+        setting=fact.setting,
     )

@@ -30,8 +30,8 @@ from ahrsd.samples import Array
 
 #: relative: columns that are alike but for rounding would else leave no root
 _ROUNDED = 1e-10
-#: a maximum is reached where a step gains less, of the nats' own size
-_FLAT, _STEPS = 1e-7, 60
+#: a maximum is reached where a step gains less, in machine precisions of the nats; and steps
+_FLAT, _STEPS = 4e8, 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +84,9 @@ def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Ar
     A = G.copy()
     diagonal = np.diag_indices_from(A)
     A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
-    L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
+    L, broken = linalg.lapack.dpotrf(A.T, lower=1, overwrite_a=1)
+    if broken:
+        raise np.linalg.LinAlgError("the columns of a model are alike to the last digit")
     root, _ = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)
     seen = root @ s
     m = seen @ root
@@ -145,7 +147,8 @@ def _climbed(products: Products, laws: Sequence[Law], log_noise: Array, psi: Arr
         return -at.nats, -at.gradient * unit
 
     start = np.clip(np.concatenate([log_noise, psi]), low, high) / unit
-    box = optimize.Bounds(low / unit, high / unit)
-    options = {"maxiter": _STEPS, "ftol": _FLAT, "gtol": 1e-3, "maxfun": 2 * _STEPS}
-    optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=box, options=options)
+    box = list(zip(low / unit, high / unit, strict=True))
+    optimize.fmin_l_bfgs_b(
+        cost, start, bounds=box, factr=_FLAT, pgtol=1e-3, maxiter=_STEPS, maxfun=2 * _STEPS
+    )
     return best[0]

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import dct, idct
 
 from ahrsd.diagnosis import noise_fit
@@ -70,7 +71,7 @@ class Linearised:
     point: Point
     context: Context
     regressing: Filtered
-    edges: Array
+    edges: NDArray[np.intp]
     y: Array
     seen: dict[str, Seen] = field(default_factory=dict)
     pairs: dict[tuple[str, str], Array] = field(default_factory=dict)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ahrsd.diagnosis.evidence import SIZES
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.evidence import At, maximised
@@ -128,7 +127,11 @@ def averaged(G: Array, s: Array, component: Component) -> float:
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     values = np.maximum(values, 0.0)
     score = vectors.T @ (s * deviation)
-    k2 = np.square(np.array(SIZES))[:, None] if len(component.law.start) else np.ones((1, 1))
+    k2 = (
+        np.square(np.array(priors.EFFECT_GRID))[:, None]
+        if len(component.law.start)
+        else np.ones((1, 1))
+    )
     terms = 0.5 * np.sum(score**2 / (values + 1 / k2) - np.log1p(k2 * values), axis=1)
     return float(np.logaddexp.reduce(terms) - np.log(len(k2)))
 

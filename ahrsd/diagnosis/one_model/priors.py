@@ -32,12 +32,8 @@ class Size:
 ORDINARY: Mapping[str, Size] = {
     "world_course": Size(8.14e-03, 1.31, 0.1),  # gauss
     "gyro_course": Size(6.86e-04, 1.66, 0.05),  # rad/s
-    "by_direction": Size(
-        4.08e-03, 2.06, 0.02
-    ),  # gauss: harmonics of degree 2 and 3
-    "by_change": Size(
-        1.34e-03, 1.73, 0.03
-    ),  # s: axes that are late by different times
+    "by_direction": Size(4.08e-03, 2.06, 0.02),  # gauss: harmonics of degree 2 and 3
+    "by_change": Size(1.34e-03, 1.73, 0.03),  # s: axes that are late by different times
     "bending": Size(7.45e-01, 1.31, 3.0),  # of the library's usual flexible mount
     "by_rate_squared": Size(6.63e-04, 1.96, 0.03),  # rad/s at 1 rad/s
     "field_by_rate": Size(7.51e-04, 1.75, 0.02),  # gauss at 1 rad/s
@@ -71,6 +67,8 @@ COURSE_SIZES = (1e-2, 5e2)
 COURSE_CORNERS = (1.0, 40.0)
 #: how many times its usual scale an effect is, evenly in the logarithm
 EFFECT_SIZES = (1e-2, 10.0)
+#: the same where candidates are only ranked
+EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 
