@@ -102,9 +102,9 @@ def _borne_out(
 
 
 def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
-    if all_sets.component(key).effect is None:
-        return priors.UNKNOWN_ODDS
-    return priors.NAME_ODDS_REAL if real and key != LAG else priors.NAME_ODDS
+    if real and key != LAG:
+        return priors.ODDS_REAL
+    return priors.UNKNOWN_ODDS if all_sets.component(key).effect is None else priors.NAME_ODDS
 
 
 def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
@@ -206,7 +206,7 @@ def _delay_name(all_sets: Hypotheses, best: Hypothesis, lag_s: float) -> str:
         as_filter = -0.5 * ((value[0] - 1.0) / deviation[0]) ** 2
         as_lag = -0.5 * (value[0] / deviation[0]) ** 2
         near = abs(value[0] - 1.0) < max(2.0 * deviation[0], _NEARLY_ALL)
-        if near and as_filter - as_lag > priors.NAME_ODDS_REAL:
+        if near and as_filter - as_lag > priors.ODDS_REAL:
             return "mag_low_pass"
     return "mag_time_lag"
 

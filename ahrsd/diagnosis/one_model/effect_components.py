@@ -26,8 +26,8 @@ NOT_ASKED = (
     LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
     "rotor_field",
 )  # fmt: skip
-#: seconds round a step for which whatever makes it (a hand with a magnet) may be anywhere
-_TRANSITION_S, _TRANSITION_PIECES = 2.0, 4
+#: parts in which the transition of a step is free
+_PIECES = 4
 #: parts of a recording's length, and factors, to which onsets and scales are sought
 _FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
 
@@ -128,10 +128,10 @@ def form_of(known: Component, context: Context) -> Component | None:
     frame = STEPS.get(known.effect or "")
     if frame is None:
         return None
-    onset_s, width_s = float(known.setting["onset_s"]), 2 * _TRANSITION_S / _TRANSITION_PIECES
-    edges = onset_s - _TRANSITION_S + width_s * np.arange(_TRANSITION_PIECES + 1)
+    onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.TRANSITION_S / _PIECES
+    edges = onset_s - priors.TRANSITION_S + width_s * np.arange(_PIECES + 1)
     piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
-    inside = (piece[:, None] == np.arange(_TRANSITION_PIECES)).astype(float)
+    inside = (piece[:, None] == np.arange(_PIECES)).astype(float)
     axes = unit_columns(context, cast("Frame", frame))
     flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)

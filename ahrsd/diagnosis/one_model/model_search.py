@@ -222,6 +222,7 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         key for name, keys in space.effects.items() if name not in had or name in steps
         for key in keys if key not in base
     ]  # fmt: skip
+    candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
     worth = scanned(all_sets.made, model.keys, at, candidates)
     best: dict[str, tuple[float, str]] = {}
     for key, nats in worth.items():
@@ -231,6 +232,21 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
             best[one.effect or key] = (total, key)
     ranked = sorted(best.values(), reverse=True)[:ASKED]
     return [sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0]
+
+
+def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
+    """Whether a set has the same effect so near in time that the two are one."""
+    one = all_sets.component(key)
+    onset_s = one.setting.get("onset_s")
+    if onset_s is None:
+        return False
+    others = [all_sets.component(other) for other in base]
+    return any(
+        other.effect == one.effect
+        and abs(float(other.setting["onset_s"]) - float(onset_s)) < priors.TRANSITION_S
+        for other in others
+        if "onset_s" in other.setting
+    )
 
 
 def sought(all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str) -> str:

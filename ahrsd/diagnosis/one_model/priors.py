@@ -52,6 +52,8 @@ LAG_IS_FILTER = 0.5
 EFFECT = 1.0 / 60.0
 #: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
 ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
+#: seconds round a step for which whatever makes it (a hand with a magnet) may be anywhere
+TRANSITION_S = 2.0
 #: of a further step of a kind that is there: what was put on is taken off
 AGAIN = 0.3
 #: steps of a kind from which on they are one source that changes, which has no name
@@ -101,10 +103,10 @@ ORDINARY_FORM_OF: Mapping[str, str] = {
 }
 
 # --- the decision -------------------------------------------------------------------------------
-#: log odds from which an effect is told; a false name costs more than a missed one.  On a recording
-#: with an ordinary remainder the model's laws are not exact, and a few nats say nothing
-NAME_ODDS, NAME_ODDS_REAL = 3.0, 12.0
-#: log odds from which something is called unknown
-UNKNOWN_ODDS = 3.0
+#: log odds from which an effect is told: a false name costs more than a missed one;  from which
+#: something is called unknown
+NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
+#: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
+ODDS_REAL = 12.0
 #: nats that a move of the search must gain
 MOVE = 2.0
