@@ -16,9 +16,8 @@ import numpy as np
 
 from ahrsd.diagnosis.aligned import align, differing
 from ahrsd.diagnosis.diagnosis import Diagnosis
-from ahrsd.diagnosis.logged import diagnose_logged
+from ahrsd.diagnosis.engines import RULES, diagnosed
 from ahrsd.diagnosis.model_file import RepairedModel, from_text
-from ahrsd.diagnosis.one_model.diagnose import diagnose as by_one_model
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
@@ -29,7 +28,6 @@ from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.recording.opening import open_recording
 from ahrsd.samples import SampleBlock
 
-RULES, ONE_MODEL = ENGINES = ("rules", "one-model")
 SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
 FEWEST_ROWS = 100
 RATE_AGREES = 0.05  # of a spec and the stamps' median step: clocks are closer, units are not
@@ -163,7 +161,7 @@ def diagnose_recording(
     """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError.
 
     columns: names and units of REAL, where it is a table of another program
-    engine: one of ENGINES
+    engine: one of `engines.ENGINES`
     """
     known, unused = (Spec(), []) if spec is None else load_spec(spec)
     track, notes = load_track(real, rate_hz, progress, spec=known, columns=columns)
@@ -186,9 +184,7 @@ def _answered(path: Path, track: Track, spec: Spec, engine: str) -> Diagnosis:
     simulated = Path(f"{path}.truth.json").exists()  # as `ahrsd simulate` leaves it
     try:
         name = printable(path.name, 200)
-        if engine == ONE_MODEL:
-            return by_one_model(track, spec, recording=name)
-        return diagnose_logged(track, spec, recording=name, simulated=simulated)
+        return diagnosed(engine, track, spec, recording=name, simulated=simulated)
     except np.linalg.LinAlgError:
         raise RecordingError(
             path,
