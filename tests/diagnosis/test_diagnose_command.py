@@ -117,7 +117,7 @@ def test_a_fit_without_an_end_is_one_line_for_a_person(run, saved, clean, capsys
     def diverging(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr("ahrsd.offline.diagnose.diagnose_logged", diverging)
+    monkeypatch.setattr("ahrsd.diagnosis.engines.diagnose_logged", diverging)
     assert run("diagnose", str(saved(clean))) == 2
     told = capsys.readouterr().err
     assert "Eigenvalues" not in told

@@ -3,7 +3,7 @@
     python tests/benchmarks/estimator/bench_regimes.py --runs 120
     python tests/benchmarks/estimator/bench_regimes.py --runs 120 --seed 1000 --at-once 32
     python tests/benchmarks/estimator/bench_regimes.py --regimes --rates 10 40 100 --runs 6
-    python tests/benchmarks/estimator/bench_regimes.py --runs 120 --at-once 32 --instrument assembled
+    python tests/benchmarks/estimator/bench_regimes.py --runs 120 --instrument assembled
 
 Each run draws two to five pieces (level circles, roll, pitch, rest, eight headings with stops,
 straight), a rate, a lag of the field and whether readings are held, and compares what the estimator

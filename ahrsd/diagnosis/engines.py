@@ -1,0 +1,21 @@
+"""The engines that answer in the contract's form, by name."""
+
+from __future__ import annotations
+
+from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.logged import diagnose_logged
+from ahrsd.diagnosis.track import Spec, Track
+
+#: by rules; by one generative model, experimental (docs/design/engine.md)
+RULES, ONE_MODEL = ENGINES = ("rules", "one-model")
+
+
+def diagnosed(
+    engine: str, track: Track, spec: Spec, *, recording: str, simulated: bool
+) -> Diagnosis:
+    """The answer of one of ENGINES.  ValueError, one line, where nothing can be fitted."""
+    if engine == ONE_MODEL:
+        from ahrsd.diagnosis.one_model.diagnose import diagnose  # whom it serves waits for it
+
+        return diagnose(track, spec, recording=recording)
+    return diagnose_logged(track, spec, recording=recording, simulated=simulated)

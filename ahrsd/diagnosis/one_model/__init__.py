@@ -1,0 +1,1 @@
+"""Diagnosis by one generative model: components with priors, one evidence, one search (beta)."""

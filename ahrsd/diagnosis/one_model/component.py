@@ -1,0 +1,134 @@
+"""What a component of the model is: columns on the readings, and the law of their coefficients.
+
+    readings = calibration + sum_j B_j w_j + noise,    w_j ~ N(0, diag(Phi_j(psi_j)))
+
+The columns are made of the context (the recording as the present model sees it); the law gives the
+variances and their slopes in its hyperparameters psi, all of which are logarithms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from ahrsd.diagnosis.values import Columns
+from ahrsd.samples import Array
+
+
+class Law(Protocol):
+    """Variances (q,) of independent coefficients as a function of psi (k,), logarithms.
+
+    start, low, high (k,): where a search begins and between which it stays
+    """
+
+    @property
+    def start(self) -> Array:
+        """Where a search begins."""
+
+    @property
+    def low(self) -> Array:
+        """Lowest psi."""
+
+    @property
+    def high(self) -> Array:
+        """Highest psi."""
+
+    def log_variance(self, psi: Array) -> Array:
+        """(q,)."""
+
+    def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances in psi."""
+
+    def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density of psi and its gradient (k,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Component:
+    """One part of the model.
+
+    key:     its name in a hypothesis, unique
+    frame:   sensor, world, gyro or link
+    columns: per unit of the coefficients
+    law:     of the coefficients
+    prior:   log odds of being there
+    effect, setting: of the library, where it is one
+    """
+
+    key: str
+    frame: str
+    columns: Columns
+    law: Law
+    prior: float = 0.0
+    effect: str | None = None
+    setting: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def width(self) -> int:
+        """Number of coefficients."""
+        return self.columns.width
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixed:
+    """Variances that are known.  variance (q,)."""
+
+    variance: Array
+    start: Array = field(default_factory=lambda: np.zeros(0))
+    low: Array = field(default_factory=lambda: np.zeros(0))
+    high: Array = field(default_factory=lambda: np.zeros(0))
+
+    def log_variance(self, psi: Array) -> Array:
+        """(q,) logarithms."""
+        return np.asarray(np.log(self.variance))
+
+    def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances."""
+        return np.zeros((len(self.variance), 0))
+
+    def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density and gradient (k,)."""
+        return 0.0, np.zeros(0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sized:
+    """One size for all: variance = scale^2 e^(2 psi).
+
+    scale (q,);  low, high: of psi;  mean, spread: of its normal law; spread 0: even between them
+    """
+
+    scale: Array
+    low: Array
+    high: Array
+    mean: float = 0.0
+    spread: float = 0.0
+
+    @property
+    def start(self) -> Array:
+        """Where a search begins."""
+        return np.asarray(np.clip(np.array([self.mean]), self.low, self.high))
+
+    def log_variance(self, psi: Array) -> Array:
+        """(q,) logarithms."""
+        return np.asarray(2.0 * np.log(self.scale) + 2.0 * psi[0])
+
+    def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances."""
+        return np.full((len(self.scale), 1), 2.0)
+
+    def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density and gradient (k,)."""
+        return log_density(psi[0], self.mean, self.spread, self.low[0], self.high[0])
+
+
+def log_density(
+    value: float, mean: float, spread: float, low: float, high: float
+) -> tuple[float, Array]:
+    """Of one logarithm: normal, or even between its ends (spread 0); and its slope (1,)."""
+    if spread > 0.0:
+        off = (value - mean) / spread
+        return -0.5 * off**2 - float(np.log(spread * np.sqrt(2 * np.pi))), np.array([-off / spread])
+    return -float(np.log(high - low)), np.zeros(1)

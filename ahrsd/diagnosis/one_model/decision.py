@@ -1,0 +1,297 @@
+"""From the likeliest set to an answer: names with their rivals, what is left, what is ordinary.
+
+A name is told where every set without it, whatever takes its place (nothing, or a course in time of
+any frame), is less likely by odds that the losses ask for.  What is left is unknown where a free
+course is as sure, or where a part of the ordinary remainder is beyond its 95 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.diagnosis.diagnosis import Finding, Share, Unexplained, Value, Where
+from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.locate import single_source
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, scanned
+from ahrsd.diagnosis.values import Term
+from ahrsd.samples import Array
+
+AXES = ("x", "y", "z")
+#: odds are told no surer than this
+_SUREST = 30.0
+_SMALLEST_SHARE = 0.01
+#: how near to all of a delay must be a filter's to be called one
+_NEARLY_ALL = 0.25
+_PIECES = 80
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """Names, terms and what is left of one hypothesis.  best: with nothing that is not told."""
+
+    best: Hypothesis
+    findings: tuple[Finding, ...]
+    terms: tuple[Term, ...]
+    unexplained: Unexplained
+    log_odds: float
+
+
+def decided(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
+) -> Answer:
+    """The answer of a search."""
+    best, odds = _borne_out(all_sets, space, best)
+    switching = _switching(all_sets, best)
+    found, terms = [], []
+    for key in sorted(odds, key=lambda one: -odds[one]):
+        effect = all_sets.component(key).effect
+        if effect is None or effect == switching or _is_ordinary(all_sets, best, key):
+            continue
+        finding, term = _told(all_sets, space, best, key, odds[key], library)
+        found.append(finding)
+        terms.append(term)
+    left = _left(all_sets, space, best, odds)
+    if switching is not None and not left.detected:
+        left = _jumping(all_sets, best, switching, odds)
+    surest = max([*odds.values(), left.evidence_nats], default=0.0)
+    return Answer(best, tuple(found), tuple(terms), left, surest)
+
+
+def _switching(all_sets: Hypotheses, best: Hypothesis) -> str | None:
+    """The kind of step of which there are so many that they are one source that changes."""
+    kinds = [all_sets.component(key).effect for key in best.names]
+    many = [k for k in STEPS if kinds.count(k) >= priors.CHANGES]
+    return max(many, key=kinds.count) if many else None
+
+
+def _jumping(
+    all_sets: Hypotheses, best: Hypothesis, kind: str, odds: Mapping[str, float]
+) -> Unexplained:
+    """A source that goes in steps: its levels between the changes, along its direction."""
+    keys = [key for key in best.names if all_sets.component(key).effect == kind]
+    keys.sort(key=lambda key: float(all_sets.component(key).setting["onset_s"]))
+    changes = np.array([coefficients(all_sets, best, key)[0] for key in keys])
+    onsets = [float(all_sets.component(key).setting["onset_s"]) for key in keys]
+    time_s = all_sets.made.context.track.time_s
+    at = np.linspace(time_s[0], time_s[-1], _PIECES)
+    levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
+    course = levels[np.searchsorted(onsets, at, side="right")]
+    frame = STEPS[kind]
+    nats = sum(odds[key] for key in keys)
+    return _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
+
+
+def _borne_out(
+    all_sets: Hypotheses, space: Space, best: Hypothesis
+) -> tuple[Hypothesis, dict[str, float]]:
+    """The set without members that are not sure, and the log odds of the others."""
+    while True:
+        own = [key for key in best.names if key not in all_sets.remainder]
+        rivals = {key: _without(all_sets, space, best, key) for key in own}
+        odds = {key: best.score - rival.score for key, rival in rivals.items()}
+        real = any(key in all_sets.remainder for key in best.names)
+        unsure = [key for key in own if odds[key] < _asked_odds(all_sets, key, real)]
+        if not unsure:
+            return best, odds
+        best = rivals[min(unsure, key=lambda one: odds[one])]
+
+
+def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
+    if real and key != LAG:
+        return priors.ODDS_REAL
+    return priors.UNKNOWN_ODDS if all_sets.component(key).effect is None else priors.NAME_ODDS
+
+
+def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
+    """Whether a named member is no larger than what real recordings ordinarily have of its kind."""
+    form = priors.ORDINARY_FORM_OF.get(all_sets.component(key).effect or "")
+    if form is None or form not in best.names:
+        return False
+    value, _ = coefficients(all_sets, best, key)
+    return float(np.max(np.abs(value))) < priors.ORDINARY[form].up_to()
+
+
+def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
+    """The likeliest set without a member: with nothing or a course in its place."""
+    fewer = best.names - {key}
+    tried = [fewer]
+    if all_sets.component(key).effect is not None:
+        tried += [fewer | {course} for course in space.courses if course not in fewer]
+    judged = [all_sets.judge(names) for names in tried]
+    return max(judged, key=lambda one: one.score)
+
+
+def _told(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, key: str, odds: float,
+    library: Mapping[str, Effect],
+) -> tuple[Finding, Term]:  # fmt: skip
+    """A member as a finding and as a term of the repaired model."""
+    one = all_sets.component(key)
+    value, deviation = coefficients(all_sets, best, key)
+    shares = _shares(all_sets, space, best, key)
+    name = _delay_name(all_sets, best, float(value[0])) if key == LAG else one.effect or key
+    if key == LAG:
+        shares = {name: 1.0}
+        value = np.abs(value) if name == "gyro_time_lag" else value
+    effect = library[name]
+    sure = 1.0 / (1.0 + np.exp(-min(odds, _SUREST)))
+    others = tuple(
+        Share(other, share * sure) for other, share in shares.items()
+        if other != name and share > _SMALLEST_SHARE
+    )  # fmt: skip
+    setting = {k: v for k, v in one.setting.items() if k != "searched"}
+    finding = Finding(
+        effect=name,
+        confidence=float(shares.get(name, 1.0) * sure),
+        alternatives=others,
+        where=_where(all_sets, best, key),
+        parameters=tuple(
+            Value(p.name, float(v), float(d), p.unit)
+            for p, v, d in zip(effect.parameters, value, deviation, strict=True)
+        ),
+        heldout=None,
+        cost_if_left_out=None,
+        separate_from=None,
+        words=effect.words,
+        equation=effect.equation,
+        setting=setting,
+        evidence_nats=float(odds),
+    )
+    return finding, Term(name, value, deviation, setting)
+
+
+def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, Array]:
+    """Likeliest coefficients of a member and their deviations."""
+    begin = 0
+    for one in best.keys:
+        width = all_sets.component(one).width
+        if one == key:
+            part = slice(begin, begin + width)
+            variance = np.sum(best.at.root[:, part] ** 2, axis=0)
+            return best.at.mean[part], np.sqrt(variance)
+        begin += width
+    raise KeyError(key)
+
+
+def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> dict[str, float]:
+    """Probabilities of the names that could be what a member is, in its place."""
+    own = all_sets.component(key)
+    fewer = all_sets.judge(best.names - {key})
+    named = {all_sets.component(k).effect for k in fewer.names}
+    asked = [k for name, keys in space.effects.items() if name not in named for k in keys]
+    worth = scanned(all_sets.made, fewer.keys, best.at_of(fewer), [*dict.fromkeys([*asked, key])])
+    by_name: dict[str, float] = {}
+    for k, nats in worth.items():
+        one = all_sets.component(k)
+        name = one.effect or k
+        by_name[name] = float(np.logaddexp(by_name.get(name, -np.inf), nats + one.prior))
+    mine = own.effect or key
+    by_name[mine] = max(by_name[mine], worth[key] + own.prior)
+    total = np.logaddexp.reduce(list(by_name.values()))
+    shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}
+    return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+def _delay_name(all_sets: Hypotheses, best: Hypothesis, lag_s: float) -> str:
+    """Which delay it is: a low-pass where its form is there in full."""
+    if lag_s < 0.0:
+        return "gyro_time_lag"
+    if LAG_FORM in best.keys:
+        value, deviation = coefficients(all_sets, best, LAG_FORM)
+        as_filter = -0.5 * ((value[0] - 1.0) / deviation[0]) ** 2
+        as_lag = -0.5 * (value[0] / deviation[0]) ** 2
+        near = abs(value[0] - 1.0) < max(2.0 * deviation[0], _NEARLY_ALL)
+        if near and as_filter - as_lag > priors.ODDS_REAL:
+            return "mag_low_pass"
+    return "mag_time_lag"
+
+
+def _where(all_sets: Hypotheses, best: Hypothesis, key: str) -> Where:
+    """When, on which axes and in which frame a member acts."""
+    one, track = all_sets.component(key), all_sets.made.context.track
+    value, _ = coefficients(all_sets, best, key)
+    matrix = one.columns.mag if one.columns.mag is not None else one.columns.gyro
+    added = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
+    spread = np.sqrt(np.mean(added**2, axis=0))
+    axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.2 * spread.max())
+    begin, end = float(track.time_s[0]), float(track.time_s[-1])
+    if "onset_s" in one.setting:
+        begin = float(one.setting["onset_s"])
+        end = min(end, begin + float(one.setting.get("length_s", end - begin)))
+    return Where(((begin, end),), axes, one.frame)
+
+
+def _left(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, odds: Mapping[str, float]
+) -> Unexplained:
+    """What no name explains, where that is beyond the ordinary."""
+    courses = [key for key in space.courses if key in best.names]
+    if courses:
+        key = max(courses, key=lambda one: odds[one])
+        return _course(all_sets, best, key, odds[key])
+    for key, size in priors.ORDINARY.items():
+        component = next((k for k in best.names if k == key), None)
+        if component is None:
+            continue
+        found = size_of(all_sets, best, key)
+        if found > size.up_to():
+            frame = all_sets.component(key).frame
+            unit = "rad/s" if frame == "gyro" else "gauss"
+            nats = best.score - all_sets.judge(best.names - {key}).score
+            where = Where((), AXES, frame, f"a part of what is left ({key})")
+            return Unexplained(True, where, None, found, unit, evidence_nats=nats)
+    return Unexplained(False)
+
+
+def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """The size of a component of the remainder, in its unit."""
+    begin = 0
+    for one in best.keys:
+        law = all_sets.component(one).law
+        if one == key:
+            return float(np.exp(best.at.psi[begin])) * float(getattr(law, "unit", 1.0))
+        begin += len(law.start)
+    raise KeyError(key)
+
+
+def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Unexplained:
+    """A free course in time: its frame, its direction and its values."""
+    one, time_s = all_sets.component(key), all_sets.made.context.track.time_s
+    value, _ = coefficients(all_sets, best, key)
+    modes = value.reshape(-1, 3)
+    at = np.linspace(time_s[0], time_s[-1], _PIECES)
+    order = np.arange(1, len(modes) + 1)
+    phase = np.pi * (at - time_s[0]) / (time_s[-1] - time_s[0])
+    course = np.cos(phase[:, None] * order) @ modes
+    whole = ((float(time_s[0]), float(time_s[-1])),)
+    return _described(at, course, one.frame, odds, whole)
+
+
+def _described(
+    at: Array, course: Array, frame: str, nats: float, spans: tuple[tuple[float, float], ...]
+) -> Unexplained:
+    """A course (k, 3) at times (k,) as what no name explains."""
+    direction, share = single_source(course, np.ones(len(at)))
+    source = course @ direction
+    spread = course.std(axis=0)
+    axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.3 * spread.max())
+    x, y, z = (float(part) for part in direction)
+    return Unexplained(
+        detected=True,
+        where=Where(spans, axes, frame, direction=(x, y, z)),
+        size=float(np.ptp(source)),
+        unit="rad/s" if frame == "gyro" else "gauss",
+        single_source_share=share,
+        evidence_nats=float(nats),
+        course=tuple(zip(at.tolist(), source.tolist(), strict=True)),
+    )
+
+
+def names_of(all_sets: Hypotheses, best: Hypothesis) -> Sequence[str]:
+    """Effects in a set, sorted."""
+    return sorted(one for key in best.names if (one := all_sets.component(key).effect))

@@ -1,0 +1,142 @@
+"""The library's effects as components: one for each setting, and what a form leaves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from ahrsd.diagnosis.delays import beyond_the_lag
+from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.locate import Frame, unit_columns
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
+from ahrsd.diagnosis.values import Columns, Context
+
+#: the delay that stands for all delays: which of them it is, is asked at the end
+LAG = "mag_time_lag"
+LAG_FORM = "form of the delay"
+#: what jumps, and in which frame
+STEPS = {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}
+#: delays and what only the recorded rate shows are not asked
+NOT_ASKED = (
+    LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
+    "rotor_field",
+)  # fmt: skip
+#: parts in which the transition of a step is free
+_PIECES = 4
+#: parts of a recording's length, and factors, to which onsets and scales are sought
+_FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
+
+
+def library_components(
+    context: Context, library: Mapping[str, Effect]
+) -> dict[str, list[Component]]:
+    """Every effect's settings that can be computed here, by identifier."""
+    out = {}
+    for name, effect in library.items():
+        settings = () if name in NOT_ASKED else effect.settings(context)
+        found = [component(context, effect, one, len(settings)) for one in settings]
+        if found:
+            out[name] = found
+    return out
+
+
+def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
+    """Effects by a logged cause (a current, a temperature, ...), each in its first setting."""
+    out = []
+    for name, effect in library.items():
+        logged = [need for need in effect.needs if "accel" not in need]
+        settings = effect.settings(context) if logged and name not in NOT_ASKED else ()
+        if settings:
+            out.append(component(context, effect, settings[0], len(settings)))
+    return out
+
+
+def component(context: Context, effect: Effect, setting: Setting, tried: int) -> Component:
+    """An effect in one setting.  tried: settings among which it is chosen."""
+    searched = int(setting.get("searched", 1))
+    odds = float(np.log(priors.EFFECT) - np.log(max(1, tried) * max(1, searched)))
+    return Component(
+        key_of(effect.identifier, setting),
+        effect.frame or effect.family,
+        effect.columns(context, setting),
+        _sized(effect),
+        odds,
+        effect.identifier,
+        dict(setting),
+    )
+
+
+def anew(known: Component, context: Context, library: Mapping[str, Effect]) -> Component:
+    """A named component, its columns made of another context."""
+    if known.effect is None or known.key == LAG:
+        return known
+    columns = library[known.effect].columns(context, known.setting)
+    return replace(known, columns=columns)
+
+
+def delay(context: Context, library: Mapping[str, Effect]) -> Component:
+    """The delay between the sensors, of either sign."""
+    odds = float(np.log(priors.ORDINARY_EFFECTS[LAG]))
+    law = Fixed(np.array([priors.ORDINARY_LAG_S**2]))
+    return Component(LAG, "sensor", library[LAG].columns(context, {}), law, odds, LAG)
+
+
+def delay_form(context: Context, lag_s: float) -> Component:
+    """What a delay by a filter does beyond a delay: of either, in part."""
+    law = Fixed(np.array([priors.LAG_IS_FILTER**2]))
+    return Component(LAG_FORM, "sensor", beyond_the_lag(context, abs(lag_s)), law)
+
+
+def key_of(name: str, setting: Setting) -> str:
+    """One text for an effect in a setting."""
+    kept = {k: v for k, v in setting.items() if k != "searched"}
+    return f"{name} {json.dumps(kept, sort_keys=True, default=str)}"
+
+
+def _sized(effect: Effect) -> Sized:
+    scale = np.array([one.scale for one in effect.parameters])
+    low, high = np.log(priors.EFFECT_SIZES)
+    return Sized(scale, np.array([low]), np.array([high]))
+
+
+def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting]:
+    """The setting with its onset a little earlier and later, and its scale less and more."""
+    out: list[Setting] = []
+    share = _FINE[min(round_, len(_FINE) - 1)]
+    if setting.get("onset_s"):
+        onset = float(setting["onset_s"])
+        steps = (-2, -1, 1, 2)
+        moved = [onset + k * share * duration_s / 2 for k in steps]
+        out += [{**setting, "onset_s": t} for t in moved if t > 0.0]
+    for name in ("length_s", "time_constant_s", "radius_gauss"):
+        if name in setting:
+            factor = 1.5 ** (1.0 / (1 + round_))
+            out += [{**setting, name: float(setting[name]) * f} for f in (1 / factor, factor)]
+    return out
+
+
+def form_of(known: Component, context: Context) -> Component | None:
+    """What an effect leaves of its form; None where nothing is known of that.
+
+    A step takes its time: within some seconds of its onset the source may be at any size.
+    """
+    frame = STEPS.get(known.effect or "")
+    if frame is None:
+        return None
+    onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.TRANSITION_S / _PIECES
+    edges = onset_s - priors.TRANSITION_S + width_s * np.arange(_PIECES + 1)
+    piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
+    inside = (piece[:, None] == np.arange(_PIECES)).astype(float)
+    axes = unit_columns(context, cast("Frame", frame))
+    flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
+    columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+    law = known.law
+    if not isinstance(law, Sized):
+        return None
+    sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
+    return Component(f"form of {known.key}", frame, columns, sized)

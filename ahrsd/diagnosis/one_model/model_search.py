@@ -1,0 +1,273 @@
+"""The search over sets of components at one linearisation.
+
+Every set is judged by one function of the set alone: its largest log likelihood with the priors of
+its hyperparameters, plus the prior odds of its members.  So it does not matter whether a set was
+reached by adding or by dropping.  A beam of a few sets moves by add, drop and swap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.evidence import At, maximised
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
+from ahrsd.samples import Array
+
+BEAM, ASKED, MOST_MOVES, FINER = 3, 4, 10, 3
+#: moments at which steps are proposed, and how far apart, of the recording's length
+MOMENTS, APART = 4, 0.02
+
+Names = frozenset[str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A set of components and how likely it is.  keys: in the order of the coefficients."""
+
+    names: Names
+    keys: tuple[str, ...]
+    at: At
+    score: float
+
+    def at_of(self, other: Hypothesis) -> At:
+        """Another hypothesis in the quieter noise of the two: what one lacks is no noise."""
+        quiet = np.minimum(self.at.log_noise, other.at.log_noise)
+        return replace(other.at, log_noise=quiet)
+
+
+@dataclass(eq=False)
+class Hypotheses:
+    """Sets of components at one linearisation, each judged once.
+
+    remainder: keys of what every real recording leaves, in or out together
+    start: noise (B,) and psi by key that the richest model has
+    forms: key of what a component leaves of its form, which comes and goes with it
+    """
+
+    made: Linearised
+    remainder: tuple[str, ...]
+    start_noise: Array
+    start_psi: Mapping[str, Array]
+    forms: dict[str, str] = field(default_factory=dict)
+    judged: dict[Names, Hypothesis] = field(default_factory=dict)
+
+    def component(self, key: str) -> Component:
+        """By its key."""
+        return self.made.seen[key].component
+
+    def judge(self, names: Iterable[str]) -> Hypothesis:
+        """The set with these members beside the calibration."""
+        members = frozenset(names)
+        if members not in self.judged:
+            forms = [self.forms[key] for key in members if key in self.forms]
+            keys = (CALIBRATION, *sorted(members), *sorted(forms))
+            real = any(key in members for key in self.remainder)
+            step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
+            products = self.made.products(keys, step)
+            laws = [self.component(key).law for key in keys]
+            psi = [self.start_psi.get(k, law.start) for k, law in zip(keys, laws, strict=True)]
+            start = (self.start_noise, np.concatenate([*psi, np.zeros(0)]))
+            at = maximised(products, laws, [start])
+            score = at.nats + sum(self.component(key).prior for key in members)
+            score += self._again(members)
+            score += self._of_class(members)
+            self.judged[members] = Hypothesis(members, keys, at, score)
+        return self.judged[members]
+
+    def _again(self, members: Names) -> float:
+        """What was put on is taken off: a further step of one kind is no rare thing."""
+        steps = [e for key in members if (e := self.component(key).effect) and e.endswith("_step")]
+        more = len(steps) - len(set(steps))
+        return more * float(np.log(priors.AGAIN / priors.EFFECT))
+
+    def _of_class(self, members: Names) -> float:
+        real = any(key in members for key in self.remainder)
+        return float(np.log(priors.REAL if real else 1.0 - priors.REAL))
+
+
+def scanned(
+    made: Linearised, keys: Sequence[str], at: At, candidates: Sequence[str]
+) -> dict[str, float]:
+    """Log Bayes factor of each candidate beside a model, in its noise, sizes averaged."""
+    products = made.products(keys, priors.NOISE_STEP_REAL)
+    inverse = np.exp(-at.log_noise)
+    laws = [made.seen[key].component.law for key in keys]
+    phi, begin = [], 0
+    for law in laws:
+        width = len(law.start)
+        phi.append(law.log_variance(at.psi[begin : begin + width]))
+        begin += width
+    A = np.tensordot(inverse, products.G, 1)
+    A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
+    factor = cho_factor(A)
+    s = inverse @ products.s
+    solved = cho_solve(factor, s)
+    out = {}
+    made.gram_between(keys, candidates)
+    for key in candidates:
+        C = np.concatenate([np.tensordot(inverse, made.pair(one, key), 1) for one in keys], axis=0)
+        own = np.tensordot(inverse, made.pair(key, key), 1)
+        G = own - C.T @ cho_solve(factor, C)
+        left = inverse @ made.cross(key) - C.T @ solved
+        out[key] = averaged(G, left, made.seen[key].component)
+    return out
+
+
+def averaged(G: Array, s: Array, component: Component) -> float:
+    """Log Bayes factor of a component with information G (p, p) and score s (p,)."""
+    variance = component.law.log_variance(np.zeros(len(component.law.start)))
+    deviation = np.exp(0.5 * variance)
+    scaled = G * deviation * deviation[:, None]
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    values = np.maximum(values, 0.0)
+    score = vectors.T @ (s * deviation)
+    k2 = (
+        np.square(np.array(priors.EFFECT_GRID))[:, None]
+        if len(component.law.start)
+        else np.ones((1, 1))
+    )
+    terms = 0.5 * np.sum(score**2 / (values + 1 / k2) - np.log1p(k2 * values), axis=1)
+    return float(np.logaddexp.reduce(terms) - np.log(len(k2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """What a search may put into a set: candidates by effect, and free courses.
+
+    finer: neighbours of a setting;  form: what a component leaves of its form;  steps_at: of a time
+    """
+
+    effects: dict[str, list[str]]
+    courses: Sequence[str]
+    finer: Callable[[Component, int], list[Component]]
+    form: Callable[[Component], Component | None]
+    steps_at: Callable[[float], list[Component]]
+
+
+def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
+    """The likeliest sets, best first."""
+    beam = _best([all_sets.judge(one) for one in starts])
+    done: set[Names] = set()
+    for _ in range(MOST_MOVES):
+        todo = [one for one in beam if one.names not in done]
+        if not todo or todo[0].score < beam[0].score - 10 * priors.MOVE:
+            break
+        here = todo[0]
+        done.add(here.names)
+        reached = [all_sets.judge(names) for names in moves(all_sets, space, here)]
+        beam = _best([*beam, *reached])
+    return beam
+
+
+def _best(found: Iterable[Hypothesis]) -> list[Hypothesis]:
+    unique = {one.names: one for one in found}
+    return sorted(unique.values(), key=lambda one: -one.score)[:BEAM]
+
+
+def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
+    """Sets that are one step away: a course or an effect more, one less, one for another."""
+    names = here.names
+    _propose_steps(all_sets, space, here)
+    own = [key for key in names if key not in all_sets.remainder]
+    out = [names - {key} for key in own]
+    courses = [key for key in space.courses if key not in names]
+    out += [names | {key} for key in courses]
+    rest = frozenset(all_sets.remainder)
+    out.append(names - rest if rest <= names else names | rest)
+    bare = names - set(space.courses)
+    for base in {names, bare}:
+        ranked = asked(all_sets, space, base, here)
+        out += [base | {key} for key in ranked]
+    return list(dict.fromkeys(out))
+
+
+def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None:
+    """Put steps at the moments at which a set is most surprised among the candidates."""
+    made = all_sets.made
+    for time_s in surprises(made.left_by(here.keys, here.at), made.context.track.time_s):
+        new = [one for one in space.steps_at(time_s) if one.key not in made.seen]
+        made.add(new)
+        for one in new:
+            space.effects.setdefault(one.effect or one.key, []).append(one.key)
+
+
+def surprises(residual: Array, time_s: Array) -> list[float]:
+    """Moments of the largest squares of a residual (N, 3) without colour, apart from each other."""
+    power = np.sum(residual**2, axis=1)
+    power = power + np.roll(power, -1)  # the row of a jump, and the next
+    found: list[float] = []
+    near = APART * float(time_s[-1] - time_s[0])
+    for row in np.argsort(-power)[: 20 * MOMENTS]:
+        at = float(time_s[row])
+        if at > time_s[0] and all(abs(at - other) > near for other in found):
+            found.append(at)
+        if len(found) == MOMENTS:
+            break
+    return found
+
+
+def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
+    """The likeliest setting of each of the likeliest effects, beside a base in here's noise."""
+    model = all_sets.judge(base)
+    at = here.at_of(model)
+    had = {all_sets.component(key).effect for key in base}
+    steps = {name for name in had if name and name.endswith("_step")}
+    candidates = [
+        key for name, keys in space.effects.items() if name not in had or name in steps
+        for key in keys if key not in base
+    ]  # fmt: skip
+    candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
+    worth = scanned(all_sets.made, model.keys, at, candidates)
+    best: dict[str, tuple[float, str]] = {}
+    for key, nats in worth.items():
+        one = all_sets.component(key)
+        total = nats + one.prior
+        if total > best.get(one.effect or key, (-np.inf, ""))[0]:
+            best[one.effect or key] = (total, key)
+    ranked = sorted(best.values(), reverse=True)[:ASKED]
+    return [sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0]
+
+
+def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
+    """Whether a set has the same effect so near in time that the two are one."""
+    one = all_sets.component(key)
+    onset_s = one.setting.get("onset_s")
+    if onset_s is None:
+        return False
+    others = [all_sets.component(other) for other in base]
+    return any(
+        other.effect == one.effect
+        and abs(float(other.setting["onset_s"]) - float(onset_s)) < priors.TRANSITION_S
+        for other in others
+        if "onset_s" in other.setting
+    )
+
+
+def sought(all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str) -> str:
+    """The candidate with its onset and scale sought more and more finely."""
+    made = all_sets.made
+    worth = scanned(made, keys, at, [key])[key] + all_sets.component(key).prior
+    for round_ in range(FINER):
+        near = space.finer(all_sets.component(key), round_)
+        if not near:
+            break
+        made.add(near)
+        found = scanned(made, keys, at, [one.key for one in near])
+        total = {one: nats + all_sets.component(one).prior for one, nats in found.items()}
+        first = max(total, key=lambda one: total[one])
+        if total[first] > worth:
+            key, worth = first, total[first]
+    form = space.form(all_sets.component(key))
+    if form is not None and key not in all_sets.forms:
+        made.add([form])
+        all_sets.forms[key] = form.key
+    listed = space.effects[all_sets.component(key).effect or ""]
+    if key not in listed:
+        listed.append(key)
+    return key

@@ -1,0 +1,112 @@
+"""Every prior, loss and ordinary size of the model, each with its unit, meaning and source.
+
+Ordinary sizes are printed by `python tests/benchmarks/diagnosis/bench_remainder_priors.py`, which measures
+them on untouched real recordings: lognormal about a median, `spread` in the logarithm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import exp
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """A deviation that is lognormal.
+
+    median: in the component's unit;  spread: of its logarithm;  most: what physics allows
+    """
+
+    median: float
+    spread: float
+    most: float
+
+    def up_to(self) -> float:
+        """What 95 % stay below, the component's unit."""
+        return self.median * exp(1.645 * self.spread)
+
+
+# --- what every real recording leaves: measured ----------------------------------------------
+#: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
+ORDINARY: Mapping[str, Size] = {
+    "world_course": Size(8.14e-03, 1.31, 0.1),  # gauss
+    "gyro_course": Size(6.86e-04, 1.66, 0.05),  # rad/s
+    "by_direction": Size(4.08e-03, 2.06, 0.02),  # gauss: harmonics of degree 2 and 3
+    "by_change": Size(1.34e-03, 1.73, 0.03),  # s: axes that are late by different times
+    "bending": Size(7.45e-01, 1.31, 3.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(6.63e-04, 1.96, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(7.51e-04, 1.75, 0.02),  # gauss at 1 rad/s
+    "by_force": Size(3.26e-03, 1.84, 0.03),  # rad/s at 1 g
+}
+#: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
+ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
+
+#: of a delay between the sensors, s: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
+ORDINARY_LAG_S = 0.04
+#: how much of a delay is a filter's, 1 all of it
+LAG_IS_FILTER = 0.5
+
+# --- what may be there besides ------------------------------------------------------------------
+#: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
+EFFECT = 1.0 / 60.0
+#: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
+ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
+#: seconds round a step for which whatever makes it (a hand with a magnet) may be anywhere
+TRANSITION_S = 2.0
+#: of a further step of a kind that is there: what was put on is taken off
+AGAIN = 0.3
+#: steps of a kind from which on they are one source that changes, which has no name
+CHANGES = 3
+#: of a course in time that nothing names, in one frame
+COURSE = 1.0 / 20.0
+#: that a recording leaves what real ones do, and not what a simulation does: nothing
+REAL = 0.5
+#: sizes of a course in its unit (1 mG, 0.1 mrad/s), and its time constants as shares of it all
+COURSE_UNIT: Mapping[str, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
+COURSE_SIZES = (1e-2, 5e2)
+#: corner of a course's spectrum, in half waves a recording
+COURSE_CORNERS = (1.0, 40.0)
+#: how many times its usual scale an effect is, evenly in the logarithm
+EFFECT_SIZES = (1e-2, 10.0)
+#: the same where candidates are only ranked
+EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
+#: relative size of what an effect leaves of its form, its second order
+FORM = 0.03
+
+# --- noise --------------------------------------------------------------------------------------
+#: deviation of a log power from that of the next octave: of a sensor's own noise, of what a real
+#: recording leaves as well, and where only a delay is sought;  of the highest from the filter's
+NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
+#: log powers between which a band stays
+NOISE_RANGE = (-9.0, 9.0)
+#: deviations from which a reading that is off alone counts no more
+WILD = 4.0
+#: seconds over which the noise's level is taken;  powers between which it stays, of the median's
+LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
+#: octaves of the noise's spectrum, at most
+BANDS = 7
+
+#: effects that a component of the remainder may be, too: beside it they are findings only where
+#: they are larger than it ordinarily is
+ORDINARY_FORM_OF: Mapping[str, str] = {
+    "field_step": "world_course",
+    "field_anomaly": "world_course",
+    "geomagnetic_drift": "world_course",
+    "gyro_bias_step": "gyro_course",
+    "gyro_bias_drift": "gyro_course",
+    "gyro_startup": "gyro_course",
+    "eddy_current": "by_change",
+    "gyro_g_sensitivity": "by_force",
+    "mag_cross_axis": "by_direction",
+    "mag_nonlinearity": "by_direction",
+}
+
+# --- the decision -------------------------------------------------------------------------------
+#: log odds from which an effect is told: a false name costs more than a missed one;  from which
+#: something is called unknown
+NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
+#: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
+ODDS_REAL = 12.0
+#: nats that a move of the search must gain
+MOVE = 2.0

@@ -1,0 +1,109 @@
+"""What every real recording leaves, with sizes measured on untouched ones (`priors`).
+
+A room differs from place to place and its field from time to time, a sensor is not quite linear, a
+gyro not quite straight.  All of that is locked to time, attitude, rate and force, and without
+components of its own the library's flexible names would be told for it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.innovation import TRACELESS
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
+from ahrsd.diagnosis.one_model.gaussian_process import course
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+_GRAVITY = 9.81
+_ASIDE = np.eye(3)
+_SKEW = np.array([
+    [[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+    [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
+])  # fmt: skip
+
+
+def ordinary_remainder(context: Context) -> list[Component]:
+    """Its components along a recording."""
+    found = [
+        course(context, "world", priors.ORDINARY["world_course"]),
+        course(context, "gyro", priors.ORDINARY["gyro_course"]),
+        _sized(context, "by_direction", "sensor", harmonics(context.smooth_b)),
+        by_change(context),
+        _sized(context, "field_by_rate", "sensor", context.rate_b_rad_s),
+        bending(context),
+        _sized(context, "by_rate_squared", "gyro", squares(context.rate_b_rad_s)),
+        gyro_matrix(context),
+    ]
+    if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
+        found.append(_sized(context, "by_force", "gyro", context.force_b_m_s2 / _GRAVITY))
+    return found
+
+
+def _sized(context: Context, key: str, frame: str, functions: Array) -> Component:
+    """Each function (N, k) along each axis of the sensor, all coefficients of one size."""
+    law = ordinary(priors.ORDINARY[key], np.ones(3 * functions.shape[1]))
+    flat = np.einsum("nk,ia->nika", functions, _ASIDE).reshape(len(functions), 3, -1)
+    columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+    return Component(key, frame, columns, law)
+
+
+def ordinary(size: priors.Size, scale: Array) -> Sized:
+    """The law of an ordinary size, of coefficients in units of `scale` (q,)."""
+    mean = float(np.log(size.median))
+    low, high = mean - 4.0 * size.spread, float(np.log(size.most))
+    return Sized(scale, np.array([low]), np.array([high]), mean, size.spread)
+
+
+def by_change(context: Context) -> Component:
+    """A matrix on the field's change, without what is alike on all axes: that is the delay."""
+    matrix = np.concatenate([TRACELESS, _SKEW])
+    columns = np.einsum("aij,nj->nia", matrix, context.field_dot_b)
+    law = ordinary(priors.ORDINARY["by_change"], np.ones(len(matrix)))
+    return Component("by_change", "sensor", Columns(mag=columns), law)
+
+
+def bending(context: Context) -> Component:
+    """A mount that gives: turned by what force and angular acceleration do to it."""
+    found = EFFECTS["flexible_mount"]
+    law = ordinary(priors.ORDINARY["bending"], np.array([one.scale for one in found.parameters]))
+    return Component("bending", "sensor", found.columns(context, {}), law)
+
+
+def gyro_matrix(context: Context) -> Component:
+    """Of the rates: three turns, three scales, three shears, of known ordinary sizes."""
+    w = context.rate_b_rad_s
+    columns = np.zeros((len(w), 3, 9))
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        columns[:, i, axis], columns[:, j, axis] = -w[:, j], w[:, i]
+        columns[:, axis, 3 + axis] = w[:, axis]
+        columns[:, i, 6 + axis], columns[:, j, 6 + axis] = w[:, j], w[:, i]
+    deviation = np.repeat([priors.ORDINARY_MISALIGNMENT_RAD, priors.ORDINARY_SCALE], [3, 6])
+    return Component("gyro_matrix", "gyro", Columns(gyro=columns), Fixed(deviation**2))
+
+
+def harmonics(field_b: Array) -> Array:
+    """(N, 12) harmonics of degree 2 and 3 of a direction, of mean square 1 on the sphere."""
+    x, y, z = (field_b / np.maximum(np.linalg.norm(field_b, axis=1, keepdims=True), 1e-300)).T
+    second = [x * y, y * z, z * x, (x**2 - y**2) / 2, (3 * z**2 - 1) / (2 * np.sqrt(3))]
+    third = [
+        x * y * z * 2,
+        z * (x**2 - y**2),
+        x * (5 * z**2 - 1) / np.sqrt(10),
+        y * (5 * z**2 - 1) / np.sqrt(10),
+        z * (5 * z**2 - 3) / np.sqrt(15),
+        x * (x**2 - 3 * y**2) / np.sqrt(6),
+        y * (3 * x**2 - y**2) / np.sqrt(6),
+    ]
+    return np.column_stack(
+        [np.sqrt(15.0) * np.array(second).T, np.sqrt(105.0 / 4) * np.array(third).T]
+    )
+
+
+def squares(rate: Array) -> Array:
+    """(N, 6) products of the rates, less nothing: a mean is a bias, which the calibration has."""
+    x, y, z = rate.T
+    return np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x])

@@ -1,0 +1,153 @@
+"""The richest model: calibration, delay, ordinary remainder and free courses in every frame.
+
+It is where everything is linearised.  In the null, what is missing counts as noise: beside a magnet
+of 0.14 G its sigma was ten times too large, the calibration was bent to it, and the step never got
+its evidence.  Here courses hold what is missing, whatever it is; the noise is what they leave, the
+calibration is the one beside them, and a name has to do better than they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.innovation import Filtered
+from ahrsd.diagnosis.locate import FRAMES
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.effect_components import LAG, anew, causes, delay, delay_form
+from ahrsd.diagnosis.one_model.evidence import At, maximised
+from ahrsd.diagnosis.one_model.gaussian_process import course
+from ahrsd.diagnosis.one_model.linearised import (
+    CALIBRATION,
+    Linearised,
+    Point,
+    first_point,
+    linearised,
+    moved,
+)
+from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
+from ahrsd.diagnosis.problem import Problem
+
+#: linearisations, and nats that a further one must gain
+ROUNDS, SETTLED = 6, 2.0
+#: parts of a step that are tried
+SHARES = (1.0, 0.3)
+#: the sensor's course stands for all three where the remainder, with the other two, is in
+RICH_COURSES = ("free sensor",)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Base:
+    """A linearisation with everything but candidates.
+
+    remainder: keys of what real recordings leave;  small, whole: keys of the model of the first
+    steps (calibration, delay, logged causes), and of the richest
+    """
+
+    made: Linearised
+    remainder: tuple[str, ...]
+    small: tuple[str, ...]
+    whole: tuple[str, ...]
+
+
+def base_of(point: Point, library: Mapping[str, Effect], named: Sequence[Component]) -> Base:
+    """The base at a point.  named: components known by name, made anew of this context."""
+    made = linearised(point)
+    context = made.context
+    rest = ordinary_remainder(context)
+    courses = [course(context, frame) for frame in FRAMES]
+    lags = [delay(context, library)]
+    if point.problem.lag_s != 0.0:
+        lags.append(delay_form(context, point.problem.lag_s))
+    known = [anew(one, context, library) for one in named]
+    driven = [one for one in causes(context, library) if one.key not in {k.key for k in known}]
+    parts = [*rest, *lags, *courses, *known, *driven]
+    made.exact = (LAG,)
+    made.add(parts)
+    made.put_back({key: value for key, value in point.values.items() if key in made.seen})
+    made.gram_of([CALIBRATION, *(one.key for one in parts)])
+    remainder = tuple(one.key for one in rest)
+    small = (CALIBRATION, *(one.key for one in (*lags, *known, *driven)))
+    return Base(made, remainder, small, (*small, *remainder, *RICH_COURSES))
+
+
+def fitted(made: Linearised, keys: Sequence[str], step: float = priors.NOISE_STEP_REAL) -> At:
+    """The likeliest hyperparameters of a model, from the highest band's power on.
+
+    That is the sensor's own: from there an effect is not noise before it was asked for.
+    """
+    products = made.products(keys, step)
+    laws = [made.seen[key].component.law for key in keys]
+    psi = np.concatenate([law.start for law in laws])
+    top = float(np.log(products.square[-1] / products.rows[-1]))
+    starts = [(np.full(len(products.rows), top), psi)]
+    return maximised(products, laws, starts)
+
+
+def psi_by_key(made: Linearised, keys: Sequence[str], at: At) -> dict[str, np.ndarray]:
+    """Hyperparameters of each component."""
+    out, begin = {}, 0
+    for key in keys:
+        width = len(made.seen[key].component.law.start)
+        out[key] = at.psi[begin : begin + width]
+        begin += width
+    return out
+
+
+def richest(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Point:
+    """The likeliest point of some at the richest model, nothing named, from a null's filter.
+
+    First the delay and the logged causes alone, beside noise of any spectrum: a delay of a tenth of
+    a second, or a motor's current, bend everything else that is fitted beside them.
+    """
+    point = settled(first_point(problem, filtered), library, (), whole=False)
+    return settled(point, library, (), whole=True)
+
+
+def settled(
+    point: Point, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool
+) -> Point:
+    """The point moved to where the richest model with these names is likeliest.
+
+    A step that makes it less likely, linear as it is, is taken in part or not at all.
+    whole: the richest model, else the small one
+    """
+    here = _judged(point, library, named, whole=whole)
+    for _ in range(ROUNDS):
+        for share in SHARES:
+            new = moved(here.made, here.keys, here.at, share)
+            if not np.isfinite(new.filtered.whitened).all():
+                continue
+            found = _judged(new, library, named, whole=whole)
+            if found.nats > here.nats:
+                break
+        else:
+            return here.made.point
+        gained, here = found.nats - here.nats, found
+        if gained < SETTLED:
+            break
+    return here.made.point
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """A model at a linearisation; nats: by readings and not by rows, so that points compare."""
+
+    made: Linearised
+    keys: tuple[str, ...]
+    at: At
+    nats: float
+
+
+def _judged(
+    point: Point, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool
+) -> _Judged:
+    base = base_of(point, library, named)
+    keys = base.whole if whole else base.small
+    step = priors.NOISE_STEP_REAL if whole else priors.NOISE_STEP_FREE
+    at = fitted(base.made, keys, step)
+    return _Judged(base.made, keys, at, at.nats + base.made.log_whitening)

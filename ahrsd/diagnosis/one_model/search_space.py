@@ -1,0 +1,83 @@
+"""What a search at one point may choose from: the library's settings there, courses, forms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.one_model import rich
+from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.effect_components import (
+    LAG,
+    LAG_FORM,
+    STEPS,
+    component,
+    form_of,
+    library_components,
+    neighbours,
+)
+from ahrsd.diagnosis.one_model.linearised import Point
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
+
+COURSES = ("free sensor", "free world", "free gyro")
+#: settings that an onset which was sought finely counts for at least
+_SOUGHT = 40
+#: onsets among which one that the data proposed was chosen
+_ONSETS = 200
+
+
+def best_at(
+    point: Point, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
+) -> tuple[Hypotheses, Space, Hypothesis]:
+    """The likeliest set at a point, searched from the names that are known and from nothing."""
+    base = rich.base_of(point, library, named)
+    all_sets, space = _space(base, library, named)
+    real = frozenset(base.remainder)
+    known = frozenset(one.key for one in named)
+    lag = frozenset([LAG])
+    starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
+    if known:
+        here = known | real if was_real else known
+        starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
+    found = searched(all_sets, space, starts)
+    return all_sets, space, found[0]
+
+
+def _space(
+    base: rich.Base, library: Mapping[str, Effect], named: Sequence[Component]
+) -> tuple[Hypotheses, Space]:
+    made, context = base.made, base.made.context
+    found = library_components(context, library)
+    effects = {name: [one.key for one in parts] for name, parts in found.items()}
+    made.add([one for parts in found.values() for one in parts])
+    effects[LAG] = [LAG]
+    forms = {}
+    for one in named:
+        listed = effects.setdefault(one.effect or one.key, [])
+        if one.key not in listed:
+            listed.append(one.key)
+        form = form_of(one, context)
+        if form is not None:
+            made.add([form])
+            forms[one.key] = form.key
+    if LAG_FORM in made.seen:
+        forms[LAG] = LAG_FORM
+    at = rich.fitted(made, base.whole)
+    psi = rich.psi_by_key(made, base.whole, at)
+    all_sets = Hypotheses(made, base.remainder, at.log_noise, psi, forms)
+    length_s = context.track.duration_s
+
+    def finer(one: Component, round_: int) -> list[Component]:
+        if one.effect is None or one.effect == LAG:
+            return []
+        tried = max(_SOUGHT, len(effects[one.effect]))
+        near = neighbours(one.setting, length_s, round_)
+        return [component(context, library[one.effect], setting, tried) for setting in near]
+
+    def steps_at(time_s: float) -> list[Component]:
+        setting = {"onset_s": round(time_s, 3)}
+        asked = [name for name in STEPS if name in library]
+        return [component(context, library[name], setting, _ONSETS) for name in asked]
+
+    space = Space(effects, COURSES, finer, lambda one: form_of(one, context), steps_at)
+    return all_sets, space

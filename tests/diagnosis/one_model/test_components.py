@@ -1,0 +1,92 @@
+"""Laws of coefficients, functions of the remainder, and the noise's weights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ahrsd.diagnosis.one_model import noise_model, priors
+from ahrsd.diagnosis.one_model.component import Sized
+from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
+from ahrsd.diagnosis.one_model.remainder import harmonics, squares
+
+
+@pytest.mark.parametrize("psi", [np.array([0.3, 0.5]), np.array([-1.0, 3.0])])
+def test_a_course_has_the_size_that_its_law_says(psi):
+    law = CourseLaw(np.repeat(np.arange(1.0, 41.0), 3), 1e-3)
+    variance = np.exp(law.log_variance(psi))
+    t = np.linspace(0.0, 1.0, 4001)
+    modes = np.cos(np.pi * t[:, None] * np.arange(1, 41))
+    over_time = np.mean(modes**2, axis=0) @ variance[::3]
+    assert np.sqrt(over_time) == pytest.approx(1e-3 * np.exp(psi[0]), rel=1e-3)
+
+
+def test_slopes_are_those_of_differences():
+    law = CourseLaw(np.repeat(np.arange(1.0, 21.0), 3), 1e-3, mean=0.5, spread=1.2)
+    psi = np.array([0.2, 1.1])
+    for k in range(2):
+        step = 1e-6 * np.eye(2)[k]
+        ahead, behind = law.log_variance(psi + step), law.log_variance(psi - step)
+        np.testing.assert_allclose(law.slope(psi)[:, k], (ahead - behind) / 2e-6, atol=1e-6)
+        density = (law.log_prior(psi + step)[0] - law.log_prior(psi - step)[0]) / 2e-6
+        assert law.log_prior(psi)[1][k] == pytest.approx(density, abs=1e-6)
+
+
+def test_an_ordinary_size_is_a_lognormal_density():
+    law = Sized(np.ones(2), np.array([-20.0]), np.array([20.0]), mean=-1.0, spread=0.7)
+    grid = np.linspace(-10.0, 10.0, 4001)
+    density = np.exp([law.log_prior(np.array([x]))[0] for x in grid])
+    assert np.sum(density) * (grid[1] - grid[0]) == pytest.approx(1.0, abs=1e-6)
+    assert law.log_variance(np.array([-1.0]))[0] == pytest.approx(-2.0)
+
+
+def test_harmonics_are_orthonormal_and_no_calibration():
+    rng = np.random.default_rng(1)
+    n = rng.normal(size=(200_000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    H = harmonics(0.5 * n)
+    np.testing.assert_allclose(H.T @ H / len(n), np.eye(12), atol=0.03)
+    np.testing.assert_allclose(H.T @ np.column_stack([np.ones(len(n)), n]) / len(n), 0.0, atol=0.02)
+
+
+def test_squares_of_the_rates():
+    np.testing.assert_allclose(squares(np.array([[2.0, 3.0, 5.0]])), [[4, 9, 25, 6, 15, 10]])
+
+
+def test_octaves_cover_all_cosines():
+    edges = noise_model.octaves(6000)
+    assert edges[0] == 0
+    assert edges[-1] == 6000
+    assert len(edges) == priors.BANDS + 1
+    assert np.all(edges[2:-1] * 2 <= edges[3:] + 1)
+
+
+def test_the_noise_prior_has_the_slope_of_its_differences():
+    x = np.array([0.3, -0.2, 0.9, 0.1])
+    _, gradient = noise_model.log_prior(x, 0.6)
+    for k in range(4):
+        step = 1e-6 * np.eye(4)[k]
+        slope = (
+            noise_model.log_prior(x + step, 0.6)[0] - noise_model.log_prior(x - step, 0.6)[0]
+        ) / 2e-6
+        assert gradient[k] == pytest.approx(slope, abs=1e-6)
+
+
+def test_a_wild_reading_counts_less_and_a_step_does_not():
+    rng = np.random.default_rng(2)
+    residual = rng.normal(size=(2000, 3))
+    used = np.ones(2000, dtype=bool)
+    residual[500] = 60.0
+    residual[1200:1300] += 20.0
+    weight = noise_model.amplitude(residual, used, 10.0)
+    assert weight[500] > 10.0
+    assert np.all(weight[1190:1310] < 1.5)
+    assert np.median(weight) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_level_follows_noise_that_is_louder_for_long():
+    rng = np.random.default_rng(3)
+    residual = rng.normal(size=(4000, 3))
+    residual[2500:] *= 4.0
+    weight = noise_model.amplitude(residual, np.ones(4000, dtype=bool), 10.0)
+    assert np.median(weight[3000:]) / np.median(weight[:2000]) == pytest.approx(4.0, rel=0.15)

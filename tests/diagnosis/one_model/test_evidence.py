@@ -1,0 +1,139 @@
+"""The evidence against a dense Gaussian, its slope against differences, and its one maximum."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from ahrsd.diagnosis.one_model import noise_model
+from ahrsd.diagnosis.one_model.component import Fixed, Sized
+from ahrsd.diagnosis.one_model.evidence import Products, evaluated, maximised
+from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
+
+ROWS, STEP = (20, 20, 40, 80), 0.7
+
+
+def design(seed: int, widths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns that overlap, and readings that hold some of them."""
+    rng = np.random.default_rng(seed)
+    count = sum(ROWS)
+    B = rng.normal(size=(count, sum(widths))) + 0.5 * rng.normal(size=(count, 1))
+    band = np.repeat(np.arange(len(ROWS)), ROWS)
+    y = B @ rng.normal(scale=0.7, size=B.shape[1]) + np.exp(0.3 * band) * rng.normal(size=count)
+    return B, y
+
+
+def products(B: np.ndarray, y: np.ndarray) -> Products:
+    edges = np.cumsum([0, *ROWS])
+    parts = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    return Products(
+        np.stack([B[p].T @ B[p] for p in parts]),
+        np.stack([B[p].T @ y[p] for p in parts]),
+        np.array([y[p] @ y[p] for p in parts]),
+        np.array(ROWS, dtype=float),
+        STEP,
+    )
+
+
+def laws() -> list:
+    even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
+    return [
+        Fixed(np.full(3, 4.0)),
+        Sized(np.array([0.5, 1.0, 2.0]), *even),
+        Sized(np.ones(4), *even, mean=np.log(0.3), spread=0.8),
+        CourseLaw(np.repeat(np.arange(1, 6), 2).astype(float), 1.0),
+    ]
+
+
+WIDTHS = (3, 3, 4, 10)
+
+
+def dense(B: np.ndarray, y: np.ndarray, log_noise: np.ndarray, psi: np.ndarray) -> float:
+    """Log density of the readings by their whole covariance, and of the hyperparameters."""
+    at, variance, prior = 0, [], 0.0
+    for law in laws():
+        mine = psi[at : at + len(law.start)]
+        at += len(mine)
+        variance.append(np.exp(law.log_variance(mine)))
+        prior += law.log_prior(mine)[0]
+    V = np.diag(np.repeat(np.exp(log_noise), ROWS)) + (B * np.concatenate(variance)) @ B.T
+    readings = multivariate_normal(np.zeros(len(y)), V).logpdf(y)
+    return float(readings + prior + noise_model.log_prior(log_noise, STEP)[0])
+
+
+LOG_NOISE, PSI = np.array([0.4, 0.1, -0.2, 0.3]), np.array([-0.4, -0.9, 0.2, 0.8])
+
+
+def test_the_evidence_is_that_of_the_dense_gaussian():
+    B, y = design(1, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    assert at.nats == pytest.approx(dense(B, y, LOG_NOISE, PSI), abs=1e-6)
+
+
+def test_the_gradient_is_that_of_differences():
+    B, y = design(2, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    x = np.concatenate([LOG_NOISE, PSI])
+    for k in range(len(x)):
+        step = 1e-5 * np.eye(len(x))[k]
+        ahead, behind = (dense(B, y, (x + s)[:4], (x + s)[4:]) for s in (step, -step))
+        assert at.gradient[k] == pytest.approx((ahead - behind) / 2e-5, rel=1e-5, abs=1e-5)
+
+
+def test_the_mean_and_covariance_are_those_of_bayes():
+    B, y = design(3, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    weight = np.repeat(np.exp(-LOG_NOISE), ROWS)
+    k, variance = 0, []
+    for law in laws():
+        variance.append(np.exp(law.log_variance(PSI[k : k + len(law.start)])))
+        k += len(law.start)
+    precision = (B.T * weight) @ B + np.diag(1 / np.concatenate(variance))
+    covariance = np.linalg.inv(precision)
+    np.testing.assert_allclose(at.covariance, covariance, atol=1e-8)
+    np.testing.assert_allclose(at.mean, covariance @ (B.T @ (weight * y)), atol=1e-7)
+
+
+def test_adding_and_dropping_agree_on_200_hypotheses():
+    """A set is worth the same whether the search came to it from fewer members or from more."""
+    rng = np.random.default_rng(4)
+    width, members = 3, 8
+    worst = 0.0
+    for trial in range(200):
+        if trial % 20 == 0:
+            B, y = design(100 + trial, (width,) * members)
+        few = np.sort(rng.choice(members, size=rng.integers(1, members), replace=False))
+        whole = np.arange(members)
+
+        def of(chosen, start=None, B=B, y=y):
+            columns = np.concatenate([np.arange(width) + width * k for k in chosen])
+            even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
+            own = [Sized(np.ones(width), *even) for _ in chosen]
+            begin = start or (np.full(4, 1.0), np.zeros(len(chosen)))
+            return maximised(products(B[:, columns], y), own, [begin])
+
+        rich = of(whole)
+        dropped = of(few, (rich.log_noise, rich.psi[few]))
+        fewer = of(few[:-1]) if len(few) > 1 else of(few)
+        psi = np.concatenate([fewer.psi, [0.0]]) if len(few) > 1 else np.zeros(1)
+        added = of(few, (fewer.log_noise, psi))
+        worst = max(worst, abs(added.nats - dropped.nats))
+    assert worst < 1.0
+
+
+def test_what_is_not_there_is_small_and_what_is_there_is_found():
+    rng = np.random.default_rng(5)
+    B = rng.normal(size=(sum(ROWS), 16))
+    y = B[:, :8] @ rng.normal(scale=2.0, size=8) + rng.normal(size=len(B))
+    even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
+    found = maximised(
+        products(B, y),
+        [Sized(np.ones(8), *even), Sized(np.ones(8), *even)],
+        [(np.zeros(4), np.zeros(2))],
+    )
+    assert np.exp(found.psi[0]) == pytest.approx(2.0, rel=0.5)
+    assert np.exp(found.psi[1]) < 0.15
+    np.testing.assert_allclose(np.exp(found.log_noise), 1.0, rtol=0.6)
