@@ -1,7 +1,7 @@
 """Every prior, loss and ordinary size of the model, each with its unit, meaning and source.
 
-Ordinary sizes are printed by `python tests/benchmarks/diagnosis/bench_remainder_priors.py`, which measures
-them on untouched real recordings: lognormal about a median, `spread` in the logarithm.
+Ordinary sizes are printed by `python tests/benchmarks/diagnosis/bench_remainder_priors.py`, which
+measures them on untouched real recordings: lognormal about a median, `spread` in the logarithm.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What untouched real recordings leave: the sizes of `ahrsd/diagnosis/one_model/priors.py`.
 
-    python tests/benchmarks/diagnosis/bench_remainder_priors.py --measured SIZES.json [--only WORD ...]
+    python tests/benchmarks/diagnosis/bench_remainder_priors.py --measured SIZES.json [--only WORD]
     python tests/benchmarks/diagnosis/bench_remainder_priors.py --table SIZES.json
 
 The first fits the richest model to each untouched recording beside the project and keeps, for each
