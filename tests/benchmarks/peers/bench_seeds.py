@@ -1,8 +1,8 @@
 """The figures that the seeds print, beside the same methods here, ours and the floor.
 
-    python tests/benchmarks/diagnosis/bench_seeds.py
+    python tests/benchmarks/peers/bench_seeds.py
         # short: half a minute
-    python tests/benchmarks/diagnosis/bench_seeds.py
+    python tests/benchmarks/peers/bench_seeds.py
         --runs 100 --jobs 2 --cache DIR --output docs/validation
 
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023, chapters 5 and 6; [M] Rodriguez-Martinez & Troni,

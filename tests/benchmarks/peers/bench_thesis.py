@@ -1,6 +1,6 @@
 """The figures that [R] prints, beside the same methods here, ours and the bound.
 
-    python tests/benchmarks/diagnosis/bench_thesis.py
+    python tests/benchmarks/peers/bench_thesis.py
         --cache DIR --runs 100 --output docs/validation/thesis
 
 [R] Rodriguez-Martinez, thesis, PUC Chile 2023. Its experiment is simulated as its tables were made:
