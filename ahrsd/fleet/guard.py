@@ -8,7 +8,10 @@ what was asked for; Arrow's own pool reserves a gigabyte that it never touches, 
 the system's allocator.
 
 A task whose process died is tried again, because whoever killed it may have meant another;
-after `TRIES` it is lost, and so it is said. On a cluster every Dask worker has a guard.
+after `TRIES` it is lost, and so it is said. That includes one that no process began with: pebble
+forgets a task whose process ended while it took it, as where the code that it needs is gone, and
+gives up all processes where none of them was at work then. On a cluster every Dask worker has a
+guard.
 """
 
 from __future__ import annotations
@@ -20,10 +23,12 @@ import multiprocessing
 import os
 import resource
 import signal
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, wait
 from concurrent.futures import TimeoutError as LateError
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -46,10 +51,14 @@ _R = TypeVar("_R")
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Of each task; 0 is none."""
+    """Of each task; 0 is none.
+
+    begin_s: within which a process begins with it, as many as tasks are asked for at once
+    """
 
     time_s: float = 0.0
     memory_bytes: int = 0
+    begin_s: float = _START_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +72,10 @@ class Loss:
     words: str
     tries: int
     seconds: float
+
+
+class _NotBegunError(Exception):
+    """No process took the task, or the one that did ended at that moment."""
 
 
 class Ask(Protocol):
@@ -86,16 +99,29 @@ class Guard:
             )
         for name, value in _ENVIRONMENT.items():
             os.environ.setdefault(name, value)
-        self._limits, self._closed = limits, False
-        self._pool = ProcessPool(
-            processes,
+        self._processes, self._limits, self._loads = processes, limits, loads
+        self._closed, self._lock = False, threading.Lock()
+        # the processes belong to the thread that starts them: this one, which outlives them
+        self._pool = self._started()
+
+    def _started(self) -> ProcessPool:
+        pool = ProcessPool(
+            self._processes,
             max_tasks=_RECYCLED,
             initializer=_begin,
-            initargs=(os.getpid(), limits.memory_bytes, loads),
+            initargs=(os.getpid(), self._limits.memory_bytes, self._loads),
             context=multiprocessing.get_context("spawn"),
         )
-        # the processes belong to the thread that starts them: this one, which outlives them
-        self._pool.schedule(_ready, timeout=_START_S).result()
+        pool.schedule(_ready, timeout=_START_S).result()
+        return pool
+
+    def _in_place_of(self, broken: ProcessPool) -> None:
+        """Other processes, unless another thread has started them."""
+        with self._lock:
+            if self._pool is broken and not self._closed:
+                broken.stop()  # type: ignore[no-untyped-call]
+                broken.join()
+                self._pool = self._started()
 
     def ask(self, do: Callable[[_T], _R], task: _T, lost: Callable[[_T, Loss], _R]) -> _R:
         """What `do` answers to a task, or `lost` where it has no answer; it waits for it."""
@@ -105,20 +131,33 @@ class Guard:
     def _answer(self, do: Callable[[_T], _R], task: _T) -> _R | Loss:
         for number in range(1, TRIES + 1):
             begun = time.monotonic()
-            future = self._pool.schedule(do, args=[task], timeout=self._limits.time_s or None)
-            while not wait([future], _LOOKS_S).done:
-                if self._closed:  # the pool leaves what it was at without an answer
-                    raise CancelledError
-            error = future.exception()
+            pool = self._pool
+            try:
+                future = pool.schedule(do, args=[task], timeout=self._limits.time_s or None)
+                error = self._error(future)
+            except RuntimeError as closed:  # all its processes ended
+                error = BrokenProcessPool(str(closed))
             if error is None:
                 return future.result()
             outcome, words = self._loss(error)
             if self._closed:
                 raise CancelledError
+            if isinstance(error, BrokenProcessPool):
+                self._in_place_of(pool)
             if outcome == CRASHED and number < TRIES:
                 continue
             return Loss(outcome, words, number, time.monotonic() - begun)
         raise AssertionError("the last try returns")
+
+    def _error(self, future: Future[_R]) -> BaseException | None:
+        """Wait for a task; its error, _NotBegunError where no process began with it."""
+        until = time.monotonic() + self._limits.begin_s
+        while not wait([future], _LOOKS_S).done:
+            if self._closed:  # the pool leaves what it was at without an answer
+                raise CancelledError
+            if time.monotonic() > until and future.cancel():
+                return _NotBegunError()
+        return future.exception()
 
     def _loss(self, error: BaseException) -> tuple[str, str]:
         """The outcome that an error of a process is, and its words."""
@@ -131,6 +170,8 @@ class Guard:
             code = error.exitcode
             how = f"by signal {-code} ({_signal(-code)})" if code < 0 else f"with code {code}"
             return CRASHED, f"its process ended {how}, {TRIES} times"
+        if isinstance(error, BrokenProcessPool | _NotBegunError):
+            return CRASHED, f"no process could begin with it, {TRIES} times"
         return BUG, f"{type(error).__name__}: {error}"
 
     def close(self) -> None:

@@ -88,6 +88,41 @@ def test_a_process_that_is_killed_costs_no_task_and_all_end_with_the_crew(tmp_pa
         time.sleep(0.02)
 
 
+class GoneThere:
+    """A task whose code is there where it is asked for, and not in the process that takes it."""
+
+    def __init__(self, number: int, here: int) -> None:
+        self.number, self.here = number, here
+
+    def __reduce__(self):
+        return found_here, (self.number, self.here)
+
+
+def found_here(number: int, here: int) -> GoneThere:
+    if here not in (0, os.getpid()):
+        raise ModuleNotFoundError("No module named 'moved_meanwhile'")
+    return GoneThere(number, here)
+
+
+def slowly(task: GoneThere) -> int:
+    time.sleep(1.0)
+    return task.number
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_task_that_no_process_can_take_is_lost_and_the_others_go_on(jobs):
+    tasks = [GoneThere(number, os.getpid() if number == 1 else 0) for number in range(5)]
+    limits = Limits(begin_s=8.0)
+    with crew(Place(jobs), limits) as workers:
+        found = {task.number: answer for task, answer in workers.map(slowly, tasks, told)}
+    assert found.pop(1) == (CRASHED, "no process could begin with it, 3 times", TRIES)
+    assert found == {number: number for number in (0, 2, 3, 4)}
+
+
+def told(_: GoneThere, loss: Loss) -> tuple[str, str, int]:
+    return loss.outcome, loss.words, loss.tries
+
+
 def test_processes_hold_one_blas_thread(monkeypatch):
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with crew(Place(1), Limits()) as workers:
