@@ -8,7 +8,7 @@ from dataclasses import astuple, replace
 import numpy as np
 import pieces
 import pytest
-from ahrsd.simulation.experiment import measured
+from ahrsd.simulation.scenarios import measured
 from scipy.spatial.transform import Rotation
 
 from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, ORDINARY
