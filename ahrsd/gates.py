@@ -303,7 +303,7 @@ MOTION = (
         Level.CANDIDATE,
         meaning="expected heading error (1 sigma) at the worst attitude driven",
         advice=f"the heading is not known well enough (limit {{l:.1f}} deg): {_MOVE}; {_TILT} "
-        f"{_SEEN}{{e.estimate.most}}",
+        f"{_SEEN}",
         missing="the estimator has no answer yet",
     ),
     most(

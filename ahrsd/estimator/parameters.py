@@ -36,11 +36,6 @@ class Imperfections:
 AS_SPECIFIED = Imperfections(
     turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4, bias_rad_s=1e-5, iron_gauss=1e-4
 )
-#: between the two, as one that was checked once. Without it a gyro whose scales are .3 % off counts
-#: as one of the first kind where most of them can be seen, and what cannot be seen as no larger
-CHECKED = Imperfections(
-    turn_rad=4e-3, lag_s=3e-3, scale=1.7e-3, shape=1.7e-3, bias_rad_s=1.4e-4, iron_gauss=5e-4
-)
 #: put together from parts, and just switched on. Chosen: a degree between two boards, filters and
 #: buses, a gyro's 1 %, offsets that follow the temperature: a tenth of a degree per second, 3 mG
 ASSEMBLED = Imperfections(
@@ -115,7 +110,7 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
-    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, CHECKED, ASSEMBLED)
+    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, ASSEMBLED)
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that is out of range."""

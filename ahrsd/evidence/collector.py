@@ -356,5 +356,4 @@ def _facts(estimate: Estimate) -> EstimateFacts:
         estimate.observability.unobservable,
         float(estimate.observability.score),
         float(estimate.heading_sigma_deg),
-        estimate.widened_by,
     )

@@ -53,12 +53,6 @@ class EstimateFacts:
     unobservable: tuple[str, ...]
     score: float
     heading_sigma_deg: float
-    widened_by: str = ""
-
-    @property
-    def most(self) -> str:
-        """What makes the most of the heading's sigma, as the end of a sentence; empty: nothing."""
-        return f"; most of it: {self.widened_by}" if self.widened_by else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -209,17 +209,6 @@ def test_an_estimator_in_doubt_never_passes(world) -> None:
     assert "not known well enough (limit 1.0 deg)" in stopped["observability.heading_sigma"]
 
 
-def test_a_heading_that_is_not_known_says_what_makes_the_most_of_it(good) -> None:
-    """In a room whose field differs from place to place: what it is, and what to run."""
-    gate = "observability.heading_sigma"
-    wide = put(good, "estimate.heading_sigma_deg", 4.0)
-    assert "most of it" not in red(wide)[gate]
-    room = "the field differs with place or attitude: `ahrsd diagnose` of the recording says more"
-    told = red(put(wide, "estimate.widened_by", room))
-    assert told[gate].endswith(f"; most of it: {room}")
-    assert set(told) == set(red(wide))
-
-
 def test_before_anything_every_row_says_what_is_missing(world) -> None:
     empty = world.EvidenceCollector().evaluate(
         world.estimate(), world.old(), np.zeros(3), None, world.HEALTHY, world.SOUND

@@ -8,13 +8,13 @@ from dataclasses import astuple, replace
 import numpy as np
 import pieces
 import pytest
-from ahrsd.simulation.scenarios import measured
 from scipy.spatial.transform import Rotation
 
 from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, ORDINARY
 from ahrsd.montecarlo import nuisances
 from ahrsd.montecarlo.cramer_rao import Trajectory, cramer_rao
 from ahrsd.simulation import Iron, ScenarioSettings, simulate
+from ahrsd.simulation.scenarios import measured
 
 SM, SG, DT = 1e-3, 5e-3, 0.04
 UPPER = np.triu_indices(3)
