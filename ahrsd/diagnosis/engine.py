@@ -19,14 +19,14 @@ from ahrsd.diagnosis.cut_out import beside_brief
 from ahrsd.diagnosis.dead import dead
 from ahrsd.diagnosis.delays import DELAYS
 from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Baseline, Check, Diagnosis, Finding, Unexplained, Whiteness
+from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, Unexplained, Whiteness
 from ahrsd.diagnosis.drawing import drawn, regime_map, validation
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.exam import rest_of
 from ahrsd.diagnosis.explained import explained
-from ahrsd.diagnosis.facts import Fact, around, lost_at, matters
-from ahrsd.diagnosis.findings import finding, of_fact, rounding, whole_term
+from ahrsd.diagnosis.facts import Fact, around, lost_at, matters, of_fact, stopped
+from ahrsd.diagnosis.findings import finding, rounding, whole_term
 from ahrsd.diagnosis.foretold import without_unforetold
 from ahrsd.diagnosis.free_course import with_free_course
 from ahrsd.diagnosis.free_source import without_names_of_a_source
@@ -40,7 +40,7 @@ from ahrsd.diagnosis.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.diagnosis.missing import lost_turns
 from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
-from ahrsd.diagnosis.null import fit_null, unusable
+from ahrsd.diagnosis.null import baseline, fit_null, unusable
 from ahrsd.diagnosis.omnibus import omnibus
 from ahrsd.diagnosis.ordinary import held_against, is_course_on_sensor
 from ahrsd.diagnosis.own_form import without_trifles
@@ -94,7 +94,7 @@ def diagnose(
         raise ValueError(why)
     facts = hygiene(track)
     if any(fact.stops for fact in facts):
-        return _stopped(recording, [fact for fact in facts if fact.stops], notes)
+        return stopped(recording, [fact for fact in facts if fact.stops], EFFECTS, notes)
     problem, cold = problem_of(put_right(track, facts), spec, library, limits)
     whole, lost = problem, lost_turns(problem.recorded, problem.cold)
     if lost:
@@ -215,7 +215,7 @@ def _told(
     lesser = (fact.words for fact in facts if not matters(fact))
     return Diagnosis(
         recording=recording,
-        baseline=_baseline(done.start),
+        baseline=baseline(done.start),
         mismatch=something,
         p_value=_p_value(seen, found, done.left, left),
         findings=found,
@@ -325,20 +325,6 @@ def _least_gain(one: Finding) -> float:
     return 0.0 if one.heldout is None else -one.heldout.nll_gain_per_sample
 
 
-def _stopped(recording: str, facts: list[Fact], notes: tuple[str, ...]) -> Diagnosis:
-    """The answer where nothing that is fitted would mean anything."""
-    return Diagnosis(
-        recording=recording,
-        baseline=None,
-        mismatch=True,
-        p_value=0.0,
-        findings=tuple(of_fact(fact, EFFECTS) for fact in facts),
-        unexplained=Unexplained(False),
-        posterior_predictive={},
-        notes=(*notes, *(fact.words for fact in facts), "put this right first, then ask again"),
-    )
-
-
 def _checked(
     done: _Searched,
     fast: Quick,
@@ -373,15 +359,6 @@ def _loud(facts: Sequence[Fact]) -> list[tuple[float, float]]:
     """Where the noise is at another level, seconds."""
     levels = ("noise_burst", "noise_level")
     return [span for fact in facts if fact.effect in levels for span in fact.where.intervals_s]
-
-
-def _baseline(start: NullFit) -> Baseline:
-    done = start.filtered
-    return Baseline(
-        float(np.sqrt(np.mean(done.innovation[done.used] ** 2))),
-        float(-np.mean(done.log_likelihood[done.used])),
-        done.normalised_innovation,
-    )
 
 
 def _p_value(

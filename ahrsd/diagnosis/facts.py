@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.diagnosis import Value, Where
+from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
+from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.samples import Array
 
 
@@ -85,3 +86,37 @@ def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:
     firsts = at[np.r_[0, cut + 1]]
     lasts = at[np.r_[cut, len(at) - 1]] + 1
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
+
+
+def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
+    """A fact that was counted, not fitted, as a finding; nothing is held out, nothing moves."""
+    effect = library.get(fact.effect)
+    return Finding(
+        effect=fact.effect,
+        confidence=fact.confidence,
+        alternatives=(),
+        where=fact.where,
+        parameters=fact.parameters,
+        heldout=None,
+        cost_if_left_out=None,
+        separate_from=None,
+        words=fact.words,
+        equation="" if effect is None else effect.equation,
+        setting=fact.setting,
+    )
+
+
+def stopped(
+    recording: str, facts: Sequence[Fact], library: Mapping[str, Effect], notes: tuple[str, ...]
+) -> Diagnosis:
+    """The answer where nothing that is fitted would mean anything, for these facts."""
+    return Diagnosis(
+        recording=recording,
+        baseline=None,
+        mismatch=True,
+        p_value=0.0,
+        findings=tuple(of_fact(fact, library) for fact in facts),
+        unexplained=Unexplained(False),
+        posterior_predictive={},
+        notes=(*notes, *(fact.words for fact in facts), "put this right first, then ask again"),
+    )

@@ -10,7 +10,6 @@ from ahrsd.diagnosis.confound import separating_manoeuvre
 from ahrsd.diagnosis.delay import usual_step
 from ahrsd.diagnosis.delays import DELAYS, time_constant_less_lag, weighed
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Heldout, Share, Value, Where
-from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.evidence import SHARPER, posterior
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.gram import solve
@@ -91,24 +90,6 @@ def finding(
         setting=term.setting,
         evidence_nats=judged.evidence,
         term=number,
-    )
-
-
-def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
-    """A fact that was counted, not fitted, as a finding; nothing is held out, nothing moves."""
-    effect = library.get(fact.effect)
-    return Finding(
-        effect=fact.effect,
-        confidence=fact.confidence,
-        alternatives=(),
-        where=fact.where,
-        parameters=fact.parameters,
-        heldout=None,
-        cost_if_left_out=None,
-        separate_from=None,
-        words=fact.words,
-        equation="" if effect is None else effect.equation,
-        setting=fact.setting,
     )
 
 

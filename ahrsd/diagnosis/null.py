@@ -25,6 +25,7 @@ import numpy as np
 from ahrsd.diagnosis import noise_fit
 from ahrsd.diagnosis.coarse import group_size, thinned
 from ahrsd.diagnosis.descent import FitProblem, FittedTerm, NullFit, descended
+from ahrsd.diagnosis.diagnosis import Baseline
 from ahrsd.diagnosis.innovation import run_filter
 from ahrsd.diagnosis.prior import (
     TURNED,
@@ -193,3 +194,13 @@ def _epochs(track: Track) -> list[chain.EpochData]:
         for run in track.runs
         if run.stop - run.start > _SHORTEST_RUN
     ]
+
+
+def baseline(start: NullFit) -> Baseline:
+    """What the null model leaves, for an answer."""
+    done = start.filtered
+    return Baseline(
+        float(np.sqrt(np.mean(done.innovation[done.used] ** 2))),
+        float(-np.mean(done.log_likelihood[done.used])),
+        done.normalised_innovation,
+    )

@@ -6,19 +6,18 @@ hygiene -> null fit -> richest model, linearised -> search over sets -> linearis
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from ahrsd.diagnosis import roles
-from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Baseline, Diagnosis, Finding, Unexplained
+from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.facts import Fact, matters
+from ahrsd.diagnosis.facts import matters, of_fact, stopped
 from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null, unusable
+from ahrsd.diagnosis.null import baseline, fit_null, unusable
 from ahrsd.diagnosis.one_model.search_rounds import answered
 from ahrsd.diagnosis.pauses import without_jumps
 from ahrsd.diagnosis.problem import model_at_rate, problem_of
@@ -43,17 +42,17 @@ def diagnose(
     if why := unusable(track):
         raise ValueError(why)
     facts = hygiene(track)
-    said = [_of_fact(fact, library) for fact in facts if matters(fact)]
+    said = [of_fact(fact, library) for fact in facts if matters(fact)]
     notes = (NOTE, *jumped, *notes, *(fact.words for fact in facts if not matters(fact)))
     if any(fact.stops for fact in facts):
-        return _stopped(recording, facts, library, notes)
+        return stopped(recording, [fact for fact in facts if fact.stops], library, notes)
     problem, cold = problem_of(put_right(track, facts), spec or Spec(), library, LIMITS)
     start = fit_null(problem.track, problem.spec, cold, walk=False)
     answer, model = answered(problem, start, library)
     something = bool(said or answer.findings or answer.unexplained.detected)
     return Diagnosis(
         recording=recording,
-        baseline=_baseline(start),
+        baseline=baseline(start),
         mismatch=something,
         p_value=float(np.exp(-max(answer.log_odds, 0.0))) if not said else 0.0,
         findings=(*said, *answer.findings),
@@ -62,46 +61,4 @@ def diagnose(
         notes=(*notes, *problem.notes),
         model=model_at_rate(model.point.filtered.model, problem),
         terms=answer.terms,
-    )
-
-
-def _baseline(start: NullFit) -> Baseline:
-    done = start.filtered
-    rms = float(np.sqrt(np.mean(done.innovation[done.used] ** 2)))
-    nats = float(-np.mean(done.log_likelihood[done.used]))
-    return Baseline(rms, nats, done.normalised_innovation)
-
-
-def _stopped(
-    recording: str, facts: Sequence[Fact], library: Mapping[str, Effect], notes: tuple[str, ...]
-) -> Diagnosis:
-    """The answer where nothing that is fitted would mean anything."""
-    found: list[Finding] = [_of_fact(fact, library) for fact in facts if fact.stops]
-    return Diagnosis(
-        recording=recording,
-        baseline=None,
-        mismatch=True,
-        p_value=0.0,
-        findings=tuple(found),
-        unexplained=Unexplained(False),
-        posterior_predictive={},
-        notes=(*notes, "put this right first, then ask again"),
-    )
-
-
-def _of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
-    """What was counted, not fitted, as a finding."""
-    effect = library.get(fact.effect)
-    return Finding(
-        effect=fact.effect,
-        confidence=fact.confidence,
-        alternatives=(),
-        where=fact.where,
-        parameters=fact.parameters,
-        heldout=None,
-        cost_if_left_out=None,
-        separate_from=None,
-        words=fact.words,
-        equation="" if effect is None else effect.equation,
-        setting=fact.setting,
     )
