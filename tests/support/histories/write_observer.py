@@ -14,7 +14,8 @@ foreign_save       a save of what another program wrote while this one listened,
 half_save          a save while the device does not hold all of the transaction's new values; one
                    that shows them in every reading and does not apply them is for the trial on
                    samples to find, and that lasts two seconds in these histories
-foreign_replaced   a write over another program's value that the journal knows nothing of
+foreign_replaced   a write over another program's value that the journal knows nothing of; a write
+                   that the unit did not carry out made no value another program's
 proven_not_held    PROVEN of values that the device, when asked, does not show
 unproven_saved     a save for a client (no FLASH_SENT announced it) of a value that came from the
                    daemon and that no save of its own has made permanent; but for a unit that
@@ -163,7 +164,8 @@ class Observer:
                 seen.own[change.register].add(change.after)
             else:
                 self._written(unit, seen, change)
-            seen.author[change.register] = (who, change.at_s)
+            if change.after == change.asked:  # else what is there is still whose it was
+                seen.author[change.register] = (who, change.at_s)
             seen.changed_s = change.at_s
         elif change.what == "save":
             if change.who == "host" and seen.announced:

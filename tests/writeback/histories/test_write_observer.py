@@ -47,9 +47,9 @@ class Story:
         lines = " ".join(f"$VNWRG,{n},{text}*00" for n, text in values.items())
         self.observer.announced(f"candidate 12345678, to write: {lines}", self.now_s)
 
-    def prepare(self, serial: int = 1, values: dict[int, str] = GOOD) -> None:
+    def prepare(self, serial: int = 1, values: dict[int, str] = GOOD, shown: str = FACTORY) -> None:
         new = {str(n): [float(v) for v in text.split(",")] for n, text in values.items()}
-        old = {str(n): [float(v) for v in FACTORY.split(",")] for n in values}
+        old = {str(n): [float(v) for v in shown.split(",")] for n in values}
         facts = {"serial": serial, "old": old, "new": new}
         self.observer.record(serial, "PREPARED", facts, self.now_s)
 
@@ -201,6 +201,20 @@ def test_somebodys_values_are_not_replaced_unseen():
     story.now_s += 5.0
     story.write({23: GOOD[23]})
     assert story.kinds == ["foreign_replaced"]
+
+
+def test_a_write_that_the_unit_did_not_carry_out_makes_nothing_somebodys():
+    story = Story()
+    story.observer.asked_by_client(f"VNWRG,23,{FOREIGN}")
+    story.unit.lies.not_held.add(23)
+    story.write({23: FOREIGN})
+    assert story.unit.memory.ram[23] == FACTORY
+    story.unit.lies.not_held.clear()
+    story.announce()
+    story.prepare(values={23: GOOD[23]}, shown=FOREIGN)
+    story.now_s += 5.0
+    story.write({23: GOOD[23]})  # over what was there before the other program came
+    assert story.kinds == []
 
 
 def test_a_save_that_no_record_announced_may_hold_nothing_of_the_daemons():
