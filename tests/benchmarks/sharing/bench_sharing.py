@@ -1,6 +1,6 @@
 """What a shared port costs a driver: the time from the device's port to the driver's, and bytes.
 
-    python tests/benchmarks/writeback/bench_sharing.py
+    python tests/benchmarks/sharing/bench_sharing.py
         [--rate HZ] [--seconds S] [--way NAME] [--wire socket] [--times N]
 
 A writer puts binary packets with the host's time into a pty, a reader stamps each when it is whole:

@@ -1,6 +1,6 @@
 """Drivers that start again and again on shared ports of a working daemon.
 
-    python tests/benchmarks/writeback/bench_drivers.py [--seconds S] [--rate HZ] [--json FILE]
+    python tests/benchmarks/sharing/bench_drivers.py [--seconds S] [--rate HZ] [--json FILE]
 
 An emulated device, `ahrsd run` beside it, and two programs: one on the owner's port, which starts
 as each of four real drivers in turn (drivers_at_start.py), and one on a second port

@@ -1,6 +1,6 @@
 """Answers in worlds of another author: how often is one wrong beyond its sigmas, and silent?
 
-    python tests/benchmarks/gates/bench_worlds.py [--seeds N] [--first SEED] [--json FILE]
+    python tests/benchmarks/estimator/bench_worlds.py [--seeds N] [--first SEED] [--json FILE]
 
 The generator and its scores are in ../shared/worlds, written apart from this project; the command
 says so and ends where they are not. Six motions by thirteen troubles for each seed, some .2 s each;

@@ -1,4 +1,4 @@
-"""How fast recordings of other programs are read: `python tests/benchmarks/fleet/bench_files.py`.
+"""How fast recordings of other programs are read: `python tests/benchmarks/recording/bench_files.py`.
 
 `camera` is a ROS 1 bag as a vehicle records it, with pictures beside the sensors.
 
