@@ -1,4 +1,6 @@
-"""How fast recordings of other programs are read: `python tests/benchmarks/recording/bench_files.py`.
+"""How fast recordings of other programs are read.
+
+    python tests/benchmarks/recording/bench_files.py [FORMAT ...] [--megabytes 60]
 
 `camera` is a ROS 1 bag as a vehicle records it, with pictures beside the sensors.
 
