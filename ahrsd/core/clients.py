@@ -63,6 +63,7 @@ class Clients:
         shares = tuple(policies)
         self.arbiter = Arbiter(shares)
         self._session, self._writeback = session, writeback
+        self._announced: Waiting | None = None  # a write that the journal was told of, not yet sent
         self._reset = ("", float("-inf"))  # who reset the device last, and when it was acknowledged
         self._notes = [_passing(s.name, writeback) for s in shares if any(map(s.passes, PASSABLE))]
 
@@ -100,6 +101,10 @@ class Clients:
     def next(self, host_s: float, *, free: bool) -> tuple[list[Action], ClientTurn | None]:
         """The next command for the wire, where it is free, and what must happen before it."""
         waiting = self.arbiter.first(host_s)
+        if self._announced is not None and self._announced is not waiting:
+            self._announced = None
+            if dropped := self._writeback.on_client_dropped(host_s):
+                return dropped, None
         if waiting is None or not free or not self._session.idle:
             return [], None
         if (does := _DOES.get(waiting.asked.kind)) is not None:
@@ -111,13 +116,13 @@ class Clients:
                 self.arbiter.refuse_first(Refusal(UNAUTHORIZED, f"{_NOT_SAVED}: {why_not}"))
                 return [], None
         if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
-            return self._calibrate(waiting.client, waiting.asked.command, host_s)
+            return self._calibrate(waiting, waiting.asked.command, host_s)
         lasts = waiting.asked.kind is Kind.SAVE
         known = self._writeback.known if lasts else None
         return [], ClientTurn(self.arbiter.begin().asked, known)
 
     def _calibrate(
-        self, client: str, command: Write, host_s: float
+        self, waiting: Waiting, command: Write, host_s: float
     ) -> tuple[list[Action], ClientTurn | None]:
         """A write of what calibrates: refused with the same code as where none passes, or next."""
         why = self._writeback.may_client_write(command.register)
@@ -127,8 +132,9 @@ class Clients:
             told = f"register {command.register} was not written for it: {why}"
             self.arbiter.refuse_first(Refusal(UNAUTHORIZED, told))
             return [], None
-        wanted = (client, command.register, command.values)
+        wanted = (waiting.client, command.register, command.values)
         actions, ready = self._writeback.on_client_writes(*wanted, host_s)
+        self._announced = None if ready else waiting
         if not ready:
             return actions, None
         return actions, ClientTurn(self.arbiter.begin().asked, self._writeback.known)

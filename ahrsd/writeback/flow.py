@@ -108,16 +108,20 @@ class SetAside:
 
 @dataclass(slots=True)
 class ClientWrite:
-    """What goes to the device, and for whom; whether the journal has it."""
+    """What is to go to the device for a client, as the journal was told of it.
+
+    serial, old: which unit it is for, and what its register held then
+    journaled:   whether the record is on the disk
+    dropped:     it will not be sent, whatever the journal answers
+    """
 
     client: str
     number: int
     values: Values
+    serial: int | None
+    old: Values
     journaled: bool = False
-
-    def is_of(self, client: str, number: int, values: Values) -> bool:
-        """Whether this is that very write."""
-        return (self.client, self.number, self.values) == (client, number, values)
+    dropped: bool = False
 
 
 # -- The ways of the table -------------------------------------------------------------------------
@@ -499,21 +503,39 @@ class Flow:
 
     def announce(self, client: str, number: int, values: Values) -> None:
         """The journal is told of a client's write, with what the register holds until now."""
-        self.client_write = ClientWrite(client, number, values)
+        old, serial = self.registers[number], self._the_identity().serial
+        self.client_write = ClientWrite(client, number, values, serial, old)
         self.outbox.record(
             RecordKind.CLIENT_WRITES,
             client=client,
-            serial=self._the_identity().serial,
-            old={str(number): list(self.registers[number])},
+            serial=serial,
+            old={str(number): list(old)},
             new={str(number): list(values)},
         )
 
     def announced(self, journaled: bool) -> None:
         """That record is on the disk, or is not; then nothing is sent."""
-        if self.client_write is not None and not journaled:
+        write = self.client_write
+        if write is not None and (write.dropped or not journaled):
             self.client_write = None
-        elif self.client_write is not None:
-            self.client_write.journaled = True
+        elif write is not None:
+            write.journaled = True
+
+    @property
+    def as_announced(self) -> bool:
+        """Whether the journal has the client's write, for this unit with what it holds now."""
+        write = self.client_write
+        if write is None or not write.journaled or self.identity is None:
+            return False
+        holds = self.registers.get(write.number)
+        return (write.serial, write.old) == (self.identity.serial, holds)
+
+    def drop_client_write(self) -> None:
+        """It is not sent. Its record stays; the journal may still answer."""
+        if self.client_write is not None and not self.client_write.journaled:
+            self.client_write.dropped = True
+        else:
+            self.client_write = None
 
     def client_wrote(self) -> None:
         """The client's write was answered, refused or lost: the device is read again."""

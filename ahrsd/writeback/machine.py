@@ -504,7 +504,8 @@ class WriteBack:
 
     def on_client_waits(self, reason: str, host_s: float) -> list[Action]:
         """A client's save or write was held back: why the device is not as known, if that is so."""
-        self._outbox.host_s, self._flow.client_write = host_s, None
+        self._outbox.host_s = host_s
+        self._flow.drop_client_write()
         if reason and self.state is not State.RECONCILING:
             self._outbox.note("warning", f"held back for a client: {reason}")
             self._flow.look_closer(reason)
@@ -520,15 +521,24 @@ class WriteBack:
         """A client's write of what calibrates is next: what must happen, and whether it may go.
 
         Asked again until the journal has it; from then on nobody knows what the device applies,
-        until `on_client_wrote`.
+        until `on_client_wrote`. Where it will not be sent after all: `on_client_dropped`.
         """
         self._outbox.host_s, write = host_s, self._flow.client_write
-        if write is None or not write.is_of(client, number, values):
-            self._flow.announce(client, number, values)
-        elif write.journaled:
+        if self._flow.as_announced:
             self._outbox.in_force(None)
             return self._answer(), True
+        if write is None or write.journaled:
+            self._flow.announce(client, number, values)
         return self._answer(), False
+
+    def on_client_dropped(self, host_s: float) -> list[Action]:
+        """The write that the journal was told of is not sent: its client left, or waited too long.
+
+        The next one, even of the same values, is a write of its own.
+        """
+        self._outbox.host_s = host_s
+        self._flow.drop_client_write()
+        return self._answer()
 
     def on_client_wrote(self, host_s: float) -> list[Action]:
         """That write was carried out, refused, or nobody knows."""

@@ -255,6 +255,74 @@ def test_a_client_that_leaves_while_its_write_is_journaled_leaves_nothing_behind
     assert say(run, f"VNWRG,23,{THEIRS}") == f"VNWRG,23,{THEIRS}"
 
 
+def announced_and_not_sent(run: CabledRun, how: str) -> None:
+    """The journal has a write of the owner's, and then it is not sent: it left, or waited long."""
+    handle, held = run.core.handle, []
+
+    def hold(item):
+        if isinstance(item, inputs.Journalled) and item.kind == "CLIENT_WRITES":
+            held.append(item)
+            return []
+        return handle(item)
+
+    run.core.handle = hold
+    run.say("owner", f"VNWRG,84,{THEIRS}")
+    assert run.until(lambda: held, 1.0)
+    if how == "leaves":
+        run.feed(inputs.ClientLeft(run.now_ns, "owner"))
+    else:
+        run.run(3.0)
+    run.core.handle = handle
+    (answer,) = held
+    run.feed(answer)
+    run.run(1.0)
+    assert (writes(run), run.kinds()) == ([], ["CLIENT_WRITES"])
+
+
+@pytest.mark.parametrize("how", ["leaves", "late"])
+def test_a_write_that_was_not_sent_after_all_is_journaled_again_when_it_is(how):
+    run, order = shared(planted=False), []
+    announced_and_not_sent(run, how)
+    run.cable.unit.before = order.append
+    run.listeners.append(
+        lambda e: order.append(e.kind) if type(e).__name__ == "JournalAppend" else None
+    )
+    assert say(run, f"VNWRG,84,{THEIRS}") == f"VNWRG,84,{THEIRS}"
+    asked = [one for one in order if one == "CLIENT_WRITES" or one.startswith("VNWRG")]
+    assert asked == ["CLIENT_WRITES", f"VNWRG,84,{THEIRS}"]
+    assert run.cable.unit.held() == (ONE, THEIRS)
+
+
+@pytest.mark.parametrize("how", ["leaves", "late"])
+def test_a_write_that_was_not_sent_holds_nothing_up(how):
+    run = shared()
+    announced_and_not_sent(run, how)
+    run.approve()
+    assert run.until("TRIAL", 30.0), run.core.writeback.holds()
+    assert run.cable.unit.held() == NEW
+
+
+def test_what_somebody_changed_meanwhile_is_in_the_journal_before_it_is_written_over():
+    """The register changes between the journal's answer and the write."""
+    run, meanwhile = shared(planted=False), "1,0,0,0,1,0,0,0,1,0.3,0.2,0.1"
+    changed: list[str] = []
+
+    def change(event):
+        if type(event).__name__ == "JournalAppend" and not changed:
+            changed.append(event.kind)
+            run.cable.unit.ram[84] = meanwhile
+
+    run.listeners.append(change)
+    run.say("owner", f"VNWRG,84,{THEIRS}")
+    run.run(12.0)
+    assert changed == ["CLIENT_WRITES"]
+    if writes(run):
+        assert run.journal[FIRST][-1]["facts"]["old"] == {
+            "84": [float(v) for v in meanwhile.split(",")]
+        }
+    assert run.core.registers[84] == tuple(float(v) for v in run.cable.unit.ram[84].split(","))
+
+
 @pytest.mark.parametrize("answered", ["refused", "lost", "link"])
 def test_whatever_was_answered_the_device_is_read_again(answered):
     run = shared(planted=False)
