@@ -63,6 +63,11 @@ class SampleBlock:
         )
 
 
+def known_force(read: Array) -> Array:
+    """(N, 3) specific force, nan where it reads 0 on all axes, which not even gravity allows."""
+    return np.where(np.any(read != 0.0, axis=1)[:, None], read, np.nan)
+
+
 def in_periods(step_s: Array) -> Array | None:
     """N positive steps of a regular clock in periods of it (near 2: a sample is missing), or None.
 

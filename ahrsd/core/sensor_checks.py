@@ -277,6 +277,8 @@ class SensorChecks:
         design = np.stack([column.ravel() for column in columns], axis=1)
         size = np.linalg.norm(design, axis=0)
         used = np.flatnonzero(size > 1e-9 * max(float(size.max()), 1e-300))
+        if not len(used):  # a gyroscope that reads exactly zero
+            return None
         scaled = design[:, used] / size[used]
         target = moved.ravel()
         u, values, vt = np.linalg.svd(scaled, full_matrices=False)

@@ -27,6 +27,10 @@ _MOVED_NOISE = 8.0
 _MOVED_STEPS = 20.0  # of coarse readings, which repeat themselves where they turn the least
 _TURNED_RAD = 0.3
 _STUCK_ROWS = 8
+_BLOCK = 10  # rows whose mean is one reading, to be above the noise
+_SHOWN_SHARE = 0.5  # of what is left of the field's changes, which lies as a turn about one axis
+_ABOVE_NOISE = 3.0  # times the noise of such readings, for what is left
+_TURNED_ABOUT_RAD = 0.1  # about one axis, by the field
 #: usual size of a reading in any unit of a field, from tesla to nanotesla
 _FIELDS = (1e-6, 1e6)
 #: readings so many times the usual field, rates so many times the quickest but for one in a
@@ -35,7 +39,11 @@ _FAR, _FAR_RATE, _QUICK = 100.0, 100.0, 40.0
 
 
 def dead(track: Track) -> str | None:
-    """Why nothing can be fitted: one sensor never changes while the other moves; else None."""
+    """Why nothing can be fitted: a sensor, or one of its axes, never changes and should; else None.
+
+    An axis that has nothing to say, as of a simulation without noise that turns about another one,
+    may be constant.
+    """
     mag, gyro = track.mag_b_gauss, track.gyro_b_rad_s
     seen = np.isfinite(mag).all(axis=1)
     size = track.usual_gauss
@@ -47,12 +55,75 @@ def dead(track: Track) -> str | None:
             f"{np.degrees(_swing_rad(mag[seen])):.0f} deg: it is stuck or was not logged"
         )
     turned = _turned_rad(track)
+    if _constant(mag[seen]) and _constant(gyro):
+        return (
+            f"the magnetometer reads {_words(mag[seen][0])} gauss and the gyro {_words(gyro[0])} "
+            "rad/s in every row: no sensor is so still, even at rest it scatters"
+        )
     if _constant(mag[seen]) and turned > _TURNED_RAD:
         return (
             f"the magnetometer reads {_words(mag[seen][0])} gauss in every row while the gyro "
             f"turns by {np.degrees(turned):.0f} deg: it is stuck or was not logged"
         )
+    return _dead_axis(track)
+
+
+def _dead_axis(track: Track) -> str | None:
+    """Why one axis cannot be right: it reads one number where the other five say that it turned."""
+    mag, gyro = track.mag_b_gauss, track.gyro_b_rad_s
+    course = _course(track)
+    for k, axis in enumerate(_AXES):
+        column = mag[np.isfinite(mag[:, k]), k]
+        moved = float(np.ptp(course[:, k]))
+        if _constant(column) and moved > _least_gauss(track):
+            return (
+                f"the magnetometer's {axis} reads {column[0] + 0.0:.4g} gauss in every row while "
+                f"the field on it changes by {moved:.2g} gauss: it is stuck or was not logged"
+            )
+        if _constant(gyro[:, k]) and (turned := _turned_by_field(track, k)) > _TURNED_ABOUT_RAD:
+            return (
+                f"the gyro's {axis} reads {gyro[0, k] + 0.0:.4g} rad/s in every row while the "
+                f"field turns by {np.degrees(turned):.0f} deg about it: it is stuck or was not "
+                "logged"
+            )
     return None
+
+
+def _course(track: Track) -> Array:
+    """(N, 3) gauss: what the magnetometer should have changed by since the start, by the gyro."""
+    step = np.nan_to_num(track.dt_s, nan=0.0)[:, None]
+    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
+    turn: Array = np.cumsum(np.nan_to_num(np.cross(track.mag_b_gauss, rate * step)), axis=0)
+    return turn
+
+
+def _turned_by_field(track: Track, k: int) -> float:
+    """Range in rad of the turn about axis k that the field shows and the rates about others do not.
+
+    0 where iron explains as much of it: m = (I + S) b + h, so that to first order
+    dm = w x h + w x (S m) - S (w x m) beside the turn itself, with S symmetric.
+    """
+    rows = _BLOCK * (len(track) // _BLOCK)
+    mag = np.nan_to_num(track.mag_b_gauss[:rows]).reshape(-1, _BLOCK, 3).mean(axis=1)
+    angle = np.nan_to_num(track.gyro_b_rad_s * track.dt_s[:, None])[:rows]
+    angle = angle.reshape(-1, _BLOCK, 3).sum(axis=1)
+    w, m, moved = (angle[1:] + angle[:-1]) / 2, (mag[1:] + mag[:-1]) / 2, np.diff(mag, axis=0)
+    unit = np.eye(3)
+    iron = [np.cross(w, h) for h in unit]
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        S = (np.outer(unit[i], unit[j]) + np.outer(unit[j], unit[i])) / 2
+        iron.append(np.cross(w, m @ S) - np.cross(w, m) @ S)
+    design = np.stack([column.ravel() for column in iron], axis=1)
+    target = (moved + np.cross(w, m)).ravel()
+    rest = (target - design @ np.linalg.lstsq(design, target)[0]).reshape(-1, 3)
+    across = -np.cross(unit[k], m)
+    turn = np.sum(rest * across, axis=1) / np.maximum(np.sum(across**2, axis=1), 1e-300)
+    left = rest - turn[:, None] * across
+    noise = noise_of(track)[0] * np.sqrt(2.0 / _BLOCK)
+    shown = 1.0 - np.sum(left**2) / max(float(np.sum(rest**2)), 1e-300)
+    if shown < _SHOWN_SHARE or rest.std() < _ABOVE_NOISE * noise:
+        return 0.0
+    return float(np.ptp(np.cumsum(turn)))
 
 
 def possible(track: Track) -> tuple[Track, tuple[str, ...]]:
@@ -107,9 +178,7 @@ def stuck_axes(track: Track, bad: NDArray[np.bool]) -> list[Fact]:
     two, whatever it says itself, so what it should have said is known.
     """
     mag = track.mag_b_gauss
-    step = np.nan_to_num(track.dt_s, nan=0.0)[:, None]
-    rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
-    course = np.cumsum(np.nan_to_num(np.cross(mag, rate * step)), axis=0)
+    course = _course(track)
     rows: dict[str, NDArray[np.bool]] = {}
     for k, axis in enumerate(_AXES):
         again = _again(track, mag[:, k : k + 1]) & ~bad

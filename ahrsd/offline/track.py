@@ -87,8 +87,6 @@ def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
         time_s = track.time_s
         accel = np.column_stack([np.interp(time_s, time_s[known], a[known]) for a in accel.T])
     size = float(np.median(np.linalg.norm(accel, axis=1)))
-    if size == 0.0:
-        return None, ["the acceleration was left out: it is 0 throughout, not even gravity"]
     for unit, factor in _ACCEL_UNITS:
         if 0.7 * GRAVITY_M_S2 < size * factor < 1.4 * GRAVITY_M_S2:
             return accel * factor, [*notes, f"the acceleration was in {unit}: taken as m/s^2"]

@@ -144,6 +144,8 @@ _ROS_PARTS = (
 _ROS_TIMES = ("field.header.stamp", "%time")  # in ns, best first
 _WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 _WORDS = {"time": "time|stamp", "mag": "mag|field", "gyro": "gyr|ang|rate|omega", "accel": "acc"}
+#: what stands before the axis in names of two letters: mx, b_y, w[2], a.z
+_LETTERS = {"mag": "[mbh]", "gyro": "[gw]", "accel": "a"}
 _SDK_MARKS = {"TimeStartup", "TimeGps", "UncompMagX", "AngularRateX"}
 
 
@@ -274,22 +276,41 @@ def _with_units(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
 
 
 def _only(kind: str, axis: str, told: Sequence[tuple[str, str, str]]) -> Source | None:
-    """The one column of this kind and axis; None where there is none, or several."""
-    place = rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$" if axis else ""
-    found = [
-        Source(name, factor)
+    """The one column of this kind and axis; None where there is none, or several.
+
+    A time needs no word for it, in whatever language, where only one column has such a unit.
+    """
+    of_kind = [
+        (stem, Source(name, factor))
         for stem, unit, name in told
-        if re.search(_WORDS[kind], stem)
-        and re.search(place, stem)
-        and (factor := _factor(kind, unit)) is not None
+        if (factor := _factor(kind, unit)) is not None
     ]
+    if axis:
+        found = [source for stem, source in of_kind if _is_axis(kind, axis, stem)]
+    else:
+        named = [source for stem, source in of_kind if re.search(_WORDS[kind], stem)]
+        found = named or [source for _, source in of_kind]
     return found[0] if len(found) == 1 else None
+
+
+def _is_axis(kind: str, axis: str, low: str) -> bool:
+    """Whether a name, lower case, is that of this axis of this vector; the first is x, or 0.
+
+    A unit at its end does not count.
+    """
+    stem, _, unit = low.rpartition("_")
+    low = stem if stem and _factor(kind, unit) is not None else low
+    place = rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$|[\[_.]{'xyz'.index(axis)}\]?$"
+    letter = rf"^{_LETTERS[kind]}[_.\[]?({axis}|{'xyz'.index(axis)})\]?$"
+    worded = re.search(_WORDS[kind], low) and re.search(place, low)
+    return bool(worded or re.search(letter, low))
 
 
 def _remedy(missing: Sequence[str], names: Sequence[str], used: set[str]) -> str:
     """The option that names the missing columns, as far as the others are alike."""
     others = [name for name in names[:1000] if name not in used and name.strip()]
     alike = [(name, _alike(name, others)) for name in missing]
+    alike += zip(ACCEL, (_axis_of("accel", axis, others) for axis in "xyz"), strict=True)
     short = {long: key for key, long in _SHORT.items()}
     guessed = [
         f"{short[name]}={printable(column)}{_unit_of(name, column)}"
@@ -308,13 +329,11 @@ def _alike(name: str, others: Sequence[str]) -> str | None:
         times = [other for other in others if re.search(r"time|stamp|date|^t$", other.lower())]
         return times[0] if times else None
     kind, axis = name.split("_")[:2]
-    words = _WORDS[kind]
-    fit = [
-        other
-        for low, other in folded.items()
-        if re.search(words, low) and re.search(rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$", low)
-    ]
-    return fit[0] if fit else folded[found[0]] if found else None
+    return _axis_of(kind, axis, others) or (folded[found[0]] if found else None)
+
+
+def _axis_of(kind: str, axis: str, others: Sequence[str]) -> str | None:
+    return next((other for other in others if _is_axis(kind, axis, other.lower())), None)
 
 
 def _unit_of(name: str, column: str) -> str:

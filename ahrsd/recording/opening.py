@@ -28,6 +28,7 @@ from ahrsd.recording.foreign.formats import Format, format_of, ready
 from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.foreign.sensors import NO_CHOICE, Choice, RawBytes, merged
 from ahrsd.recording.table import PARQUET, Table, read_table, table_of
+from ahrsd.recording.text_table import is_table_text
 
 _END = "end of recording"
 _HEAD_BYTES = 4096
@@ -249,7 +250,7 @@ def _in_spite_of_its_name(
             raise RecordingError(path, "is packed with gzip", f"unpack it: gunzip {path.name}")
         return RecordingKind.CAPTURE if blocks.is_mcap(start) else RecordingKind.TABLE
     line = _as_utf8(start).lstrip().split(b"\n", 1)[0]
-    if named is RecordingKind.BYTES and _names_columns(line):
+    if named is not RecordingKind.TABLE and (_names_columns(line) or is_table_text(start)):
         return RecordingKind.TABLE
     if named is RecordingKind.TABLE and line.startswith(b"$VN"):
         return RecordingKind.BYTES
@@ -266,8 +267,7 @@ def _as_utf8(start: bytes) -> bytes:
 
 
 def _by_content(path: Path, start: bytes) -> RecordingKind:
-    line = _as_utf8(start).split(b"\n", 1)[0]
-    if b"time_s" in line or _names_columns(line):
+    if b"time_s" in _as_utf8(start).split(b"\n", 1)[0]:
         return RecordingKind.TABLE
     if b"$VN" in start or b"\xfa" in start:
         return RecordingKind.BYTES

@@ -53,7 +53,7 @@ from ahrsd.recording.limits import (
     TABLE_ROWS,
     refuse_beyond,
 )
-from ahrsd.samples import Array, SampleBlock, in_periods
+from ahrsd.samples import Array, SampleBlock, in_periods, known_force
 
 PARQUET = b"PAR1"  # how such a file begins
 NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
@@ -299,7 +299,10 @@ class _TableRows:
                     f"column {missing[0]} is missing, so the acceleration was left out"
                 )
             return np.full((len(self.numbers), 3), np.nan)
-        accel = self._without_holes(np.column_stack([found[name] for name in ACCEL]))
+        read = np.column_stack([found[name] for name in ACCEL])
+        accel = self._without_holes(known_force(read))
+        if np.all(read == 0.0):
+            self.notes.append("the acceleration was left out: it is 0 throughout, not even gravity")
         size = float(np.median(np.linalg.norm(accel, axis=1)))
         for unit, factor in _ACCEL_UNITS:
             if _GRAVITY[0] * GRAVITY_M_S2 < size * factor < _GRAVITY[1] * GRAVITY_M_S2:

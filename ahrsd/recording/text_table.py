@@ -18,6 +18,7 @@ import pyarrow.csv
 from ahrsd.errors import RecordingError
 from ahrsd.printable import counted, printable
 from ahrsd.recording.bytestream import read_chunks, utf16_of
+from ahrsd.recording.column_names import REQUIRED
 from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.limits import (
     HEADER_BYTES,
@@ -35,6 +36,7 @@ _COMMENT_LINE = re.compile(rb"(?m)^(?:#|%|//)[^\n]*(?:\n|\Z)")
 _SEPARATOR_LINE = re.compile(rb"^\"?sep=(.)\"?\s*$", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(rb"^\s*[+-]?\d+,\d+\s*$")
 _WRONG_SHARE, _WRONG_FEW = 0.01, 3  # rows with another number of cells that are left out
+_ROWS_THAT_TELL = 2
 _LESS = "keep fewer of them, or cut the recording in parts"
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "N/A", "n/a", "NA", "#N/A"]
 
@@ -57,6 +59,29 @@ class _Text:
     separator: str
     at: int
     first_row: int
+
+
+def is_table_text(start: bytes) -> bool:
+    """Whether the first bytes of a file are rows of numbers beyond doubt, whatever it is called.
+
+    Two whole lines that follow each other have as many cells, at least those that a table needs,
+    and all but the time are numbers. A message of a VN-100 is none.
+    """
+    if (encoding := utf16_of(start)) is not None:
+        start = start.decode(encoding, "ignore").encode("utf-8")
+    lines = re.split(rb"[\r\n]+", start.removeprefix(b"\xef\xbb\xbf"))[:-1]
+    lines = [line for line in lines if line.strip() and not line.startswith(_COMMENTS)]
+    message = re.search(rb"(?m)\$VN|^VN[A-Z]{3},", start)
+    if len(lines) < _ROWS_THAT_TELL or message or any(byte < 9 for byte in start):
+        return False
+    mark = _separator_of(lines[-1])
+    rows = [line.split() if mark == b" " else line.split(mark) for line in lines]
+    tell = rows[-_ROWS_THAT_TELL:]
+    return all(
+        len(row) == len(tell[0]) >= len(REQUIRED)
+        and sum(_is_numbers(cell, mark) for cell in row) >= len(REQUIRED) - 1
+        for row in tell
+    )
 
 
 def read_text_table(path: Path) -> TextTable:

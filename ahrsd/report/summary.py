@@ -158,13 +158,14 @@ def estimate_lines(estimate: Estimate | None, wrong: Sequence[str] = ()) -> list
         _value(number, sigma, 2 if k < 3 else 3) if not blind[k] else "not determined"
         for k, (number, sigma) in enumerate(zip(numbers, sigmas, strict=True))
     ]
-    late_ms = 1e3 * estimate.mag_lag_s
+    lag_ms = 1e3 * estimate.mag_lag_s
+    lag = f"the field is {abs(lag_ms):.1f} ms {'late' if lag_ms > 0 else 'early'} against the gyro"
     return [
         f"  hard iron  {', '.join(values[:3])} mG",
         f"  gyro bias  {', '.join(values[3:])} mrad/s",
         f"  heading    {heading_words(estimate.heading_sigma_deg)}",
         *([f"             most of it: {estimate.widened_by}"] if estimate.widened_by else []),
-        *([f"  lag        the field is {late_ms:.1f} ms late against the gyro"] if late_ms else []),
+        *([f"  lag        {lag}"] if lag_ms else []),
         *(f"  {text}" for text in why_not_converged(estimate, wrong)),
     ]
 

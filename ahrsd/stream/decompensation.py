@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.calibration import Affine
-from ahrsd.samples import Array, SampleBlock
+from ahrsd.samples import Array, SampleBlock, known_force
 from ahrsd.stream.device_clock import Mask, TimelineSteps
 from drivers.vn100.messages import Layout
 
@@ -294,7 +294,7 @@ class Extractor:
             time_s=None if self._time is None else table[:, self._time],
             mag_gauss=mag,
             gyro_rad_s=gyro,
-            accel_m_s2=nothing if self._accel is None else table[:, self._accel],
+            accel_m_s2=nothing if self._accel is None else known_force(table[:, self._accel]),
             usable=usable,
             covariates={name: table[:, k] for name, k in self._rest},
         )

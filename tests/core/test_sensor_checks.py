@@ -120,6 +120,24 @@ def test_a_magnetometer_that_is_stuck_while_the_vehicle_turns():
     assert len(told) == 1
 
 
+@pytest.mark.parametrize("value", [0.0, 0.01])
+def test_a_gyroscope_that_is_stuck_while_the_field_turns(value):
+    time_s, field, gyro = stream()
+    gyro[:] = value
+    checks, told = said(time_s, field, gyro)
+    (text,) = checks.findings.values()
+    assert text.startswith(f"the gyroscope gives the same value on all axes ({value:g}, ")
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_gyroscope_without_one_axis_is_named_for_it(axis):
+    time_s, field, gyro = stream()
+    gyro[:, axis] = 0.0
+    checks, _ = said(time_s, field, gyro)
+    assert f"the same value on axis {'xyz'[axis]} (0 rad/s)" in checks.findings["gyroscope still"]
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_one_axis_that_is_stuck_is_named(axis):
     time_s, field, gyro = stream()

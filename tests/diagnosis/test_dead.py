@@ -42,6 +42,43 @@ def test_a_magnetometer_that_never_changes_while_the_gyro_turns(track: Track) ->
     assert "the magnetometer reads 0.2 0.2 0.2 gauss in every row while the gyro turns by" in why
 
 
+def test_neither_ever_changes(track: Track) -> None:
+    same = np.ones_like(track.mag_b_gauss)
+    why = dead(replace(track, mag_b_gauss=0.2 * same, gyro_b_rad_s=0.0 * same))
+    assert why is not None
+    assert "reads 0.2 0.2 0.2 gauss and the gyro 0 0 0 rad/s in every row" in why
+
+
+@pytest.mark.parametrize("scenario", ["mam", "wam", "lam"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_axis_that_never_changes_while_it_turns_is_said(scenario: str, axis: int) -> None:
+    track = track_of(experiment(scenario, samples=6000, seed=axis))
+    gyro, mag = track.gyro_b_rad_s.copy(), track.mag_b_gauss.copy()
+    gyro[:, axis], mag[:, axis] = 0.0, 0.1
+    why = dead(replace(track, gyro_b_rad_s=gyro)) or ""
+    assert why.startswith(f"the gyro's {'xyz'[axis]} reads 0 rad/s in every row while the field")
+    why = dead(replace(track, mag_b_gauss=mag)) or ""
+    assert why.startswith(f"the magnetometer's {'xyz'[axis]} reads 0.1 gauss in every row")
+
+
+@pytest.mark.parametrize("iron", [0.0, 0.1])
+def test_an_axis_that_has_nothing_to_say_may_be_still(iron: float) -> None:
+    """A simulation without noise that turns about one axis only, with iron."""
+    t = np.arange(4000) / 25.0
+    rate = 0.2 + 0.1 * np.sin(0.1 * t)
+    angle = np.cumsum(rate) / 25.0
+    S = np.eye(3) + iron * np.array([[0.5, 1.0, 0.3], [1.0, -0.5, 0.2], [0.3, 0.2, 0.0]])
+    field = np.column_stack([0.2 * np.cos(angle), -0.2 * np.sin(angle), np.full(len(t), 0.4)])
+    still = Track(
+        time_s=t,
+        dt_s=np.concatenate([[np.nan], np.diff(t)]),
+        mag_b_gauss=field @ S.T + iron * np.array([1.0, -2.0, 0.5]),
+        gyro_b_rad_s=np.column_stack([0.0 * t, 0.0 * t, rate]),
+        accel_b_m_s2=None,
+    )
+    assert dead(still) is None
+
+
 def test_a_field_in_no_unit(track: Track) -> None:
     why = dead(replace(track, mag_b_gauss=1e30 * track.mag_b_gauss))
     assert why is not None

@@ -23,6 +23,7 @@ from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, REQUIRED, TIME, parse_columns
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
+from ahrsd.recording.text_table import is_table_text
 
 NAMES = (*REQUIRED, *ACCEL)
 COUNT, RATE_HZ = 400, 20.0
@@ -729,6 +730,7 @@ def test_a_field_of_rostopic_that_is_in_gauss_is_told_and_the_option_reads_it(tm
          (1.0, 100.0, 1.0, 1.0)),
         ("TimeStartup [ns]", "UnCompMag{} [Gauss]", "UnCompGyro{} [rad/s]", "UnCompAcc{} [m/s^2]",
          (1e9, 1.0, 1.0, 1.0)),
+        ("Zeit [s]", "mag_{} [nT]", "gyr_{} [mrad/s]", "acc_{} [m/s²]", (1.0, 1e5, 1e3, 1.0)),
         ("timestamp (ms)", "mag_{} (uT)", "gyro_{} (deg/s)", "acc_{} (g)",
          (1e3, 100.0, 180.0 / np.pi, 1 / 9.80665)),
     ],
@@ -756,3 +758,70 @@ def test_of_two_columns_that_could_be_meant_none_is_taken(tmp_path):
     cells["Mag filtered x (uT)"] = cells["Mag x (uT)"]
     with pytest.raises(RecordingError, match="has no column mag_x_gauss"):
         read_table(save(tmp_path / "phone.csv", cells))
+
+
+@pytest.mark.parametrize(
+    ("time", "mag", "gyro", "accel", "option"),
+    [
+        ("time", "m{}", "g{}", "a{}",
+         "time=time,mag_x=mx,mag_y=my,mag_z=mz,gyro_x=gx,gyro_y=gy,gyro_z=gz,"
+         "accel_x=ax,accel_y=ay,accel_z=az"),
+        ("t", "B{}_nT", "w{}_dps", "acc_{}",
+         "time=t,mag_x=Bx_nT:nT,mag_y=By_nT:nT,mag_z=Bz_nT:nT,gyro_x=wx_dps:dps,gyro_y=wy_dps:dps,"
+         "gyro_z=wz_dps:dps,accel_x=acc_x,accel_y=acc_y,accel_z=acc_z"),
+    ],
+)  # fmt: skip
+def test_short_names_are_in_the_option_that_would_give_them(
+    tmp_path, time, mag, gyro, accel, option
+):
+    cells = renamed(
+        {
+            TIME: (time, 1.0),
+            **vectors(MAG, mag, 1e5 if "nT" in mag else 1.0),
+            **vectors(GYRO, gyro, 180.0 / np.pi if "dps" in gyro else 1.0),
+            **vectors(ACCEL, accel),
+        }
+    )
+    path = save(tmp_path / "logger.csv", cells)
+    with pytest.raises(RecordingError, match="has no column time_s") as refused:
+        read_table(path)
+    assert str(refused.value).endswith(f"--columns {option})")
+    same(read_table(path, columns=parse_columns([option])), sensor())
+
+
+@pytest.mark.parametrize("name", ["log.txt", "log.tsv", "log", "log.dat", "log.bin", "log.txt.gz"])
+@pytest.mark.parametrize("separator", ["\t", "   ", ","])
+@pytest.mark.parametrize("comment", ["", "# "])
+def test_rows_of_numbers_are_a_table_whatever_the_file_is_called(
+    tmp_path, name, separator, comment
+):
+    cells = renamed({one: (one, 1.0) for one in (TIME, *MAG, *GYRO, *ACCEL)})
+    path = save(tmp_path / "table.csv", cells)
+    text = comment + path.read_text(encoding="utf-8").replace(",", separator)
+    data = text.encode()
+    renamed_path = tmp_path / name
+    renamed_path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    opened = open_recording(renamed_path)
+    assert opened.table is not None
+    same(opened.table, sensor())
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["$VNYMR,+010.071,+000.278,-002.026,-01.0670,-00.2568,+03.0696,-00.019,+00.320,-09.802,"
+     "-00.002801,-00.001186,-00.001582*65",
+     "VNYMR,+010.071,+000.278,-002.026,-01.0670,-00.2568,+03.0696,-00.019,+00.320,-09.802,"
+     "-00.002801,-00.001186,-00.001582",
+     "1,2,3,4,5,6", "one,two,three,four,five,six,seven,eight"],
+)  # fmt: skip
+def test_other_lines_are_no_table(line):
+    assert not is_table_text(f"{line}\n".encode() * 40)
+
+
+def test_a_force_of_zero_is_none(tmp_path):
+    cells = renamed({one: (one, 1.0) for one in (TIME, *MAG, *GYRO, *ACCEL)})
+    for name in ACCEL:
+        cells[name] = ["0"] * len(cells[name])
+    table = read_table(save(tmp_path / "imu.csv", cells))
+    assert np.isnan(table.rows.accel_b_m_s2).all()
+    assert "the acceleration was left out: it is 0 throughout, not even gravity" in table.notes
