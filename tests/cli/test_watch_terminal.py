@@ -37,13 +37,13 @@ def terminal(tmp_path):
         env={**os.environ, "TERM": "xterm", "COLUMNS": "", "LINES": ""},
     )  # fmt: skip
 
-    def drawn(words: str) -> str:
+    def drawn(pattern: str) -> str:
         text, end_s = "", time.monotonic() + PATIENCE_S
-        while words not in text:
-            assert time.monotonic() < end_s, f"{words!r} was not drawn: {text[-3000:]}"
+        while not re.search(pattern, text):
+            assert time.monotonic() < end_s, f"{pattern!r} was not drawn: {text[-3000:]}"
             status["at_s"] += 1.0
             server.status(status)
-            while select.select([ours], [], [], 0.2)[0]:
+            if select.select([ours], [], [], 0.2)[0]:
                 text += os.read(ours, 1 << 16).decode(errors="replace")
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
 
@@ -62,10 +62,10 @@ def test_it_fits_scrolls_and_ends_by_a_key(terminal):
     assert "0 of 2 held-out segments are usable" in text
     assert "heading: " in text
     assert "40 of 49 gates are green" in text
-    (found,) = set(re.findall(r"lines 1-23 of (\d+)", text))
+    assert re.search(r"lines 1-23 of \d+", text)
     press(b"\x1b[B")
-    drawn(f"lines 2-24 of {found}")
+    drawn(r"lines 2-24 of \d+")
     press(b"\x1b[6~")
-    assert "stream: " in drawn(f"-{found} of {found}")
+    assert "stream: " in drawn(r"-(\d+) of \1:")
     press(b"q")
     assert process.wait(PATIENCE_S) == 0
