@@ -137,6 +137,8 @@ def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
         count += 1
         gradient, data, prior = _normal(problem, point)
         covariance = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
+        if not np.all(np.diag(covariance) > 0.0):  # singular to rounding: no step is to be trusted
+            break
         step = covariance @ gradient
         largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
         new = _taken(problem, point, step, cost, largest < _NEAR)
@@ -262,10 +264,15 @@ def _taken(
     for halving in range(_HALVINGS):
         part = step / 4**halving
         model = moved(point.model, part)
+        if not np.isfinite(part).all():
+            continue
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
             continue
         held = point.filtered if near else None
-        new = _at(problem, model, point.values + part[11:], point, held)
+        try:
+            new = _at(problem, model, point.values + part[11:], point, held)
+        except np.linalg.LinAlgError:  # a step too far
+            continue
         if _cost(problem, new) <= cost * (1 + 1e-9):
             return new
     return None

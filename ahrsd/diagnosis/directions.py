@@ -29,7 +29,7 @@ def by_direction(basis: Base, columns: Array) -> Base:
     """
     left = residual(np.concatenate([basis.known, columns], axis=2), basis.innovation)
     field = basis.context.field_b @ basis.context.model.soft_iron
-    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
+    unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
     part = np.sum(left * unit, axis=1, keepdims=True)
     across = np.sqrt(1.5) * (left - part * unit)  # two axes of three
     along = max(colour(part, basis.rate_hz), mean_colour(part, basis.rate_hz))

@@ -64,7 +64,7 @@ from ahrsd.diagnosis.search import (
 )
 from ahrsd.diagnosis.sought import sought
 from ahrsd.diagnosis.spectrum import against, spectrum_of
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.unplaced import without_unplaced
 from ahrsd.diagnosis.values import NullModel, Term
 from ahrsd.diagnosis.wandering import wandering
@@ -91,7 +91,7 @@ def diagnose(
     track, jumped = without_jumps(track)
     notes = (*jumped, *notes)
     if why := unusable(track) or dead(track):
-        raise ValueError(why)
+        raise NothingToFit(why)
     facts = hygiene(track)
     if any(fact.stops for fact in facts):
         return stopped(recording, [fact for fact in facts if fact.stops], EFFECTS, notes)

@@ -166,7 +166,8 @@ def _both_ways(values: Array, width_s: float, time_s: Array) -> Array:
 
 def _smallest_turn(vectors: Array, onto: Array) -> Array:
     """The smallest rotations (N, 3, 3) that turn each of the vectors (N, 3) onto one direction."""
-    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = np.where(size > 0.0, vectors / np.where(size > 0.0, size, 1.0), onto)
     axis = np.cross(unit, onto)
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, unit @ onto)

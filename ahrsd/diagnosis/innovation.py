@@ -124,7 +124,8 @@ def run_filter(
     held: take gains and nominal field of this earlier run (same track), not the model's own
     sensitive: false where only innovations are wanted, not what `sensitivities` needs
     strength_known: the field is as strong as the nominal one, else a run finds it (not with `held`)
-    Rows whose reading is not finite are passed over.  ValueError where a run has no rows.
+    Rows whose reading is not finite are passed over.  ValueError where a run has no rows,
+    LinAlgError where the model is so far off that its innovations have no finite size.
     """
     field, motion = _readings(track, model, terms_mag), _motion(track, model, terms_gyro)
     layout, opens = _laid_out(track)
@@ -132,7 +133,8 @@ def run_filter(
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
         linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
-        found = gains(linear, _runs(track))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            found = gains(linear, _runs(track))
     else:
         nominal, found = held.nominal_b, held.gains
     guessed = opens if strength_known else opens & blind
@@ -142,7 +144,11 @@ def run_filter(
     readings = np.where((blind & ~guessed)[:, None], 0, field)
     predicted = _predicted(layout, state, found, model.soft_iron, readings)
     innovation = np.where(used[:, None], (field - predicted) @ model.soft_iron, 0.0)
-    root = _inverse_root(found.innovation_covariance) * used[:, None, None]
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        root = _inverse_root(found.innovation_covariance)
+    if not np.isfinite(root).all():
+        raise np.linalg.LinAlgError("innovations of no finite size: the model is far off")
+    root = root * used[:, None, None]
     whitened = np.einsum("nij,nj->ni", root, innovation)
     needed = (layout, state, found, model.soft_iron, root, motion, predicted)
     return Filtered(

@@ -36,7 +36,7 @@ from ahrsd.diagnosis.prior import (
     turned,
 )
 from ahrsd.diagnosis.thin import turned_up
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.estimator import chain
 from ahrsd.estimator.start import linear_start
@@ -67,11 +67,11 @@ def fit_null(
     noise: estimate what the spec leaves open; else keep the noise of `start`
     walk:  let the gyro's bias wander where the data say so
 
-    ValueError where there is nothing to fit to (`unusable`).
+    NothingToFit where there is nothing to fit to (`unusable`).
     """
     reason = unusable(track)
     if reason:
-        raise ValueError(reason)
+        raise NothingToFit(reason)
     known = spec or Spec()
     problem = FitProblem(track, tuple(terms), prior_of(track))
     if start is None:

@@ -44,6 +44,7 @@ _LEAST = 1e-12
 _TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
 _ROUNDED = "mag_quantisation"
 _ACROSS = 2.0 / 3.0  # of an innovation's three parts are across the field
+_QUIETEST = 1e-3  # of an innovation's deviation: the least that the magnetometer scatters by
 _BEYOND = 2.0  # times what noise has in means over segments
 
 
@@ -99,7 +100,7 @@ def noise_law(
     for rows in (within, ~within):
         if np.any(rows & done.used):
             of_mag = float(np.mean(done.whitened[rows & done.used] ** 2)) - of_gyro
-            level[rows] = np.sqrt(max(of_mag, 0.0) / (1.0 - of_gyro))
+            level[rows] = np.sqrt(max(of_mag, _QUIETEST**2) / (1.0 - of_gyro))
     if steps:
         truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
 
@@ -279,7 +280,8 @@ def scene_of(context: Context) -> Scene:
     """The scene of a recording."""
     track = context.track
     return Scene(
-        unit_b=context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True),
+        unit_b=context.field_b
+        / np.maximum(np.linalg.norm(context.field_b, axis=1, keepdims=True), 1e-300),
         R_nb=context.R_nb,
         segment=segments_of(track),
         time=_courses([track.time_s]),
@@ -400,7 +402,8 @@ def _shift(values: Array, scene: Scene) -> float:
     count = np.bincount(scene.segment, weights=np.any(values != 0.0, axis=1))
     kept = count > 0.3 * count.max()
     sums = np.column_stack([np.bincount(scene.segment, weights=column) for column in values.T])
-    return float(np.abs(sums[kept] / np.sqrt(count[kept])[:, None]).max())
+    means = np.abs(sums[kept] / np.sqrt(count[kept])[:, None])
+    return float(means.max(initial=0.0))
 
 
 def _follows(values: Array, courses: Array) -> float:

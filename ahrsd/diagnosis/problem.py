@@ -14,7 +14,7 @@ from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.null import cold_start
 from ahrsd.diagnosis.shaken import carrying, quieter
 from ahrsd.diagnosis.thin import thinned, working_factor
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
@@ -86,7 +86,9 @@ def problem_of(
     track = told
     m = working_factor(track, carrying(track, cold))
     work = thinned(track, m, cold)
-    averaged = _readings(track) / max(_readings(work), 1)
+    if not _readings(work):
+        raise NothingToFit("no whole reading of the magnetometer is left: all are stuck or missing")
+    averaged = _readings(track) / _readings(work)
     start = replace(
         cold,
         sigma_mag_gauss=cold.sigma_mag_gauss / float(np.sqrt(averaged)),

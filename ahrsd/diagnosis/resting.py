@@ -132,6 +132,8 @@ def _rest(context: Context) -> _Rest | None:
     track = context.track
     second = np.floor(track.time_s - track.time_s[0]).astype(np.intp)
     known = np.flatnonzero(np.bincount(second) > 2)
+    if len(known) < FEWEST:  # rows that come more slowly
+        return None
     means = np.stack([track.gyro_b_rad_s[second == k].mean(axis=0) for k in known])
     scatter = np.array([track.gyro_b_rad_s[second == k].std(axis=0).max() for k in known])
     still = scatter < SCATTER * np.median(scatter)

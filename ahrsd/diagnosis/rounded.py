@@ -81,7 +81,8 @@ def bent(truth: Readings, covariance: Array, seed: int) -> Readings:
     is not.
     """
     dice = np.random.default_rng([seed, 3])
-    drawn = dice.multivariate_normal(np.zeros(len(covariance)), covariance)
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * dice.standard_normal(len(values)))
     iron = np.einsum("a,aij->ij", drawn[:5], TRACELESS)
     return replace(truth, mag_b_gauss=truth.mag_b_gauss + truth.field_b @ iron + drawn[5:8])
 

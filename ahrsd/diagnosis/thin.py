@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.track import Track
+from ahrsd.diagnosis.track import NothingToFit, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
@@ -71,6 +71,8 @@ def thinned(track: Track, m: int, model: NullModel, riding: Array | None = None)
     if riding is not None:
         return _beside(track, m, model, riding)
     runs = [run for run in track.runs if run.stop - run.start >= 2 * m]
+    if not runs:
+        raise NothingToFit(f"no run of {2 * m} samples without a gap: too little for a fit")
     parts = [_thinned_run(track, run, m, model) for run in runs]
     lengths = [len(part["time_s"]) for part in parts]
     ends = np.cumsum(lengths).tolist()

@@ -9,6 +9,10 @@ import numpy as np
 from ahrsd.samples import Array
 
 
+class NothingToFit(ValueError):
+    """Why nothing can be fitted to a recording, in words for a person."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """N samples in the sensor frame, time increasing.

@@ -83,7 +83,7 @@ def _periods(quick: Array, step_s: float, span_s: float, longest_s: float) -> tu
         at = np.rint(multiple * base_hz / spacing_hz).astype(np.intp)
         inside = multiple <= lines
         score[inside] += power[at[inside]]
-    score = (score - lines * power.mean()) / np.sqrt(lines)
+    score = (score - lines * power.mean()) / np.sqrt(np.maximum(lines, 1.0))
     found = []
     for _ in range(_PERIODS):
         best = int(np.argmax(score))

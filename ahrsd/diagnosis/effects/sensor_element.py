@@ -304,7 +304,8 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     width = 2.0 / (len(values) * step_s)
     inside = (frequency > _LOWEST_HZ) & (frequency < 0.5 / step_s - width)
     power = np.where(inside, power, 0.0)
-    power = power / _background(power)
+    background = _background(power)
+    power = np.divide(power, background, out=np.zeros_like(power), where=background > 0.0)
     turns = np.nan_to_num(gyro_b_rad_s[run])
     turned = np.fft.rfft((turns - turns.mean(axis=0)) * window, 4 * len(values), axis=0)
     power[_to_and_fro(frequency, np.sum(np.abs(turned) ** 2, axis=1))] = 0.0

@@ -21,7 +21,7 @@ from ahrsd.diagnosis.null import baseline, fit_null, unusable
 from ahrsd.diagnosis.one_model.search_rounds import answered
 from ahrsd.diagnosis.pauses import without_jumps
 from ahrsd.diagnosis.problem import model_at_rate, problem_of
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 
 NOTE = "by the engine one-model, which is experimental"
 
@@ -40,7 +40,7 @@ def diagnose(
     track, notes = roles.prepared(track)
     track, jumped = without_jumps(track)
     if why := unusable(track):
-        raise ValueError(why)
+        raise NothingToFit(why)
     facts = hygiene(track)
     said = [of_fact(fact, library) for fact in facts if matters(fact)]
     notes = (NOTE, *jumped, *notes, *(fact.words for fact in facts if not matters(fact)))
