@@ -835,10 +835,16 @@ class Flow:
         held = self.outbox.history.holds or {}
         changed = [n for n, v in held.items() if not same(n, v, self.registers.get(n, ()))]
         if changed:
+            tried = all(self.outbox.history.tried(n, self.registers.get(n, ())) for n in changed)
+            cause = (
+                "it holds a value of a trial that was undone: the device did not give it up, or "
+                "somebody saved it"
+                if tried
+                else "somebody else wrote or saved it"
+            )
+            which = ", ".join(map(str, changed))
             self.outbox.note(
-                "error",
-                f"register {', '.join(map(str, changed))} changed since the journal's last record: "
-                "somebody else wrote or saved it",
+                "error", f"register {which} changed since the journal's last record: {cause}"
             )
         factory, history = Affine.identity().to_register(), self.outbox.history
         strange = [

@@ -14,12 +14,13 @@ foreign_save       a save of what another program wrote while this one listened,
 half_save          a save while the device does not hold all of the transaction's new values; one
                    that shows them in every reading and does not apply them is for the trial on
                    samples to find, and that lasts two seconds in these histories
-foreign_replaced   a write over another program's value that the journal knows nothing of; a write
-                   that the unit did not carry out made no value another program's
+foreign_replaced   a write over another program's value that the unit shows and the journal knows
+                   nothing of; a write that the unit did not carry out made no value another
+                   program's
 proven_not_held    PROVEN of values that the device, when asked, does not show
 unproven_saved     a save for a client (no FLASH_SENT announced it) of a value that came from the
-                   daemon and that no save of its own has made permanent; but for a unit that
-                   shows the old value in every reading and applies the new one
+                   daemon and that nothing has made permanent before; but for a unit that shows
+                   the old value in every reading and applies the new one
 false_confirmed    CONFIRMED although that unit did not restart with the values in its flash
 """
 
@@ -65,6 +66,8 @@ class Seen:
     prepared_s: float = -1e9
     sent_s: float = -1e9
     announced: bool = False  # a save of the daemon's own, by its journal
+    lies: set[int] = field(default_factory=set)  # registers that showed another value at PREPARED
+    flash: dict[int, str] = field(default_factory=dict)
     kept: dict[int, set[str]] = field(default_factory=lambda: {23: set(), 84: set()})
     noted: int = 0
 
@@ -130,6 +133,7 @@ class Observer:
         if kind == "PREPARED":
             seen.prepared, self.newest_prepared = dict(facts), serial
             seen.prepared_s, seen.sent_s = at_s, -1e9
+            seen.lies = {n for n in _REGISTERS if unit.shown(n) != unit.memory.ram[n]}
         elif kind == "FLASH_SENT":
             seen.sent_s = at_s
         elif kind == "PROVEN" and not facts.get("unsent") and not late:
@@ -146,6 +150,7 @@ class Observer:
         """What is known of a unit."""
         if unit.serial not in self.units:
             seen = self.units[unit.serial] = Seen()
+            seen.flash = {number: unit.memory.flash[number] for number in _REGISTERS}
             for number in _REGISTERS:
                 seen.own[number] |= {unit.memory.flash[number], unit.memory.ram[number]}
         return self.units[unit.serial]
@@ -177,8 +182,10 @@ class Observer:
                 for number, text in zip(_REGISTERS, change.pair, strict=True):
                     seen.own[number].add(text)
             seen.flash_author = dict(seen.author)
+            seen.flash = dict(zip(_REGISTERS, change.pair, strict=True))
         elif change.what in ("restart", "factory"):
             seen.restarts.append((change.at_s, change.pair))
+            seen.flash = dict(zip(_REGISTERS, change.pair, strict=True))
             seen.author = dict(seen.flash_author)
             seen.changed_s = change.at_s
 
@@ -188,7 +195,7 @@ class Observer:
         who, since_s = seen.author[number]
         if who == "other" and change.at_s - since_s > RACE_S and text != change.before:
             named = [self._pair(seen, which).get(number) for which in ("old", "new")]
-            if change.before not in named:
+            if change.before not in named and number not in seen.lies:
                 self._wrong("foreign_replaced", change.at_s, f"register {number}: {change.before}")
         if text in seen.own[number]:
             return
@@ -217,7 +224,8 @@ class Observer:
             seen.kept[number].add(text)
             who, since_s = seen.author[number]
             theirs = who == "other" and seen.flash_author[number] != (who, since_s)
-            theirs &= since_s > max(self._first_read_s(unit, number), self.begun_s + RACE_S)
+            known_s = self._first_read_s(unit, number, since_s)
+            theirs &= since_s > max(known_s, self.begun_s + RACE_S)
             if theirs and at_s - since_s > RACE_S and text != new.get(number):
                 self._wrong("foreign_save", at_s, f"unit {unit.serial} register {number}: {text}")
             half = number in new and new[number] not in (text, unit.shown(number))
@@ -230,6 +238,8 @@ class Observer:
     def _saved_for_a_client(self, unit: Unit, seen: Seen, change: Change) -> None:
         self.counts["client saves"] += 1
         for number, text in zip(_REGISTERS, change.pair, strict=True):
+            if text == seen.flash.get(number):  # it makes nothing permanent that was not
+                continue
             if not {text, unit.shown(number)} & (seen.own[number] | seen.kept[number]):
                 where = f"unit {unit.serial} register {number}: {text}"
                 self._wrong("unproven_saved", change.at_s, where)
@@ -253,13 +263,16 @@ class Observer:
         away = np.linalg.norm(values[:9].reshape(3, 3) @ (raw - values[9:]))
         return bool(abs(away - np.linalg.norm(field)) > VISIBLE_GAUSS)
 
-    def _first_read_s(self, unit: Unit, number: int) -> float:
-        """When this run of the program read a register of this unit first."""
+    def _first_read_s(self, unit: Unit, number: int, until_s: float) -> float:
+        """When this run of the program read a register of this unit first, since its last restart
+        before a time: what it reads behind a restart it must take for what is in flash."""
         label = f"VNRRG,{number}"
+        restarts = [at_s for at_s, _ in self.seen(unit).restarts if at_s <= until_s]
+        begun_s = max([self.begun_s, *restarts])
         times = (
             at_s
-            for at_s, serial, heard in self.cable.heard
-            if at_s >= self.begun_s and (serial, heard) == (unit.serial, label)
+            for at_s, serial, heard in self.cable.answered
+            if at_s >= begun_s and (serial, heard) == (unit.serial, label)
         )
         return next(times, float("inf"))
 

@@ -228,6 +228,58 @@ def test_a_save_that_no_record_announced_may_hold_nothing_of_the_daemons():
     assert story.kinds == ["unproven_saved"]
 
 
+def test_a_register_that_shows_another_value_than_it_holds_is_replaced_unseen_by_anybody():
+    story = Story()
+    story.cable.other_master(f"VNWRG,23,{FOREIGN}", story.now_s)
+    story.unit.lies.not_held, story.unit.lies.reads_told = {23}, True
+    story.observer.asked_by_client(f"VNWRG,23,{FACTORY}")
+    story.write({23: FACTORY})
+    assert story.unit.memory.ram[23] == FOREIGN
+    assert story.unit.shown(23) == FACTORY
+    story.now_s += 5.0
+    story.announce()
+    story.prepare()
+    story.write({23: GOOD[23]})
+    assert "foreign_replaced" not in story.kinds
+
+
+def test_a_save_of_what_is_in_flash_already_makes_nothing_permanent():
+    story = Story()
+    story.unit.memory.flash[23] = story.unit.memory.ram[23] = FACTORY
+    story.observer.look(story.now_s)
+    story.announce()
+    story.prepare()
+    story.write({23: GOOD[23]})
+    story.say("VNWNV")
+    assert story.kinds == ["unproven_saved"]
+    story.unit.restart(story.now_s)
+    story.observer.look(story.now_s)
+    story.say("VNWNV")
+    assert story.kinds == ["unproven_saved"]
+
+
+def test_somebodys_value_from_before_the_first_reading_behind_a_restart_is_the_units_own():
+    for reads_after_s in (0.0, 2.0):
+        story = Story()
+        story.observer.begun(story.now_s)
+        story.now_s += 10.0
+        story.say("VNRRG,84")
+        story.unit.restart(story.now_s)
+        story.now_s += 3.0
+        if not reads_after_s:
+            story.say("VNRRG,84")
+        story.cable.other_master(f"VNWRG,84,{FOREIGN}", story.now_s)
+        story.now_s += 5.0
+        if reads_after_s:
+            story.say("VNRRG,84")
+        story.announce({23: GOOD[23]})
+        story.prepare(values={23: GOOD[23]})
+        story.write({23: GOOD[23]})
+        story.record("PROVEN")
+        story.save()
+        assert story.kinds == ([] if reads_after_s else ["foreign_save"])
+
+
 def test_what_a_client_wrote_and_saved_is_its_own():
     story = Story()
     story.observer.asked_by_client(f"VNWRG,23,{FOREIGN}")

@@ -41,6 +41,7 @@ class Cable:
         self._nobody_until_s = at_s
         self.moment: Callable[[str], None] = lambda _: None
         self.heard: list[tuple[float, int, str]] = []
+        self.answered: list[tuple[float, int, str]] = []
         self._input = bytearray()
         self._waiting: list[tuple[float, bytes]] = []
         self._out: list[tuple[float, int, bytes]] = []
@@ -96,6 +97,7 @@ class Cable:
         faults = self.faults
         if self.unit is not unit or faults.draw.random() < faults.lost:
             return
+        self.answered.append((at_s, unit.serial, label))
         if faults.late and faults.draw.random() < faults.late:
             due_s += faults.late_s
         self._put(due_s, reply)
