@@ -8,7 +8,7 @@ from ahrsd.config.loading import Config
 from ahrsd.core.settings import CalibratorSettings, CoreSettings
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import text_within
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.world_field import WorldField, world_field
 from ahrsd.writeback.policy import WriteBackPolicy
 

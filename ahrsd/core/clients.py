@@ -15,13 +15,15 @@ from dataclasses import dataclass, field
 from ahrsd import inputs
 from ahrsd.core.device_session import DeviceSession, NotAsKnown
 from ahrsd.events import SendToClient
-from ahrsd.sharing.arbiter import COUNTED, Arbiter, Waiting
-from ahrsd.sharing.client_commands import (
+from ahrsd.sharing.arbiter import (
+    COUNTED,
     UNAUTHORIZED,
+    Arbiter,
     ClientCommand,
     Kind,
     Refusal,
     SharePolicy,
+    Waiting,
 )
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.journal_history import LATENCY_S

@@ -30,7 +30,7 @@ from ahrsd.config.loading import Config
 from ahrsd.core import estimation
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy
 from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy
