@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.core.estimation import supervised
 from ahrsd.daemon import host_clock
 from ahrsd.events import Failure

@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from ahrsd import events
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import CONFIG_KEY, Config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import CONFIG_KEY, Config, core_settings, print_config
 from ahrsd.core.core import Core
 from ahrsd.core.settings import BESIDE_KEY
 from ahrsd.daemon import host_clock

@@ -18,14 +18,13 @@ from queue import SimpleQueue
 from typing import Protocol
 
 from ahrsd import inputs
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Change, Config, Reloader
 from ahrsd.core.core import Core
 from ahrsd.daemon.background import Recall
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
 from ahrsd.daemon.host_clock import HostClock
-from ahrsd.daemon.ports.serial_link import Bytes, Item, Lost, SerialLink
-from ahrsd.daemon.reloading import Change, Reloader
+from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink
 from ahrsd.daemon.vehicle_files import VehicleFiles
 from ahrsd.telemetry.feeds import Outlet
 from ahrsd.telemetry.status import LinkFacts

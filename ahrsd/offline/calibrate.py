@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.core.estimation import Calibrator
 from ahrsd.diagnosis.model_file import RepairedModel
 from ahrsd.events import Estimated, Event, SamplesSeen

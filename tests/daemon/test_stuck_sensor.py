@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from patience import PATIENCE_S
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader

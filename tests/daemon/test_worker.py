@@ -16,8 +16,7 @@ from virtual_run import VirtualRun
 
 from ahrsd import events
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import EstimationTask, EstimatorState
 from ahrsd.daemon.background import MOST_WAITING, Worker

@@ -14,7 +14,7 @@ from fleet_rows import row, store_of
 from ros_files import sensor
 
 from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive
 from ahrsd.fleet.crew import Place

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS, MethodError, MethodSettings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.parameters import EstimatorParameters

@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from ahrsd.baselines import METHODS
 from ahrsd.baselines.registry import ComparisonRow
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge

@@ -25,7 +25,7 @@ from ahrsd.cli.device.registers import locks
 from ahrsd.cli.device.registers.changes import Changes, apply, gate, save_to_flash, to_write
 from ahrsd.cli.device.registers.sources import Sources, calibrated, find, journals, newest_in_force
 from ahrsd.cli.files import refuse_unwritable, write_text
-from ahrsd.config.loading import default_state_directory
+from ahrsd.config.config import default_state_directory
 from ahrsd.daemon.journal import (
     Journal,
     Record,

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from ahrsd.cli.device.registers.sources import journals
-from ahrsd.config.loading import default_state_directory
+from ahrsd.config.config import default_state_directory
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, journal_path
 from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFolderError

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def calibrated(path: Path, orders: Orders) -> Calibrated:
     """`ahrsd calibrate` of one recording of an archive."""
-    from ahrsd.config.loading import Config
+    from ahrsd.config.config import Config
     from ahrsd.offline.calibrate import calibrate
 
     return calibrate(path, Config(), rate_hz=orders.rate_hz, columns=orders.columns)
