@@ -326,7 +326,7 @@ _PREFACE = """\
 
 `ahrsd run --config FILE` reads TOML; every key has a default, so an empty file is a configuration.
 `ahrsd run --print-config` prints the one in force, with these comments. A key that is not here is
-an error. Written from the code by `python -m ahrsd.config.config > docs/reference/configuration.md`.
+an error. From the code by `python -m ahrsd.config.config > docs/reference/configuration.md`.
 """
 
 
