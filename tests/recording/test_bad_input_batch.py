@@ -19,9 +19,9 @@ from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.offline.batch_result import BatchResult
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, run_published, saturated
+from ahrsd.report.summary import BatchResult
 
 SOFT_IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
 HARD_IRON = np.array([0.04, 0.11, 0.11])

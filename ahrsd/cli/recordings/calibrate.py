@@ -15,8 +15,8 @@ from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.baselines.registry import ComparisonRow
-    from ahrsd.offline.batch_result import BatchResult
     from ahrsd.recording.column_names import ColumnMap
+    from ahrsd.report.summary import BatchResult
 
 _ALL = "all"
 _METHODS = (  # ours first; a test holds this list against `ahrsd.baselines`, slow to import

@@ -21,7 +21,7 @@ from ahrsd.config.config import Config, load_config
 from ahrsd.daemon.operator_inbox import VERBS
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, AhrsdError, DeviceError
 from ahrsd.printable import line
-from ahrsd.telemetry.client import DaemonConnection, find_socket
+from ahrsd.telemetry.unix_socket import DaemonConnection, find_socket
 
 # -- Where a command listens -----------------------------------------------------------------------
 

@@ -40,10 +40,10 @@ from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
 from ahrsd.evaluation.heading import QUATERNION, HeadingReference, course, optical
 from ahrsd.heading import wrapped
-from ahrsd.offline.batch_result import BatchResult
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published
 from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
+from ahrsd.report.summary import BatchResult
 from ahrsd.samples import Array, SampleBlock
 
 RECORDINGS = Path(__file__).parents[4] / "shared" / "recordings"

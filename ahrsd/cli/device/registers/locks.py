@@ -18,7 +18,7 @@ from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, journal_path
 from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFolderError
 from ahrsd.errors import DeviceError, JournalError
-from ahrsd.telemetry.client import DaemonConnection, default_socket_path
+from ahrsd.telemetry.unix_socket import DaemonConnection, default_socket_path
 from ahrsd.writeback.journal_history import JournalHistory, RecordKind
 
 _WAIT_S = 5.0
