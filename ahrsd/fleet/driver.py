@@ -17,8 +17,7 @@ from typing import Protocol
 
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive, ArchiveEntry, sweep
-from ahrsd.fleet.crew import Place, crew
-from ahrsd.fleet.guard import Limits
+from ahrsd.fleet.processes import Limits, Place, crew
 from ahrsd.fleet.row import ANSWERED
 from ahrsd.fleet.store import Known, Store
 from ahrsd.fleet.work import THERE, Answer, Orders, keep_loss, stamp

@@ -19,7 +19,7 @@ from ahrsd import __version__
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import row as rows
 from ahrsd.fleet.archive import ArchiveEntry, local_file, pieces
-from ahrsd.fleet.guard import TOO_LARGE, TOO_SLOW, Loss
+from ahrsd.fleet.processes import TOO_LARGE, TOO_SLOW, Loss
 from ahrsd.fleet.row import Calibrated, Row
 from ahrsd.fleet.store import Store
 from ahrsd.printable import printable

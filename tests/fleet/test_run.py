@@ -17,8 +17,8 @@ from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
 from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.crew import Place
 from ahrsd.fleet.driver import Progress, run
+from ahrsd.fleet.processes import Place
 from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import Store
 from ahrsd.fleet.work import Orders

@@ -35,8 +35,8 @@ from fleet_rows import computing, nothing, sleeping
 
 from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.crew import Place
 from ahrsd.fleet.driver import run
+from ahrsd.fleet.processes import Place
 from ahrsd.fleet.questions import FleetRows
 from ahrsd.fleet.store import SCHEMA, Store
 from ahrsd.fleet.work import Orders

@@ -97,8 +97,8 @@ def run(
     is gone.
     """
     from ahrsd.fleet.archive import Archive
-    from ahrsd.fleet.crew import Place
     from ahrsd.fleet.driver import run as run_fleet
+    from ahrsd.fleet.processes import Place
 
     if folder is not None:
         make_folder(folder, ("report.html",))
