@@ -13,9 +13,8 @@ from pathlib import Path
 from types import FrameType
 
 from ahrsd.config.config import Config, Reloader, terms_text, with_date
-from ahrsd.daemon.background import SWITCH_S, Recall
-from ahrsd.daemon.core_runner import Shell, close_shell, open_shell
-from ahrsd.daemon.daemon import Daemon
+from ahrsd.daemon.core_runner import SWITCH_S, Shell, close_shell, open_shell
+from ahrsd.daemon.daemon import Daemon, Recall
 from ahrsd.daemon.heap import needed_bytes, take_heap
 from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.vehicle_files import VehicleFiles

@@ -3,10 +3,10 @@
 ::
 
     archive    which recordings there are, on a disk or behind fsspec; one of them as a local file
-    work       one recording -> one row, through the same functions as the commands
     row        what a row holds, and how a recording's answers become one
     store      rows: spool/KEY.json, then parts/serial=N/HASH.parquet
-    driver     a run over what has no row yet, resumed where it was killed
+    run        over what has no row yet, resumed where it was killed; one recording -> one row,
+               through the same functions as the commands
     drift      all calibrations as columns, averaged to points by device and time
     questions  what the rows say: drift, recurring, failures, SQL; the answers as lines for a person
     page       and as one page

@@ -1,6 +1,6 @@
 """A function over many tasks, each in a process of its own, on this machine or on a Dask cluster.
 
-The one way in which ahrsd does many things at once: archives (`driver`), Monte Carlo and the blind
+The one way in which ahrsd does many things at once: archives (`run`), Monte Carlo and the blind
 trials. Answers come as they are made, each with its task, so that the order says nothing; no more
 tasks are taken than the window holds, so that a million cost the memory of a few.
 

@@ -168,7 +168,7 @@ def read_head(path: Path) -> dict[str, str]:
 
 def _of_another(path: Path, profile: str, not_ours: RecordingError) -> RecordingError:
     """What an MCAP file of another program is."""
-    from ahrsd.recording.foreign.formats import ROS
+    from ahrsd.recording.foreign.recognised import ROS
 
     number = {"ros1": "1", "ros2": "2"}.get(profile)
     if number is not None:

@@ -27,7 +27,8 @@ from ahrsd.recording.bytestream import (
     utf16_of,
 )
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, NO_MAP, TIME, ColumnMap
-from ahrsd.recording.foreign.formats import Format, format_of, ready, recognised
+from ahrsd.recording.foreign.formats import Format, format_of, ready
+from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.foreign.sensors import NO_CHOICE, Choice, RawBytes, merged
 from ahrsd.recording.table import PARQUET, Table, read_table, table_of
 from drivers.vn100.decode import ErrorReply, Measurement, Unused, decode

@@ -18,7 +18,7 @@ import pyarrow.csv
 from ahrsd.errors import RecordingError
 from ahrsd.printable import counted, printable
 from ahrsd.recording.bytestream import read_chunks, utf16_of
-from ahrsd.recording.foreign.formats import recognised
+from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.limits import (
     HEADER_BYTES,
     TABLE_BYTES,

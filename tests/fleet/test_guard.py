@@ -9,10 +9,9 @@ from fleet_rows import by_name
 
 from ahrsd.fleet import processes
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.driver import run
 from ahrsd.fleet.processes import Place
+from ahrsd.fleet.run import Orders, run
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.work import Orders
 
 NAMES = ("good1", "hang", "good2", "hog", "kill", "good3", "once", "bug", "good4")
 
