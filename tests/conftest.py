@@ -157,7 +157,7 @@ class LiveDaemon:
     """
 
     def __init__(self, folder: Path, setup: dict[str, object], tables: dict[str, object]) -> None:
-        from ahrsd.config.loading import check_config
+        from ahrsd.config.config import check_config
         from ahrsd.daemon.core_runner import open_shell
         from ahrsd.daemon.daemon import Daemon
         from ahrsd.daemon.host_clock import HostClock

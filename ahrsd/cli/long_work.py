@@ -87,7 +87,7 @@ def fleet_progress(every_s: float = 60.0) -> Iterator[Callable[[int, int, int, f
 
 
 def _lines(every_s: float) -> Callable[[int, int, int, float], None]:
-    from ahrsd.fleet.words import duration
+    from ahrsd.fleet.questions import duration
 
     said_s = time.monotonic()
 

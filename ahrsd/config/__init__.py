@@ -1,1 +1,1 @@
-"""The configuration file: its keys, how it is read, and what the core takes from it."""
+"""The configuration: its tables and keys (`sections`), all that is done with it (`config`)."""

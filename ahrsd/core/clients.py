@@ -13,22 +13,24 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from ahrsd import inputs
-from ahrsd.core.device_session import DeviceSession, NotAsKnown
+from ahrsd.core.device_session import DeviceSession
 from ahrsd.events import SendToClient
-from ahrsd.sharing.arbiter import COUNTED, Arbiter, Waiting
-from ahrsd.sharing.client_commands import (
+from ahrsd.sharing.arbiter import (
+    COUNTED,
     UNAUTHORIZED,
+    Arbiter,
     ClientCommand,
     Kind,
     Refusal,
     SharePolicy,
+    Waiting,
 )
 from ahrsd.writeback.actions import Action
 from ahrsd.writeback.journal_history import LATENCY_S
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import PASSABLE
 from ahrsd.writeback.states import Mode
-from drivers.vn100.commands import NoReply, Seen, TooLate, Write
+from drivers.vn100.commands import NoReply, NotAsKnown, Seen, TooLate, Write
 from drivers.vn100.messages import Reply
 from drivers.vn100.registers import Values
 

@@ -6,22 +6,37 @@
                                                                 READY <-> LOOKING (who answers?)
                                                                 READY <-> SERVING (a client's)
 ```
-Before the session's outputs are set up, the journal keeps the user's (KEEPING, `kept_settings`).
+Before the session's outputs are set up, the journal keeps the user's (KEEPING, `KeptOutputs`).
 A device that stops sending although its output may be switched on is asked for it
 (`OutputWatchdog`), and a stop ends within `STOP_S`, whatever the device does (`StopLimit`).
 
 In mode `passive` the port goes from CLOSED to READY at once and no byte is ever sent. A device that
 answers nothing is listened to and asked again now and then: it stays IDENTIFYING, without an
 identity, so nothing can be written to it.
+
+**The user's outputs.** A session changes registers 6 and 75 to 77. A program that is killed cannot
+put them back, and the next one would take what it finds for the user's. So the user's values go
+into the journal before the first byte (`OUTPUTS_KEPT`), and are done with when they were put back
+(`OUTPUTS_BACK`).
+
+A record that is still open tells a run whose outputs it finds, register by register: what only a
+session leaves there (`calibration_stream.left_by_session`) stands for the value that was kept; any
+other value was put there since, by a person or by a restart of the device, and is the user's own.
+
+**Settings of clients.** A driver sets its outputs at every start, in RAM. For the user's own
+configuration they count as little as a session of ours: they are put back before a save and set
+again behind it, so that a save of a calibration makes nothing else permanent. When the device
+restarts they are gone, and what a client saves itself is the user's from then on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
-from ahrsd.core.kept_settings import ClientSettings, KeptOutputs
+from ahrsd.writeback.actions import Action, AppendToJournal, SetUpStream
 from ahrsd.writeback.journal_history import JournalRecord, RecordKind
 from ahrsd.writeback.permissions import CALIBRATION, permitted
 from ahrsd.writeback.states import Mode, Purpose
@@ -31,41 +46,173 @@ from drivers.vn100.calibration_stream import (
     NoStream,
     NotPutBack,
     configure_stream,
+    left_by_session,
 )
 from drivers.vn100.commands import (
     RESUME,
     Command,
     Identity,
     LinkGone,
-    NoReply,
-    Pause,
     Procedure,
     Read,
     Seen,
     SessionError,
     Speech,
-    TooLate,
-    Word,
-    Write,
-    differences,
-    identify,
+    WrongDevice,
+    asked,
+    asked_of,
+    identify_in,
+    identify_surely,
     look,
+    put_back_to,
     quiet,
-    read,
-    read_configuration,
-    read_unit,
+    read_surely,
     restore,
     resume,
 )
 from drivers.vn100.decode import Measurement
-from drivers.vn100.errors import DeviceRefused
-from drivers.vn100.messages import Reply
-from drivers.vn100.registers import SESSION_SETTINGS, Unit, Values, format_command, same
+from drivers.vn100.registers import (
+    SESSION_SETTINGS,
+    Unit,
+    Values,
+    register_lines,
+    same,
+)
 from drivers.vn100.session import Event, ProcedureFailed, ProcedureFinished, Session
+
+# -- Outputs of the session ------------------------------------------------------------------------
+
+
+class KeptOutputs:
+    """What is known of the user's outputs of one device, the one that was read last.
+
+    users: by register, empty before a device was read
+    left:  registers in which a session that did not end left its own values
+    """
+
+    def __init__(self) -> None:
+        self.users: dict[int, Values] = {}
+        self.left: tuple[int, ...] = ()
+        self._serial: int | None = None
+        self._kept: dict[int, Values] | None = None  # as the open record has them
+        self._actions: list[Action] = []
+
+    @property
+    def kept(self) -> bool:
+        """Whether the journal has the user's outputs as they are."""
+        return self._kept == self.users
+
+    def read(
+        self, serial: int, registers: Mapping[int, Values], journal: Sequence[JournalRecord] | None
+    ) -> None:
+        """A device and its journal were read; None: the journal cannot be trusted.
+
+        Then what this run itself has kept for the device is better than nothing.
+        """
+        if journal is not None or serial != self._serial:
+            self._kept = open_record(journal or (), serial)
+        self._serial = serial
+        kept = self._kept or {}
+        present = {n: registers[n] for n in SESSION_SETTINGS if n in registers}
+        self.users = {
+            n: kept[n] if n in kept and left_by_session(n, kept, value) else value
+            for n, value in present.items()
+        }
+        self.left = tuple(n for n, value in present.items() if self.users[n] != value)
+
+    def keep(self) -> None:
+        """Set up the session's outputs, behind a record of the user's where there is none yet."""
+        if self.kept:
+            self._actions.append(SetUpStream())
+        else:
+            self._actions.append(AppendToJournal(RecordKind.OUTPUTS_KEPT, self._facts()))
+
+    def give_back(self) -> None:
+        """The user's outputs are in the device again."""
+        self._actions.append(AppendToJournal(RecordKind.OUTPUTS_BACK, {"serial": self._serial}))
+
+    def journalled(self, kind: RecordKind, error: str) -> bool:
+        """A record of this kind is on the disk, or is not; what waited for it follows."""
+        if error:
+            return False
+        self._kept = dict(self.users) if kind is RecordKind.OUTPUTS_KEPT else None
+        if kind is RecordKind.OUTPUTS_KEPT:
+            self._actions.append(SetUpStream())
+        return True
+
+    def take_actions(self) -> list[Action]:
+        """What the core is to do now."""
+        actions, self._actions = self._actions, []
+        return actions
+
+    def describe_left(self, *, put_back: bool) -> str:
+        """For the log: what a killed session left, and what a person may do."""
+        lines = " ".join(register_lines({n: self.users[n] for n in self.left}))
+        text = f"outputs of a session that was killed are in the device; the user's are {lines}"
+        if put_back:
+            return text
+        return f"{text}; type that or set device.configure_stream, until then nothing is saved"
+
+    def _facts(self) -> dict[str, Any]:
+        """`old` is what a person goes back to."""
+        values = {str(number): list(row) for number, row in sorted(self.users.items())}
+        return {"serial": self._serial, "old": values}
+
+
+def open_record(journal: Sequence[JournalRecord], serial: int) -> dict[int, Values] | None:
+    """The outputs that were kept and not put back; None where nothing is open."""
+    kept: dict[int, Values] | None = None
+    for record in journal:
+        if record.kind == RecordKind.OUTPUTS_BACK:
+            kept = None
+        elif record.kind == RecordKind.OUTPUTS_KEPT and record.facts.get("serial") == serial:
+            kept = {int(number): tuple(row) for number, row in record.facts["old"].items()}
+    return kept
+
+
+# -- Settings of clients ---------------------------------------------------------------------------
+
+
+class ClientSettings:
+    """Of one device. `now`: what the clients set; `users`: what these registers held before."""
+
+    def __init__(self) -> None:
+        self.now: dict[int, Values] = {}
+        self.users: dict[int, Values] = {}
+        self._serial: int | None = None
+
+    def of(self, serial: int) -> None:
+        """This device was identified; another one has none of it."""
+        if self._serial != serial:
+            self._serial = serial
+            self.forget()
+
+    def written(self, number: int, values: Values, before: Values | None) -> None:
+        """A client's write was carried out; `before` None: nobody knows what was there."""
+        if before is None:
+            return
+        users = self.users.setdefault(number, before)
+        self.now[number] = values
+        if same(number, users, values):  # the user's own again
+            del self.users[number], self.now[number]
+
+    def read(self, registers: Mapping[int, Values]) -> dict[int, Values]:
+        """All registers were read; those that still hold a client's value, as the user had them."""
+        for number in list(self.now):
+            if not same(number, self.now[number], registers.get(number, ())):
+                del self.users[number], self.now[number]
+        return dict(self.users)
+
+    def forget(self) -> None:
+        """They are saved, and so the user's."""
+        self.now, self.users = {}, {}
+
+
+# -- The session -----------------------------------------------------------------------------------
+
 
 ASK_AGAIN_S = (0.5, 8.0)  # a device that does not answer: first wait, longest wait
 RESTORE_AGAIN_S = 0.1
-BEHIND_TRIES = 5  # to have the answers and the command right behind them
 _FOREIGN = 20  # messages without one of the session's own output: it is gone
 FIRST_S, LONGEST_S = 2.0, 5.0  # outputs have 1 Hz at least, so 2 s without one is a silence
 # First and longest wait: after the journal refused the user's outputs; where they could not be put
@@ -164,18 +311,6 @@ DeviceEvent = (
     | Closed
 )
 _ENDING = (Phase.RESTORING, Phase.CLOSING, Phase.DONE)
-
-
-class WrongDevice(SessionError):
-    """Another device than the one whose outputs were to be put back."""
-
-
-class Unsteady(SessionError):
-    """A register does not read the same twice."""
-
-
-class NotAsKnown(SessionError):
-    """Another device answers than the one that was read, or it holds something else."""
 
 
 class OutOfTime(SessionError):
@@ -690,84 +825,3 @@ def again_after(error: Exception) -> tuple[float, float] | None:
     if isinstance(error, NotPutBack):
         return PUT_BACK_AGAIN_S
     return None if isinstance(error, DoesNotFit | NoStream) else SET_UP_AGAIN_S
-
-
-def asked(command: Speech) -> Procedure[Reply]:
-    """One command and its reply."""
-    return (yield command)
-
-
-def asked_of(known: Seen, command: Speech) -> Procedure[Reply]:
-    """The same, once it is sure who answers and what it holds, and right behind that answer.
-
-    Raises NotAsKnown, where nothing was sent, and TooLate on a line that answers too slowly.
-    """
-    if isinstance(command, Write):
-        command = replace(command, once=True)
-    elif isinstance(command, Word):
-        command = replace(command, behind=True)
-    for left in reversed(range(BEHIND_TRIES)):
-        try:
-            seen = yield from look(known.unit, known.values)
-        except (NoReply, DeviceRefused) as error:
-            raise NotAsKnown(f"the device does not say what it holds: {error}") from error
-        if seen.unit != known.unit:
-            raise NotAsKnown(f"another device answers: {seen.unit}")
-        if changed := differences(known.values, seen.values):
-            raise NotAsKnown(f"registers {', '.join(map(str, sorted(changed)))} changed")
-        try:
-            return (yield command)
-        except TooLate:
-            if not left:
-                raise
-    raise AssertionError("no try is left")
-
-
-def identify_in(seconds: float) -> Procedure[Identity]:
-    """`identify_surely` after a while."""
-    yield Pause(seconds)
-    return (yield from identify_surely())
-
-
-def identify_surely() -> Procedure[Identity]:
-    """Who answers, asked twice: an altered reply must not pass for another device.
-
-    Raises Unsteady.
-    """
-    identity = yield from identify()
-    again = yield from read_unit()
-    if again != identity.unit:
-        raise Unsteady(f"the device says that it is {identity.unit}, then {again}")
-    return identity
-
-
-def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
-    """The configuration of this device, and at the end it still is this device that answers.
-
-    Some registers are read `twice`; those that will be put back can be written.
-
-    A reading that was altered on the way would else become what the user had. Raises Unsteady,
-    RegisterValueError.
-    """
-    values = yield from read_configuration(identity.profile)
-    for number in (n for n in twice if n in values):
-        again = yield from read(number)
-        if not same(number, values[number], again):
-            raise Unsteady(f"register {number} reads {values[number]}, then {again}")
-        if number in SESSION_SETTINGS:
-            format_command(number, again, held=True)
-    if (unit := (yield from read_unit())) != identity.unit:
-        raise Unsteady(f"{unit} answers, and a moment ago it was {identity.unit}")
-    return values
-
-
-def put_back_to(
-    serial: int | None, users: Mapping[int, Values], wait_s: float
-) -> Procedure[object]:
-    """The user's outputs, to the device with this serial number and to no other."""
-    if wait_s:
-        yield Pause(wait_s)
-    answered = int((yield from read(3))[0])
-    if answered != serial:
-        raise WrongDevice(f"the device has the serial number {answered}, not {serial}")
-    return (yield from quiet(restore(users, SESSION_SETTINGS)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.events import GateResult
 from ahrsd.gates import GateLimits, Level, for_level
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.world_field import WorldField
 from ahrsd.writeback.policy import WriteBackPolicy
 

@@ -1,36 +1,140 @@
-"""What surrounds the core: the record of every input, the journal, the viewer, the log.
+"""What surrounds the core: the record of every input, the journal, the viewer, the log, its thread.
 
 `Shell.feed` is the only way into the core, for the daemon and for a replay. It records the input
 before the core sees it, carries out what the core answers, and returns the bytes to send.
+
+**Tasks of the estimation** (`Worker`, `core.estimation`) are done in a thread beside the daemon's
+loop. Python lets one thread run at a time, and lets another one have its turn after `SWITCH_S`:
+that, and no longer, is what a byte waits for a long computation.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Protocol
 
 from ahrsd import events
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import CONFIG_KEY, Config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import CONFIG_KEY, Config, core_settings, print_config
 from ahrsd.core.core import Core
 from ahrsd.core.settings import BESIDE_KEY
 from ahrsd.daemon import host_clock
-from ahrsd.daemon.background import Worker
 from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.journal import Journal
 from ahrsd.errors import CaptureError, JournalError
+from ahrsd.events import Failure
 from ahrsd.inputs import Input, Journalled, JournalOpened
 from ahrsd.recording.capture import CaptureWriter, make_private_folder
 from ahrsd.viewer.sink import RerunLimits, RerunSink
 from ahrsd.writeback.journal_history import of_another_device
 
 log = logging.getLogger("ahrsd")
+
+# -- Tasks of the estimation -----------------------------------------------------------------------
+
+
+SWITCH_S = 0.0005
+MOST_WAITING = 40  # pieces, of up to two seconds of samples each: older verdicts are of no use
+_STUCK_S = 5.0  # no piece takes so long; the service manager's watchdog then goes hungry
+_MOST_REASONS = 16  # whose traceback is logged, once each
+
+
+class Worker:
+    """Does what it is given, in order. `woken` is called after each piece, from the thread.
+
+    Giving never waits: who takes the bytes that become pieces asks `full` before, and lets the
+    bytes wait instead. What breaks off is logged once, and told by `take_done`.
+    """
+
+    def __init__(self) -> None:
+        self.woken: Callable[[], None] = lambda: None
+        self._todo: SimpleQueue[Callable[[], Failure | None] | None] = SimpleQueue()
+        self._free = threading.Event()
+        self._put = self._done = self._told = 0  # each is written by one thread only
+        self._broken: SimpleQueue[tuple[int, str]] = SimpleQueue()  # which piece, and how
+        self._reasons: set[str] = set()
+        self._ended = self._closing = False
+        self._began_s: float | None = None
+        self._thread = threading.Thread(target=self._run, name="estimator", daemon=True)
+        self._thread.start()
+
+    def put(self, work: Callable[[], Failure | None]) -> None:
+        """One more."""
+        self._put += 1
+        self._todo.put(work)
+
+    @property
+    def full(self) -> bool:
+        """Whether so many wait that nothing more should be given."""
+        return self._put - self._done >= MOST_WAITING and not (self._ended or self.stuck)
+
+    def wait_for_room(self, timeout_s: float) -> None:
+        """Until a piece is done."""
+        self._free.clear()
+        if self.full:
+            self._free.wait(timeout_s)
+
+    def take_done(self) -> list[tuple[int, str]]:
+        """How many were done since this was asked last; one that broke off is the last of a pair.
+
+        Raises RuntimeError where the thread itself ended.
+        """
+        if self._ended and not self._closing:
+            raise RuntimeError("the estimator's thread ended, see above")
+        done, batches = self._done, []
+        while not self._broken.empty():
+            number, reason = self._broken.get()
+            batches.append((number - self._told, reason))
+            self._told = number
+        if done > self._told:
+            batches.append((done - self._told, ""))
+            self._told = done
+        return batches
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it has been at one piece for longer than any takes."""
+        began_s = self._began_s
+        return began_s is not None and time.monotonic() - began_s > _STUCK_S
+
+    def close(self, timeout_s: float) -> None:
+        """Leave what waits; what is under way may end within `timeout_s`."""
+        self._closing = True
+        self._todo.put(None)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            while (work := self._todo.get()) is not None and not self._closing:
+                self._began_s = time.monotonic()
+                failure = work()
+                self._began_s = None
+                if failure is not None:
+                    self._log(failure)
+                    self._broken.put((self._done + 1, failure.reason))
+                self._done += 1
+                self._free.set()
+                self.woken()
+        finally:  # also after a bug: who waits for the work must know it
+            self._ended = True
+            self._free.set()
+            self.woken()
+
+    def _log(self, failure: Failure) -> None:
+        if failure.reason in self._reasons or len(self._reasons) >= _MOST_REASONS:
+            return
+        self._reasons.add(failure.reason)
+        log.error("the estimator broke off: %s", failure.reason, extra={"trace": failure.trace})
+
+
+# -- The core and its side taps --------------------------------------------------------------------
+
 
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
 _CLOSE_S = 8.0  # where nobody waits for the end

@@ -4,34 +4,91 @@ One loop: wait for bytes, a deadline, the vehicle's word or a signal; hand each 
 input; write what it answers. Losing the port is normal: the loop waits for it to come back and the
 core identifies the device again. At the end (SIGTERM, SIGINT) the core first puts back what it
 changed for the session.
+
+**Samples of an earlier run** (`Recall`): the newest captures are read for a warm start, beside the
+run that begins. The thread ends by itself, within `LONGEST_S`; whatever goes wrong in it is a
+reason for a run that begins with nothing, never an end of the run.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
 from ahrsd import inputs
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Change, Config, Reloader
 from ahrsd.core.core import Core
-from ahrsd.daemon.background import Recall
+from ahrsd.core.estimation import supervised
+from ahrsd.daemon import host_clock
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
 from ahrsd.daemon.host_clock import HostClock
-from ahrsd.daemon.ports.serial_link import Bytes, Item, Lost, SerialLink
-from ahrsd.daemon.reloading import Change, Reloader
+from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink
 from ahrsd.daemon.vehicle_files import VehicleFiles
+from ahrsd.inputs import EarlierRun, EarlierSamples
+from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.telemetry.feeds import Outlet
 from ahrsd.telemetry.status import LinkFacts
+from ahrsd.writeback.journal_history import Stamp
 from drivers.serial_port import PortError, PortLost, find_device, latency_timer_ms, spelled
 
 log = logging.getLogger("ahrsd")
+
+# -- Samples of an earlier run ---------------------------------------------------------------------
+
+
+LONGEST_S = 120.0
+
+
+class Recall:
+    """Reads; `take` gives one input at a time, once all of them are there."""
+
+    def __init__(
+        self, read: Callable[[Callable[[], bool]], list[EarlierSamples | EarlierRun]]
+    ) -> None:
+        self._read = read
+        self._found: deque[EarlierSamples | EarlierRun] = deque()
+        self._until_s = time.monotonic() + LONGEST_S
+        self._thread = threading.Thread(target=self._run, name="earlier runs", daemon=True)
+        self._thread.start()
+
+    @staticmethod
+    def of(config: Config, own: Path | None) -> Recall | None:
+        """As the configuration says; None where no earlier run is of use."""
+        limit_s = config.estimator.warm_start_s
+        if limit_s <= 0.0 or config.mode == "passive":
+            return None
+        now = Stamp(time.time(), host_clock.boot_id(), host_clock.boot_s())
+        folder, rate_hz = config.captures, config.estimator.step_rate_hz
+        return Recall(lambda go_on: earlier_inputs(folder, own, now, limit_s, rate_hz, go_on))
+
+    def _run(self) -> None:
+        found, failure = supervised(lambda: self._read(self._go_on))
+        if failure is not None:
+            log.error("no warm start: %s", failure.reason, extra={"trace": failure.trace})
+            found = [EarlierRun(0, why=failure.reason)]
+        self._found.extend(found or ())
+
+    def _go_on(self) -> bool:
+        return time.monotonic() < self._until_s
+
+    def take(self, host_ns: int) -> EarlierSamples | EarlierRun | None:
+        """The next input, as of now; None while there is none."""
+        if self._thread.is_alive() or not self._found:
+            return None
+        return replace(self._found.popleft(), host_ns=host_ns)
+
+
+# -- The loop --------------------------------------------------------------------------------------
+
 
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
 _LONGEST_WAIT_S = 0.2

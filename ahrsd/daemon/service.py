@@ -12,14 +12,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
-from ahrsd.config.core_settings import terms_text, with_date
-from ahrsd.config.loading import Config
-from ahrsd.daemon.background import SWITCH_S, Recall
-from ahrsd.daemon.core_runner import Shell, close_shell, open_shell
-from ahrsd.daemon.daemon import Daemon
+from ahrsd.config.config import Config, Reloader, terms_text, with_date
+from ahrsd.daemon.core_runner import SWITCH_S, Shell, close_shell, open_shell
+from ahrsd.daemon.daemon import Daemon, Recall
 from ahrsd.daemon.heap import needed_bytes, take_heap
 from ahrsd.daemon.host_clock import HostClock
-from ahrsd.daemon.reloading import Reloader
 from ahrsd.daemon.vehicle_files import VehicleFiles
 from ahrsd.errors import EXIT_DONE, ConfigError
 from ahrsd.recording.capture import new_capture_path

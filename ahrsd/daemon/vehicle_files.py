@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorCommand, OperatorInbox
 from ahrsd.events import Answered, Event
 from ahrsd.foreign_file import Contents, FileWatch, boot_s, read_regular

@@ -14,9 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import CONFIG_KEY, Config, check_config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import CONFIG_KEY, Config, check_config, core_settings, print_config
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, close_shell
 from ahrsd.daemon.daemon import Daemon

@@ -71,7 +71,7 @@ COLUMNS: dict[str, str] = {
 
 DONE, PARTLY, REFUSED = "done", "partly done", "refused"
 UNREADABLE = "unreadable"
-ANSWERED = (DONE, PARTLY)  # every other outcome is a failure: these, and those of `guard`
+ANSWERED = (DONE, PARTLY)  # every other outcome is a failure: these, and those of `processes`
 
 _EARLIEST_S, _LATEST_S = 946684800.0, 4102444800.0  # 2000 to 2100: what a stamp of UTC can be
 _IN_NAME = re.compile(

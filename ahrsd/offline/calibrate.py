@@ -11,15 +11,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.core.estimation import Calibrator
 from ahrsd.diagnosis.model_file import RepairedModel
 from ahrsd.events import Estimated, Event, SamplesSeen
-from ahrsd.offline.batch_result import BatchResult
 from ahrsd.offline.replay import Replayed, replay
 from ahrsd.offline.track import faults, without_terms
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
+from ahrsd.report.summary import BatchResult
 
 
 @on_one_thread

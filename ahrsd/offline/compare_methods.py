@@ -14,7 +14,7 @@ from ahrsd.baselines.registry import ComparisonRow, halves, spread_of
 from ahrsd.calibration_json import calibration_json
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import SamplesSeen
-from ahrsd.offline.batch_result import BatchResult
+from ahrsd.report.summary import BatchResult
 from ahrsd.samples import Array, SampleBlock
 
 OURS = "magyc"

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd import __version__
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import replay

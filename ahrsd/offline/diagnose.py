@@ -85,7 +85,7 @@ def _streamed(
     path: Path, rate_hz: float | None, progress: Callable[[int], None] | None
 ) -> tuple[list[SampleBlock], list[str]]:
     # the daemon's whole pipeline, which a table does not need
-    from ahrsd.config.loading import Config
+    from ahrsd.config.config import Config
     from ahrsd.offline.replay import replay
 
     seen: list[Event] = []

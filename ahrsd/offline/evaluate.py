@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.calibration import Affine
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import RecordingError
 from ahrsd.evaluation import (
     Evaluation,

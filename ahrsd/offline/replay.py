@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ahrsd.config.core_settings import core_settings, terms_text
-from ahrsd.config.loading import CONFIG_KEY, Config, recorded_config
+from ahrsd.config.config import CONFIG_KEY, Config, core_settings, recorded_config, terms_text
 from ahrsd.core.core import Core
 from ahrsd.core.settings import BESIDE_KEY, CoreSettings
 from ahrsd.daemon.core_runner import Listener, Shell, Viewer

@@ -43,9 +43,9 @@ from ahrsd.errors import DeviceError
 from ahrsd.page import view
 from ahrsd.page.access import Token, comes_from_here, form_mark, host_is_known, is_form_mark
 from ahrsd.report.template import render
-from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.driving import Pace, circle_is_wanted, shown_of, tilt_is_wanted
 from ahrsd.telemetry.protocol import STATUS_SCHEMA
+from ahrsd.telemetry.unix_socket import DaemonConnection
 
 # -- The newest status -----------------------------------------------------------------------------
 

@@ -1,20 +1,23 @@
 """One way to open any recording: what kind it is, its inputs in order, and what is to be known.
 
 The name decides the kind; where it says nothing or the content is another kind beyond doubt, the
-content does. Every recording yields what
-the core takes and ends in `Stop`, so that `replay` is `run` with another source.
+content does. Every recording yields what the core takes and ends in `Stop`, so that `replay` is
+`run` with another source. `listed` says in lines for a person what is in one.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
+import numpy as np
+
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Input, Received, Samples, Stop
-from ahrsd.printable import printable
+from ahrsd.printable import counted, printable
 from ahrsd.recording.bytestream import (
     is_gzip,
     read_chunks,
@@ -23,12 +26,14 @@ from ahrsd.recording.bytestream import (
     unpacked_size,
     utf16_of,
 )
-from ahrsd.recording.column_names import NO_MAP, ColumnMap
+from ahrsd.recording.column_names import ACCEL, GYRO, MAG, NO_MAP, TIME, ColumnMap
 from ahrsd.recording.foreign.formats import Format, format_of, ready
 from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.foreign.sensors import NO_CHOICE, Choice, RawBytes, merged
-from ahrsd.recording.table import PARQUET, Table, read_table, table_of
-from ahrsd.recording.text_table import is_table_text
+from ahrsd.recording.table import PARQUET, Table, is_rows_of_numbers, read_table, table_of
+from drivers.vn100.decode import ErrorReply, Measurement, Unused, decode
+from drivers.vn100.deframer import Deframer
+from drivers.vn100.messages import Reply
 
 _END = "end of recording"
 _HEAD_BYTES = 4096
@@ -250,7 +255,7 @@ def _in_spite_of_its_name(
             raise RecordingError(path, "is packed with gzip", f"unpack it: gunzip {path.name}")
         return RecordingKind.CAPTURE if blocks.is_mcap(start) else RecordingKind.TABLE
     line = _as_utf8(start).lstrip().split(b"\n", 1)[0]
-    if named is not RecordingKind.TABLE and (_names_columns(line) or is_table_text(start)):
+    if named is not RecordingKind.TABLE and (_names_columns(line) or is_rows_of_numbers(start)):
         return RecordingKind.TABLE
     if named is RecordingKind.TABLE and line.startswith(b"$VN"):
         return RecordingKind.BYTES
@@ -276,3 +281,56 @@ def _by_content(path: Path, start: bytes) -> RecordingKind:
         "is no recording by its name nor by its content",
         f"name it by its kind: {' '.join(_SUFFIXES)}",
     )
+
+
+# -- What it holds ---------------------------------------------------------------------------------
+
+
+def listed(path: Path) -> list[str]:
+    """What is in a recording, one line for each thing.  Raises RecordingError."""
+    start = b"" if path.is_dir() or not path.is_file() else next(read_chunks(path, _HEAD_BYTES))
+    kind = format_of(path, start)
+    if kind is not None:
+        ready(path, kind)
+        return [f"{path.name} {kind.what}", *kind.list(path)]
+    recording = open_recording(path)
+    lines = [f"{recording.name} is a {recording.kind.value}"]
+    if recording.table is not None:
+        rows = recording.table.rows
+        lines.append(f"rows: {len(rows)}, {rows.time_s[-1] - rows.time_s[0]:.1f} s")
+        accel = ACCEL if np.isfinite(rows.accel_b_m_s2).any() else ()
+        names = (TIME, *MAG, *GYRO, *accel, *sorted(rows.covariates))
+        return lines + [f"column {name}" for name in names]
+    return lines + _messages(recording)
+
+
+def _messages(recording: Recording) -> list[str]:
+    """One line per kind of message that a device sent, and what came to nothing."""
+    deframer = Deframer()
+    counts: Counter[str] = Counter()
+    columns: dict[str, tuple[str, ...]] = {}
+    for item in recording.inputs():
+        if not isinstance(item, Received):
+            continue
+        for frame in deframer.feed(item.data):
+            match decode(frame):
+                case Measurement(layout=layout):
+                    counts[layout.name] += 1
+                    columns[layout.name] = tuple(column.name for column in layout.columns)
+                case Reply(word=word):
+                    counts[f"{word}, a reply"] += 1
+                case ErrorReply():
+                    counts["VNERR, an error"] += 1
+                case Unused(name=name):
+                    counts[f"{name}, not used"] += 1
+    told = deframer.counters
+    lines = [
+        f"{printable(name)}  {counted(count, 'message')}"
+        + (f"  {', '.join(columns[name])}" if name in columns else "")
+        for name, count in counts.most_common()
+    ]
+    left = told.fed_bytes - told.valid_bytes
+    return [
+        *lines,
+        f"{left:,} of {counted(told.fed_bytes, 'byte', ',')} belong to no whole message",
+    ]

@@ -162,6 +162,13 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     return _checked(rows, check_units)
 
 
+def is_rows_of_numbers(start: bytes) -> bool:
+    """Whether the first bytes of a file are a table's, whatever the file is called."""
+    from ahrsd.recording.text_table import is_table_text
+
+    return is_table_text(start)
+
+
 def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
     """The same checks for columns, by canonical names, that another reader made of a file."""
     _check_length(path, len(columns[TIME]))

@@ -16,13 +16,12 @@ from ahrsd.calibration import Affine
 from ahrsd.core.core import Core
 from ahrsd.samples import SampleBlock
 from ahrsd.stream.decompensation import user_compensation
-from ahrsd.telemetry.client import default_socket_path
 from ahrsd.telemetry.feeds import Feed, Outlet
 from ahrsd.telemetry.metrics import MetricsServer
 from ahrsd.telemetry.protocol import Newest, samples_record
 from ahrsd.telemetry.sd_notify import Notifier
-from ahrsd.telemetry.server import SocketServer
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
+from ahrsd.telemetry.unix_socket import SocketServer, default_socket_path
 from ahrsd.telemetry.words import service_line
 
 _PACE_S = 0.004  # samples are told so often at most; a look at those that wait takes 0.3 ms

@@ -7,7 +7,7 @@
 | STAGE | a transaction writes registers 23 and 84 in RAM | stage |
 | ROLL_BACK | a transaction puts them back | stage |
 | SAVE | session settings put back (with `configure_stream`), then VNWNV | commit |
-| CLIENT | what a program on a shared port asked for (`sharing.client_commands`) | passive |
+| CLIENT | what a program on a shared port asked for (`sharing.arbiter`) | passive |
 | CLIENT_CALIBRATION | the same, of the owner with `calibration_writes = "pass"` | stage |
 
 A client's settings, in RAM for its session, are put back for a save like the daemon's own.

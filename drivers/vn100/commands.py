@@ -569,3 +569,102 @@ def _attempted(
     except (DeviceRefused, NoReply, VerifyFailed, ValueError) as error:
         errors[number] = error
         return False
+
+
+# -- Sequences that make sure who answers ----------------------------------------------------------
+
+
+BEHIND_TRIES = 5  # to have the answers and the command right behind them
+
+
+class WrongDevice(SessionError):
+    """Another device than the one whose outputs were to be put back."""
+
+
+class Unsteady(SessionError):
+    """A register does not read the same twice."""
+
+
+class NotAsKnown(SessionError):
+    """Another device answers than the one that was read, or it holds something else."""
+
+
+def asked(command: Speech) -> Procedure[Reply]:
+    """One command and its reply."""
+    return (yield command)
+
+
+def asked_of(known: Seen, command: Speech) -> Procedure[Reply]:
+    """The same, once it is sure who answers and what it holds, and right behind that answer.
+
+    Raises NotAsKnown, where nothing was sent, and TooLate on a line that answers too slowly.
+    """
+    if isinstance(command, Write):
+        command = replace(command, once=True)
+    elif isinstance(command, Word):
+        command = replace(command, behind=True)
+    for left in reversed(range(BEHIND_TRIES)):
+        try:
+            seen = yield from look(known.unit, known.values)
+        except (NoReply, DeviceRefused) as error:
+            raise NotAsKnown(f"the device does not say what it holds: {error}") from error
+        if seen.unit != known.unit:
+            raise NotAsKnown(f"another device answers: {seen.unit}")
+        if changed := differences(known.values, seen.values):
+            raise NotAsKnown(f"registers {', '.join(map(str, sorted(changed)))} changed")
+        try:
+            return (yield command)
+        except TooLate:
+            if not left:
+                raise
+    raise AssertionError("no try is left")
+
+
+def identify_in(seconds: float) -> Procedure[Identity]:
+    """`identify_surely` after a while."""
+    yield Pause(seconds)
+    return (yield from identify_surely())
+
+
+def identify_surely() -> Procedure[Identity]:
+    """Who answers, asked twice: an altered reply must not pass for another device.
+
+    Raises Unsteady.
+    """
+    identity = yield from identify()
+    again = yield from read_unit()
+    if again != identity.unit:
+        raise Unsteady(f"the device says that it is {identity.unit}, then {again}")
+    return identity
+
+
+def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """The configuration of this device, and at the end it still is this device that answers.
+
+    Some registers are read `twice`; those that will be put back can be written.
+
+    A reading that was altered on the way would else become what the user had. Raises Unsteady,
+    RegisterValueError.
+    """
+    values = yield from read_configuration(identity.profile)
+    for number in (n for n in twice if n in values):
+        again = yield from read(number)
+        if not same(number, values[number], again):
+            raise Unsteady(f"register {number} reads {values[number]}, then {again}")
+        if number in SESSION_SETTINGS:
+            format_command(number, again, held=True)
+    if (unit := (yield from read_unit())) != identity.unit:
+        raise Unsteady(f"{unit} answers, and a moment ago it was {identity.unit}")
+    return values
+
+
+def put_back_to(
+    serial: int | None, users: Mapping[int, Values], wait_s: float
+) -> Procedure[object]:
+    """The user's outputs, to the device with this serial number and to no other."""
+    if wait_s:
+        yield Pause(wait_s)
+    answered = int((yield from read(3))[0])
+    if answered != serial:
+        raise WrongDevice(f"the device has the serial number {answered}, not {serial}")
+    return (yield from quiet(restore(users, SESSION_SETTINGS)))

@@ -1,4 +1,6 @@
-"""Messages out of the byte stream on which ASCII lines and binary packets are mixed. Sans I/O.
+"""Messages with a right checksum or CRC out of a stream of ASCII lines and binary packets.
+
+Sans I/O.
 
 Theory of operation (vn100-protocol 1.4)
 ========================================
@@ -11,6 +13,12 @@ included.
 one), or at ``\\r`` alone where the next message begins there. It dies at ``$``, at a byte that is
 not printable and at the length limit. A packet ends where its header says. A candidate that fails
 is left by one byte: the next start inside of it is tried.
+
+**Checks.** Source: UM001 "Checksum / CRC" (vn100-protocol 1.1, 1.2).
+
+* ASCII, 2 hex digits: XOR of all bytes between ``$`` and ``*``.
+* ASCII, 4 hex digits, and binary: CRC-16/XMODEM (polynomial 0x1021, initial value 0), sent with the
+  high byte first, so that the CRC over data and CRC together is 0.
 
 **Which message wins.** Behind a valid message a packet of a layout that was seen before is believed
 and waited for. Anywhere else all starts are followed in parallel and the message that ends first
@@ -31,23 +39,52 @@ damage, but not rejected.
 from __future__ import annotations
 
 import re
+from binascii import crc_hqx
 from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 
 from drivers.vn100.messages import (
-    COMMAND_LINE,
-    LINE,
-    LINE_AT_THE_END,
     SYNC,
     BinaryLayout,
+    crc16,
     is_of_vn100,
     layout_of,
-    line_intact,
-    packet_intact,
     read_header,
     size_in,
+    xor8,
 )
+
+# -- Checks ----------------------------------------------------------------------------------------
+
+
+_AFTER_SYNC = 0xFA00  # from here the byte FA leads to 0: lets the CRC run over a packet with its FA
+_TEXT = rb"[ -#%-)+-~]"  # printable, neither $ nor *
+_CHECKED = rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})" % _TEXT
+# A port in text mode makes CR CR LF of CR LF; one that edits lines may leave CR alone.
+LINE = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]))")
+LINE_AT_THE_END = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]|\Z))")
+COMMAND_LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2}|XX)\r?\n" % _TEXT)
+
+
+def packet_intact(packet: bytes) -> bool:
+    """Whether the CRC of a whole binary packet, sync byte FA to last CRC byte, is right."""
+    return crc_hqx(packet, _AFTER_SYNC) == 0
+
+
+def line_intact(match: re.Match[bytes]) -> bool:
+    """Whether the check of a line, matched by one of the two, is right.
+
+    Two digits are the XOR, four the CRC; a host may write XX to have none.
+    """
+    body, check = match.groups()
+    if check == b"XX":
+        return True
+    return (xor8(body) if len(check) == 2 else crc16(body)) == int(check, 16)
+
+
+# -- Messages out of bytes -------------------------------------------------------------------------
+
 
 LONGEST_LINE = 320
 LONGEST_COMMAND = 256  # receive buffer of the device

@@ -1,10 +1,7 @@
-"""What a VN-100 streams: quantities, ASCII sentences, binary packets, and their checks. Sans I/O.
+"""What a VN-100 streams: quantities, ASCII sentences, binary packets. Sans I/O.
 
-**Checks.** Source: UM001 "Checksum / CRC" (vn100-protocol 1.1, 1.2).
-
-* ASCII, 2 hex digits: XOR of all bytes between ``$`` and ``*``.
-* ASCII, 4 hex digits, and binary: CRC-16/XMODEM (polynomial 0x1021, initial value 0), sent with the
-  high byte first, so that the CRC over data and CRC together is 0.
+Here messages are written, with their checksum or CRC. Both are checked in `deframer`; values come
+out of a whole message in `decode`.
 
 **Quantities**: one row per number, for ASCII and binary messages alike. A column's name says
 quantity, frame where it is not the sensor's, axis and unit, and is the same in every message that
@@ -36,7 +33,6 @@ length is none.
 from __future__ import annotations
 
 import math
-import re
 import struct
 from binascii import crc_hqx
 from collections.abc import Sequence
@@ -45,10 +41,9 @@ from functools import cache, lru_cache
 from operator import mul
 from typing import Literal
 
-# -- Checks ----------------------------------------------------------------------------------------
+# -- Checksum and CRC ------------------------------------------------------------------------------
 
 
-_AFTER_SYNC = 0xFA00  # from here the byte FA leads to 0: lets the CRC run over a packet with its FA
 _FOLDED_BYTES = 128  # covers every line that a device streams
 
 
@@ -70,11 +65,6 @@ def xor8(body: bytes) -> int:
 def crc16(data: bytes) -> int:
     """CRC-16/XMODEM; ``crc16(b"123456789") == 0x31C3``."""
     return crc_hqx(data, 0)
-
-
-def packet_intact(packet: bytes) -> bool:
-    """Whether the CRC of a whole binary packet, sync byte FA to last CRC byte, is right."""
-    return crc_hqx(packet, _AFTER_SYNC) == 0
 
 
 # -- Quantities ------------------------------------------------------------------------------------
@@ -269,25 +259,6 @@ def sentence_layout(name: str, count: bool = False, status: bool = False) -> Lay
     Count comes before status in the columns, whichever the device prints first.
     """
     return _LAYOUTS[name, count, status]
-
-
-_TEXT = rb"[ -#%-)+-~]"  # printable, neither $ nor *
-_CHECKED = rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})" % _TEXT
-# A port in text mode makes CR CR LF of CR LF; one that edits lines may leave CR alone.
-LINE = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]))")
-LINE_AT_THE_END = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]|\Z))")
-COMMAND_LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2}|XX)\r?\n" % _TEXT)
-
-
-def line_intact(match: re.Match[bytes]) -> bool:
-    """Whether the check of a line, matched by one of the two, is right.
-
-    Two digits are the XOR, four the CRC; a host may write XX to have none.
-    """
-    body, check = match.groups()
-    if check == b"XX":
-        return True
-    return (xor8(body) if len(check) == 2 else crc16(body)) == int(check, 16)
 
 
 def encode(body: str, crc: bool = False) -> bytes:

@@ -10,9 +10,7 @@ import pytest
 from contract import CALIBRATION, faults
 from streams import binary_device, content, emitted
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import CONFIG_KEY, Config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import CONFIG_KEY, Config, core_settings, print_config
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
 from ahrsd.events import Event, SamplesSeen

@@ -14,7 +14,7 @@ import pytest
 from ahrsd import __main__ as program
 from ahrsd import __version__
 from ahrsd.cli import COMMANDS
-from ahrsd.config.loading import Config, load_config
+from ahrsd.config.config import Config, load_config
 from ahrsd.daemon import logs
 from ahrsd.errors import ConfigError, DeviceError, JournalError, RecordingError
 

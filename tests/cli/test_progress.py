@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from ahrsd.cli.long_work import byte_progress, count_progress
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.offline.replay import replay
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ahrsd.cli import COMMANDS
-from ahrsd.config.loading import check_config
+from ahrsd.config.config import check_config
 from ahrsd.demo import FILES
 
 PROJECT = Path(__file__).parents[2]

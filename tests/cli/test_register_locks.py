@@ -10,8 +10,7 @@ from planted_calibrator import PlantedCalibrator
 from virtual_run import VirtualRun
 from writeback_rig import estimate
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.daemon.journal import Journal, journal_path
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorBox, OperatorInbox
 from ahrsd.writeback.policy import WriteBackPolicy
@@ -132,11 +131,11 @@ def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, c
 
     OperatorBox(tmp_path).prepare()
     (tmp_path / "socket").touch()
-    monkeypatch.setattr("ahrsd.cli.device.registers.locks._daemon_heard", lambda *_: True)
-    monkeypatch.setattr("ahrsd.cli.device.registers.locks.DaemonConnection", answers(77))
+    monkeypatch.setattr("ahrsd.cli.device.registers._daemon_heard", lambda *_: True)
+    monkeypatch.setattr("ahrsd.cli.device.registers.DaemonConnection", answers(77))
     assert here("registers", "lock", "crew aboard", "--serial", SERIAL) == 0
     assert kinds(tmp_path) == ["LOCKED"]
-    monkeypatch.setattr("ahrsd.cli.device.registers.locks.DaemonConnection", answers(SERIAL))
+    monkeypatch.setattr("ahrsd.cli.device.registers.DaemonConnection", answers(SERIAL))
     assert here("registers", "unlock", "gone", "--serial", SERIAL) == 0
     assert "the daemon heard it" in capsys.readouterr().out
     assert kinds(tmp_path) == ["LOCKED"]
@@ -145,7 +144,7 @@ def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, c
 def test_a_daemon_that_is_gone_leaves_its_folder_and_the_journal_takes_the_word(
     here, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("ahrsd.cli.device.registers.locks._WAIT_S", 0.1)
+    monkeypatch.setattr("ahrsd.cli.device.registers._WAIT_S", 0.1)
     OperatorBox(tmp_path).prepare()
     assert here("registers", "lock", "crew aboard", "--serial", SERIAL) == 0
     assert kinds(tmp_path) == ["LOCKED"]

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from patience import PATIENCE_S
 
-from ahrsd.telemetry.server import SocketServer
+from ahrsd.telemetry.unix_socket import SocketServer
 
 STATUS = Path(__file__).parents[1] / "page" / "gathering.json"
 

@@ -12,10 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config, check_config, default_state_directory, load_config
+from ahrsd.config.config import (
+    Config,
+    check_config,
+    core_settings,
+    default_state_directory,
+    load_config,
+    print_config,
+    reference,
+    to_toml,
+)
 from ahrsd.config.sections import DeviceSection, GatesSection, Section
-from ahrsd.config.text import print_config, reference, to_toml
 from ahrsd.errors import ConfigError
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.gates import GATES, GateLimits
@@ -213,7 +220,7 @@ def test_the_state_directory(monkeypatch):
 
 def test_the_reference_is_up_to_date():
     assert (PROJECT / "docs" / "reference" / "configuration.md").read_text() == reference(), (
-        "run: python -m ahrsd.config.text > docs/reference/configuration.md"
+        "run: python -m ahrsd.config.config > docs/reference/configuration.md"
     )
 
 

@@ -9,8 +9,7 @@ import pytest
 from streams import binary_device, emitted, inputs
 
 from ahrsd.calibration import Affine
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import Calibrator
 from ahrsd.core.settings import CalibratorSettings

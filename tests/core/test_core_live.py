@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from ahrsd.config.loading import Config, check_config
+from ahrsd.config.config import Config, check_config
 from ahrsd.config.sections import GatesSection
 from ahrsd.daemon.core_runner import close_shell, open_shell
 from ahrsd.daemon.daemon import Daemon

@@ -17,12 +17,20 @@ from ahrsd.core.device_session import (
     Phase,
     StreamChanged,
     Unanswered,
-    WrongDevice,
 )
 from ahrsd.writeback.actions import SetUpStream
 from ahrsd.writeback.journal_history import RecordKind, StoredRecord
 from ahrsd.writeback.states import Mode, Purpose
-from drivers.vn100.commands import LinkGone, Read, Word, Write, quiet, read, write_verified
+from drivers.vn100.commands import (
+    LinkGone,
+    Read,
+    Word,
+    Write,
+    WrongDevice,
+    quiet,
+    read,
+    write_verified,
+)
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.registers import SESSION_SETTINGS
 

@@ -13,10 +13,8 @@ from planted_calibrator import PlantedCalibrator
 from virtual_run import VirtualRun
 from writeback_rig import estimate
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
-from ahrsd.core.device_session import Phase
-from ahrsd.core.kept_settings import KeptOutputs, open_record
+from ahrsd.config.config import Config, core_settings
+from ahrsd.core.device_session import KeptOutputs, Phase, open_record
 from ahrsd.events import Send
 from ahrsd.offline.replay import replay
 from ahrsd.writeback.journal_history import StoredRecord

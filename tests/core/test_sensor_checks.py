@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.sensor_checks import SensorChecks, SensorLimits
 from ahrsd.events import Noted

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ahrsd.core.unconfirmed_samples import MOST_ROWS, UnconfirmedSamples
+from ahrsd.core.sample_source import MOST_ROWS, UnconfirmedSamples
 from ahrsd.samples import SampleBlock
 
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from patience import PATIENCE_S
 
-from ahrsd.config.core_settings import core_settings, terms_text
-from ahrsd.config.loading import Config, check_config
+from ahrsd.config.config import Config, check_config, core_settings, terms_text
 from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.core import Core
 from ahrsd.daemon.vehicle_files import ColumnsFile

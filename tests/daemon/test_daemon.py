@@ -12,7 +12,7 @@ import pytest
 from patience import PATIENCE_S
 from planted_operator import Operator
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.core_runner import FoldedLog
 from ahrsd.events import SamplesSeen

@@ -10,8 +10,7 @@ from planted_calibrator import PlantedCalibrator
 from virtual_run import VirtualRun
 from writeback_rig import estimate
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.core_runner import JournalKeeper, journal_in

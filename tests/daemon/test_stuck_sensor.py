@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from patience import PATIENCE_S
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader
-from ahrsd.telemetry.client import DaemonConnection, default_socket_path
+from ahrsd.telemetry.unix_socket import DaemonConnection, default_socket_path
 
 
 def constant(field):

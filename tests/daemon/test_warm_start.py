@@ -13,10 +13,10 @@ from patience import PATIENCE_S
 from recorded_run import LIMIT_S, RecordedRun
 
 from ahrsd import events, inputs
-from ahrsd.config.loading import check_config
+from ahrsd.config.config import check_config
 from ahrsd.core.decision_log import DecisionLog
 from ahrsd.core.warm_start import CONFIRM_S, Present, WarmStart, too_old
-from ahrsd.daemon.background import Recall
+from ahrsd.daemon.daemon import Recall
 from ahrsd.offline.replay import replay
 from ahrsd.recording import capture
 from ahrsd.recording.earlier_run import earlier_inputs

@@ -16,11 +16,10 @@ from virtual_run import VirtualRun
 
 from ahrsd import events
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import EstimationTask, EstimatorState
-from ahrsd.daemon.background import MOST_WAITING, Worker
+from ahrsd.daemon.core_runner import MOST_WAITING, Worker
 from ahrsd.events import Examine
 from ahrsd.inputs import Examined, Input, LinkLost, LinkOpened
 from ahrsd.samples import SampleBlock
@@ -78,7 +77,7 @@ def test_giving_never_waits_and_who_gives_too_much_is_told(worker):
 
 
 def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch):
-    monkeypatch.setattr("ahrsd.daemon.background._STUCK_S", 0.05)
+    monkeypatch.setattr("ahrsd.daemon.core_runner._STUCK_S", 0.05)
     gate = threading.Event()
     assert not worker.stuck
     worker.put(lambda: gate.wait() and None)
@@ -105,7 +104,7 @@ def test_a_thread_that_ended_is_told(worker, monkeypatch):
 
 
 def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch):
-    monkeypatch.setattr("ahrsd.daemon.background._STUCK_S", 0.2)
+    monkeypatch.setattr("ahrsd.daemon.core_runner._STUCK_S", 0.2)
     gate, fed = threading.Event(), []
     with live({"output": "imu"}) as daemon:
         public = Public(time.monotonic())

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rerun_cli
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.demo import FILES, demo_config, emulated, lines, run_demo
 from ahrsd.errors import DeviceError
 from ahrsd.offline.replay import replay

@@ -11,7 +11,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.calibration_json import why_not_converged
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.estimator import chain
 from ahrsd.estimator.epoch_data import delayed, rates
 from ahrsd.estimator.online import Estimator

@@ -12,7 +12,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.calibration_json import why_not_converged
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.estimator.model_checks import divided
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.offline.calibrate import calibrate

@@ -14,8 +14,18 @@ import psutil
 import pytest
 from patience import PATIENCE_S
 
-from ahrsd.fleet.crew import Crew, Place, crew
-from ahrsd.fleet.guard import BUG, CRASHED, TOO_LARGE, TOO_SLOW, TRIES, Limits, Loss
+from ahrsd.fleet.processes import (
+    BUG,
+    CRASHED,
+    TOO_LARGE,
+    TOO_SLOW,
+    TRIES,
+    Crew,
+    Limits,
+    Loss,
+    Place,
+    crew,
+)
 
 
 def squared(number: int) -> tuple[int, object]:

@@ -7,12 +7,11 @@ import time
 import pytest
 from fleet_rows import by_name
 
-from ahrsd.fleet import guard
+from ahrsd.fleet import processes
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.crew import Place
-from ahrsd.fleet.driver import run
+from ahrsd.fleet.processes import Place
+from ahrsd.fleet.run import Orders, run
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.work import Orders
 
 NAMES = ("good1", "hang", "good2", "hog", "kill", "good3", "once", "bug", "good4")
 
@@ -57,7 +56,7 @@ def test_a_failure_is_a_row_with_its_words(ended, name, outcome, words):
 
 def test_what_was_killed_once_is_done_at_the_second_try(ended):
     assert ended["once"]["outcome"] == "done"
-    assert ended["kill"]["tries"] == guard.TRIES == 3
+    assert ended["kill"]["tries"] == processes.TRIES == 3
 
 
 def test_what_to_do_is_beside_what_a_limit_ended(ended):

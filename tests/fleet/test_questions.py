@@ -7,9 +7,8 @@ import pytest
 from fleet_rows import row, store_of
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet import words
-from ahrsd.fleet.questions import FleetRows
-from ahrsd.fleet.words import duration
+from ahrsd.fleet import questions
+from ahrsd.fleet.questions import FleetRows, duration
 
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
@@ -35,14 +34,14 @@ def test_drift_of_each_device_worst_first(tmp_path):
     assert unnamed.iron.per_year[0] == pytest.approx(4e-3, rel=0.05)
     (change,) = stepped.iron.changes
     assert change.size[0] == pytest.approx(0.02, abs=4 * change.sigma[0])
-    assert words.date(change.after_day) == "2026-07-20"
+    assert questions.date(change.after_day) == "2026-07-20"
     assert slow.bias.changes == ()
     # 20 mG against half of 500 mG
     assert stepped.heading_kept_deg == pytest.approx(np.degrees(np.arctan2(0.02, 0.25)), rel=0.05)
     body = stepped.json()
     assert body["hard_iron"]["changes"][0]["until_utc"] == "2026-07-20T00:00:00"
     assert body["recordings"] == 40
-    text = "\n".join(words.drift_lines(found))
+    text = "\n".join(questions.drift_lines(found))
     assert "steps by (+20.0, -0.0, +0.0)" in text or "steps by (+20.0" in text
     assert "between 2026-07-10 and 2026-07-20" in text
     assert text.startswith("2, rov2: 40 calibrations, 2026-01-01 to 2027-01-26")
@@ -55,7 +54,7 @@ def test_recordings_of_which_nobody_knows_the_device_are_not_one_device(tmp_path
         assert asked.counts()["devices"] == 0
         left_out = asked.of_no_device()
     assert left_out == 3
-    assert words.drift_lines([], left_out) == [
+    assert questions.drift_lines([], left_out) == [
         "no device has two calibrations whose time is known",
         "left out: 3 calibrations of no known device: in another OUT, --vehicle or --folders say "
         "whose they are",
@@ -66,7 +65,7 @@ def test_what_has_not_converged_or_has_no_time_is_no_calibration(tmp_path):
     rows = [row(1, day=0.0), row(2, day=1.0, converged=False), row(3)]
     with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         assert asked.drift() == []
-    assert words.drift_lines([]) == ["no device has two calibrations whose time is known"]
+    assert questions.drift_lines([]) == ["no device has two calibrations whose time is known"]
 
 
 def test_findings_recur_by_vehicle_place_and_temperature(tmp_path):
@@ -89,7 +88,7 @@ def test_findings_recur_by_vehicle_place_and_temperature(tmp_path):
     by_place = {row[2]: row[3:5] for row in found.rows if row[1] == "place"}
     assert by_place == {"harbour": (5, 30), "lake": (5, 30)}
     assert {row[2] for row in found.rows if row[1] == "temperature"} == {"0 to 10 degC"}
-    lines = words.recurring_lines(found)
+    lines = questions.recurring_lines(found)
     assert any("rov0" in line and "10 of 20" in line and "50%" in line for line in lines)
     assert not any("harbour" in line for line in lines)
 
@@ -106,7 +105,7 @@ def test_failures_by_reason_the_most_frequent_first(tmp_path):
         ("partly done", "diagnose: is too short", 1),
         ("too slow", "stopped after 600 s", 1),
     ]
-    assert words.failure_lines(found)[:3] == [
+    assert questions.failure_lines(found)[:3] == [
         "2 refused: is empty",
         "  record again",
         "  for example dive_2.mcap",
@@ -173,17 +172,17 @@ def test_foreign_texts_do_not_reach_the_terminal(tmp_path):
     rows += [row(20, outcome="refused", error="\x1b]0;x", recording="a\x1bb")]
     with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         lines = [
-            *words.drift_lines(asked.drift()),
-            *words.failure_lines(asked.failures()),
-            *words.table_lines(*(lambda a: (a.columns, a.rows))(asked.sql("from recordings"))),
-            *words.table_lines(("\x1b",), []),
+            *questions.drift_lines(asked.drift()),
+            *questions.failure_lines(asked.failures()),
+            *questions.table_lines(*(lambda a: (a.columns, a.rows))(asked.sql("from recordings"))),
+            *questions.table_lines(("\x1b",), []),
         ]
     assert lines
     assert all(text.isprintable() for text in lines)
 
 
 def test_a_table_is_cut_and_says_so():
-    lines = words.table_lines(("n",), [(i,) for i in range(1000)])
+    lines = questions.table_lines(("n",), [(i,) for i in range(1000)])
     assert lines[0].strip() == "n"
     assert lines[-1] == "... and 960 more rows: --json has all"
 

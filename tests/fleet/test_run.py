@@ -14,14 +14,13 @@ from fleet_rows import row, store_of
 from ros_files import sensor
 
 from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.crew import Place
-from ahrsd.fleet.driver import Progress, run
+from ahrsd.fleet.processes import Place
 from ahrsd.fleet.questions import FleetRows
+from ahrsd.fleet.run import Orders, Progress, run
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.work import Orders
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.offline.simulate import write_experiment

@@ -12,8 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ahrsd.config.loading import Config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import Config, print_config
 from ahrsd.daemon.journal import Journal
 from ahrsd.inputs import Received, Stop, Tick
 from ahrsd.recording.capture import CaptureWriter

@@ -12,9 +12,7 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config, check_config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import Config, check_config, core_settings, print_config
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.journal import Journal, wrg_lines

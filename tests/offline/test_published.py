@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS
 from ahrsd.cli.recordings.calibrate import _METHODS
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import run_published

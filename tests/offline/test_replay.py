@@ -11,7 +11,7 @@ import pytest
 from contract import REPLAY, faults
 from streams import content, cut, inputs
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.core.core import Core
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import replay

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from contract import REPLAY, faults
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import Replayed, replay
 from ahrsd.report.summary import summary_json, summary_lines, warnings_of

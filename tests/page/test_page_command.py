@@ -23,7 +23,7 @@ from patience import PATIENCE_S
 
 from ahrsd.__main__ import group
 from ahrsd.daemon.operator_inbox import OperatorAnswer, OperatorBox, OperatorInbox
-from ahrsd.telemetry.server import SocketServer
+from ahrsd.telemetry.unix_socket import SocketServer
 
 TOKEN = "a1b2c3d4e5f6a7b8"
 in_a_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")

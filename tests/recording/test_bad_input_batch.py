@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ahrsd.baselines import METHODS, MethodError, MethodSettings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.parameters import EstimatorParameters
-from ahrsd.offline.batch_result import BatchResult
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, run_published, saturated
+from ahrsd.report.summary import BatchResult
 
 SOFT_IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
 HARD_IRON = np.array([0.04, 0.11, 0.11])

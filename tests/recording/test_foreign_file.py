@@ -10,7 +10,7 @@ import time
 import pytest
 from patience import PATIENCE_S
 
-from ahrsd.config.loading import load_config
+from ahrsd.config.config import load_config
 from ahrsd.daemon.vehicle_files import ColumnsFile, InterlockFile
 from ahrsd.errors import ConfigError
 from ahrsd.foreign_file import (

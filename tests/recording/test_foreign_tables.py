@@ -17,7 +17,7 @@ import pytest
 from ahrsd import so3
 from ahrsd.__main__ import main
 from ahrsd.cli import module_of
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, REQUIRED, TIME, parse_columns

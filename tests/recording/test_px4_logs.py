@@ -9,7 +9,7 @@ import pytest
 import ulog_files as ul
 from ros_files import sensor
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import RecordingError
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.foreign import formats

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from ros_files import BIAS, HARD, SUFFIXES, imu, magnetic, ns_of, sensor
 
 from ahrsd.cli import LazyGroup
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.errors import RecordingError
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import parse_columns

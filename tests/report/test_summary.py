@@ -10,8 +10,7 @@ from rich.console import Console
 from streams import emitted, inputs
 
 from ahrsd.cli.running.watch import gates_table
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES, Level, guards_a_write

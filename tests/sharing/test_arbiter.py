@@ -7,8 +7,7 @@ import pytest
 from cabled_units import sentence
 
 from ahrsd.events import SendToClient
-from ahrsd.sharing.arbiter import MOST_WAITING, PATIENCE_S, Arbiter
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import MOST_WAITING, PATIENCE_S, Arbiter, SharePolicy
 from drivers.vn100.commands import Identity, NoReply, Read, Write
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.messages import Reply

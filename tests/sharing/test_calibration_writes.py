@@ -12,7 +12,7 @@ from planted_calibrator import PlantedCalibrator
 from ahrsd import inputs
 from ahrsd.core.core import Core
 from ahrsd.events import SamplesSeen
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.writeback.states import Mode
 
 OWNER = SharePolicy("owner", owner=True, calibration_writes="pass")

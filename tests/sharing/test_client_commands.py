@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ahrsd.sharing.client_commands import (
+from ahrsd.sharing.arbiter import (
     GUARDED,
     ClientCommand,
     Kind,

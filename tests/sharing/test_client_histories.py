@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from client_histories import SHARES, ClientHistory
 
-from ahrsd.sharing import client_commands
+from ahrsd.sharing import arbiter
 from ahrsd.sharing.arbiter import Arbiter
 from ahrsd.writeback import flow
 from ahrsd.writeback.machine import WriteBack
@@ -55,7 +55,7 @@ def test_a_save_in_the_middle_of_a_trial_would_be_seen(monkeypatch):
 
 
 def test_a_client_that_may_write_what_calibrates_would_be_seen(monkeypatch):
-    monkeypatch.setattr(client_commands, "GUARDED", ())
+    monkeypatch.setattr(arbiter, "GUARDED", ())
     monkeypatch.setitem(WRITES, Purpose.CLIENT, (23, 25, 84))
     assert played(0).wrong["calibration"] > 0
 

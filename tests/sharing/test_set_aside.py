@@ -15,7 +15,7 @@ from planted_calibrator import PlantedCalibrator
 from ahrsd import inputs
 from ahrsd.core.core import Core
 from ahrsd.events import Estimated
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 
 SHARES = (SharePolicy("owner", owner=True), SharePolicy("log"))
 ONE = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2

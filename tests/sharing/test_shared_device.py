@@ -18,7 +18,7 @@ from planted_calibrator import PlantedCalibrator
 
 from ahrsd import inputs
 from ahrsd.core.core import Core
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.writeback.policy import StillPolicy
 from ahrsd.writeback.states import Mode
 

@@ -16,7 +16,7 @@ import ahrsd
 from ahrsd.cli import COMMANDS
 from ahrsd.cli.running import daemon as running_daemon
 from ahrsd.cli.running.daemon import _HINT, DaemonPlace
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 
 TALK = ("status", "explain", "watch", "bundle", "operator")
 

@@ -11,10 +11,9 @@ import pytest
 from patience import PATIENCE_S
 
 from ahrsd.errors import DeviceError
-from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.protocol import SCHEMA, line_of
 from ahrsd.telemetry.public import Public
-from ahrsd.telemetry.server import MOST_CLIENTS, SocketServer
+from ahrsd.telemetry.unix_socket import MOST_CLIENTS, DaemonConnection, SocketServer
 from ahrsd.telemetry.words import status_lines
 
 

@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from ahrsd import events
 from ahrsd.__main__ import group
 from ahrsd.errors import EXIT_BUSY, DeviceError
-from ahrsd.telemetry.server import SocketServer
+from ahrsd.telemetry.unix_socket import SocketServer
 from ahrsd.viewer.foxglove import CLOUDS, SCHEMAS, Topics
 
 SAMPLES = {

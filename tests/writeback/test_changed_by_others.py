@@ -8,8 +8,7 @@ from planted_calibrator import PlantedCalibrator
 from virtual_run import VirtualRun
 
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.write_back import DeviceRecord
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import Mode

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.core.device_session import identify_surely, read_surely
 from ahrsd.writeback.actions import AppendToJournal, IdentifyAgain, RunProcedure
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import Mode, Purpose, State
 from ahrsd.writeback.trial import TrialPolicy
+from drivers.vn100.commands import identify_surely, read_surely
 from drivers.vn100.emulator.scenarios import Setup, build
 from drivers.vn100.session import ProcedureFailed, ProcedureFinished, Session
 

@@ -70,7 +70,7 @@ def test_every_mode_and_purpose(mode: Mode, configure_stream: bool, purpose: Pur
 def test_what_clients_ask_for_passes_in_every_mode_but_nothing_that_calibrates(
     mode: Mode, configure_stream: bool
 ) -> None:
-    """Who may ask what is decided before (`sharing.client_commands`)."""
+    """Who may ask what is decided before (`sharing.arbiter`)."""
     passed = allowed(mode, configure_stream, Purpose.CLIENT)
     registers = {str(c.register) for c in WRITES} - {
         str(n) for n in (5, 23, 25, 26, 43, 44, 74, 84)

@@ -17,8 +17,7 @@ from planted_calibrator import PlantedCalibrator
 from virtual_run import VirtualRun
 
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.config.sections import LocationSection
 from ahrsd.samples import Array
 from ahrsd.so3 import exp

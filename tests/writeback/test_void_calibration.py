@@ -10,8 +10,7 @@ import pytest
 from cabled_run import FIRST, IRON, CabledRun, estimate, lenient_gates, two_units
 from planted_calibrator import PlantedCalibrator
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import check_config
+from ahrsd.config.config import check_config, core_settings
 from ahrsd.core.estimation import Calibrator
 from ahrsd.events import GateResult
 from ahrsd.gates import GATES

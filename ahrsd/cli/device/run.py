@@ -8,8 +8,7 @@ from typing import get_args
 
 import click
 
-from ahrsd.config.loading import Config, Mode, load_config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import Config, Mode, load_config, print_config
 
 # Whether it may be opened is for the driver to say: it knows the group that one must join.
 _PORT = click.Path(path_type=Path, readable=False)

@@ -9,14 +9,14 @@ import click
 
 from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
 from ahrsd.cli.long_work import byte_progress
-from ahrsd.config.loading import Config, load_config
+from ahrsd.config.config import Config, load_config
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, RecordingError
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.baselines.registry import ComparisonRow
-    from ahrsd.offline.batch_result import BatchResult
     from ahrsd.recording.column_names import ColumnMap
+    from ahrsd.report.summary import BatchResult
 
 _ALL = "all"
 _METHODS = (  # ours first; a test holds this list against `ahrsd.baselines`, slow to import

@@ -41,8 +41,8 @@ def command(
     CSV (with --columns), or one of ours. Every other command opens these files directly, too.
     """
     from ahrsd.offline.convert import converted, save
-    from ahrsd.offline.listing import listed
     from ahrsd.recording.foreign.sensors import Choice
+    from ahrsd.recording.opening import listed
 
     if only_list:
         for line in listed(recording):

@@ -16,8 +16,7 @@ from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
-    from ahrsd.fleet.crew import Crew
-    from ahrsd.fleet.guard import Loss
+    from ahrsd.fleet.processes import Crew, Loss
     from ahrsd.montecarlo.runs import Plan, Record
     from ahrsd.montecarlo.summary import SummaryRow
 
@@ -102,8 +101,7 @@ def command(
     method and not the end; --resume runs it again. Exit 1 where a method had no answer at the last
     time in some run.
     """
-    from ahrsd.fleet.crew import Place, crew
-    from ahrsd.fleet.guard import Limits
+    from ahrsd.fleet.processes import Limits, Place, crew
 
     refuse_unwritable(json_path)
     refuse_unwritable(figure_path)

@@ -9,7 +9,7 @@ import click
 
 from ahrsd.cli.files import columns_option, refuse_unwritable, write_json
 from ahrsd.cli.long_work import byte_progress
-from ahrsd.config.loading import Config, load_config
+from ahrsd.config.config import Config, load_config
 from ahrsd.errors import AhrsdError
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from typing import Any
 import click
 
 from ahrsd.cli.files import refuse_unwritable, write_json
-from ahrsd.config.loading import Config, load_config
+from ahrsd.config.config import Config, load_config
 from ahrsd.daemon.operator_inbox import VERBS
 from ahrsd.errors import EXIT_BUSY, EXIT_NO, EXIT_USAGE, AhrsdError, DeviceError
 from ahrsd.printable import line
-from ahrsd.telemetry.client import DaemonConnection, find_socket
+from ahrsd.telemetry.unix_socket import DaemonConnection, find_socket
 
 # -- Where a command listens -----------------------------------------------------------------------
 
@@ -194,7 +194,7 @@ def operator(verb: str, text: str, directory: Path | None) -> None:
     does not trust the folder, 75 where no daemon listens or none answers. The daemon's user and
     root may do this, and nobody else: STATE/operator must belong to one of them.
     """
-    from ahrsd.config.loading import default_state_directory
+    from ahrsd.config.config import default_state_directory
     from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFolderError
 
     if verb == "approve" and not text:
@@ -228,7 +228,7 @@ def bundle(output: Path, place: DaemonPlace) -> None:
     large files only a part is taken, and what was left out is printed. The capture holds where the
     sensor was turned to, and the location if one is configured: look before you pass it on.
     """
-    from ahrsd.config.text import print_config
+    from ahrsd.config.config import print_config
     from ahrsd.daemon.support_bundle import collect, format_of, write_bundle
 
     format_of(output)

@@ -15,7 +15,7 @@ from ahrsd.cli.running.daemon import DaemonPlace, in_url, ip_address, place_opti
 from ahrsd.errors import AhrsdError, DeviceError
 
 if TYPE_CHECKING:
-    from ahrsd.telemetry.client import DaemonConnection
+    from ahrsd.telemetry.unix_socket import DaemonConnection
     from ahrsd.viewer.foxglove import FoxgloveServer
 
 _AGAIN_S = 1.0

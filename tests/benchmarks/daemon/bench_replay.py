@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.core.estimation import Calibrator
 from ahrsd.estimator.online import Estimator
 from ahrsd.evidence.collector import EvidenceCollector

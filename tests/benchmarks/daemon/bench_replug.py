@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from ahrsd.config.loading import check_config
+from ahrsd.config.config import check_config
 from ahrsd.daemon.core_runner import close_shell, open_shell
 from ahrsd.daemon.daemon import Daemon
 from ahrsd.daemon.host_clock import HostClock

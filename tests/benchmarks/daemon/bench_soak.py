@@ -37,8 +37,7 @@ import numpy as np
 import psutil
 
 from ahrsd import inputs
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config, check_config
+from ahrsd.config.config import Config, check_config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import DAEMON_KEEPS, JournalKeeper, Shell, journal_in
 from ahrsd.daemon.heap import needed_bytes, take_heap

@@ -34,16 +34,16 @@ from scipy.spatial.transform import Rotation
 from ahrsd.baselines import METHODS
 from ahrsd.baselines.registry import ComparisonRow
 from ahrsd.calibration import Affine, Estimate
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
 from ahrsd.evaluation.heading import QUATERNION, HeadingReference, course, optical
 from ahrsd.heading import wrapped
-from ahrsd.offline.batch_result import BatchResult
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published
 from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
+from ahrsd.report.summary import BatchResult
 from ahrsd.samples import Array, SampleBlock
 
 RECORDINGS = Path(__file__).parents[4] / "shared" / "recordings"

@@ -35,11 +35,10 @@ from fleet_rows import computing, nothing, sleeping
 
 from ahrsd.cli.recordings.fleet import EXAMINER, LOADS
 from ahrsd.fleet.archive import Archive
-from ahrsd.fleet.crew import Place
-from ahrsd.fleet.driver import run
+from ahrsd.fleet.processes import Place
 from ahrsd.fleet.questions import FleetRows
+from ahrsd.fleet.run import Orders, run
 from ahrsd.fleet.store import SCHEMA, Store
-from ahrsd.fleet.work import Orders
 
 TASK_S = 2.0
 DEVICES, DAY_MS = 500, 86_400_000

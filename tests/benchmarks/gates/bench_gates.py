@@ -23,7 +23,7 @@ from bench_worlds import WORLDS
 
 from ahrsd import events
 from ahrsd.calibration import Estimate
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.gates import Level, for_level
 from ahrsd.offline.replay import replay
 

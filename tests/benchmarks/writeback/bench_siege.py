@@ -28,8 +28,8 @@ from typing import BinaryIO
 import numpy as np
 import psutil
 
-from ahrsd.telemetry.client import DaemonConnection
 from ahrsd.telemetry.protocol import line_of
+from ahrsd.telemetry.unix_socket import DaemonConnection
 from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 

@@ -23,7 +23,7 @@ import pytest
 from drivers_at_start import ROS2_DAWONN, SDK
 from patience import PATIENCE_S
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
 from drivers.vn100.messages import encode

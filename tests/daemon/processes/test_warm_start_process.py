@@ -13,8 +13,7 @@ import time
 from cabled_run import lenient_gates
 from patience import PATIENCE_S
 
-from ahrsd.config.loading import check_config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import check_config, print_config
 from ahrsd.core.warm_start import CONFIRM_S
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.linalg
 from streams import emitted
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.core.core import Core
 from ahrsd.offline.replay import replay
 from drivers.vn100.emulator.scenarios import Setup, build

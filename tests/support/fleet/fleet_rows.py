@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.fleet.row import Row, whole
+from ahrsd.fleet.run import Answer, key, stamp
 from ahrsd.fleet.store import Store
-from ahrsd.fleet.work import Answer, key, stamp
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 

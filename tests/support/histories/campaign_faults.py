@@ -30,8 +30,7 @@ from virtual_run import VirtualRun
 from writeback_rig import estimate
 
 from ahrsd.calibration import Estimate
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.writeback.policy import WriteBackPolicy
 from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy

@@ -23,7 +23,7 @@ from cabled_units import printed
 from planted_calibrator import PlantedCalibrator
 
 from ahrsd import inputs
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 
 SHARES = (SharePolicy("owner", owner=True), SharePolicy("log"))
 ONE = "1,0,0,0,1,0,0,0,1,0,0,0"

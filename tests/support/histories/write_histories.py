@@ -33,7 +33,7 @@ from write_events import (
 )
 from write_observer import KINDS
 
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.writeback.policy import StillPolicy
 from ahrsd.writeback.trial import TrialPolicy

@@ -12,8 +12,7 @@ from planted_calibrator import PlantedCalibrator
 
 from ahrsd import events, inputs
 from ahrsd.calibration import Estimate, Observability
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.config.sections import GatesSection
 from ahrsd.core.core import Core
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy

@@ -8,9 +8,7 @@ from typing import Any
 from virtual_run import VirtualRun
 
 from ahrsd import inputs
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import check_config
-from ahrsd.config.text import print_config
+from ahrsd.config.config import check_config, core_settings, print_config
 from ahrsd.recording.capture import CaptureWriter
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.writeback.journal_history import Stamp

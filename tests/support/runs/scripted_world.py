@@ -25,12 +25,11 @@ from scripted_vn100.wire import sentence
 from write_observer import Observer
 
 from ahrsd import events, inputs
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core import estimation
 from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import JournalKeeper, Shell, journal_in
-from ahrsd.sharing.client_commands import SharePolicy
+from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.writeback.policy import StillPolicy, WriteBackPolicy
 from ahrsd.writeback.states import Mode
 from ahrsd.writeback.trial import TrialPolicy

@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.crew import Place, crew
-from ahrsd.fleet.guard import Limits, Loss, end_with
+from ahrsd.fleet.processes import Limits, Loss, Place, crew, end_with
 from blind_trials.sealing import Json, Round, read_object, seal
 
 GENERATOR = "blind_trials.world"

@@ -1,7 +1,7 @@
 """A tool over all cases: one process per case, answers kept as they come, hashed at the end.
 
-Each case is a task of `fleet.crew`: its process starts the tool, and the tool ends with it, at the
-limit of time and wherever a run is killed.
+Each case is a task of `fleet.processes`: its process starts the tool, and the tool ends with it, at
+the limit of time and wherever a run is killed.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from functools import partial
 from pathlib import Path
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.crew import Place, crew
-from ahrsd.fleet.guard import Limits, Loss, end_with
+from ahrsd.fleet.processes import Limits, Loss, Place, crew, end_with
 from blind_trials.sealing import (
     Json,
     Round,

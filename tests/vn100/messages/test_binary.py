@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.vn100.decode import Measurement, decode
-from drivers.vn100.deframer import Deframer
+from drivers.vn100.deframer import Deframer, packet_intact
 from drivers.vn100.messages import (
     FIELD_MASKS,
     GROUPS,
@@ -19,7 +19,6 @@ from drivers.vn100.messages import (
     binary_layout,
     encode_packet,
     layout_of,
-    packet_intact,
     packet_size,
     read_header,
 )

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.vn100.messages import crc16, packet_intact, xor8
+from drivers.vn100.deframer import packet_intact
+from drivers.vn100.messages import crc16, xor8
 
 # vn100-protocol 1.1: body, XOR, CRC
 WORKED = [

@@ -13,12 +13,12 @@ from ahrsd.cli.long_work import fleet_progress, limit_options
 from ahrsd.cli.recordings.fleet import answers
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
 from ahrsd.fleet.row import Calibrated
-from ahrsd.fleet.work import ROLES, Examiner, Orders, summary
+from ahrsd.fleet.run import ROLES, Examiner, Orders, summary
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
     from ahrsd.diagnosis.diagnosis import Diagnosis
-    from ahrsd.fleet.driver import Progress
+    from ahrsd.fleet.run import Progress
     from ahrsd.recording.column_names import ColumnMap
 
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def calibrated(path: Path, orders: Orders) -> Calibrated:
     """`ahrsd calibrate` of one recording of an archive."""
-    from ahrsd.config.loading import Config
+    from ahrsd.config.config import Config
     from ahrsd.offline.calibrate import calibrate
 
     return calibrate(path, Config(), rate_hz=orders.rate_hz, columns=orders.columns)
@@ -97,8 +97,8 @@ def run(
     is gone.
     """
     from ahrsd.fleet.archive import Archive
-    from ahrsd.fleet.crew import Place
-    from ahrsd.fleet.driver import run as run_fleet
+    from ahrsd.fleet.processes import Place
+    from ahrsd.fleet.run import run as run_fleet
 
     if folder is not None:
         make_folder(folder, ("report.html",))

@@ -18,9 +18,8 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--report", "folder", type=_FOLDER, help="A page about the fleet in here.")
 def status(output: Path, json_path: str | None, folder: Path | None) -> None:
     """How many rows there are, of what, and whether a run is at work."""
-    from ahrsd.fleet.questions import FleetRows
+    from ahrsd.fleet.questions import FleetRows, status_lines
     from ahrsd.fleet.store import Store
-    from ahrsd.fleet.words import status_lines
 
     refuse_unwritable(json_path)
     store = Store(output)
@@ -67,8 +66,14 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
     failures    what gave no answer, and why
     SELECT ...  one query over the table `recordings`; nothing can be written
     """
-    from ahrsd.fleet import words
-    from ahrsd.fleet.questions import AnswerTable, FleetRows
+    from ahrsd.fleet.questions import (
+        AnswerTable,
+        FleetRows,
+        drift_lines,
+        failure_lines,
+        recurring_lines,
+        table_lines,
+    )
     from ahrsd.fleet.store import Store
 
     refuse_unwritable(json_path)
@@ -77,17 +82,17 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
         if question == "drift":
             found = rows.drift()
             body = [one.json() for one in found]
-            lines = words.drift_lines(found, rows.of_no_device())
+            lines = drift_lines(found, rows.of_no_device())
         else:
             if question == "recurring":
                 answer = rows.recurring()
-                lines = words.recurring_lines(answer)
+                lines = recurring_lines(answer)
             elif question == "failures":
                 answer = rows.failures()
-                lines = words.failure_lines(answer)
+                lines = failure_lines(answer)
             else:
                 answer = rows.sql(question)
-                lines = words.table_lines(answer.columns, answer.rows)
+                lines = table_lines(answer.columns, answer.rows)
             body = answer.json()
     if json_path is not None:
         write_json(json_path, body)

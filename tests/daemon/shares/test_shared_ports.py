@@ -18,7 +18,7 @@ from cabled_units import sentence
 from patience import PATIENCE_S
 
 from ahrsd.config.sections import ShareSection
-from ahrsd.daemon.ports.shares import SharedPorts, Shares
+from ahrsd.daemon.shares import SharedPorts, Shares
 from ahrsd.errors import ConfigError
 from ahrsd.events import SendToClient
 from ahrsd.inputs import ClientLeft, ClientSent

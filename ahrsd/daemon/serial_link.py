@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from ahrsd.config.sections import ShareSection
-from ahrsd.daemon.ports.shares import Shares
+from ahrsd.daemon.shares import Shares
 from ahrsd.inputs import ClientLeft, ClientSent
 from drivers.serial_port import (
     SCANNED_BAUD,

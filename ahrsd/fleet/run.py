@@ -1,32 +1,43 @@
-"""One recording in, one row out and on the disk: what a process of the guard does.
+"""A run over an archive: every recording that has no row yet gets one, here or on a cluster.
 
-A row's key names the work and not the place: the same bytes under the same version and options are
-never worked twice, wherever they lie. A stamp names the place: it tells without reading a recording
-that its row is there.
+**One recording in, one row out** and on the disk: what a process does. A row's key names the work
+and not the place: the same bytes under the same version and options are never worked twice,
+wherever they lie. A stamp names the place: it tells without reading a recording that its row is
+there.
+
+**The run** goes through a bounded window and keeps nothing of what is done: rows are on the disk
+before it hears of them. It may be killed at any moment; started again it looks which stamps have
+rows and goes on with the others.
 """
 
 from __future__ import annotations
 
+import collections
 import hashlib
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from ahrsd import __version__
 from ahrsd.errors import AhrsdError
 from ahrsd.fleet import row as rows
-from ahrsd.fleet.archive import ArchiveEntry, local_file, pieces
-from ahrsd.fleet.guard import TOO_LARGE, TOO_SLOW, Loss
-from ahrsd.fleet.row import Calibrated, Row
-from ahrsd.fleet.store import Store
+from ahrsd.fleet.archive import Archive, ArchiveEntry, local_file, pieces, sweep
+from ahrsd.fleet.processes import TOO_LARGE, TOO_SLOW, Limits, Loss, Place, crew
+from ahrsd.fleet.row import ANSWERED, Calibrated, Row
+from ahrsd.fleet.store import Known, Store
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 
 if TYPE_CHECKING:
     from ahrsd.diagnosis.diagnosis import Diagnosis
+
+# -- One recording, one row ------------------------------------------------------------------------
+
 
 _T = TypeVar("_T")
 
@@ -68,7 +79,7 @@ class Orders:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the driver is told; the row itself is on the disk by then."""
+    """What the run is told; the row itself is on the disk by then."""
 
     key: str
     outcome: str
@@ -221,3 +232,123 @@ def summary(outcomes: Mapping[str, int]) -> str:
     """Outcomes of a run in words, the most frequent first."""
     ordered = sorted(outcomes.items(), key=lambda item: -item[1])
     return ", ".join(f"{number:,} {outcome}" for outcome, number in ordered) or "nothing to do"
+
+
+# -- The run ---------------------------------------------------------------------------------------
+
+
+_COMPACTED = 4096  # rows in the spool after which they are moved
+_TOLD_S = 2.0
+
+
+class Task(Protocol):
+    """One recording, one row: an `Examiner`."""
+
+    def __call__(self, entry: ArchiveEntry, orders: Orders) -> Answer: ...  # noqa: D102
+
+
+@dataclass(slots=True)
+class Progress:
+    """How far a run is.
+
+    left_out: files that by their name are no recordings, by suffix; before: recordings with a row
+    """
+
+    total: int = 0
+    before: int = 0
+    left_out: collections.Counter[str] = field(default_factory=collections.Counter)
+    outcomes: collections.Counter[str] = field(default_factory=collections.Counter)
+    begun_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def done(self) -> int:
+        """Recordings of this run."""
+        return sum(self.outcomes.values())
+
+    @property
+    def failed(self) -> int:
+        """Those of them that gave no answer."""
+        return self.done - sum(self.outcomes[name] for name in (*ANSWERED, THERE))
+
+    @property
+    def per_minute(self) -> float:
+        """Recordings a minute since the start."""
+        return 60.0 * self.done / max(time.monotonic() - self.begun_s, 1e-9)
+
+    def json(self) -> dict[str, object]:
+        """For `status`."""
+        return {
+            "total": self.total,
+            "before": self.before,
+            "done": self.done,
+            "failed": self.failed,
+            "per_minute": round(self.per_minute, 3),
+            "process": os.getpid(),
+        }
+
+
+def run(
+    archive: Archive, orders: Orders, task: Task, place: Place, tell: Callable[[Progress], None]
+) -> Progress:
+    """Give every recording of the archive its row; what happened.  AhrsdError.
+
+    tell: called after each recording; where a run is interrupted, all rows so far are kept
+    """
+    store = Store(Path(orders.out))
+    store.create()
+    with store.alone():
+        sweep()
+        store.compact()
+        known = store.known("stamp", failures=not orders.again)
+        progress = _planned(archive, orders, known)
+        tell(progress)
+        missing = (one for one in archive.entries() if not known.holds(stamp(one, orders)))
+        try:
+            if progress.total:
+                _through(missing, orders, task, place, store, progress, tell)
+            store.compact()
+            store.tell(progress.json())
+        except OSError as error:
+            raise AhrsdError(
+                f"{orders.out}: a row cannot be written: {error.strerror or error}; all rows so "
+                "far are kept: make room, then the same command"
+            ) from error
+    return progress
+
+
+def _through(
+    missing: Iterable[ArchiveEntry],
+    orders: Orders,
+    task: Task,
+    place: Place,
+    store: Store,
+    progress: Progress,
+    tell: Callable[[Progress], None],
+) -> None:
+    told_s = 0.0
+    do, lost = partial(task, orders=orders), partial(keep_loss, orders=orders)
+    with crew(place, Limits(orders.limit_s, orders.memory_bytes)) as processes:
+        progress.begun_s = time.monotonic()
+        for _, answer in processes.map(do, missing, lost):
+            progress.outcomes[answer.outcome] += 1
+            tell(progress)
+            if time.monotonic() - told_s > _TOLD_S:
+                store.tell(progress.json())
+                told_s = time.monotonic()
+            if progress.done % _COMPACTED == 0:
+                store.compact()
+
+
+def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:
+    """How much there is to do."""
+    progress = Progress()
+
+    def other(name: str) -> None:
+        progress.left_out[Path(name).suffix or "without a suffix"] += 1
+
+    for entry in archive.entries(other):
+        progress.total += 1
+        progress.before += known.holds(stamp(entry, orders))
+    progress.total -= progress.before
+    progress.begun_s = time.monotonic()
+    return progress

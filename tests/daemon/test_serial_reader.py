@@ -10,7 +10,7 @@ from pathlib import Path
 
 from patience import PATIENCE_S
 
-from ahrsd.daemon.ports.serial_link import Bytes, Inbox, Lost, SerialLink, SerialReader
+from ahrsd.daemon.serial_link import Bytes, Inbox, Lost, SerialLink, SerialReader
 from ahrsd.inputs import LinkLost, Received
 from ahrsd.recording.capture import CaptureReader
 from drivers.vn100.deframer import Cause

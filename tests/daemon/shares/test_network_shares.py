@@ -18,8 +18,7 @@ from cabled_units import sentence
 from patience import PATIENCE_S
 
 from ahrsd.config.sections import ShareSection
-from ahrsd.daemon.ports.network_shares import MOST_READERS, NetworkShares
-from ahrsd.daemon.ports.shares import Shares
+from ahrsd.daemon.shares import MOST_READERS, NetworkShares, Shares
 from ahrsd.errors import ConfigError
 
 TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,+0.1,+0.2,+0.3")

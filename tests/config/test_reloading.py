@@ -13,10 +13,16 @@ import pytest
 from patience import PATIENCE_S
 from planted_operator import estimate
 
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config, check_config, load_config
+from ahrsd.config.config import (
+    Config,
+    Reloader,
+    check_config,
+    core_settings,
+    load_config,
+    may_change,
+    merged,
+)
 from ahrsd.core.core import Core
-from ahrsd.daemon.reloading import Reloader, may_change, merged
 from ahrsd.events import GateResult
 from ahrsd.inputs import LimitsChanged, Samples
 from ahrsd.offline.replay import replay
