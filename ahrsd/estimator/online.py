@@ -4,18 +4,17 @@ Samples become steps, steps become epochs of constant size, each epoch becomes o
 graph. While the window of epochs holds everything, the answer is that of the batch smoother; what
 falls out of it is folded into the prior.
 
-An `Estimate` comes from the graph's numbers: scale as a gauge, sigmas, heading, observability.
+An `Estimate` comes from the graph's numbers; what it is worth, from `worth`.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 
 import numpy as np
 
-from ahrsd.calibration import Affine, Estimate, Observability
+from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
     Instrument,
@@ -24,7 +23,7 @@ from ahrsd.estimator.epoch import (
     instrument,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
-from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
+from ahrsd.estimator.graph import Node, SingularError, curvature, whitening
 from ahrsd.estimator.model_checks import (
     Misalignment,
     change_message,
@@ -33,141 +32,15 @@ from ahrsd.estimator.model_checks import (
 )
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
 from ahrsd.estimator.window import Window, search
-from ahrsd.samples import Array, SampleBlock
-
-# -- What an estimate is worth ---------------------------------------------------------------------
-
-
-_NAMES = (
-    *(f"soft iron {i}" for i in ("xx", "xy", "xz", "yy", "yz", "zz")),
-    *(f"hard iron {i}" for i in "xyz"),
-    *(f"gyro bias {i}" for i in "xyz"),
+from ahrsd.estimator.worth import (
+    HeadingAdvice,
+    attitude,
+    heading_sigma_deg,
+    motion_and_misfit,
+    observability,
+    unit_volume,
 )
-_TYPICAL_DIP_RAD = float(np.radians(65.0))  # pessimistic for most of the inhabited earth
-_STEEPEST_RAD = float(np.radians(80.0))
-_HEADINGS = 12
-_FLOOR = 0.1  # ratio at which the observability score is 1
-
-
-def unit_volume(c: Array) -> tuple[Array, Array, float, Array]:
-    """A (3, 3) with det 1, b (3,), |h|, and d[A (6), b (3)]/d[M (6), b (3)] (9, 9).
-
-    A = M / r with r = det(M)^(1/3), so dA = dM / r - A tr(M^-1 dM) / 3.
-    """
-    M = chain.symmetric(c[:6])
-    r = float(np.cbrt(np.linalg.det(M)))
-    A = M / r
-    inverse = np.linalg.inv(M)
-    J = np.eye(9)
-    for j in range(6):
-        dM = chain.symmetric(np.eye(6)[j])
-        J[:6, j] = chain.upper_triangle(dM / r - A * np.trace(inverse @ dM) / 3)
-    return A, c[6:9].copy(), r, J
-
-
-def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float) -> float:
-    """Worst 1-sigma heading error over 12 headings at the given tilts.
-
-    down_b (K, 3): unit vectors towards the earth, sensor frame. The direction error of a field
-    direction u is the tangential part of M^-1 (dM u + db); its part along (down x u) turns the
-    heading by that over cos(dip).
-    """
-    M = chain.symmetric(c[:6])
-    psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
-    helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
-    north = np.cross(helper, down_b)
-    north /= np.linalg.norm(north, axis=1, keepdims=True)
-    east = np.cross(down_b, north)
-    level = np.cos(psi)[:, None, None] * north + np.sin(psi)[:, None, None] * east
-    u = (np.cos(dip_rad) * level + np.sin(dip_rad) * down_b).reshape(-1, 3)
-    across = np.cross(down_b, level).reshape(-1, 3) @ np.linalg.inv(M) / np.cos(dip_rad)
-    J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
-    row = (across[:, None, :] @ J)[:, 0]
-    variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
-    return float(np.degrees(np.sqrt(np.max(variance))))
-
-
-_TELLS_DEG = 0.5  # a heading that is known better needs no advice
-_WIDENED = {
-    "motion": "the motion so far tells too little: turn through all headings, and roll and pitch",
-    "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
-    "motion at another place, away from steel and currents, once it is warm",
-    "axes": "the magnetometer's axes may be turned against the gyro's: roll and pitch as well",
-    "lag": "the field's readings may be late: turn fast and slow, both ways",
-    "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
-    "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
-}
-
-
-def widened_by(
-    c: Array, parts: Mapping[str, Array], down: Array, dip_rad: float, sigma_deg: float
-) -> str:
-    """What makes more than half of the variance of a heading known to `sigma_deg`, in words.
-
-    c, down, dip_rad: as for `heading_sigma_deg`; parts: covariances (12, 12) by the names of
-    `_WIDENED`, which add up to that of the answer but for what they have in common
-    """
-    if not sigma_deg > _TELLS_DEG:
-        return ""
-    variances = {n: heading_sigma_deg(c, one, down, dip_rad) ** 2 for n, one in parts.items()}
-    most = max(variances, key=lambda name: variances[name])
-    if not variances[most] > 0.5 * sum(variances.values()):
-        return ""
-    return _WIDENED[most]
-
-
-def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:
-    """Tilts driven (K, 3) and the field's dip in rad, from gravity; level and steep without it.
-
-    tilts: unit vectors towards the earth, some nan; epochs: directions (n, 3) of the field and of
-    down.
-    """
-    down = np.array([d for d in tilts if np.isfinite(d).all()])
-    if len(down) == 0:
-        return np.array([[0.0, 0.0, 1.0]]), _TYPICAL_DIP_RAD
-    along = [
-        float(u[len(u) // 2] @ d[len(u) // 2])
-        for u, d in epochs
-        if np.isfinite(d[len(u) // 2]).all()
-    ]
-    if not along:
-        return down, _TYPICAL_DIP_RAD
-    dip = float(np.median(np.arcsin(np.clip(along, -1.0, 1.0))))
-    return down, float(np.clip(dip, -_STEEPEST_RAD, _STEEPEST_RAD))
-
-
-def observability(covariance: Array, W: Array) -> Observability:
-    """Compare the posterior of [M (6), b (3), w_b (3)] with the prior, direction by direction.
-
-    W (12, 12) whitens the prior.
-    """
-    scaled = W @ covariance @ W.T
-    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    ratio = np.sqrt(np.clip(values, 0.0, None))
-    return Observability(
-        prior_ratio=ratio,
-        unobservable=_blind_names(vectors[:, ratio > BLIND]),
-        score=float(_FLOOR / max(float(ratio[-1]), 1e-9)),
-    )
-
-
-def _blind_names(vectors: Array) -> tuple[str, ...]:
-    """One name for each dimension of the subspace that the orthonormal vectors (12, K) span.
-
-    Eigenvectors of equal eigenvalues are any basis, another on each processor. So the parameter
-    that lies nearest to the subspace is taken, then the nearest to what is left of it: with
-    |P_ij| <= sqrt(P_ii P_jj) it leads its own projection, and no two names begin alike.
-    """
-    P = vectors @ vectors.T
-    names = []
-    for _ in range(vectors.shape[1]):
-        lead = int(np.argmax(np.round(np.diag(P), 6)))
-        v = P[:, lead] / np.sqrt(P[lead, lead])
-        others = [i for i in np.argsort(-np.abs(v), kind="stable") if i != lead and abs(v[i]) > 0.4]
-        names.append(" + ".join(_NAMES[i] for i in [lead, *others[:2]]))
-        P = P - np.outer(v, v)
-    return tuple(names)
-
+from ahrsd.samples import Array, SampleBlock
 
 # -- The estimator ---------------------------------------------------------------------------------
 
@@ -490,8 +363,9 @@ class Estimator:
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         by_instrument, parts = self._by_imperfections(window)
         tempered = window.covariance()
-        parts |= {"motion": graph.covariance(), "misfit": tempered - graph.covariance()}
-        covariance = tempered * (1.0 + doubt**2) * self._parted
+        divided = tempered * self._parted
+        parts |= motion_and_misfit(window.explained_covariance(), divided, self._whitening)
+        covariance = divided * (1.0 + doubt**2)
         covariance = covariance + self._by_lag(window) + by_instrument
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = unit_volume(graph.c)
@@ -499,6 +373,7 @@ class Estimator:
         K[:9, :9] = J
         down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
         heading = heading_sigma_deg(graph.c, covariance, down, dip)
+        advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
             soft_iron=A,
@@ -525,5 +400,5 @@ class Estimator:
             mag_lag_s=window.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
-            widened_by=widened_by(graph.c, parts, down, dip, heading),
+            widened_by=advice.widened_by(parts, covariance),
         )

@@ -539,6 +539,12 @@ class Window:
         graph.temper = max(graph.temper, self._repeating(smooth=True))
         return graph.covariance() * graph.temper
 
+    def explained_covariance(self) -> Array:
+        """The same (12, 12) if the model explained the data."""
+        graph = self.graph.copy()
+        graph.temper = 1.0
+        return graph.covariance()
+
 
 # -- Which epochs are worth linearising again ------------------------------------------------------
 #

@@ -16,6 +16,7 @@ from ahrsd import so3
 from ahrsd.estimator.epoch import with_drift
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, EstimatorParameters
+from ahrsd.estimator.worth import HeadingAdvice, motion_and_misfit
 from ahrsd.simulation import ScenarioSettings, simulate
 
 #: rolls, pitches and turns at once, as a diver does
@@ -99,6 +100,54 @@ def test_what_makes_the_most_of_the_sigma_is_named_with_what_would_shrink_it():
     field = rich.block.raw_b_gauss + 0.02 * np.sin(3.0 * rich.block.raw_b_gauss / 0.1)
     place = answer(replace(rich, block=replace(rich.block, raw_b_gauss=field)))
     assert "the field differs with place or attitude" in place.widened_by
+
+
+def wandering(made, size_gauss):
+    """With a field that is another at every place, a new one each 9 s, straight in between."""
+    time_s, period_s = made.block.time_s, 9.0
+    knots_s = np.arange(0.0, time_s[-1] + 2 * period_s, period_s)
+    at_knots = np.random.default_rng(0).normal(0.0, size_gauss, (len(knots_s), 3))
+    course = np.column_stack([np.interp(time_s, knots_s, one) for one in at_knots.T])
+    return replace(made, block=replace(made.block, raw_b_gauss=made.block.raw_b_gauss + course))
+
+
+def test_what_no_motion_has_told_is_not_blamed_on_the_field():
+    """A field that differs by place hides little there: on another motion it is what counts."""
+    names = {}
+    for name, motion in (("level", "circles"), ("straight", "straight"), ("rolling", "roll")):
+        found = answer(wandering(pieces.drive(((motion, 160.0),), 3), 0.01))
+        assert found.misfit > 5.0
+        names[name] = found.widened_by
+    assert "the motion so far tells too little: roll by 30 deg" in names["level"]
+    assert "the motion so far tells too little: " in names["straight"]
+    assert "the field differs with place or attitude" in names["rolling"]
+
+
+def test_shares_of_motion_and_misfit_by_hand():
+    """Twelve numbers with a prior of 1: two are known to .1, one of them by a field that wanders;
+    a third is left at the prior, and was known to .3 had the model explained the data."""
+    plain, found = np.full(12, 1e-4), np.full(12, 1e-4)
+    plain[:3], found[:3] = (0.01, 1e-4, 0.09), (0.01, 0.01, 0.9)
+    shares = motion_and_misfit(np.diag(plain), np.diag(found), np.eye(12))
+    assert np.diag(shares["motion"])[:4] == pytest.approx([0.01, 1e-4, 0.9, 1e-4])
+    assert np.diag(shares["misfit"])[:4] == pytest.approx([0.0, 0.01 - 1e-4, 0.0, 0.0])
+
+
+LEVEL_IRON = np.eye(12)[6]
+UNSEEN_LEVEL = np.eye(12)[5] - np.sin(np.radians(60.0)) * np.eye(12)[8]  # M zz against b z
+
+
+@pytest.mark.parametrize(
+    ("unknown", "asked"),
+    [(LEVEL_IRON, "turn through all headings"), (UNSEEN_LEVEL, " by 30 deg both ways")],
+)
+def test_the_manoeuvre_that_is_asked_for_tells_what_is_not_known(unknown, asked):
+    """The second moves no reading of a level turn at a dip of 60 deg."""
+    c = np.r_[0.5 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]), np.zeros(3)]
+    down = np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 0.87], [0.5, 0.0, 0.87]])
+    advice = HeadingAdvice(c, down, np.radians(60.0), 1e-3)
+    covariance = 1e-8 * np.eye(12) + 0.1**2 * np.outer(unknown, unknown)
+    assert asked in advice.manoeuvre(covariance)
 
 
 @pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
