@@ -47,7 +47,22 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     direction u is the tangential part of M^-1 (dM u + db); its part along (down x u) turns the
     heading by that over cos(dip).
     """
-    M = chain.symmetric(c[:6])
+    u, across = _headings(down_b, dip_rad)
+    along = across @ np.linalg.inv(chain.symmetric(c[:6]))
+    J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
+    row = (along[:, None, :] @ J)[:, 0]
+    variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
+    return float(np.degrees(np.sqrt(max(float(np.max(variance)), 0.0))))
+
+
+def turned_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
+    """Worst heading error over the same headings where the magnetometer's axes are turned (3,)."""
+    u, across = _headings(down_b, dip_rad)
+    return float(np.degrees(np.max(np.abs(np.sum(np.cross(turn_rad, u) * across, axis=1)))))
+
+
+def _headings(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
+    """Field directions (n, 3) over 12 headings at each tilt, and what turns each heading (n, 3)."""
     psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
     helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
     north = np.cross(helper, down_b)
@@ -55,11 +70,7 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     east = np.cross(down_b, north)
     level = np.cos(psi)[:, None, None] * north + np.sin(psi)[:, None, None] * east
     u = (np.cos(dip_rad) * level + np.sin(dip_rad) * down_b).reshape(-1, 3)
-    across = np.cross(down_b, level).reshape(-1, 3) @ np.linalg.inv(M) / np.cos(dip_rad)
-    J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
-    row = (across[:, None, :] @ J)[:, 0]
-    variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
-    return float(np.degrees(np.sqrt(max(float(np.max(variance)), 0.0))))
+    return u, np.cross(down_b, level).reshape(-1, 3) / np.cos(dip_rad)
 
 
 _TELLS_DEG = 0.5  # a heading that is known better needs no advice
@@ -69,6 +80,8 @@ _WIDENED = {
     "motion at another place, away from steel and currents, once it is warm; `ahrsd diagnose` of "
     "the recording says what it is",
     "axes": "the magnetometer's axes may be turned against the gyro's: roll and pitch as well",
+    "turned": "the magnetometer's axes are turned against the gyro's: mount them alike, or take "
+    "the correction that `ahrsd calibrate` of a recording gives for it",
     "lag": "the field's readings may be late: turn fast and slow, both ways",
     "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
@@ -109,15 +122,19 @@ class HeadingAdvice:
     dip_rad: float
     noise_gauss: float
 
-    def widened_by(self, parts: Mapping[str, Array], covariance: Array) -> str:
+    def widened_by(
+        self, parts: Mapping[str, Array], covariance: Array, turned_deg: float = 0.0
+    ) -> str:
         """What makes more than half of the heading's variance, in words; empty: it is known well.
 
         covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the names of
-        `_WIDENED`, which add up to it but for what they have in common
+        `_WIDENED`, which add up to it but for what they have in common; turned_deg: what axes that
+        were found to be turned make of the heading
         """
-        if not self._sigma_deg(covariance) > _TELLS_DEG:
+        if not np.hypot(self._sigma_deg(covariance), turned_deg) > _TELLS_DEG:
             return ""
         variances = {name: self._sigma_deg(one) ** 2 for name, one in parts.items()}
+        variances["turned"] = turned_deg**2
         most = max(variances, key=lambda name: variances[name])
         if not variances[most] > 0.5 * sum(variances.values()):
             return ""
