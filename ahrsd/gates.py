@@ -21,7 +21,7 @@ from enum import IntEnum
 from operator import attrgetter
 
 from ahrsd.events import GateResult
-from ahrsd.evidence.values import Evidence
+from ahrsd.evidence.values import CIRCLES, Evidence
 
 # -- Limits ----------------------------------------------------------------------------------------
 
@@ -72,6 +72,7 @@ class GateLimits:
     min_rest_s: float = 3.0
     max_gyro_sigma_share: float = 1.0 / 3.0
     max_gyro_disagreement: float = 4.0
+    max_gyro_apart_mrad_s: float = 1.2
 
     def with_margin(self, margin: float) -> GateLimits:
         """After a rollback: an improvement must be `margin` times as clear."""
@@ -141,9 +142,8 @@ def no(gate: str, code: str, value: str, level: Level, **words: str) -> Gate:
 # Rows about the data: the stream, what it rests on, the motion, the field.
 
 
-_MOVE = "drive at least two full circles in calm surroundings"
-_TILT = "pitch and roll by 30 deg if the vehicle can"
-_SEEN = "({e.motion.tilts})"
+_MOVE = CIRCLES
+_TILT = "{e.motion.more_tilt}"
 _NO_TILT = "tilt is not known: {e.motion.turn}"
 
 STREAM = (
@@ -280,7 +280,7 @@ MOTION = (
         "estimate.converged",
         Level.CANDIDATE,
         meaning="the estimator says that it has converged",
-        advice=f"the estimate has not converged: {_MOVE}; {_TILT} {_SEEN}",
+        advice="the estimate has not converged: {e.would_tell}",
     ),
     least(
         "observability.score",
@@ -290,8 +290,7 @@ MOTION = (
         "min_observability",
         Level.CANDIDATE,
         meaning="weakest direction of the information, 1 = just enough",
-        advice=f"the motion does not determine everything ({{v:.2g}} of {{l:.2g}}): {_TILT} "
-        f"{_SEEN}",
+        advice=f"the motion does not determine everything ({{v:.2g}} of {{l:.2g}}): {_TILT}",
         missing="the estimator has no answer yet",
     ),
     most(
@@ -302,8 +301,7 @@ MOTION = (
         "max_heading_sigma_deg",
         Level.CANDIDATE,
         meaning="expected heading error (1 sigma) at the worst attitude driven",
-        advice=f"the heading is not known well enough (limit {{l:.1f}} deg): {_MOVE}; {_TILT} "
-        f"{_SEEN}",
+        advice="the heading is not known well enough (limit {l:.1f} deg): {e.would_tell}",
         missing="the estimator has no answer yet",
     ),
     most(
@@ -314,7 +312,7 @@ MOTION = (
         "max_moved_unseen_gauss",
         Level.CANDIDATE,
         meaning="move of the vertical hard iron although the motion was too flat to see it",
-        advice=f"the vertical hard iron moved by {{v:.3f}} gauss on flat motion: {_TILT} {_SEEN}",
+        advice=f"the vertical hard iron moved by {{v:.3f}} gauss on flat motion: {_TILT}",
         missing=_NO_TILT,
     ),
 )
@@ -398,7 +396,7 @@ FIELD = (
         Level.RAM,
         meaning="dip of the corrected field against the world model",
         advice=f"the dip is {{v:.1f}} deg off the world model (limit {{l:.1f}}): check the "
-        f"location; go away from steel; {_TILT} {_SEEN}",
+        f"location; go away from steel; {_TILT}",
         missing="the dip is not known: drive some time without hard manoeuvres",
         applies="position_known",
     ),
@@ -739,6 +737,18 @@ STEADY = (
         Level.RAM,
         meaning="gyro bias of the estimate against the mean rate at rest",
         advice=f"the gyro bias is {{v:.1f}} sigma off what rest shows (limit {{l:.0f}}): {_REST}",
+        missing=_REST,
+    ),
+    most(
+        "gyro_bias.apart",
+        "G12",
+        "gyro.apart_mrad_s",
+        "mrad/s",
+        "max_gyro_apart_mrad_s",
+        Level.RAM,
+        meaning="the same as a rate",
+        advice="the gyro bias is {v:.1f} mrad/s off what rest shows (limit {l:.1f}), and known to "
+        "+-{e.gyro.sigma_mrad_s:.1f}: turn about other axes as well, slowly and both ways",
         missing=_REST,
     ),
     most(

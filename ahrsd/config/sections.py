@@ -407,6 +407,8 @@ class GatesSection(Section):
     """Sigma of the mean rate at rest over the change that is written. [1]"""
     max_gyro_disagreement: float = Field(default=_LIMITS.max_gyro_disagreement, ge=0.0, le=100.0)
     """Gyro bias of the estimate against the mean rate at rest. [sigma]"""
+    max_gyro_apart_mrad_s: float = Field(default=_LIMITS.max_gyro_apart_mrad_s, ge=0.0, le=100.0)
+    """The same as a rate. [mrad/s]"""
 
     @model_validator(mode="after")
     def _in_order(self) -> GatesSection:

@@ -6,8 +6,9 @@ axes, lag and scale, and whether it contradicts a calibration that is sure.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from operator import is_not
 
 import numpy as np
@@ -28,7 +29,7 @@ from ahrsd.estimator.graph import (
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
-from ahrsd.estimator.parameters import EstimatorParameters, instruments
+from ahrsd.estimator.parameters import Imperfections, instruments
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -212,6 +213,11 @@ class MisfitScore:
     turning: Array
     freedom: float
 
+    @property
+    def information(self) -> Array:
+        """On z (12, 12)."""
+        return np.asarray(self.turning.T @ self.turning)
+
 
 def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
     """Of several epochs' factors."""
@@ -236,6 +242,11 @@ class Misfit:
     def __init__(self) -> None:
         self._sum = 0.0
         self._count = 0.0
+
+    @property
+    def epochs(self) -> float:
+        """How many whole epochs are remembered."""
+        return self._count / _USED
 
     def remember(self, factor: Factor, score: MisfitScore, graph: Graph) -> None:
         """An epoch leaves the window: keep its score."""
@@ -299,19 +310,69 @@ def _squares(
 # looks like another, so they are asked for together. Every epoch stands alone here, its borders
 # free.
 
+# What the data ask for is taken out of them (`TakenOut`): the field is taken to be late, the gyro's
+# angles are multiplied by a matrix. The step is then one more from there.
+
 TURN, LAG, SCALE = slice(12, 15), 15, 16
 _ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
 _SIZE = 22
 _X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
 _OF_ANGLE = np.r_[12:15, 16:22]
+_SCALES = np.r_[SCALE:_SIZE]
 _FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
 _MOTION = np.ix_(np.r_[9:15, SCALE:23], np.r_[9:15, SCALE:23])
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 IMPERFECTIONS = ("axes", "lag", "scales", "bias")
 _EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:13])  # of what is considered
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
+_GYRO = np.r_[TURN, SCALE:_SIZE]  # what turns or scales the gyro's angles
+GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
+_TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
+_WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
 _LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TakenOut:
+    """What of an instrument is taken out of the epochs' data already.
+
+    lag_s: by which the field is late; gyro: (3, 3) by which the gyro's angles are multiplied
+    walk: by which its bias is let go, besides what every gyro's does, rad/s/sqrt(s)
+    """
+
+    lag_s: float
+    gyro: Array
+    walk: float = 0.0
+
+    @staticmethod
+    def nothing() -> TakenOut:
+        """Of a perfect instrument."""
+        return TakenOut(0.0, np.eye(3))
+
+    @property
+    def anything(self) -> bool:
+        """Whether there is any."""
+        return self.lag_s != 0.0 or self.walk > 0.0 or not np.array_equal(self.gyro, np.eye(3))
+
+    @property
+    def numbers(self) -> Array:
+        """Turn (3), scale and shape (5) of the matrix."""
+        E = self.gyro - np.eye(3)
+        scale = float(np.trace(E)) / 3
+        S = (E + E.T) / 2 - scale * np.eye(3)
+        turn = np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]]) / 2
+        apart = [(S[0, 0] - S[1, 1]) / 2, -S[2, 2] * np.sqrt(3.0) / 2]
+        return np.array([*turn, scale, *apart, S[1, 2], S[0, 2], S[0, 1]])
+
+    def with_gyro(self, numbers: Array) -> TakenOut:
+        """With this much more of turn (3), scale and shape (5)."""
+        (x, y, z), scale, (apart, against, yz, xz, xy) = numbers[:3], numbers[3], numbers[4:]
+        third = against / np.sqrt(3.0)
+        diagonal = np.array([apart + third, third - apart, -2 * third]) + scale
+        sides = np.array([[0.0, xy - z, xz + y], [xy + z, 0.0, yz - x], [xz - y, yz + x, 0.0]])
+        more = np.diag(diagonal) + sides
+        return replace(self, gyro=(np.eye(3) + more) @ self.gyro)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -319,11 +380,13 @@ class Instrument:
     """Step (17,) from the answer in [M (6), b (3), w_b (3), theta (3), tau, s], and its covariance.
 
     misfit: how much the epochs still disagree after the step; it is in the covariance
+    scaled: by how much the gyro's angles were scaled before
     """
 
     step: Array
     covariance: Array
     misfit: float
+    scaled: float = 0.0
 
     @property
     def lag_s(self) -> tuple[float, float]:
@@ -334,6 +397,7 @@ class Instrument:
     def misscaled(self) -> float:
         """Share of themselves by which the gyro's angles are too small; 0: they may be right."""
         scale, sigma = self._of(SCALE)
+        scale += self.scaled
         return scale if abs(scale) > max(_MISSCALED, _MISSCALED_SIGMAS * sigma) else 0.0
 
     def _of(self, row: int) -> tuple[float, float]:
@@ -375,17 +439,17 @@ class FoldedInformation:
 
     def __init__(self) -> None:
         self._H: Array = np.zeros((_SIZE, _SIZE))
-        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, 0, lag, 0]
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, turn, lag, scale, shape]
 
     @staticmethod
-    def of_iron(graph: Graph, lag_s: float) -> FoldedInformation:
+    def of_iron(graph: Graph, taken: TakenOut) -> FoldedInformation:
         """Information on the iron from the epochs folded into the graph; none on a lag."""
         H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).here())
         gain = H[C, Y_A] @ np.linalg.pinv(H[Y_A, Y_A], rcond=1e-12, hermitian=True)
         own_H, own_g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
         own_H[C, C], own_g[C] = H[C, C] - gain @ H[Y_A, C], g[C] - gain @ g[Y_A]
         past = FoldedInformation()
-        past._add(own_H, own_g, graph.c, lag_s)
+        past._add(own_H, own_g, graph.c, taken)
         return past
 
     @staticmethod
@@ -397,9 +461,9 @@ class FoldedInformation:
         return past
 
     def with_epoch(
-        self, told: InstrumentInformation, lag_s: float, sigma_bias: float
+        self, told: InstrumentInformation, taken: TakenOut, sigma_bias: float
     ) -> FoldedInformation:
-        """With one epoch more, which was linearised at this lag; sigma_bias in rad/s."""
+        """With one epoch more, which was linearised with this taken out; sigma_bias in rad/s."""
         bias = slice(9, 12)
         own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
         gain = np.linalg.solve(own, told.H[bias]).T
@@ -408,21 +472,21 @@ class FoldedInformation:
         keep[_LASTING] = 1.0
         past = FoldedInformation()
         past._H, past._eta = self._H.copy(), self._eta.copy()
-        past._add(H * np.outer(keep, keep), g * keep, told.c, lag_s)
+        past._add(H * np.outer(keep, keep), g * keep, told.c, taken)
         return past
 
-    def _add(self, H: Array, g: Array, c: Array, lag_s: float) -> None:
+    def _add(self, H: Array, g: Array, c: Array, taken: TakenOut) -> None:
         self._H = self._H + H
-        self._eta = self._eta + H @ _place(c, lag_s) - g
+        self._eta = self._eta + H @ _place(c, taken) - g
 
-    def at(self, c: Array, lag_s: float) -> tuple[Array, Array]:
+    def at(self, c: Array, taken: TakenOut) -> tuple[Array, Array]:
         """H (22, 22) and gradient (22,) there."""
-        return self._H, self._H @ _place(c, lag_s) - self._eta
+        return self._H, self._H @ _place(c, taken) - self._eta
 
 
-def _place(c: Array, lag_s: float) -> Array:
+def _place(c: Array, taken: TakenOut) -> Array:
     x = np.zeros(_SIZE)
-    x[:9], x[LAG] = c, lag_s
+    x[:9], x[LAG], x[_GYRO] = c, taken.lag_s, taken.numbers
     return x
 
 
@@ -442,7 +506,7 @@ def lag_known(
     the lag, so what both make adds up.
     """
     linearise_instrument(epochs, graph)
-    H = past.at(graph.c, 0.0)[0]
+    H = past.at(graph.c, TakenOut.nothing())[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
     H = believed(graph, sigma_bias)[0] + H[:_ASKED, :_ASKED]
     sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
@@ -457,6 +521,13 @@ class Lag:
     spread: Array
 
 
+def _inverses(H: Array) -> Array:
+    """Of each (..., n, n), as `_inverse`."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=-2, axis2=-1), 1e-30))
+    sizes = scale[..., :, None] * scale[..., None, :]
+    return np.asarray(np.linalg.inv(H * sizes) * sizes)
+
+
 def _inverse(H: Array) -> Array:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
     return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale))
@@ -467,6 +538,7 @@ def instrument(
     graph: Graph,
     sigma_bias: float,
     before: tuple[Array, Array] | None = None,
+    scaled: float = 0.0,
 ) -> Instrument:
     """Misalignment, lag and scale from the epochs of a settled window and those before it.
 
@@ -479,59 +551,134 @@ def instrument(
     covariance = _inverse(H)
     step = -covariance @ g
     misfit = max(1.0, disagreement(*epochs, step))
-    return Instrument(step, misfit * covariance, misfit)
+    return Instrument(step, misfit * covariance, misfit, scaled)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Considered:
+    """What is known of an instrument's imperfections (`_REST`, 13), and what they do to the answer.
+
+    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 13): what one of each
+    does to them; own (12,) their gradient; known (13, 13) and asked (13,): information and gradient
+    of the imperfections from the data, the answer following them; already (13,): what of them is
+    taken out of the data
+    disagree: how much the epochs disagree after a step (25,) of all
+    """
+
+    alone: Array
+    by_rest: Array
+    own: Array
+    known: Array
+    asked: Array
+    already: Array
+    disagree: Callable[[Array], float]
+
+    @staticmethod
+    def of(
+        epochs: InformationStack,
+        times_s: Array,
+        graph: Graph,
+        sigma_bias: float,
+        before: tuple[Array, Array],
+        taken: TakenOut,
+    ) -> Considered:
+        """Of epochs (of these times, (N,)) and those before.  LinAlgError: the motion tells not."""
+        epochs = with_drift(epochs, times_s)
+        H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
+        H[:_SIZE, :_SIZE] += before[0]
+        g[:_SIZE] += before[1]
+        own_H, own_g = believed(graph, sigma_bias)
+        alone = _inverse(H[_X, _X] + own_H[_X, _X])
+        by_rest, own = -alone @ H[_X, _REST], g[_X] + own_g[_X]
+        known = H[_REST, _REST] + H[_REST, _X] @ by_rest
+        already = np.zeros(len(known))
+        already[GYRO_OF_ALL] = taken.numbers
+        asked = g[_REST] + by_rest.T @ own
+        return Considered(
+            alone, by_rest, own, known, asked, already, partial(disagreement, *epochs)
+        )
+
+    def found(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
+        """Spread (..., 13, 13) over the temper, and what they are beyond what is taken out
+        (..., 13), of instruments like that (..., 13)."""
+        pull = temper / sigmas**2
+        spread = _inverses(self.known + pull[..., None] * np.eye(pull.shape[-1]))
+        return spread, -(spread @ (self.asked + pull * self.already)[..., None])[..., 0]
+
+    def temper(self, sigmas: Array, most: float) -> float:
+        """By how much the epochs disagree once what they say of the imperfections is in."""
+        rest = self.found(sigmas, most)[1]
+        step = np.r_[-self.alone @ self.own + self.by_rest @ rest, rest]
+        return min(most, max(1.0, self.disagree(step)))
+
+    def evidence(self, sigmas: Array, temper: float) -> Array:
+        """Log of how likely the data are of instruments like that (..., 13), up to a constant."""
+        sizes = sigmas[..., :, None] * sigmas[..., None, :]
+        told = np.linalg.slogdet(np.eye(sigmas.shape[-1]) + self.known / temper * sizes)[1]
+        rest = self.found(sigmas, temper)[1]
+        left = np.sum((rest @ self.known + 2.0 * self.asked) * rest, axis=-1) / temper
+        left = left + np.sum(np.square((self.already + rest) / sigmas), axis=-1)
+        return np.asarray(-0.5 * (left + told))
 
 
 def considered(
-    epochs: InformationStack,
-    times_s: Array,
-    graph: Graph,
-    parameters: EstimatorParameters,
-    before: tuple[Array, Array],
+    said: Considered, graph: Graph, kinds: Sequence[Imperfections]
 ) -> tuple[Array, dict[str, Array]]:
     """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); and what
     each of `IMPERFECTIONS` alone adds, which together may be more or less.
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
-    what they say that they are is an error of it. epochs (of these times, (N,)), before: all that
-    is known, imperfections included.
-    LinAlgError where the motion does not tell.
+    what they say that they are is an error of it.
     """
-    epochs = with_drift(epochs, times_s)
-    H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
-    H[:_SIZE, :_SIZE] += before[0]
-    g[:_SIZE] += before[1]
-    own_H, own_g = believed(graph, parameters.prior_gyro_bias_rad_s)
-    alone = _inverse(H[_X, _X] + own_H[_X, _X])
-    by_rest = -alone @ H[_X, _REST]
-    known = H[_REST, _REST] + H[_REST, _X] @ by_rest
-    asked = g[_REST] + by_rest.T @ (g[_X] + own_g[_X])
-    kinds = np.array(instruments(parameters.imperfections))
-
-    def found(sigmas: Array, temper: float) -> tuple[Array, Array]:
-        spread = _inverse(known + np.diag(temper / sigmas**2))
-        return spread, -spread @ asked
-
+    every, by_rest = np.array(instruments(kinds)), said.by_rest
     # what an imperfection makes the epochs disagree is no noise
-    most = found(kinds.max(axis=0), graph.temper)[1]
-    step = np.r_[-alone @ (g[_X] + own_g[_X]) + by_rest @ most, most]
-    temper = min(graph.temper, max(1.0, disagreement(*epochs, step)))
-    evidence, spreads, alone_spreads = [], [], []
-    for sigmas in kinds:
-        spread, rest = found(sigmas, temper)
-        told = np.linalg.slogdet(np.eye(len(rest)) + known / temper * np.outer(sigmas, sigmas))[1]
-        evidence.append(0.5 * (float(-asked @ rest) / temper - float(told)))
-        found_spread = temper * spread + np.outer(rest, rest)
-        spreads.append(by_rest @ found_spread @ by_rest.T)
-        alone_spreads.append(
-            [by_rest[:, i] @ found_spread[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
-        )
-    likely = np.exp(np.array(evidence) - max(evidence))
+    temper = said.temper(every.max(axis=0), graph.temper)
+    spread, rest = said.found(every, temper)
+    evidence = said.evidence(every, temper)
+    likely = np.exp(evidence - evidence.max())
     likely /= likely.sum()
-    added = np.einsum("k,kij->ij", likely, np.array(spreads))
-    each = np.einsum("k,kpij->pij", likely, np.array(alone_spreads))
+    spread = temper * spread + rest[:, :, None] * rest[:, None, :]
+    mean = np.einsum("k,kij->ij", likely, spread)
+    added = by_rest @ mean @ by_rest.T
+    each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
     return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True))
+
+
+def walk_asked(
+    said: Considered, graph: Graph, kinds: Sequence[Imperfections], span_s: float
+) -> float:
+    """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
+
+    0 where an instrument that does not drift is as likely.
+    """
+    every = np.array(instruments(kinds))
+    most, least = every.max(axis=0), every.min(axis=0)
+    temper = said.temper(most, graph.temper)
+    still = np.r_[most[:-3], least[-3:]]
+    if said.evidence(most, temper) - said.evidence(still, temper) < _TOLD:
+        return 0.0
+    drift = said.found(most, temper)[1][-3:]
+    return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
+
+
+def gyro_asked(said: Considered, graph: Graph, kinds: Sequence[Imperfections]) -> Array | None:
+    """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
+
+    None where an instrument as its maker calibrated it is as likely, or the step is not worth it.
+    """
+    every = np.array(instruments(kinds))
+    most, least = every.max(axis=0), every.min(axis=0)
+    temper = said.temper(most, graph.temper)
+    if not said.already.any():
+        plain = np.where(np.isin(np.arange(len(most)), GYRO_OF_ALL), least, most)
+        if said.evidence(most, temper) - said.evidence(plain, temper) < _TOLD:
+            return None
+    spread, rest = said.found(most, temper)
+    step = rest[GYRO_OF_ALL]
+    known = temper * spread[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
+    worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
+    return step if worth > _WORTH_SIGMAS else None
 
 
 def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
@@ -597,8 +744,23 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
         H[k][_FIELD] += chain.squares(J[:, :, a:b])
         H[k][_MOTION] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
+        own[_SCALES, _SIZE] -= _by_noise(epoch)
         epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+
+
+def _by_noise(epoch: WindowEpoch) -> Array:
+    """What the gyro's own noise seems to ask of scale (1) and shape (5): the gradient that it has.
+
+    Angles that are made smaller have less noise. A step's noise (1 + E) n is seen across the field,
+    so half its square grows by n' (1 - u u') E n, of which a half is in each direction.
+    """
+    uu = epoch.u.T @ epoch.u / len(epoch.u)
+    along = [uu[0, 0] - uu[1, 1], (uu[0, 0] + uu[1, 1] - 2 * uu[2, 2]) / np.sqrt(3.0)]
+    along += [2 * uu[1, 2], 2 * uu[0, 2], 2 * uu[0, 1]]
+    # of squares beyond what noise makes, the gyro is not the cause
+    squares = min(epoch.quadratic.sum_gyro, epoch.residuals.gyro_freedom)
+    return np.asarray(squares * np.array([1.0, *(-0.5 * x for x in along)]))
 
 
 def _of_angle(by_angle: Array, angle: Array) -> Array:

@@ -541,6 +541,20 @@ def delayed(data: chain.EpochData, lag_s: float) -> chain.EpochData:
     return replace(data, averaging=averaging)
 
 
+def corrected(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.EpochData:
+    """The same epoch with the gyro's angles multiplied by a matrix (3, 3).
+
+    lag_s: by which its fields are taken to be late already. Inside a group the angles are so small
+    that only the way of the lag is another.
+    """
+    angle, averaging = data.angle_b_rad @ gyro.T, data.averaging
+    if averaging is not None:
+        rate = averaging.rate_b_rad_s @ gyro.T
+        turn = so3.exp(lag_s * rate) @ so3.exp(-lag_s * averaging.rate_b_rad_s) @ averaging.turn
+        averaging = replace(averaging, turn=turn, rate_b_rad_s=rate)
+    return replace(data, angle_b_rad=angle, averaging=averaging)
+
+
 # -- Steps in groups -------------------------------------------------------------------------------
 #
 # Several steps in one state of the chain: the same information at a fraction of the cost.

@@ -132,10 +132,15 @@ class Misalignment:
         return worth and self.chi2 > _EVIDENCE and self.misfit < _MISFIT
 
 
-def misalignment(epochs: InformationStack, graph: Graph, sigma_bias: float) -> Misalignment:
-    """From what the epochs of a settled window say.  LinAlgError where the motion does not tell."""
+def misalignment(
+    epochs: InformationStack, graph: Graph, sigma_bias: float, taken_rad: Array
+) -> Misalignment:
+    """From what the epochs of a settled window say.  LinAlgError where the motion does not tell.
+
+    taken_rad (3,): turn that is taken out of the gyro's angles already
+    """
     found = instrument(epochs, graph, sigma_bias)
-    theta, spread = found.step[TURN], found.covariance[TURN, TURN]
+    theta, spread = taken_rad + found.step[TURN], found.covariance[TURN, TURN]
     c = retract(graph.c, found.step[:9], graph.moments)
     C = so3.exp(-theta[None])[0] @ np.linalg.inv(chain.symmetric(c[:6]))
     full = Affine(C / np.cbrt(np.linalg.det(C)), c[6:9].copy())

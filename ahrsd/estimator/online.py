@@ -4,170 +4,50 @@ Samples become steps, steps become epochs of constant size, each epoch becomes o
 graph. While the window of epochs holds everything, the answer is that of the batch smoother; what
 falls out of it is folded into the prior.
 
-An `Estimate` comes from the graph's numbers: scale as a gauge, sigmas, heading, observability.
+An `Estimate` comes from the graph's numbers; what it is worth, from `worth`.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.calibration import Affine, Estimate, Observability
+from ahrsd.calibration import Affine, Estimate
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
+    GYRO_OF_ALL,
+    Considered,
     Instrument,
     InstrumentInformations,
+    TakenOut,
     considered,
+    gyro_asked,
     instrument,
+    walk_asked,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
-from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
+from ahrsd.estimator.graph import Node, SingularError, curvature, whitening
 from ahrsd.estimator.model_checks import (
     Misalignment,
     change_message,
     divided,
     misalignment,
 )
-from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters
+from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, instruments
 from ahrsd.estimator.window import Window, search
-from ahrsd.samples import Array, SampleBlock
-
-# -- What an estimate is worth ---------------------------------------------------------------------
-
-
-_NAMES = (
-    *(f"soft iron {i}" for i in ("xx", "xy", "xz", "yy", "yz", "zz")),
-    *(f"hard iron {i}" for i in "xyz"),
-    *(f"gyro bias {i}" for i in "xyz"),
+from ahrsd.estimator.worth import (
+    HeadingAdvice,
+    attitude,
+    heading_sigma_deg,
+    motion_and_misfit,
+    observability,
+    turned_heading_deg,
+    unit_volume,
 )
-_TYPICAL_DIP_RAD = float(np.radians(65.0))  # pessimistic for most of the inhabited earth
-_STEEPEST_RAD = float(np.radians(80.0))
-_HEADINGS = 12
-_FLOOR = 0.1  # ratio at which the observability score is 1
-
-
-def unit_volume(c: Array) -> tuple[Array, Array, float, Array]:
-    """A (3, 3) with det 1, b (3,), |h|, and d[A (6), b (3)]/d[M (6), b (3)] (9, 9).
-
-    A = M / r with r = det(M)^(1/3), so dA = dM / r - A tr(M^-1 dM) / 3.
-    """
-    M = chain.symmetric(c[:6])
-    r = float(np.cbrt(np.linalg.det(M)))
-    A = M / r
-    inverse = np.linalg.inv(M)
-    J = np.eye(9)
-    for j in range(6):
-        dM = chain.symmetric(np.eye(6)[j])
-        J[:6, j] = chain.upper_triangle(dM / r - A * np.trace(inverse @ dM) / 3)
-    return A, c[6:9].copy(), r, J
-
-
-def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float) -> float:
-    """Worst 1-sigma heading error over 12 headings at the given tilts.
-
-    down_b (K, 3): unit vectors towards the earth, sensor frame. The direction error of a field
-    direction u is the tangential part of M^-1 (dM u + db); its part along (down x u) turns the
-    heading by that over cos(dip).
-    """
-    M = chain.symmetric(c[:6])
-    psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
-    helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
-    north = np.cross(helper, down_b)
-    north /= np.linalg.norm(north, axis=1, keepdims=True)
-    east = np.cross(down_b, north)
-    level = np.cos(psi)[:, None, None] * north + np.sin(psi)[:, None, None] * east
-    u = (np.cos(dip_rad) * level + np.sin(dip_rad) * down_b).reshape(-1, 3)
-    across = np.cross(down_b, level).reshape(-1, 3) @ np.linalg.inv(M) / np.cos(dip_rad)
-    J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
-    row = (across[:, None, :] @ J)[:, 0]
-    variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
-    return float(np.degrees(np.sqrt(np.max(variance))))
-
-
-_TELLS_DEG = 0.5  # a heading that is known better needs no advice
-_WIDENED = {
-    "motion": "the motion so far tells too little: turn through all headings, and roll and pitch",
-    "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
-    "motion at another place, away from steel and currents, once it is warm",
-    "axes": "the magnetometer's axes may be turned against the gyro's: roll and pitch as well",
-    "lag": "the field's readings may be late: turn fast and slow, both ways",
-    "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
-    "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
-}
-
-
-def widened_by(
-    c: Array, parts: Mapping[str, Array], down: Array, dip_rad: float, sigma_deg: float
-) -> str:
-    """What makes more than half of the variance of a heading known to `sigma_deg`, in words.
-
-    c, down, dip_rad: as for `heading_sigma_deg`; parts: covariances (12, 12) by the names of
-    `_WIDENED`, which add up to that of the answer but for what they have in common
-    """
-    if not sigma_deg > _TELLS_DEG:
-        return ""
-    variances = {n: heading_sigma_deg(c, one, down, dip_rad) ** 2 for n, one in parts.items()}
-    most = max(variances, key=lambda name: variances[name])
-    if not variances[most] > 0.5 * sum(variances.values()):
-        return ""
-    return _WIDENED[most]
-
-
-def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:
-    """Tilts driven (K, 3) and the field's dip in rad, from gravity; level and steep without it.
-
-    tilts: unit vectors towards the earth, some nan; epochs: directions (n, 3) of the field and of
-    down.
-    """
-    down = np.array([d for d in tilts if np.isfinite(d).all()])
-    if len(down) == 0:
-        return np.array([[0.0, 0.0, 1.0]]), _TYPICAL_DIP_RAD
-    along = [
-        float(u[len(u) // 2] @ d[len(u) // 2])
-        for u, d in epochs
-        if np.isfinite(d[len(u) // 2]).all()
-    ]
-    if not along:
-        return down, _TYPICAL_DIP_RAD
-    dip = float(np.median(np.arcsin(np.clip(along, -1.0, 1.0))))
-    return down, float(np.clip(dip, -_STEEPEST_RAD, _STEEPEST_RAD))
-
-
-def observability(covariance: Array, W: Array) -> Observability:
-    """Compare the posterior of [M (6), b (3), w_b (3)] with the prior, direction by direction.
-
-    W (12, 12) whitens the prior.
-    """
-    scaled = W @ covariance @ W.T
-    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    ratio = np.sqrt(np.clip(values, 0.0, None))
-    return Observability(
-        prior_ratio=ratio,
-        unobservable=_blind_names(vectors[:, ratio > BLIND]),
-        score=float(_FLOOR / max(float(ratio[-1]), 1e-9)),
-    )
-
-
-def _blind_names(vectors: Array) -> tuple[str, ...]:
-    """One name for each dimension of the subspace that the orthonormal vectors (12, K) span.
-
-    Eigenvectors of equal eigenvalues are any basis, another on each processor. So the parameter
-    that lies nearest to the subspace is taken, then the nearest to what is left of it: with
-    |P_ij| <= sqrt(P_ii P_jj) it leads its own projection, and no two names begin alike.
-    """
-    P = vectors @ vectors.T
-    names = []
-    for _ in range(vectors.shape[1]):
-        lead = int(np.argmax(np.round(np.diag(P), 6)))
-        v = P[:, lead] / np.sqrt(P[lead, lead])
-        others = [i for i in np.argsort(-np.abs(v), kind="stable") if i != lead and abs(v[i]) > 0.4]
-        names.append(" + ".join(_NAMES[i] for i in [lead, *others[:2]]))
-        P = P - np.outer(v, v)
-    return tuple(names)
-
+from ahrsd.samples import Array, SampleBlock
 
 # -- The estimator ---------------------------------------------------------------------------------
 
@@ -185,6 +65,9 @@ _MOST_SIGMAS = 100.0  # of movement or disagreement that are counted
 _SCALE = 0.5  # 1-sigma of the field's magnitude over its size in the present calibration
 _LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is one; settled
 _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
+_PASSES, _QUIETER = 8, 0.95  # over a gyro that is wrong; while the noise falls below that of itself
+_EXPLAINED = 1.5  # misfit of data that an instrument with imperfections explains
+_MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which something else is wrong
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
@@ -262,7 +145,8 @@ class Estimator:
                 self._window.track(everything=True, exactly=True)
             settled = self._window.step_sigmas < _SETTLED
             self._window = self._undivided(self._window)
-            if self._examine(self._window) and self._searching:
+            self._window, changed = self._examine(self._window)
+            if changed and self._searching:
                 self._search(self._window, exactly=True)
             if not settled:  # nobody could be asked before
                 self._window = self._undivided(self._window)
@@ -295,8 +179,8 @@ class Estimator:
             self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
             if self._searching:
                 self._search(window)
-            window = self._window = self._undivided(window)
-            self._examine(window)
+            window, _ = self._examine(self._undivided(window))
+            self._window = window
         window.fold()
 
     def _unchanged(self, window: Window, new: int) -> Window:
@@ -391,34 +275,95 @@ class Estimator:
         if looks > 1 and not (found.agreed or window.untried):
             self._search(window, exactly=exactly, looks=looks - 1)
 
-    def _examine(self, window: Window) -> bool:
-        """See whether the gyro's angles are the field's, and take out a lag where the epochs ask
-        for one; whether they did.
+    def _examine(self, window: Window) -> tuple[Window, bool]:
+        """See whether the gyro's angles are the field's, and take out a lag, and what is wrong with
+        the gyro, where the epochs ask for it; the window then, and whether they did.
+
+        What is wrong with a gyro is taken out only if the data are then explained: a field that
+        differs by place asks for it too, and is not.
         """
-        least, changed = _LAG_SIGMAS if window.lag_s == 0.0 else 1.0, False
-        for _ in range(_LAG_PASSES):
+        late = self._take_out(window, gyro=False)
+        if self.parameters.imperfections:
+            trial, misscaled = window.copy(), self._misscaled
+            if self._take_out(trial, gyro=True) and self._explained(trial):
+                window, late = trial, True
+            else:
+                self._misscaled = misscaled
+        self._informations = InstrumentInformations()  # nobody else asks before they are others
+        return window, late
+
+    def _explained(self, window: Window) -> bool:
+        most = instruments(self.parameters.imperfections)
+        limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
+        numbers = np.abs(window.taken.numbers)
+        return bool(window.graph.temper < _EXPLAINED and np.all(numbers < limit))
+
+    def _take_out(self, window: Window, *, gyro: bool) -> bool:
+        """Take out what is asked for until no more is; whether anything was.
+
+        gyro: what is wrong with it, too; then the noise that it passed for has to settle as well.
+        """
+        least, changed, quiet = _LAG_SIGMAS if window.taken.lag_s == 0.0 else 1.0, False, False
+        for _ in range(_PASSES if gyro else _LAG_PASSES):
             found = self._instrument(window)
             if found is None:
                 break
             self._misscaled = found.misscaled
             more, sigma = found.lag_s
-            if abs(more) < least * sigma:
+            taken = self._gyro_out(window) if gyro else window.taken
+            if gyro and taken is window.taken and not changed:
                 break
-            window.delay(float(np.clip(window.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)))
+            if abs(more) >= least * sigma:
+                lag_s = np.clip(taken.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)
+                taken, least = replace(taken, lag_s=float(lag_s)), _LAG_SAME
+            noise_gauss = window.usual.mag_gauss
+            if taken is not window.taken:
+                window.take_out(taken)
+            elif not gyro or quiet:
+                break
             window.track(everything=True)
-            least, changed = _LAG_SAME, True
-        self._informations = InstrumentInformations()  # nobody else asks before they are others
+            changed, quiet = True, window.usual.mag_gauss > _QUIETER * noise_gauss
         return changed
 
     def _instrument(self, window: Window) -> Instrument | None:
         try:
             informations = self._informations.of(window.epochs, window.graph)
-            before = window.past.at(window.graph.c, window.lag_s)
-            return instrument(
-                informations, window.graph, self.parameters.prior_gyro_bias_rad_s, before
-            )
+            before = window.past.at(window.graph.c, window.taken)
+            sigma_bias, scaled = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[3]
+            return instrument(informations, window.graph, sigma_bias, before, scaled)
         except np.linalg.LinAlgError:
             return None
+
+    def _considered(self, window: Window) -> Considered | None:
+        """What is known of the instrument's imperfections; None where they are not to be asked."""
+        if not self.parameters.imperfections:
+            return None
+        before = window.folded_information.at(window.graph.c, window.taken)
+        try:
+            said = self._informations.whole(window.epochs, window.graph)
+            moving = [e.data.time_s for e in window.epochs if e.turned]
+            times_s = np.array([(float(t[0]) + float(t[-1])) / 2 for t in moving])
+            sigma_bias = self.parameters.prior_gyro_bias_rad_s
+            return Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
+        except np.linalg.LinAlgError:
+            return None
+
+    def _gyro_out(self, window: Window) -> TakenOut:
+        """What is to be taken out, with what else the gyro's axes and scales are asked for."""
+        said, kinds = self._considered(window), self.parameters.imperfections
+        if said is None:
+            return window.taken
+        taken, moving = window.taken, [e.data.time_s for e in window.epochs if e.turned]
+        try:
+            more = gyro_asked(said, window.graph, kinds)
+            walk = walk_asked(
+                said, window.graph, kinds, float(moving[-1][-1]) - float(moving[0][0])
+            )
+        except np.linalg.LinAlgError:
+            return window.taken
+        if more is not None:
+            taken = taken.with_gyro(more)
+        return taken if walk == 0.0 else replace(taken, walk=float(np.hypot(taken.walk, walk)))
 
     @staticmethod
     def _sure(window: Window) -> bool:
@@ -441,21 +386,18 @@ class Estimator:
     @staticmethod
     def _by_lag(window: Window) -> Array:
         """What doubt about the lag, by all data so far, adds to the covariance (12, 12)."""
-        known = window.lag_known() if window.lag_s != 0.0 else None
+        known = window.lag_known() if window.taken.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
     def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array]]:
         """What an instrument that is not perfect adds to the covariance (12, 12), and each part."""
-        if not self.parameters.imperfections:
-            return np.zeros((12, 12)), {}
-        before = window.folded_information.at(window.graph.c, window.lag_s)
+        said = self._considered(window)
         try:
-            said = self._informations.whole(window.epochs, window.graph)
-            moving = [e.data.time_s for e in window.epochs if e.turned]
-            times_s = np.array([(float(t[0]) + float(t[-1])) / 2 for t in moving])
-            return considered(said, times_s, window.graph, self.parameters, before)
+            if said is not None:
+                return considered(said, window.graph, self.parameters.imperfections)
         except np.linalg.LinAlgError:
-            return np.zeros((12, 12)), {}
+            pass
+        return np.zeros((12, 12)), {}
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -464,7 +406,8 @@ class Estimator:
             return None
         try:
             informations = self._informations.of(window.epochs, window.graph)
-            return misalignment(informations, window.graph, self.parameters.prior_gyro_bias_rad_s)
+            sigma_bias, taken = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[:3]
+            return misalignment(informations, window.graph, sigma_bias, taken)
         except np.linalg.LinAlgError:
             return None
 
@@ -490,20 +433,23 @@ class Estimator:
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         by_instrument, parts = self._by_imperfections(window)
         tempered = window.covariance()
-        parts |= {"motion": graph.covariance(), "misfit": tempered - graph.covariance()}
-        covariance = tempered * (1.0 + doubt**2) * self._parted
+        divided = tempered * self._parted
+        parts |= motion_and_misfit(window.explained_covariance(), divided, self._whitening)
+        covariance = divided * (1.0 + doubt**2)
         covariance = covariance + self._by_lag(window) + by_instrument
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = unit_volume(graph.c)
         K = np.eye(12)
-        K[:9, :9] = J
+        K[:9, :9], K[9:, 9:] = J, np.linalg.inv(window.taken.gyro)
         down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
-        heading = heading_sigma_deg(graph.c, covariance, down, dip)
+        turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
+        heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
+        advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
             soft_iron=A,
             hard_iron_gauss=b,
-            gyro_bias_rad_s=graph.nodes[graph.last].bias.copy(),
+            gyro_bias_rad_s=K[9:, 9:] @ graph.nodes[graph.last].bias,
             field_gauss=size,
             field_known=False,
             covariance=K @ covariance @ K.T,
@@ -522,8 +468,8 @@ class Estimator:
                 and self._doubted_s is None
             ),
             warnings=() if self.restarted_s is None else (change_message(self.restarted_s),),
-            mag_lag_s=window.lag_s,
+            mag_lag_s=window.taken.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
-            widened_by=widened_by(graph.c, parts, down, dip, heading),
+            widened_by=advice.widened_by(parts, covariance, turned),
         )

@@ -22,12 +22,14 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.estimator import chain, noise, start
+from ahrsd.estimator.coherence import unaveraged
 from ahrsd.estimator.epoch import (
     FoldedInformation,
     Lag,
     LinearisationPlan,
     Misfit,
     Snapshot,
+    TakenOut,
     WindowEpoch,
     contradicts,
     grown,
@@ -37,6 +39,7 @@ from ahrsd.estimator.epoch import (
     scores_of,
 )
 from ahrsd.estimator.epoch_data import (
+    corrected,
     delayed,
     group_size,
     grouped,
@@ -99,8 +102,8 @@ class Window:
         self.epochs: list[WindowEpoch] = []
         self.misfit = Misfit()
         self.folded = False
-        self.lag_s = 0.0  # of the field against the gyro; it is in the epochs' data
-        self.past = FoldedInformation()  # of what was folded since there is a lag
+        self.taken = TakenOut.nothing()  # of the instrument; it is in the epochs' data
+        self.past = FoldedInformation()  # of what was folded since something was taken out
         self.folded_information = FoldedInformation()  # of all that was folded
         self._folded_cells = DirectionCells()
         self._rest: Array | None = None
@@ -113,6 +116,7 @@ class Window:
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, belief, first, prior)
         self.found_misfit = 1.0
+        self._beyond_chance = 1.0  # the same, less what chance may make
         self.step_sigmas = float(np.inf)
         self.loud = 1.0  # what searching found the model to leave over (`SearchResult.loud`)
         self._damping = _DAMPING
@@ -144,10 +148,18 @@ class Window:
         self._guess = noise.median(self._guesses)
         sizes = [group_size(d, guess, size) for d, guess in zip(new, guesses, strict=True)]
         coarse = grouped(new, sizes)
-        if self.lag_s != 0.0:
-            coarse = [delayed(data, self.lag_s) for data in coarse]
+        coarse = [self._instrument_out(data) for data in coarse]
         self._waiting += zip(coarse, moving, strict=True)
         return sum(moving)
+
+    def _walk(self) -> float:
+        return float(np.hypot(self.parameters.bias_walk_rad_s_sqrt_s, self.taken.walk))
+
+    def _instrument_out(self, data: chain.EpochData) -> chain.EpochData:
+        """Of an epoch as it was measured."""
+        if not np.array_equal(self.taken.gyro, np.eye(3)):
+            data = corrected(data, self.taken.gyro, 0.0)
+        return data if self.taken.lag_s == 0.0 else delayed(data, self.taken.lag_s)
 
     @property
     def data(self) -> list[chain.EpochData]:
@@ -167,7 +179,7 @@ class Window:
 
     def attach(self, new: Sequence[chain.EpochData], moving: Sequence[bool]) -> None:
         """Epochs whose steps are grouped already, and whether they calibrate."""
-        walk = self.parameters.bias_walk_rad_s_sqrt_s
+        walk = self._walk()
         pieces = [grown(self.graph, d, walk, moving=m) for d, m in zip(new, moving, strict=True)]
         self._work = min(self._work + _WORK * len(new), max(_MOST_WORK, _WORK * len(new)))
         begun = self._linearised([LinearisationPlan(piece, u, self.usual) for piece, u in pieces])
@@ -198,9 +210,9 @@ class Window:
             linearise_instrument([old, *self.epochs], self.graph)
         if old.instrument is not None:
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            told = old.instrument, self.lag_s, sigma_bias
+            told = old.instrument, self.taken, sigma_bias
             self.folded_information = self.folded_information.with_epoch(*told)
-            if self.lag_s != 0.0:
+            if self.taken.anything:
                 self.past = self.past.with_epoch(*told)
 
     # -- linearisation ---------------------------------------------------------------------------
@@ -273,14 +285,22 @@ class Window:
             noise.pooled(found, self._guess, self.parameters), _GYRO_LEAST * self._guess.gyro_rad_s
         )
 
-    def delay(self, lag_s: float) -> None:
-        """Take the field to be `lag_s` late in every epoch of the window, and in those to come.
+    def take_out(self, taken: TakenOut) -> None:
+        """Take this out of every epoch of the window, and of those to come.
 
-        The directions turn back by as much, so that they fit the fields as well as before.
+        The directions turn back by as much as a lag grows, so that they fit the fields as before.
+        What a gyro that is wrong left over passed for noise of the field: that is guessed anew.
         """
-        if self.lag_s == 0.0 and self.folded:
-            self.past = FoldedInformation.of_iron(self.graph, lag_s)
-        graph, more, everyone = self.graph, lag_s - self.lag_s, range(len(self.epochs))
+        if not self.taken.anything and self.folded:
+            self.past = FoldedInformation.of_iron(self.graph, taken)
+        graph, everyone = self.graph, range(len(self.epochs))
+        lag_s, more = self.taken.lag_s, taken.lag_s - self.taken.lag_s
+        gyro = taken.gyro @ np.linalg.inv(self.taken.gyro)
+        late = taken.walk == self.taken.walk and np.array_equal(taken.gyro, self.taken.gyro)
+        self.taken = taken
+        if not late:
+            self.usual = chain.Noise(self._start_noise().mag_gauss, self.usual.gyro_rad_s)
+        walk = self._walk()
         places = []
         for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):
             back = so3.exp(-more * rates(epoch.data))
@@ -290,12 +310,13 @@ class Window:
             elif epoch.data.measures_first:
                 graph.nodes[epoch.a] = Node.at(graph.nodes[epoch.a].bias, u[0])
             graph.nodes[epoch.a + 1] = Node.at(graph.nodes[epoch.a + 1].bias, u[-1])
-            data = delayed(epoch.data, more)
-            places.append(
-                LinearisationPlan(replace(epoch.piece, data=data), u, epoch.used, epoch.weights)
-            )
+            data = epoch.data if late else corrected(epoch.data, gyro, lag_s)
+            data = delayed(data, more) if more != 0.0 else data
+            firm = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
+            piece = replace(epoch.piece, data=data, walk=firm)
+            used = epoch.used if late else self.usual
+            places.append(LinearisationPlan(piece, u, used, epoch.weights))
         self._replace(everyone, places)
-        self.lag_s = lag_s
 
     # -- moving the answer ------------------------------------------------------------------------
 
@@ -319,9 +340,9 @@ class Window:
         belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
         other = Window(self.parameters, mean, belief, node, self.usual)
         other._guesses, other._guess = self._guesses.copy(), self._guess
-        other.lag_s = self.lag_s
-        if self.lag_s != 0.0 and (known := self.lag_known(self.epochs[:-count])):
-            other.past = FoldedInformation.of_lag(self.lag_s, known.sigma_s)
+        other.taken = self.taken
+        if self.taken.lag_s != 0.0 and (known := self.lag_known(self.epochs[:-count])):
+            other.past = FoldedInformation.of_lag(self.taken.lag_s, known.sigma_s)
         for epoch in kept:
             other.graph.moments.take(epoch.data.field_b_gauss)
         other.attach([first, *(e.data for e in kept[1:])], [e.turned for e in kept])
@@ -513,6 +534,7 @@ class Window:
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
         self.found_misfit, chance = self.misfit.value(factors, asked, graph, graph.step())
         told = self.found_misfit > 1.0 + _CHANCE * chance  # else sigmas would only ever grow by it
+        self._beyond_chance = max(1.0, self.found_misfit - _CHANCE * chance)
         graph.temper = max(1.0, self.found_misfit if told else 1.0, self._repeating())
         covariance = graph.covariance()[:9, :9] * graph.temper
         distance_from_prior = graph.distance_from_prior(covariance)
@@ -532,12 +554,33 @@ class Window:
     def covariance(self) -> Array:
         """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
 
+        What epochs disagree about is taken not to average out (`coherence`).
+
         What repeats with the attitude is taken to be smooth, as a room's gradient is. The answer
         itself is weighed as if it were not, which is nearer to what the data alone say.
         """
         graph = self.graph.copy()
         graph.temper = max(graph.temper, self._repeating(smooth=True))
-        return graph.covariance() * graph.temper
+        untempered = graph.covariance()
+        epochs = np.array([score.information for score in scores_of(self.epochs)])
+        folded = np.zeros((12, 12)), 0.0
+        if self.folded:
+            rest = np.linalg.inv(untempered) - epochs.sum(axis=0)
+            rest[:9, :9] -= graph.temper * graph.anchor[1]
+            folded = rest, self.misfit.epochs
+        return unaveraged(
+            untempered * graph.temper,
+            epochs,
+            misfit=self._beyond_chance,
+            temper=graph.temper,
+            folded=folded,
+        )
+
+    def explained_covariance(self) -> Array:
+        """The same (12, 12) if the model explained the data."""
+        graph = self.graph.copy()
+        graph.temper = 1.0
+        return graph.covariance()
 
 
 # -- Which epochs are worth linearising again ------------------------------------------------------

@@ -117,7 +117,6 @@ def worst_difference_deg(judged: Affine, truth: Affine, envelope: Envelope) -> f
 _NAN = float("nan")
 _VERTICAL_SEEN_DEG = 8.0  # half-range of roll or pitch from which the vertical may move
 _BIAS_FLOOR_RAD_S = 3e-4  # a smaller change of the bias needs no better rest than this one
-_MOST_BIAS_SIGMA_RAD_S = 3e-4  # an estimate that knows less must not agree with everything
 _LEAST_NOISE_GAUSS = 2e-4
 _FACTORY = 1e-6
 _ROUGH_M_S2 = 0.5  # rms of |force| - gravity above which a segment's dip is not compared
@@ -241,13 +240,14 @@ def gyro(estimate: Estimate, present_b_rad_s: Array, still: Rest) -> GyroFacts:
     """The estimate's gyro bias against rest."""
     bias = estimate.gyro_bias_rad_s
     written = max(float(np.linalg.norm(bias - present_b_rad_s)), _BIAS_FLOOR_RAD_S)
-    own = np.minimum(estimate.sigma[9:12], _MOST_BIAS_SIGMA_RAD_S)
-    sigma = np.hypot(own, still.sigma_rad_s)
+    own, apart = estimate.sigma[9:12], np.abs(bias - still.rate_b_rad_s)
     return GyroFacts(
         bias_rad_s=float(np.linalg.norm(bias)),
         rest_s=still.duration_s,
         sigma_share=still.sigma_rad_s / written,
-        disagreement=float(np.max(np.abs(bias - still.rate_b_rad_s) / sigma)),
+        disagreement=float(np.max(apart / np.hypot(own, still.sigma_rad_s))),
+        apart_mrad_s=1e3 * float(np.max(apart)),
+        sigma_mrad_s=1e3 * float(np.max(own)),
     )
 
 
@@ -356,4 +356,5 @@ def _facts(estimate: Estimate) -> EstimateFacts:
         estimate.observability.unobservable,
         float(estimate.observability.score),
         float(estimate.heading_sigma_deg),
+        estimate.widened_by,
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ahrsd.calibration import Affine
 from ahrsd.evidence.heading import sectors
 from ahrsd.evidence.segments import Nodes
-from ahrsd.evidence.values import SECTOR_DEG, SECTORS, Bools, Coverage, Regime
+from ahrsd.evidence.values import FREE_DEG, SECTOR_DEG, SECTORS, Bools, Coverage, Regime
 from ahrsd.samples import Array
 
 # -- Directions ------------------------------------------------------------------------------------
@@ -62,7 +62,6 @@ def centres() -> Array:
 
 
 PLANAR_DEG = 5.0
-FREE_DEG = 30.0
 _ANY_DEG = 45.0  # of heading, below which there was no motion to speak of
 
 

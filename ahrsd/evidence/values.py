@@ -15,8 +15,10 @@ Bools = NDArray[np.bool_]
 Regime = Literal["3D", "partial", "2D", "none", "unknown"]
 SECTOR_DEG = 10.0
 SECTORS = round(360.0 / SECTOR_DEG)
+FREE_DEG = 30.0  # of roll and of pitch, both ways: a vehicle that leans so far has shown tilt
 _NAMED = 3
 _NAN = float("nan")
+CIRCLES = "drive at least two full circles in calm surroundings"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +49,16 @@ class BasisFacts:
 
 @dataclass(frozen=True, slots=True)
 class EstimateFacts:
-    """What the estimator says about itself."""
+    """What the estimator says about itself.
+
+    widened_by: what makes the most of the heading's sigma and what would shrink it; empty: nothing
+    """
 
     converged: bool
     unobservable: tuple[str, ...]
     score: float
     heading_sigma_deg: float
+    widened_by: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +87,16 @@ class Coverage:
         if not np.isfinite([self.roll_deg, self.pitch_deg]).all():
             return "tilt not known yet"
         return f"so far roll +-{self.roll_deg:.0f}, pitch +-{self.pitch_deg:.0f} deg"
+
+    @property
+    def more_tilt(self) -> str:
+        """Which tilt is still to be shown, in words, or that none is."""
+        shown = {"pitch": self.pitch_deg, "roll": self.roll_deg}
+        missing = [name for name, half_range in shown.items() if not half_range >= FREE_DEG]
+        if not missing:
+            return f"lean so on other headings too, slowly and fast: tilt was shown ({self.tilts})"
+        lean = " and ".join(missing)
+        return f"{lean} by {FREE_DEG:.0f} deg if the vehicle can ({self.tilts})"
 
 
 UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been recorded yet")
@@ -179,14 +195,17 @@ class GyroFacts:
     """The proposed gyro bias against the mean rate at rest.
 
     sigma_share: sigma of that mean over the change that would be written
-    disagreement: distance between the two over their combined sigma (the estimate's: at most
-    0.3 mrad/s)
+    disagreement: distance between the two over their combined sigma, of the worst axis
+    apart_mrad_s: that distance, of the worst axis
+    sigma_mrad_s: the estimate's own sigma, of the axis that is known worst
     """
 
     bias_rad_s: float
     rest_s: float
     sigma_share: float
     disagreement: float
+    apart_mrad_s: float
+    sigma_mrad_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,6 +222,11 @@ class Evidence:
     refits: RefitFacts
     change: ChangeFacts
     gyro: GyroFacts
+
+    @property
+    def would_tell(self) -> str:
+        """What makes a heading that is not known well enough, or which motion is missing."""
+        return self.estimate.widened_by or f"{CIRCLES}; {self.motion.more_tilt}"
 
     @property
     def position_known(self) -> bool:

@@ -84,11 +84,14 @@ def test_rest_agrees_with_the_true_bias_and_not_with_another(world) -> None:
     assert bad.disagreement == pytest.approx(0.002 / np.hypot(1e-4, 1e-4), rel=0.1)
 
 
-def test_an_estimate_that_knows_nothing_does_not_agree(world) -> None:
+def test_a_bias_that_is_not_determined_is_judged_by_what_is_known_of_it(world) -> None:
+    """It is no sigma off, and 20 mrad/s: too far to be written, and not contradicted."""
     covariance = np.diag(np.r_[np.full(9, 1e-4), np.full(3, 0.02)]) ** 2
     off = world.BIAS + np.array([0.02, 0.0, 0.0])
     seen = world.evidence(world.Scene(), gyro_bias_rad_s=off, covariance=covariance).gyro
-    assert seen.disagreement > 50.0
+    assert seen.disagreement == pytest.approx(1.0, abs=0.02)
+    assert seen.apart_mrad_s == pytest.approx(20.0, abs=0.3)
+    assert seen.sigma_mrad_s == pytest.approx(20.0)
 
 
 def test_a_slow_steady_turn_is_no_rest(world) -> None:

@@ -155,6 +155,46 @@ def test_a_wrong_gyro_bias_never_passes(world) -> None:
     assert "stand still" in stopped["gyro_bias.agreement"]
 
 
+def test_a_gyro_bias_that_is_not_determined_never_passes_and_is_not_called_wrong(world) -> None:
+    covariance = np.diag(np.r_[np.full(9, 1e-3), 1e-4, 1e-4, 8e-3]) ** 2
+    off = world.BIAS + np.array([0.0, 0.0, 0.0072])
+    stopped = red(world.evidence(world.Scene(), gyro_bias_rad_s=off, covariance=covariance))
+    assert "gyro_bias.agreement" not in stopped
+    assert (
+        "7.2 mrad/s off what rest shows (limit 1.2), and known to +-8.0: turn"
+        in (stopped["gyro_bias.apart"])
+    )
+
+
+LEVEL_TOO_FEW = "the motion so far tells too little: turn through all headings"
+
+
+@pytest.mark.parametrize("gate", ["observability.converged", "observability.heading_sigma"])
+def test_advice_is_what_makes_the_most_of_the_doubt(good, gate) -> None:
+    doubtful = put(put(good, "estimate.converged", False), "estimate.heading_sigma_deg", 1.4)
+    told = red(put(doubtful, "estimate.widened_by", LEVEL_TOO_FEW))[gate]
+    assert told.endswith(f": {LEVEL_TOO_FEW}")
+    assert "two full circles" in red(doubtful)[gate]
+
+
+@pytest.mark.parametrize(
+    ("roll_deg", "pitch_deg", "asked"),
+    [
+        (3.0, 4.0, "pitch and roll by 30 deg if the vehicle can (so far roll +-3, pitch +-4 deg)"),
+        (3.0, 41.0, "roll by 30 deg if the vehicle can (so far roll +-3, pitch +-41 deg)"),
+        (31.0, 4.0, "pitch by 30 deg if the vehicle can (so far roll +-31, pitch +-4 deg)"),
+        (31.0, 41.0, "tilt was shown (so far roll +-31, pitch +-41 deg)"),
+        (math.nan, math.nan, "pitch and roll by 30 deg if the vehicle can (tilt not known yet)"),
+    ],
+)
+def test_tilt_that_was_shown_is_not_asked_for_again(good, roll_deg, pitch_deg, asked) -> None:
+    seen = put(put(good, "motion.roll_deg", roll_deg), "motion.pitch_deg", pitch_deg)
+    stopped = red(put(put(seen, "estimate.score", 0.1), "world.inclination_error_deg", 9.0))
+    for gate in ("observability.score", "field.inclination"):
+        assert stopped[gate].endswith(asked)
+    assert ("if the vehicle can" in stopped["observability.score"]) == ("shown" not in asked)
+
+
 def test_what_is_in_force_and_good_is_left_alone(world) -> None:
     stopped = red(world.evidence(world.Scene(), present=world.truth()))
     assert {"better.percent", "better.degrees", "better.certain"} <= set(stopped)

@@ -129,9 +129,11 @@ def drive(
 IDEAL = EstimatorParameters(imperfections=())
 
 
-def answer(made: Drive, *, at_once: int = 1) -> Estimate | None:
+def answer(
+    made: Drive, *, at_once: int = 1, parameters: EstimatorParameters = IDEAL
+) -> Estimate | None:
     """Of the estimator over the whole recording."""
-    estimator = Estimator(IDEAL, at_once=at_once)
+    estimator = Estimator(parameters, at_once=at_once)
     estimator.add(made.block)
     return estimator.finish()
 

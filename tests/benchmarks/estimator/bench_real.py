@@ -11,8 +11,9 @@ optical: broad/01, 02 and 21, each calibrated by itself and by each other, again
 punch:   one sensor on two people's fists: the hard iron must repeat
 rest:    nothing is observable: no answer is the right one
 honest:  errors over what was announced: RMS heading error against GPS course or optical attitude
-         beyond that of the oracle, over the expected worst, the lag that was found taken out; and
-         hard irons of the two halves of a recording, in their sigmas
+         beyond that of the oracle, over the expected worst, the lag that was found taken out, and
+         how the optical markers are mounted on the sensor, by the gyro alone; and hard irons of the
+         two halves of a recording, in their sigmas
 
 It reads the recordings beside the project and prints tables; the right answer is in no file.
 """
@@ -23,7 +24,7 @@ import argparse
 import json
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
@@ -53,6 +54,7 @@ BOSTON = Config(
 )
 QUICK = ("magical-ls", "magyc-bfg", "ellipsoid", "fnp")
 LEAST_SPEED_M_S = 4.0
+REMOUNTED_S, LARGEST_TURN_RAD = 0.1, 0.3  # steps in which rates are compared, and by how far
 ORACLE_EVERY = 10  # samples at 286 Hz
 BROAD_LAG_S = 0.0115  # the magnetometer trails the gyro by this in every trial
 BROAD = ("01_undisturbed_slow_rotation_A", "02_undisturbed_slow_rotation_B",
@@ -174,6 +176,30 @@ def without_lag(track: EvaluationTrack, lag_s: float) -> EvaluationTrack:
         track.accel_b_m_s2[:kept],
         covariates={name: values[:kept] for name, values in track.covariates.items()},
     )
+
+
+def remounted(track: EvaluationTrack) -> EvaluationTrack:
+    """The same with the optical attitude in the axes of the gyro, by the rates of both.
+
+    Markers that are turned against the sensor are no error of its calibration.
+    """
+    q = np.column_stack([track.covariates[name] for name in QUATERNION])
+    step = max(1, round(REMOUNTED_S / float(np.median(np.diff(track.time_s)))))
+    first = np.arange(0, len(track) - step, step)
+    first = first[np.isfinite(q[first]).all(axis=1) & np.isfinite(q[first + step]).all(axis=1)]
+    begin, end = (Rotation.from_quat(q[k], scalar_first=True) for k in (first, first + step))
+    turned = (begin.inv() * end).as_rotvec()
+    angle = np.cumsum(track.gyro_b_rad_s * np.gradient(track.time_s)[:, None], axis=0)
+    read = angle[first + step] - angle[first]
+    small = np.linalg.norm(turned, axis=1) < LARGEST_TURN_RAD
+    moved = turned[small] - turned[small].mean(axis=0), read[small] - read[small].mean(axis=0)
+    mounting = Rotation.align_vectors(*moved)[0]  # from the gyro's axes to the markers'
+    known = np.isfinite(q).all(axis=1)
+    q[known] = (Rotation.from_quat(q[known], scalar_first=True) * mounting).as_quat(
+        scalar_first=True
+    )
+    covariates = {**track.covariates, **dict(zip(QUATERNION, q.T, strict=True))}
+    return replace(track, covariates=covariates)
 
 
 def oracle(track: EvaluationTrack) -> ComparisonRow:
@@ -316,7 +342,7 @@ def honest(folder: Path) -> tuple[list[Announced], list[Halves]]:
     for path in (*broad, stick):
         own = answers[path]
         assert own is not None
-        shown[path] = without_lag(tracks[path], max(own.mag_lag_s, 0.0))
+        shown[path] = remounted(without_lag(tracks[path], max(own.mag_lag_s, 0.0)))
         reference = optical(shown[path])
         assert reference is not None
         references[path] = [reference]
