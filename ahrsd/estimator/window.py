@@ -22,7 +22,6 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.estimator import chain, noise, start
-from ahrsd.estimator.coherence import unaveraged
 from ahrsd.estimator.epoch import (
     FoldedInformation,
     Lag,
@@ -554,7 +553,7 @@ class Window:
     def covariance(self) -> Array:
         """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
 
-        What epochs disagree about is taken not to average out (`coherence`).
+        What epochs disagree about is taken not to average out (`noise.unaveraged`).
 
         What repeats with the attitude is taken to be smooth, as a room's gradient is. The answer
         itself is weighed as if it were not, which is nearer to what the data alone say.
@@ -568,7 +567,7 @@ class Window:
             rest = np.linalg.inv(untempered) - epochs.sum(axis=0)
             rest[:9, :9] -= graph.temper * graph.anchor[1]
             folded = rest, self.misfit.epochs
-        return unaveraged(
+        return noise.unaveraged(
             untempered * graph.temper,
             epochs,
             misfit=self._beyond_chance,

@@ -3,7 +3,7 @@
 One run is one seed: simulate, compute the bound, let every method answer at every time asked for.
 Each finished run is one line of a file, so that a stopped experiment goes on where it was
 (`resume`). The record of a seed does not depend on the others, so they may come in any order from
-as many processes; `ahrsd montecarlo` gives them to those of `fleet.crew`.
+as many processes; `ahrsd montecarlo` gives them to those of `fleet.processes`.
 """
 
 from __future__ import annotations

@@ -14,9 +14,14 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.estimator.epoch import with_drift
-from ahrsd.estimator.online import WHOLE, Estimator
+from ahrsd.estimator.online import (
+    WHOLE,
+    Estimator,
+    HeadingAdvice,
+    motion_and_misfit,
+    turned_heading_deg,
+)
 from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, EstimatorParameters
-from ahrsd.estimator.worth import HeadingAdvice, motion_and_misfit, turned_heading_deg
 from ahrsd.simulation import ScenarioSettings, simulate
 
 #: rolls, pitches and turns at once, as a diver does

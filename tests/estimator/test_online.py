@@ -14,7 +14,7 @@ import pytest
 from scipy.stats import chi2
 
 from ahrsd.calibration import Affine
-from ahrsd.estimator import worth
+from ahrsd.estimator import online
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.recording.table import read_table
@@ -156,7 +156,7 @@ def _tilted_over_level(run, estimate):
     scale = np.r_[np.full(6, size), np.ones(3)]
     covariance = estimate.covariance[:9, :9] * np.outer(scale, scale)
     dip = np.arcsin(bench.FIELD_N_GAUSS[2] / size)
-    level = worth.heading_sigma_deg(c, covariance, np.array([[0.0, 0.0, 1.0]]), dip)
+    level = online.heading_sigma_deg(c, covariance, np.array([[0.0, 0.0, 1.0]]), dip)
     return estimate.heading_sigma_deg / level
 
 
@@ -472,12 +472,12 @@ def test_names_of_what_is_not_seen_do_not_hang_on_the_basis():
     """Equal eigenvalues leave the basis open: another processor has another one."""
     rng = np.random.default_rng(5)
     V = np.linalg.qr(rng.normal(size=(12, 9)))[0]
-    names = worth.blind_names(V)
+    names = online.blind_names(V)
     assert len(names) == len(set(names)) == 9
     for _ in range(20):
         R = np.linalg.qr(rng.normal(size=(9, 9)))[0]
-        assert worth.blind_names(V @ R) == names
+        assert online.blind_names(V @ R) == names
     axes = np.eye(12)[:, [5, 8, 11]]
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    assert worth.blind_names(axes @ R) == ("soft iron zz", "hard iron z", "gyro bias z")
-    assert worth.blind_names(axes[:, :0]) == ()
+    assert online.blind_names(axes @ R) == ("soft iron zz", "hard iron z", "gyro bias z")
+    assert online.blind_names(axes[:, :0]) == ()

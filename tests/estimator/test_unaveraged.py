@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.estimator.coherence import unaveraged
+from ahrsd.estimator.noise import unaveraged
 
 NOTHING = np.zeros((2, 2)), 0.0
 #: four epochs tell the first number, the last of them the second one as well
