@@ -227,8 +227,9 @@ def variance_inflation(
 # What misfit does to an answer that has many epochs: it does not average out.
 #
 # What epochs disagree about beyond their noise comes from a field that differs by place, a drift,
-# an instrument. Each epoch is bent by it, and nothing says that the next is bent another way: the part
-# that is the same in all of them is an error of the answer, and is not seen in their disagreement.
+# an instrument. Each epoch is bent by it, and nothing says that the next is bent another way: the
+# part that is the same in all of them is an error of the answer, and is not seen in their
+# disagreement.
 # The least that may be assumed of it is that it is as large as the part that is seen.
 #
 # An epoch with information S asks for a gradient of covariance (misfit - 1) S beyond its noise,
