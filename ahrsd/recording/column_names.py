@@ -2,7 +2,8 @@
 
 The canonical names carry their units (`mag_x_gauss`). Other names are told by the user
 (`--columns mag_x=MagX:uT`) or known from a program that everybody uses; capitals and blanks do not
-count. What is missing is answered with the option that would give it.
+count. What is missing is answered with the option that would give it, and a size that is that of
+another unit (tesla, mG, deg/s) with the option that names it.
 """
 
 from __future__ import annotations
@@ -356,3 +357,61 @@ def _covariates(names: Sequence[str], used: set[str], taken: set[str]) -> dict[s
             continue
         out[name] = column
     return out
+
+
+# -- Another unit, by the size of what was read ----------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class VectorRange:
+    """Where the median magnitude of a vector must lie, and what it looks like elsewhere."""
+
+    columns: tuple[str, str, str]
+    minimum: float
+    maximum: float
+    unit: str
+    above: tuple[tuple[float, str], ...]  # from this magnitude on it looks like that unit
+    below: tuple[float, float, str] | None = None  # between these it looks like that unit
+
+
+# Above 10 G no VN-100 reads (2.5 G full scale); 20 rad/s is a sustained 1150 deg/s.
+RANGES = (
+    VectorRange(
+        MAG, 0.01, 10.0, "gauss", ((5000.0, "nT"), (200.0, "mG"), (10.0, "uT")), (1e-5, 1e-3, "T")
+    ),
+    VectorRange(GYRO, 0.0, 20.0, "rad/s", ((20.0, "deg/s"),)),
+)
+
+
+def other_unit(
+    median: float, limits: VectorRange, sources: Mapping[str, Source]
+) -> tuple[str, str] | None:
+    """What is wrong with a vector of this median magnitude, and the remedy; None: nothing."""
+    if limits.minimum <= median <= limits.maximum:
+        return None
+    own = [sources.get(name, Source(name)) for name in limits.columns]
+    factor = abs(own[0].factor)
+    native = median / factor  # as the file has it
+    guess = next((unit for level, unit in limits.above if native > level), None)
+    if limits.below is not None and limits.below[0] <= native <= limits.below[1]:
+        guess = limits.below[2]
+    if factor != 1.0 and limits.minimum < native <= limits.maximum and guess is None:
+        guess = limits.unit
+    words = f"it looks like {guess}" if guess else "it looks like another unit or a dead sensor"
+    read_as = limits.unit if factor == 1.0 else f"times {factor:g} is {median:.4g} {limits.unit}"
+    name = printable(own[0].column)
+    return (
+        f"columns {name} ... : median magnitude {native:.4g} {read_as}, {words}",
+        f"convert it to {limits.unit}{_with_option(limits, [one.column for one in own], guess)}",
+    )
+
+
+def _with_option(limits: VectorRange, columns: list[str], unit: str | None) -> str:
+    if unit is None:
+        return ""
+    short = [name.removesuffix("_gauss").removesuffix("_rad_s") for name in limits.columns]
+    pairs = [
+        f"{a}={printable(b).replace(',', chr(92) + ',')}:{unit}"
+        for a, b in zip(short, columns, strict=True)
+    ]
+    return f", or say so: --columns {','.join(pairs)}"

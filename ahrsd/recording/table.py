@@ -37,12 +37,14 @@ from ahrsd.recording.column_names import (
     GYRO,
     MAG,
     NO_MAP,
+    RANGES,
     REQUIRED,
     TIME,
     ColumnError,
     ColumnMap,
     Resolved,
     Source,
+    other_unit,
     resolve,
 )
 from ahrsd.recording.limits import (
@@ -63,25 +65,6 @@ GAP_FACTOR = 1.6
 GAP_PERCENTILE = 95.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Range:
-    """Where the median magnitude of a vector must lie, and what it looks like elsewhere."""
-
-    columns: tuple[str, str, str]
-    minimum: float
-    maximum: float
-    unit: str
-    above: tuple[tuple[float, str], ...]  # from this magnitude on it looks like that unit
-    below: tuple[float, float, str] | None = None  # between these it looks like that unit
-
-
-# Above 10 G no VN-100 reads (2.5 G full scale); 20 rad/s is a sustained 1150 deg/s.
-_RANGES = (
-    _Range(
-        MAG, 0.01, 10.0, "gauss", ((5000.0, "nT"), (200.0, "mG"), (10.0, "uT")), (1e-5, 1e-3, "T")
-    ),
-    _Range(GYRO, 0.0, 20.0, "rad/s", ((20.0, "deg/s"),)),
-)
 _STEP_S = (1e-4, 2.0)  # 10 kHz ... 0.5 Hz: other units of time end outside
 _TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
 _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
@@ -187,8 +170,10 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
     columns.drop_doubles()
     columns.set_clock()
     if check_units:
-        for limits in _RANGES:
-            _check_units(path, columns.vectors(limits.columns), limits, columns.sources)
+        for limits in RANGES:
+            size = float(np.median(np.linalg.norm(columns.vectors(limits.columns), axis=1)))
+            if wrong := other_unit(size, limits, columns.sources):
+                raise RecordingError(path, *wrong)
     accel = columns.acceleration()
     _check_length(path, len(accel))
     return columns.table(accel)
@@ -631,39 +616,6 @@ def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
             f"column time_s: {median_s:g} s from row to row is no sensor's rate",
             f"give the time in seconds{hint}",
         )
-
-
-def _check_units(path: Path, vectors: Array, limits: _Range, sources: Mapping[str, Source]) -> None:
-    median = float(np.median(np.linalg.norm(vectors, axis=1)))
-    if limits.minimum <= median <= limits.maximum:
-        return
-    own = [sources.get(name, Source(name)) for name in limits.columns]
-    factor = abs(own[0].factor)
-    native = median / factor  # as the file has it
-    guess = next((unit for level, unit in limits.above if native > level), None)
-    if limits.below is not None and limits.below[0] <= native <= limits.below[1]:
-        guess = limits.below[2]
-    if factor != 1.0 and limits.minimum < native <= limits.maximum and guess is None:
-        guess = limits.unit
-    words = f"it looks like {guess}" if guess else "it looks like another unit or a dead sensor"
-    read_as = limits.unit if factor == 1.0 else f"times {factor:g} is {median:.4g} {limits.unit}"
-    name = printable(own[0].column)
-    raise RecordingError(
-        path,
-        f"columns {name} ... : median magnitude {native:.4g} {read_as}, {words}",
-        f"convert it to {limits.unit}{_with_option(limits, [one.column for one in own], guess)}",
-    )
-
-
-def _with_option(limits: _Range, columns: list[str], unit: str | None) -> str:
-    if unit is None:
-        return ""
-    short = [name.removesuffix("_gauss").removesuffix("_rad_s") for name in limits.columns]
-    pairs = [
-        f"{a}={printable(b).replace(',', chr(92) + ',')}:{unit}"
-        for a, b in zip(short, columns, strict=True)
-    ]
-    return f", or say so: --columns {','.join(pairs)}"
 
 
 def _steps(time_s: Array, known: tuple[int, ...] = ()) -> tuple[Array, tuple[int, ...]]:
