@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.config.core_settings import core_settings
-from ahrsd.config.loading import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.track import NothingToFit, Track
