@@ -92,13 +92,17 @@ def _borne_out(
     """The set without members that are not sure, and the log odds of the others."""
     while True:
         own = [key for key in best.names if key not in all_sets.remainder]
-        rivals = {key: _without(all_sets, space, best, key) for key in own}
+        real = all_sets.is_real(best.names)
+        asked = {key: _asked_odds(all_sets, key, real) for key in own}
+        rivals = {key: all_sets.judge(best.names - {key}, best) for key in own}
+        if all(best.score - rivals[key].score >= asked[key] for key in own):
+            rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        real = any(key in all_sets.remainder for key in best.names)
-        unsure = [key for key in own if odds[key] < _asked_odds(all_sets, key, real)]
+        unsure = [key for key in own if odds[key] < asked[key]]
         if not unsure:
             return best, odds
-        best = rivals[min(unsure, key=lambda one: odds[one])]
+        key = min(unsure, key=lambda one: odds[one])
+        best = _without(all_sets, space, best, key)
 
 
 def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
@@ -122,7 +126,7 @@ def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> 
     tried = [fewer]
     if all_sets.component(key).effect is not None:
         tried += [fewer | {course} for course in space.courses if course not in fewer]
-    judged = [all_sets.judge(names) for names in tried]
+    judged = [all_sets.judge(names, best) for names in tried]
     return max(judged, key=lambda one: one.score)
 
 
@@ -172,8 +176,7 @@ def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Arra
         width = all_sets.component(one).width
         if one == key:
             part = slice(begin, begin + width)
-            variance = np.sum(best.at.root[:, part] ** 2, axis=0)
-            return best.at.mean[part], np.sqrt(variance)
+            return best.at.mean[part], best.at.deviation[part]
         begin += width
     raise KeyError(key)
 

@@ -250,6 +250,20 @@ def moved(made: Linearised, keys: Sequence[str], at: At, share: float = 1.0) -> 
     return Point(problem, filtered, values, mag, gyro, left)
 
 
+def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array]:
+    """How far the likeliest calibration and delay are from the point, and how well known."""
+    prior = prior_of(made.point.problem.track).mean
+    before = {
+        CALIBRATION: coefficients(made.point.filtered.model) - prior,
+        **{key: made.point.values.get(key, np.zeros(1)) for key in made.exact},
+    }
+    value = by_key(made, keys, at)
+    deviation = by_key(made, keys, replace(at, mean=at.deviation))
+    asked = [key for key in keys if key in before]
+    off = [value[key] - before[key] for key in asked]
+    return np.concatenate(off), np.concatenate([deviation[key] for key in asked])
+
+
 def _no_louder(found: NullModel, before: NullModel) -> NullModel:
     """The noise that was found, but for what is louder than before: that would be the misfit's."""
     return replace(

@@ -61,24 +61,43 @@ class Hypotheses:
         """By its key."""
         return self.made.seen[key].component
 
-    def judge(self, names: Iterable[str]) -> Hypothesis:
-        """The set with these members beside the calibration."""
+    def judge(self, names: Iterable[str], near: Hypothesis | None = None) -> Hypothesis:
+        """The set with these members beside the calibration.
+
+        near: a set of the same class from whose noise and sizes the climb begins, which is short;
+        else it begins where the richest model is
+        """
         members = frozenset(names)
         if members not in self.judged:
             forms = [self.forms[key] for key in members if key in self.forms]
             keys = (CALIBRATION, *sorted(members), *sorted(forms))
-            real = any(key in members for key in self.remainder)
+            real = self.is_real(members)
             step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
             products = self.made.products(keys, step)
             laws = [self.component(key).law for key in keys]
-            psi = [self.start_psi.get(k, law.start) for k, law in zip(keys, laws, strict=True)]
-            start = (self.start_noise, np.concatenate([*psi, np.zeros(0)]))
-            at = maximised(products, laws, [start])
+            noise, known = self.start_noise, self.start_psi
+            if near is not None and real == self.is_real(near.names):
+                noise, known = near.at.log_noise, {**known, **self.psi_of(near)}
+            psi = [known.get(key, law.start) for key, law in zip(keys, laws, strict=True)]
+            at = maximised(products, laws, [(noise, np.concatenate([*psi, np.zeros(0)]))])
             score = at.nats + sum(self.component(key).prior for key in members)
             score += self._again(members)
             score += self._of_class(members)
             self.judged[members] = Hypothesis(members, keys, at, score)
         return self.judged[members]
+
+    def is_real(self, members: Names) -> bool:
+        """Whether a set leaves what real recordings do."""
+        return any(key in members for key in self.remainder)
+
+    def psi_of(self, known: Hypothesis) -> dict[str, Array]:
+        """Hyperparameters of each of a set's components."""
+        out, begin = {}, 0
+        for key in known.keys:
+            width = len(self.component(key).law.start)
+            out[key] = known.at.psi[begin : begin + width]
+            begin += width
+        return out
 
     def _again(self, members: Names) -> float:
         """What was put on is taken off: a further step of one kind is no rare thing."""
@@ -87,7 +106,7 @@ class Hypotheses:
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
 
     def _of_class(self, members: Names) -> float:
-        real = any(key in members for key in self.remainder)
+        real = self.is_real(members)
         return float(np.log(priors.REAL if real else 1.0 - priors.REAL))
 
 
@@ -160,7 +179,7 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
             break
         here = todo[0]
         done.add(here.names)
-        reached = [all_sets.judge(names) for names in moves(all_sets, space, here)]
+        reached = [all_sets.judge(names, here) for names in moves(all_sets, space, here)]
         beam = _best([*beam, *reached])
     return beam
 
@@ -214,7 +233,7 @@ def surprises(residual: Array, time_s: Array) -> list[float]:
 
 def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
     """The likeliest setting of each of the likeliest effects, beside a base in here's noise."""
-    model = all_sets.judge(base)
+    model = all_sets.judge(base, here)
     at = here.at_of(model)
     had = {all_sets.component(key).effect for key in base}
     steps = {name for name in had if name and name.endswith("_step")}

@@ -52,9 +52,8 @@ def profiles(path: Path) -> dict[str, list[list[float]]]:
     track, _ = without_jumps(roles.prepared(track)[0])
     problem, cold = problem_of(put_right(track, hygiene(track)), Spec(), {}, LIMITS)
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    base = rich.base_of(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
-    made, remainder, keys = base.made, base.remainder, base.whole
-    at = rich.fitted(made, keys)
+    found = rich.richest(problem, fit.filtered, EFFECTS)
+    made, remainder, keys, at = found.base.made, found.base.remainder, found.base.whole, found.at
     products = made.products(keys, priors.NOISE_STEP_REAL)
     laws = [made.seen[key].component.law for key in keys]
     out, begin = {}, 0
