@@ -17,7 +17,7 @@ from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, scanned
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
@@ -187,7 +187,8 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     fewer = all_sets.judge(best.names - {key})
     named = {all_sets.component(k).effect for k in fewer.names}
     asked = [k for name, keys in space.effects.items() if name not in named for k in keys]
-    worth = scanned(all_sets.made, fewer.keys, best.at_of(fewer), [*dict.fromkeys([*asked, key])])
+    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+    worth = scan.worth([*dict.fromkeys([*asked, key])])
     by_name: dict[str, float] = {}
     for k, nats in worth.items():
         one = all_sets.component(k)

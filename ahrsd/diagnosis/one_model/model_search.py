@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky, solve_triangular
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
@@ -110,32 +110,47 @@ class Hypotheses:
         return float(np.log(priors.REAL if real else 1.0 - priors.REAL))
 
 
-def scanned(
-    made: Linearised, keys: Sequence[str], at: At, candidates: Sequence[str]
-) -> dict[str, float]:
-    """Log Bayes factor of each candidate beside a model, in its noise, sizes averaged."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Beside:
+    """A model in its noise, beside which candidates are asked.
+
+    root: lower, of the information of its coefficients with their prior;  seen: root^-1 s
+    """
+
+    made: Linearised
+    keys: Sequence[str]
+    inverse: Array
+    root: Array
+    seen: Array
+
+    def worth(self, candidates: Sequence[str]) -> dict[str, float]:
+        """Log Bayes factor of each candidate, sizes averaged."""
+        C, own, s = self.made.candidates(self.keys, candidates, self.inverse)
+        W = solve_triangular(self.root, C, lower=True, check_finite=False)
+        left = s - self.seen @ W
+        out, begin = {}, 0
+        for key, square in zip(candidates, own, strict=True):
+            part = slice(begin, begin + len(square))
+            begin += len(square)
+            G = square - W[:, part].T @ W[:, part]
+            out[key] = averaged(G, left[part], self.made.seen[key].component)
+        return out
+
+
+def beside(made: Linearised, keys: Sequence[str], at: At) -> Beside:
+    """A model beside which candidates are asked."""
     products = made.products(keys, priors.NOISE_STEP_REAL)
     inverse = np.exp(-at.log_noise)
-    laws = [made.seen[key].component.law for key in keys]
     phi, begin = [], 0
-    for law in laws:
+    for law in (made.seen[key].component.law for key in keys):
         width = len(law.start)
         phi.append(law.log_variance(at.psi[begin : begin + width]))
         begin += width
     A = np.tensordot(inverse, products.G, 1)
     A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
-    factor = cho_factor(A)
-    s = inverse @ products.s
-    solved = cho_solve(factor, s)
-    out = {}
-    made.gram_between(keys, candidates)
-    for key in candidates:
-        C = np.concatenate([np.tensordot(inverse, made.pair(one, key), 1) for one in keys], axis=0)
-        own = np.tensordot(inverse, made.pair(key, key), 1)
-        G = own - C.T @ cho_solve(factor, C)
-        left = inverse @ made.cross(key) - C.T @ solved
-        out[key] = averaged(G, left, made.seen[key].component)
-    return out
+    root = cholesky(A, lower=True, check_finite=False)
+    seen = solve_triangular(root, inverse @ products.s, lower=True, check_finite=False)
+    return Beside(made, tuple(keys), inverse, root, seen)
 
 
 def averaged(G: Array, s: Array, component: Component) -> float:
@@ -242,7 +257,8 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         for key in keys if key not in base
     ]  # fmt: skip
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
-    worth = scanned(all_sets.made, model.keys, at, candidates)
+    scan = beside(all_sets.made, model.keys, at)
+    worth = scan.worth(candidates)
     best: dict[str, tuple[float, str]] = {}
     for key, nats in worth.items():
         one = all_sets.component(key)
@@ -250,7 +266,7 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         if total > best.get(one.effect or key, (-np.inf, ""))[0]:
             best[one.effect or key] = (total, key)
     ranked = sorted(best.values(), reverse=True)[:ASKED]
-    return [sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0]
+    return [sought(all_sets, space, scan, key) for total, key in ranked if total > 0.0]
 
 
 def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
@@ -268,16 +284,16 @@ def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
     )
 
 
-def sought(all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str) -> str:
+def sought(all_sets: Hypotheses, space: Space, scan: Beside, key: str) -> str:
     """The candidate with its onset and scale sought more and more finely."""
     made = all_sets.made
-    worth = scanned(made, keys, at, [key])[key] + all_sets.component(key).prior
+    worth = scan.worth([key])[key] + all_sets.component(key).prior
     for round_ in range(FINER):
         near = space.finer(all_sets.component(key), round_)
         if not near:
             break
         made.add(near)
-        found = scanned(made, keys, at, [one.key for one in near])
+        found = scan.worth([one.key for one in near])
         total = {one: nats + all_sets.component(one).prior for one, nats in found.items()}
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:

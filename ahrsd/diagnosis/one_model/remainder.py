@@ -33,12 +33,12 @@ def ordinary_remainder(context: Context) -> list[Component]:
         _sized(context, "by_direction", "sensor", harmonics(context.smooth_b)),
         by_change(context),
         _sized(context, "field_by_rate", "sensor", context.rate_b_rad_s),
-        bending(context),
         _sized(context, "by_rate_squared", "gyro", squares(context.rate_b_rad_s)),
         gyro_matrix(context),
     ]
     if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
         found.append(_sized(context, "by_force", "gyro", context.force_b_m_s2 / _GRAVITY))
+        found.append(bending(context))
     return found
 
 

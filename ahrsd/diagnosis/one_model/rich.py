@@ -77,7 +77,6 @@ def base_of(
     made.exact = (LAG,)
     made.add(parts)
     made.put_back({key: value for key, value in point.values.items() if key in made.seen})
-    made.gram_of([CALIBRATION, *(one.key for one in parts)])
     remainder = tuple(one.key for one in rest)
     small = (CALIBRATION, *(one.key for one in (*lags, *known, *driven)))
     return Base(made, remainder, small, (*small, *remainder, *RICH_COURSES) if whole else small)
