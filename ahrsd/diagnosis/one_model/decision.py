@@ -16,6 +16,7 @@ from ahrsd.diagnosis.diagnosis import Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.values import Term
@@ -94,7 +95,7 @@ def _borne_out(
         own = [key for key in best.names if key not in all_sets.remainder]
         real = all_sets.is_real(best.names)
         asked = {key: _asked_odds(all_sets, key, real) for key in own}
-        rivals = {key: all_sets.judge(best.names - {key}, best) for key in own}
+        rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
         if all(best.score - rivals[key].score >= asked[key] for key in own):
             rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
@@ -112,17 +113,16 @@ def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
 
 
 def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
-    """Whether a named member is no larger than what real recordings ordinarily have of its kind."""
-    form = priors.ORDINARY_FORM_OF.get(all_sets.component(key).effect or "")
-    if form is None or form not in best.names:
+    """Whether a member is no larger than what real recordings ordinarily have of its kind."""
+    if key == LAG or not all_sets.is_real(best.names):
         return False
-    value, _ = coefficients(all_sets, best, key)
-    return float(np.max(np.abs(value))) < priors.ORDINARY[form].up_to()
+    kind = all_sets.component(key).effect or key
+    return size_of(all_sets, best, key) < priors.ORDINARY_EFFECT.get(kind, 0.0)
 
 
 def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
     """The likeliest set without a member: with nothing or a course in its place."""
-    fewer = best.names - {key}
+    fewer = all_sets.without(best.names, key)
     tried = [fewer]
     if all_sets.component(key).effect is not None:
         tried += [fewer | {course} for course in space.courses if course not in fewer]
@@ -235,32 +235,30 @@ def _left(
 ) -> Unexplained:
     """What no name explains, where that is beyond the ordinary."""
     courses = [key for key in space.courses if key in best.names]
+    courses = [key for key in courses if not _is_ordinary(all_sets, best, key)]
     if courses:
         key = max(courses, key=lambda one: odds[one])
         return _course(all_sets, best, key, odds[key])
     for key, size in priors.ORDINARY.items():
-        component = next((k for k in best.names if k == key), None)
-        if component is None:
+        if key not in best.names or size_of(all_sets, best, key) < size.up_to():
             continue
-        found = size_of(all_sets, best, key)
-        if found > size.up_to():
-            frame = all_sets.component(key).frame
+        nats = best.score - all_sets.judge(best.names - {key}, best).score
+        if nats > priors.ODDS_REAL:
+            frame, found = all_sets.component(key).frame, size_of(all_sets, best, key)
             unit = "rad/s" if frame == "gyro" else "gauss"
-            nats = best.score - all_sets.judge(best.names - {key}).score
             where = Where((), AXES, frame, f"a part of what is left ({key})")
             return Unexplained(True, where, None, found, unit, evidence_nats=nats)
     return Unexplained(False)
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """The size of a component of the remainder, in its unit."""
-    begin = 0
-    for one in best.keys:
-        law = all_sets.component(one).law
-        if one == key:
-            return float(np.exp(best.at.psi[begin])) * float(getattr(law, "unit", 1.0))
-        begin += len(law.start)
-    raise KeyError(key)
+    """How large a member is: an effect in its usual scales, all else its deviation in its unit."""
+    one = all_sets.component(key)
+    if one.effect is not None and isinstance(one.law, Sized):
+        value, _ = coefficients(all_sets, best, key)
+        return float(np.max(np.abs(value) / one.law.scale))
+    psi = all_sets.psi_of(best)[key]
+    return float(np.exp(psi[0])) * float(getattr(one.law, "unit", 1.0))
 
 
 def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Unexplained:

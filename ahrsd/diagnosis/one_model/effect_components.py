@@ -26,6 +26,8 @@ NOT_ASKED = (
     LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
     "rotor_field",
 )  # fmt: skip
+#: part of the squares that may be left where one component's columns hold another's
+_ALIKE = 1e-3
 #: parts in which the transition of a step is free
 _PIECES = 4
 #: parts of a recording's length, and factors, to which onsets and scales are sought
@@ -84,6 +86,17 @@ def delay(context: Context, library: Mapping[str, Effect]) -> Component:
     odds = float(np.log(priors.ORDINARY_EFFECTS[LAG]))
     law = Fixed(np.array([priors.ORDINARY_LAG_S**2]))
     return Component(LAG, "sensor", library[LAG].columns(context, {}), law, odds, LAG)
+
+
+def holds(one: Component, part: Component) -> bool:
+    """Whether a component can be all that another is: its columns are among the first's."""
+    mine, other = one.columns.mag, part.columns.mag
+    if mine is None or other is None or one.columns.gyro is not None or one.width <= part.width:
+        return False
+    X, y = mine.reshape(-1, one.width), other.reshape(-1, part.width)
+    G = X.T @ X
+    left = y - X @ np.linalg.lstsq(G, X.T @ y, rcond=None)[0]
+    return float(np.sum(left**2)) < _ALIKE * float(np.sum(y**2))
 
 
 def delay_form(context: Context, lag_s: float) -> Component:

@@ -15,6 +15,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import At, maximised
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
 from ahrsd.samples import Array
@@ -48,6 +49,7 @@ class Hypotheses:
     remainder: keys of what every real recording leaves, in or out together
     start: noise (B,) and psi by key that the richest model has
     forms: key of what a component leaves of its form, which comes and goes with it
+    beside_delay: effects of which a delay is a part: they are asked beside it, not in its place
     """
 
     made: Linearised
@@ -55,6 +57,7 @@ class Hypotheses:
     start_noise: Array
     start_psi: Mapping[str, Array]
     forms: dict[str, str] = field(default_factory=dict)
+    beside_delay: frozenset[str] = frozenset()
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
 
     def component(self, key: str) -> Component:
@@ -85,6 +88,14 @@ class Hypotheses:
             score += self._of_class(members)
             self.judged[members] = Hypothesis(members, keys, at, score)
         return self.judged[members]
+
+    def without(self, members: Names, key: str) -> Names:
+        """The set without a member, and without what is asked only beside it."""
+        if key != LAG:
+            return members - {key}
+        return (
+            members - {key} - {k for k in members if self.component(k).effect in self.beside_delay}
+        )
 
     def is_real(self, members: Names) -> bool:
         """Whether a set leaves what real recordings do."""
@@ -209,7 +220,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     names = here.names
     _propose_steps(all_sets, space, here)
     own = [key for key in names if key not in all_sets.remainder]
-    out = [names - {key} for key in own]
+    out = [all_sets.without(names, key) for key in own]
     courses = [key for key in space.courses if key not in names]
     out += [names | {key} for key in courses]
     rest = frozenset(all_sets.remainder)
@@ -257,6 +268,9 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         for key in keys if key not in base
     ]  # fmt: skip
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
+    if LAG not in base:
+        part = all_sets.beside_delay
+        candidates = [key for key in candidates if all_sets.component(key).effect not in part]
     scan = beside(all_sets.made, model.keys, at)
     worth = scan.worth(candidates)
     best: dict[str, tuple[float, str]] = {}

@@ -9,7 +9,7 @@ calibration is the one beside them, and a name has to do better than they do.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     moved,
     step_of,
 )
-from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
+from ahrsd.diagnosis.one_model.remainder import ordinary_remainder, resting_places
 from ahrsd.diagnosis.problem import Problem
 
 #: linearisations, and nats that a further one must gain
@@ -47,13 +47,12 @@ RICH_COURSES = ("free sensor",)
 class Base:
     """A linearisation with everything but candidates.
 
-    remainder: keys of what real recordings leave;  small, whole: keys of the model of the first
-    steps (calibration, delay, logged causes), and of the richest that is in
+    remainder: keys of what real recordings leave;  whole: keys of the richest model, or of that of
+    the first steps: calibration, delay, logged causes, places at rest
     """
 
     made: Linearised
     remainder: tuple[str, ...]
-    small: tuple[str, ...]
     whole: tuple[str, ...]
 
 
@@ -66,7 +65,8 @@ def base_of(
     """
     made = linearised(point)
     context = made.context
-    rest = ordinary_remainder(context) if whole else []
+    recorded = point.problem.recorded
+    rest = (ordinary_remainder if whole else resting_places)(context, recorded)
     courses = [course(context, frame) for frame in FRAMES] if whole else []
     lags = [delay(context, library)]
     if point.problem.lag_s != 0.0:
@@ -78,8 +78,8 @@ def base_of(
     made.add(parts)
     made.put_back({key: value for key, value in point.values.items() if key in made.seen})
     remainder = tuple(one.key for one in rest)
-    small = (CALIBRATION, *(one.key for one in (*lags, *known, *driven)))
-    return Base(made, remainder, small, (*small, *remainder, *RICH_COURSES) if whole else small)
+    few = (CALIBRATION, *(one.key for one in (*lags, *known, *driven)), *remainder)
+    return Base(made, remainder, (*few, *RICH_COURSES) if whole else few)
 
 
 def fitted(made: Linearised, keys: Sequence[str], step: float = priors.NOISE_STEP_REAL) -> At:
@@ -111,20 +111,43 @@ def richest(problem: Problem, filtered: Filtered, library: Mapping[str, Effect])
     First the delay and the logged causes alone, beside noise of any spectrum: a delay of a tenth of
     a second, or a motor's current, bend everything else that is fitted beside them.
     """
-    small = settled(first_point(problem, filtered), library, (), whole=False)
-    return settled(small.base.made.point, library, (), whole=True)
+    small = _settled(_likeliest_delay(problem, filtered, library), library, (), whole=False)
+    return settled(small.base.made.point, library, ())
 
 
-def settled(
-    point: Point, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool
+def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Judged:
+    """The small model at the likeliest of some delays, sought up and down from none.
+
+    Beside a calibration that a long delay has bent, what is linear in it may point the other way.
+    """
+
+    def at(lag_s: float) -> Judged:
+        if lag_s == 0.0:
+            return judged(first_point(problem, filtered), library, (), whole=False)
+        start = first_point(problem.lagging(lag_s), filtered)
+        start = replace(start, values={LAG: np.array([lag_s])})
+        return judged(start, library, (), whole=False)
+
+    best = at(0.0)
+    for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
+        while (found := at(best.base.made.point.problem.lag_s + way)).nats > best.nats:
+            best = found
+    return best
+
+
+def settled(point: Point, library: Mapping[str, Effect], named: Sequence[Component]) -> Judged:
+    """The point moved to where the richest model with these names is likeliest."""
+    return _settled(judged(point, library, named), library, named, whole=True)
+
+
+def _settled(
+    here: Judged, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool
 ) -> Judged:
-    """The point moved to where the richest model with these names is likeliest.
+    """Moved while that makes the model likelier.
 
     A step that makes it less likely, linear as it is, is taken in part or not at all; none is taken
     that is less than the calibration and the delay are known to.
-    whole: the richest model, else the small one
     """
-    here = judged(point, library, named, whole=whole)
     for _ in range(ROUNDS):
         if _is_there(here):
             return here

@@ -30,7 +30,7 @@ def answered(
         if not named:
             break
         real = any(key in all_sets.remainder for key in answer.best.names)
-        found = rich.settled(all_sets.made.point, library, named, whole=True)
+        found = rich.settled(all_sets.made.point, library, named)
         all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)
         if decision.names_of(all_sets, answer.best) == before:

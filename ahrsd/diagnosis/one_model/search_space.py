@@ -12,6 +12,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     STEPS,
     component,
     form_of,
+    holds,
     library_components,
     neighbours,
 )
@@ -28,9 +29,9 @@ _ONSETS = 200
 def best_at(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
-    """The likeliest set at a richest model, searched from the names that are known and from nothing."""
+    """The likeliest set at a richest model, searched from what is known and from nothing."""
     base = rich.base
-    all_sets, space = _space(rich, library, named)
+    all_sets, space = space_at(rich, library, named)
     real = frozenset(base.remainder)
     known = frozenset(one.key for one in named)
     lag = frozenset([LAG])
@@ -42,15 +43,18 @@ def best_at(
     return all_sets, space, found[0]
 
 
-def _space(
+def space_at(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
+    """The sets at a richest model, none judged yet, and what they may be made of."""
     base = rich.base
     made, context = base.made, base.made.context
     found = library_components(context, library)
     effects = {name: [one.key for one in parts] for name, parts in found.items()}
     made.add([one for parts in found.values() for one in parts])
     effects[LAG] = [LAG]
+    delay = made.seen[LAG].component
+    nested = frozenset(name for name, parts in found.items() if holds(parts[0], delay))
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])
@@ -63,7 +67,7 @@ def _space(
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
     psi = psi_by_key(made, base.whole, rich.at)
-    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms)
+    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, nested)
     length_s = context.track.duration_s
 
     def finer(one: Component, round_: int) -> list[Component]:
