@@ -92,23 +92,22 @@ BANDS = 7
 #: stay below, in units of the effect's usual scale (of a course gauss, rad/s); beside the remainder
 #: it is a finding only where it is larger;  source: the same command
 ORDINARY_EFFECT: Mapping[str, float] = {
-    "eddy_current": 13,
-    "field_anomaly": 16,
-    "field_step": 2,
-    "free sensor": 0.1,
-    "gyro_nonlinearity": 16,
-    "gyro_nonorthogonality": 26,
-    "gyro_scale": 40,
+    "eddy_current": 2.6,
+    "field_anomaly": 5.5,
+    "field_step": 1.2,
+    "free sensor": 0.038,
+    "gyro_nonlinearity": 0.66,
+    "gyro_scale": 38,
     "hard_iron_drift": 22,
-    "hard_iron_step": 24,
-    "hysteresis": 32,
-    "mag_cross_axis": 61,
-    "mag_gyro_misalignment": 87,
-    "mag_nonlinearity": 63,
-    "onboard_calibration_active": 9.5,
-    "soft_iron_step": 52,
-    "vibration_rectification": 19,
-    "viscous_magnetisation": 41,
+    "hard_iron_step": 2.2,
+    "hysteresis": 20,
+    "mag_cross_axis": 26,
+    "mag_gyro_misalignment": 19,
+    "mag_nonlinearity": 41,
+    "onboard_calibration_active": 5.6,
+    "soft_iron_step": 47,
+    "vibration_rectification": 6.3,
+    "viscous_magnetisation": 28,
 }
 
 # --- the decision -------------------------------------------------------------------------------

@@ -128,7 +128,7 @@ def law_of(curves: list[list[list[float]]]) -> priors.Size:
 def ordinary_effects(known: list[dict[str, Any]]) -> dict[str, float]:
     """Of each effect the size that one in ten of all recordings is beyond; none where it is nil."""
     out = {}
-    beyond = len(known) // 10
+    beyond = round(len(known) / 10)
     for name in sorted({name for one in known for name in one["effects"]}):
         found = [one["effects"].get(name, [0.0, 0.0]) for one in known]
         sizes = sorted((size for size, nats in found if nats > 0.0), reverse=True)
