@@ -19,6 +19,7 @@ from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
+from ahrsd.diagnosis.one_model.remainder import still_spells
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
@@ -117,7 +118,19 @@ def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     if key == LAG or not all_sets.is_real(best.names):
         return False
     kind = all_sets.component(key).effect or key
+    if kind in STEPS and _is_place(all_sets, key):
+        return True
     return size_of(all_sets, best, key) < priors.ORDINARY_EFFECT.get(kind, 0.0)
+
+
+def _is_place(all_sets: Hypotheses, key: str) -> bool:
+    """Whether a step of the field is where the sensor is lifted off a place or put down on it."""
+    one, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
+    spells = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
+    if not spells or one.frame != "world":
+        return False
+    off = np.abs(np.array(spells) - float(one.setting["onset_s"]))
+    return bool(np.min(off) < 2.0 * priors.TRANSITION_S)
 
 
 def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:

@@ -30,15 +30,14 @@ class Size:
 # --- what every real recording leaves: measured ----------------------------------------------
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(8.64e-03, 1.34, 0.1),  # gauss
-    "gyro_course": Size(6.81e-04, 1.73, 0.05),  # rad/s
-    "by_direction": Size(1.12e-02, 2.54, 0.2),  # gauss: harmonics of degree 2 and 3
-    "at_rest": Size(1.19e-03, 1.09, 0.5),  # gauss: where it stands, against where it moves
-    "by_change": Size(1.56e-03, 1.56, 0.1),  # s: axes that are late by different times
-    "bending": Size(1.10e+00, 1.57, 10),  # of the library's usual flexible mount
-    "by_rate_squared": Size(1.05e-03, 2.25, 0.1),  # rad/s at 1 rad/s
-    "field_by_rate": Size(1.02e-03, 1.82, 0.1),  # gauss at 1 rad/s
-    "by_force": Size(2.37e-03, 1.55, 0.1),  # rad/s at 1 g
+    "world_course": Size(8.98e-03, 1.33, 0.1),  # gauss
+    "gyro_course": Size(5.32e-04, 1.79, 0.05),  # rad/s
+    "by_direction": Size(1.13e-02, 2.45, 0.2),  # gauss: harmonics of degree 2 and 3
+    "by_change": Size(1.33e-03, 1.51, 0.1),  # s: axes that are late by different times
+    "bending": Size(1.11e+00, 1.56, 10),  # of the library's usual flexible mount
+    "by_rate_squared": Size(1.20e-03, 2.24, 0.1),  # rad/s at 1 rad/s
+    "field_by_rate": Size(1.04e-03, 1.84, 0.1),  # gauss at 1 rad/s
+    "by_force": Size(2.16e-03, 1.52, 0.1),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
@@ -93,20 +92,20 @@ BANDS = 7
 #: it is a finding only where it is larger;  source: the same command
 ORDINARY_EFFECT: Mapping[str, float] = {
     "eddy_current": 2.6,
-    "field_anomaly": 5.5,
+    "field_anomaly": 16,
     "field_step": 1.2,
-    "free sensor": 0.038,
-    "gyro_nonlinearity": 0.66,
-    "gyro_scale": 38,
+    "free sensor": 0.036,
+    "gyro_nonlinearity": 0.64,
+    "gyro_scale": 40,
     "hard_iron_drift": 22,
     "hard_iron_step": 2.2,
-    "hysteresis": 20,
+    "hysteresis": 25,
     "mag_cross_axis": 26,
-    "mag_gyro_misalignment": 19,
+    "mag_gyro_misalignment": 16,
     "mag_nonlinearity": 41,
     "onboard_calibration_active": 5.6,
     "soft_iron_step": 47,
-    "vibration_rectification": 6.3,
+    "vibration_rectification": 4,
     "viscous_magnetisation": 28,
 }
 

@@ -15,13 +15,12 @@ from ahrsd.diagnosis.innovation import TRACELESS
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import course
-from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
 #: rad/s below which a sensor stands still, and part of its ordinary rate; of all of its time, above
 #: which this is how it moves;  seconds of a spell, and how many of them, the longest
-STILL_RAD_S, STILL_PART, MOSTLY, STILL_S, MOST_SPELLS = 0.05, 0.2, 0.8, 3.0, 8
+STILL_RAD_S, STILL_PART, MOSTLY, STILL_S, MOST_SPELLS = 0.05, 0.2, 0.8, 3.0, 4
 #: s over which the rate is taken
 SMOOTHED_S = 0.5
 _GRAVITY = 9.81
@@ -32,7 +31,7 @@ _SKEW = np.array([
 ])  # fmt: skip
 
 
-def ordinary_remainder(context: Context, recorded: Track) -> list[Component]:
+def ordinary_remainder(context: Context) -> list[Component]:
     """Its components along a recording."""
     found = [
         course(context, "world", priors.ORDINARY["world_course"]),
@@ -46,7 +45,7 @@ def ordinary_remainder(context: Context, recorded: Track) -> list[Component]:
     if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
         found.append(_sized(context, "by_force", "gyro", context.force_b_m_s2 / _GRAVITY))
         found.append(bending(context))
-    return [*found, *resting_places(context, recorded)]
+    return found
 
 
 def _sized(context: Context, key: str, frame: str, functions: Array) -> Component:
@@ -62,24 +61,6 @@ def ordinary(size: priors.Size, scale: Array) -> Sized:
     mean = float(np.log(size.median))
     low, high = mean - 4.0 * size.spread, float(np.log(size.most))
     return Sized(scale, np.array([low]), np.array([high]), mean, size.spread)
-
-
-def resting_places(context: Context, recorded: Track) -> list[Component]:
-    """The field where a sensor stands still, another one at each place; none where it never does.
-
-    A table, the ground before a flight and after it: iron is near that is not there in motion.
-    recorded: the whole recording, in which the places are the same whatever is known by now
-    """
-    spells = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
-    if not spells:
-        return []
-    time_s = context.track.time_s
-    columns = np.zeros((len(time_s), 3, 3 * len(spells)))
-    for k, (begin, end) in enumerate(spells):
-        inside = (time_s >= begin) & (time_s <= end)
-        columns[inside, :, 3 * k : 3 * k + 3] = np.eye(3)
-    law = ordinary(priors.ORDINARY["at_rest"], np.ones(columns.shape[2]))
-    return [Component("at_rest", "sensor", Columns(mag=columns), law)]
 
 
 def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:

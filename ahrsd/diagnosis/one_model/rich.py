@@ -30,7 +30,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     moved,
     step_of,
 )
-from ahrsd.diagnosis.one_model.remainder import ordinary_remainder, resting_places
+from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
 from ahrsd.diagnosis.problem import Problem
 
 #: linearisations, and nats that a further one must gain
@@ -48,7 +48,7 @@ class Base:
     """A linearisation with everything but candidates.
 
     remainder: keys of what real recordings leave;  whole: keys of the richest model, or of that of
-    the first steps: calibration, delay, logged causes, places at rest
+    the first steps: calibration, delay, logged causes
     """
 
     made: Linearised
@@ -65,8 +65,7 @@ def base_of(
     """
     made = linearised(point)
     context = made.context
-    recorded = point.problem.recorded
-    rest = (ordinary_remainder if whole else resting_places)(context, recorded)
+    rest = ordinary_remainder(context) if whole else []
     courses = [course(context, frame) for frame in FRAMES] if whole else []
     lags = [delay(context, library)]
     if point.problem.lag_s != 0.0:
@@ -130,7 +129,10 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
 
     best = at(0.0)
     for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
-        while (found := at(best.base.made.point.problem.lag_s + way)).nats > best.nats:
+        while True:
+            found = at(best.base.made.point.problem.lag_s + way)
+            if found.nats < best.nats + priors.ODDS_REAL:  # readings between samples are smoother
+                break
             best = found
     return best
 

@@ -176,7 +176,9 @@ def test_the_maximum_is_that_of_another_climb():
         B, y = design(20 + seed, WIDTHS)
         found = maximised(products(B, y), laws(), [(np.full(4, 1.5), np.zeros(4))])
 
-        def cost(x, known=products(B, y)):
+        of_all = products(B, y)
+
+        def cost(x, known=of_all):
             at = evaluated(known, laws(), x[:4], x[4:])
             return -at.nats, -at.gradient
 
