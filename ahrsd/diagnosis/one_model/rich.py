@@ -71,7 +71,8 @@ def base_of(
     if point.problem.lag_s != 0.0:
         lags.append(delay_form(context, point.problem.lag_s))
     known = [anew(one, context, library) for one in named]
-    driven = [one for one in causes(context, library) if one.key not in {k.key for k in known}]
+    had = {one.effect for one in known}
+    driven = [one for one in causes(context, library) if one.effect not in had]
     parts = [*rest, *lags, *courses, *known, *driven]
     made.exact = (LAG,)
     made.add(parts)

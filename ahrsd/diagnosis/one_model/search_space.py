@@ -10,6 +10,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
     LAG_FORM,
     STEPS,
+    beyond,
     component,
     form_of,
     holds,
@@ -51,10 +52,12 @@ def space_at(
     made, context = base.made, base.made.context
     found = library_components(context, library)
     effects = {name: [one.key for one in parts] for name, parts in found.items()}
-    made.add([one for parts in found.values() for one in parts])
-    effects[LAG] = [LAG]
     delay = made.seen[LAG].component
     nested = frozenset(name for name, parts in found.items() if holds(parts[0], delay))
+    for name in nested:
+        found[name] = [beyond(one, delay) for one in found[name]]
+    made.add([one for parts in found.values() for one in parts])
+    effects[LAG] = [LAG]
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])

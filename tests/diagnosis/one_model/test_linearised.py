@@ -13,7 +13,8 @@ from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.component import Component, Fixed
-from ahrsd.diagnosis.one_model.effect_components import LAG, holds, library_components
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.one_model.effect_components import LAG, beyond, holds, library_components
 from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key
 from ahrsd.diagnosis.one_model.model_search import beside
@@ -71,6 +72,10 @@ def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
     delay = bare.base.made.seen[LAG].component
     parts = library_components(bare.base.made.context, EFFECTS)
     assert [name for name, some in parts.items() if holds(some[0], delay)] == ["eddy_current"]
+    eddy = beyond(parts["eddy_current"][0], delay)
+    assert not holds(eddy, delay)
+    shared = np.einsum("nia,ni->a", eddy.columns.mag, delay.columns.mag[:, :, 0])
+    np.testing.assert_allclose(shared, 0.0, atol=1e-9)
 
 
 def test_columns_hold_others_that_are_a_sum_of_them():
@@ -101,3 +106,20 @@ def test_what_hardly_turns_in_most_of_its_time_is_never_at_rest():
     gyro = np.zeros((len(t), 3))
     gyro[:100, 2] = 1.0
     assert still_spells(t, gyro) == []
+
+
+def test_what_a_logged_cause_took_out_is_put_back_whatever_its_reference():
+    """A step of the gyro's bias beside a logged temperature that rises: the same at every point."""
+    track = track_of(experiment("wam", seed=4, samples=4000))
+    step = np.array([-4e-4, -3e-4, 5e-4])
+    later = track.time_s[:, None] >= 70.0
+    warm = 15.0 + np.cumsum(np.random.default_rng(2).normal(size=len(track))) / 500.0
+    found = diagnose(
+        replace(
+            track,
+            gyro_b_rad_s=track.gyro_b_rad_s + later * step,
+            covariates={"temperature_c": warm},
+        )
+    )
+    assert [one.effect for one in found.findings] == ["gyro_bias_step"]
+    np.testing.assert_allclose([p.value for p in found.findings[0].parameters], step, atol=1e-4)
