@@ -33,11 +33,11 @@ ORDINARY: Mapping[str, Size] = {
     "world_course": Size(8.98e-03, 1.33, 0.1),  # gauss
     "gyro_course": Size(5.32e-04, 1.79, 0.05),  # rad/s
     "by_direction": Size(1.13e-02, 2.45, 0.2),  # gauss: harmonics of degree 2 and 3
-    "by_change": Size(1.33e-03, 1.51, 0.1),  # s: axes that are late by different times
-    "bending": Size(1.11e00, 1.56, 10),  # of the library's usual flexible mount
-    "by_rate_squared": Size(1.20e-03, 2.24, 0.1),  # rad/s at 1 rad/s
-    "field_by_rate": Size(1.04e-03, 1.84, 0.1),  # gauss at 1 rad/s
-    "by_force": Size(2.16e-03, 1.52, 0.1),  # rad/s at 1 g
+    "by_change": Size(1.33e-03, 1.51, 0.03),  # s: axes that are late by different times
+    "bending": Size(1.11e00, 1.56, 3.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(1.20e-03, 2.24, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(1.04e-03, 1.84, 0.02),  # gauss at 1 rad/s
+    "by_force": Size(2.16e-03, 1.52, 0.03),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
