@@ -52,23 +52,26 @@ def decided(
     found, terms = [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
-        if effect is None or effect == switching or _is_ordinary(all_sets, best, key):
+        if effect is None or effect in switching or _is_ordinary(all_sets, best, key):
             continue
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
     left = _left(all_sets, space, best, odds)
-    if switching is not None and not left.detected:
-        left = _jumping(all_sets, best, switching, odds)
+    if switching and not left.detected:
+        left = _jumping(all_sets, best, switching[0], odds)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
     return Answer(best, tuple(found), tuple(terms), left, surest)
 
 
-def _switching(all_sets: Hypotheses, best: Hypothesis) -> str | None:
-    """The kind of step of which there are so many that they are one source that changes."""
+def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
+    """Kinds of steps of which there are so many that they are one source that changes, most first.
+
+    Those that are ordinary count as well.
+    """
     kinds = [all_sets.component(key).effect for key in best.names]
     many = [k for k in STEPS if kinds.count(k) >= priors.CHANGES]
-    return max(many, key=kinds.count) if many else None
+    return sorted(many, key=kinds.count, reverse=True)
 
 
 def _jumping(
