@@ -35,6 +35,10 @@ class Law(Protocol):
     def high(self) -> Array:
         """Highest psi."""
 
+    @property
+    def stiffness(self) -> Array:
+        """(k,) curvature of minus the log density of psi."""
+
     def log_variance(self, psi: Array) -> Array:
         """(q,)."""
 
@@ -79,6 +83,7 @@ class Fixed:
     start: Array = field(default_factory=lambda: np.zeros(0))
     low: Array = field(default_factory=lambda: np.zeros(0))
     high: Array = field(default_factory=lambda: np.zeros(0))
+    stiffness: Array = field(default_factory=lambda: np.zeros(0))
 
     def log_variance(self, psi: Array) -> Array:
         """(q,) logarithms."""
@@ -111,6 +116,11 @@ class Sized:
         """Where a search begins."""
         return np.asarray(np.clip(np.array([self.mean]), self.low, self.high))
 
+    @property
+    def stiffness(self) -> Array:
+        """(k,) curvature of minus the log density of psi."""
+        return np.array([stiff(self.spread)])
+
     def log_variance(self, psi: Array) -> Array:
         """(q,) logarithms."""
         return np.asarray(2.0 * np.log(self.scale) + 2.0 * psi[0])
@@ -122,6 +132,11 @@ class Sized:
     def log_prior(self, psi: Array) -> tuple[float, Array]:
         """Log density and gradient (k,)."""
         return log_density(psi[0], self.mean, self.spread, self.low[0], self.high[0])
+
+
+def stiff(spread: float) -> float:
+    """Curvature of minus the log density of one logarithm; spread 0: even."""
+    return spread**-2 if spread > 0.0 else 0.0
 
 
 def log_density(

@@ -16,8 +16,10 @@ from ahrsd.diagnosis.diagnosis import Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, scanned
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
+from ahrsd.diagnosis.one_model.remainder import still_spells
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
@@ -50,23 +52,26 @@ def decided(
     found, terms = [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
-        if effect is None or effect == switching or _is_ordinary(all_sets, best, key):
+        if effect is None or effect in switching or _is_ordinary(all_sets, best, key):
             continue
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
     left = _left(all_sets, space, best, odds)
-    if switching is not None and not left.detected:
-        left = _jumping(all_sets, best, switching, odds)
+    if switching and not left.detected:
+        left = _jumping(all_sets, best, switching[0], odds)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
     return Answer(best, tuple(found), tuple(terms), left, surest)
 
 
-def _switching(all_sets: Hypotheses, best: Hypothesis) -> str | None:
-    """The kind of step of which there are so many that they are one source that changes."""
+def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
+    """Kinds of steps of which there are so many that they are one source that changes, most first.
+
+    Those that are ordinary count as well.
+    """
     kinds = [all_sets.component(key).effect for key in best.names]
     many = [k for k in STEPS if kinds.count(k) >= priors.CHANGES]
-    return max(many, key=kinds.count) if many else None
+    return sorted(many, key=kinds.count, reverse=True)
 
 
 def _jumping(
@@ -92,13 +97,17 @@ def _borne_out(
     """The set without members that are not sure, and the log odds of the others."""
     while True:
         own = [key for key in best.names if key not in all_sets.remainder]
-        rivals = {key: _without(all_sets, space, best, key) for key in own}
+        real = all_sets.is_real(best.names)
+        asked = {key: _asked_odds(all_sets, key, real) for key in own}
+        rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
+        if all(best.score - rivals[key].score >= asked[key] for key in own):
+            rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        real = any(key in all_sets.remainder for key in best.names)
-        unsure = [key for key in own if odds[key] < _asked_odds(all_sets, key, real)]
+        unsure = [key for key in own if odds[key] < asked[key]]
         if not unsure:
             return best, odds
-        best = rivals[min(unsure, key=lambda one: odds[one])]
+        key = min(unsure, key=lambda one: odds[one])
+        best = _without(all_sets, space, best, key)
 
 
 def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
@@ -108,21 +117,32 @@ def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
 
 
 def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
-    """Whether a named member is no larger than what real recordings ordinarily have of its kind."""
-    form = priors.ORDINARY_FORM_OF.get(all_sets.component(key).effect or "")
-    if form is None or form not in best.names:
+    """Whether a member is no larger than what real recordings ordinarily have of its kind."""
+    if key == LAG or not all_sets.is_real(best.names):
         return False
-    value, _ = coefficients(all_sets, best, key)
-    return float(np.max(np.abs(value))) < priors.ORDINARY[form].up_to()
+    kind = all_sets.component(key).effect or key
+    if kind in STEPS and _is_place(all_sets, key):
+        return True
+    return size_of(all_sets, best, key) < priors.ORDINARY_EFFECT.get(kind, 0.0)
+
+
+def _is_place(all_sets: Hypotheses, key: str) -> bool:
+    """Whether a step of the field is where the sensor is lifted off a place or put down on it."""
+    one, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
+    spells = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
+    if not spells or one.frame != "world":
+        return False
+    off = np.abs(np.array(spells) - float(one.setting["onset_s"]))
+    return bool(np.min(off) < 2.0 * priors.TRANSITION_S)
 
 
 def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
     """The likeliest set without a member: with nothing or a course in its place."""
-    fewer = best.names - {key}
+    fewer = all_sets.without(best.names, key)
     tried = [fewer]
     if all_sets.component(key).effect is not None:
         tried += [fewer | {course} for course in space.courses if course not in fewer]
-    judged = [all_sets.judge(names) for names in tried]
+    judged = [all_sets.judge(names, best) for names in tried]
     return max(judged, key=lambda one: one.score)
 
 
@@ -172,8 +192,7 @@ def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Arra
         width = all_sets.component(one).width
         if one == key:
             part = slice(begin, begin + width)
-            variance = np.sum(best.at.root[:, part] ** 2, axis=0)
-            return best.at.mean[part], np.sqrt(variance)
+            return best.at.mean[part], best.at.deviation[part]
         begin += width
     raise KeyError(key)
 
@@ -184,7 +203,8 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     fewer = all_sets.judge(best.names - {key})
     named = {all_sets.component(k).effect for k in fewer.names}
     asked = [k for name, keys in space.effects.items() if name not in named for k in keys]
-    worth = scanned(all_sets.made, fewer.keys, best.at_of(fewer), [*dict.fromkeys([*asked, key])])
+    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+    worth = scan.worth([*dict.fromkeys([*asked, key])])
     by_name: dict[str, float] = {}
     for k, nats in worth.items():
         one = all_sets.component(k)
@@ -231,32 +251,30 @@ def _left(
 ) -> Unexplained:
     """What no name explains, where that is beyond the ordinary."""
     courses = [key for key in space.courses if key in best.names]
+    courses = [key for key in courses if not _is_ordinary(all_sets, best, key)]
     if courses:
         key = max(courses, key=lambda one: odds[one])
         return _course(all_sets, best, key, odds[key])
     for key, size in priors.ORDINARY.items():
-        component = next((k for k in best.names if k == key), None)
-        if component is None:
+        if key not in best.names or size_of(all_sets, best, key) < size.up_to():
             continue
-        found = size_of(all_sets, best, key)
-        if found > size.up_to():
-            frame = all_sets.component(key).frame
+        nats = best.score - all_sets.judge(best.names - {key}, best).score
+        if nats > priors.ODDS_REAL:
+            frame, found = all_sets.component(key).frame, size_of(all_sets, best, key)
             unit = "rad/s" if frame == "gyro" else "gauss"
-            nats = best.score - all_sets.judge(best.names - {key}).score
             where = Where((), AXES, frame, f"a part of what is left ({key})")
             return Unexplained(True, where, None, found, unit, evidence_nats=nats)
     return Unexplained(False)
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """The size of a component of the remainder, in its unit."""
-    begin = 0
-    for one in best.keys:
-        law = all_sets.component(one).law
-        if one == key:
-            return float(np.exp(best.at.psi[begin])) * float(getattr(law, "unit", 1.0))
-        begin += len(law.start)
-    raise KeyError(key)
+    """How large a member is: an effect in its usual scales, all else its deviation in its unit."""
+    one = all_sets.component(key)
+    if one.effect is not None and isinstance(one.law, Sized):
+        value, _ = coefficients(all_sets, best, key)
+        return float(np.max(np.abs(value) / one.law.scale))
+    psi = all_sets.psi_of(best)[key]
+    return float(np.exp(psi[0])) * float(getattr(one.law, "unit", 1.0))
 
 
 def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Unexplained:

@@ -26,6 +26,8 @@ NOT_ASKED = (
     LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
     "rotor_field",
 )  # fmt: skip
+#: part of the squares that may be left where one component's columns hold another's
+_ALIKE = 1e-3
 #: parts in which the transition of a step is free
 _PIECES = 4
 #: parts of a recording's length, and factors, to which onsets and scales are sought
@@ -46,13 +48,18 @@ def library_components(
 
 
 def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
-    """Effects by a logged cause (a current, a temperature, ...), each in its first setting."""
+    """Effects by a logged cause (a current, a temperature, ...), each in its first setting.
+
+    Their keys are the same at every point: a setting that follows the readings (a mean temperature)
+    would else be another component at the next, and what it took out of them were lost.
+    """
     out = []
     for name, effect in library.items():
         logged = [need for need in effect.needs if "accel" not in need]
         settings = effect.settings(context) if logged and name not in NOT_ASKED else ()
         if settings:
-            out.append(component(context, effect, settings[0], len(settings)))
+            made = component(context, effect, settings[0], len(settings))
+            out.append(replace(made, key=f"{name} as logged"))
     return out
 
 
@@ -75,8 +82,8 @@ def anew(known: Component, context: Context, library: Mapping[str, Effect]) -> C
     """A named component, its columns made of another context."""
     if known.effect is None or known.key == LAG:
         return known
-    columns = library[known.effect].columns(context, known.setting)
-    return replace(known, columns=columns)
+    made = replace(known, columns=library[known.effect].columns(context, known.setting))
+    return beyond(made, delay(context, library))
 
 
 def delay(context: Context, library: Mapping[str, Effect]) -> Component:
@@ -84,6 +91,26 @@ def delay(context: Context, library: Mapping[str, Effect]) -> Component:
     odds = float(np.log(priors.ORDINARY_EFFECTS[LAG]))
     law = Fixed(np.array([priors.ORDINARY_LAG_S**2]))
     return Component(LAG, "sensor", library[LAG].columns(context, {}), law, odds, LAG)
+
+
+def holds(one: Component, part: Component) -> bool:
+    """Whether a component can be all that another is: its columns are among the first's."""
+    mine, other = one.columns.mag, part.columns.mag
+    if mine is None or other is None or one.columns.gyro is not None or one.width <= part.width:
+        return False
+    X, y = mine.reshape(-1, one.width), other.reshape(-1, part.width)
+    G = X.T @ X
+    left = y - X @ np.linalg.lstsq(G, X.T @ y, rcond=None)[0]
+    return float(np.sum(left**2)) < _ALIKE * float(np.sum(y**2))
+
+
+def beyond(one: Component, part: Component) -> Component:
+    """A component that holds another, without it: both in one set would share what they have."""
+    if one.columns.mag is None or part.columns.mag is None or not holds(one, part):
+        return one
+    X, y = one.columns.mag, part.columns.mag[:, :, 0]
+    along = np.einsum("nia,ni->a", X, y) / np.sum(y**2)
+    return replace(one, columns=Columns(mag=X - y[:, :, None] * along))
 
 
 def delay_form(context: Context, lag_s: float) -> Component:

@@ -1,4 +1,4 @@
-"""The log marginal likelihood of a model, its gradient, and where it is largest.
+"""The log marginal likelihood of a model, its gradient and curvature, and where it is largest.
 
     y = B w + e,    w_j ~ N(0, Phi_j(psi)),    e in band b white of variance v_b
 
@@ -14,15 +14,26 @@ m = A^-1 D s,
 with r_b the square of the band's residual.  The calibration is in B with its own wide prior, so
 this is a restricted likelihood.  Priors of psi and log v are added: what is maximised is their
 joint density, and every hypothesis is judged at its own maximum.
+
+A step to the maximum takes the average information (Gilmour, Thompson and Cullis 1995), half of
+Z^T P Z with Z the columns dV P y and P the projection of the restricted likelihood: the mean of
+observed and expected curvature, without a trace of a product.  With M = I - A^-1 and, of each band,
+t_b = A^-1 D B_b^T r_b / v_b it is
+
+    2 H(phi_i, phi_j) = m_i M_ij m_j,    2 H(v_b, phi_j) = t_bj m_j,
+    2 H(v_b, v_c) = |r_b|^2 / v_b where b = c, less (B_b^T r_b / v_b)^T D A^-1 D (B_c^T r_c / v_c)
+
+Where a variance is far too large m is nothing: its diagonal is at least the expected one.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg
 
 from ahrsd.diagnosis.one_model import noise_model
 from ahrsd.diagnosis.one_model.component import Law
@@ -30,8 +41,12 @@ from ahrsd.samples import Array
 
 #: relative: columns that are alike but for rounding would else leave no root
 _ROUNDED = 1e-10
-#: a maximum is reached where a step gains less, in machine precisions of the nats; and steps
-_FLAT, _STEPS = 4e8, 60
+#: a maximum is reached where a step would gain less, nats; steps; and the longest, of a logarithm
+_FLAT, _STEPS, _LONGEST = 0.02, 40, 2.0
+#: parts of a step that are tried
+_PARTS = (1.0, 0.3, 0.1, 0.02)
+#: curvature of a logarithm that nothing tells of
+_LOOSE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,77 +67,136 @@ class Products:
 class At:
     """The model at one point of its hyperparameters.
 
-    nats: log likelihood and log priors;  gradient: in (log v, psi)
-    mean, root: of the coefficients: D m, and R with D A^-1 D = R^T R
-    residual: (B,) expected square of each band's noise
+    nats: log likelihood and log priors;  gradient (k,), curvature (k, k): in (log v, psi)
+    mean, deviation: (q,) of the coefficients
     """
 
     nats: float
     gradient: Array
+    curvature: Array
     mean: Array
-    root: Array
-    residual: Array
+    deviation: Array
     log_noise: Array
     psi: Array
 
-    @property
-    def covariance(self) -> Array:
-        """(q, q) posterior covariance of the coefficients."""
-        return np.asarray(self.root.T @ self.root)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prior:
+    """The laws at one psi: log variances (q,), slopes (q, k), log density with slope, stiffness."""
+
+    phi: Array
+    slopes: Array
+    nats: float
+    gradient: Array
+    stiffness: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Noise:
+    """Of each band: expected square (B,), square of the likeliest residual (B,), B^T r (B, q)."""
+
+    expected: Array
+    square: Array
+    turned: Array
 
 
 def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> At:
     """The log marginal likelihood with its priors, at these hyperparameters."""
-    phi, slopes, prior, slope_of_prior = _laws(laws, psi)
-    inverse = np.exp(-log_noise)
-    deviation = np.exp(0.5 * phi)
-    bands = products.G.reshape(len(inverse), -1)
-    G = (inverse @ bands).reshape(products.G.shape[1:])
-    G *= deviation
-    G *= deviation[:, None]
-    s = deviation * (inverse @ products.s)
-    A = G.copy()
-    diagonal = np.diag_indices_from(A)
-    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
-    L, broken = linalg.lapack.dpotrf(A.T, lower=1, overwrite_a=1)
-    if broken:
-        raise np.linalg.LinAlgError("the columns of a model are alike to the last digit")
-    root, _ = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)
-    seen = root @ s
-    m = seen @ root
-    weighted = m * deviation
-    covariance = root.T @ root
-    covariance *= deviation
-    covariance *= deviation[:, None]
-    fitted = products.G @ weighted
-    square = products.square - 2 * products.s @ weighted + fitted @ weighted
-    unsure = bands @ covariance.ravel()
-    residual = square + unsure
-    by_phi = 0.5 * (m**2 - 1.0 + np.einsum("ij,ij->j", root, root))
-    by_noise = 0.5 * (residual * inverse - products.rows)
+    prior, inverse = _laws(laws, psi), np.exp(-log_noise)
+    deviation = np.exp(0.5 * prior.phi)
+    scaled = deviation * (inverse @ products.s)
+    found, log_det = _inverse(products, inverse, deviation)
+    m = found @ scaled
+    sure = 1.0 - np.diag(found)
+    by_phi = 0.5 * (m**2 - sure)
+    noise = _noise(products, found, m * deviation, deviation)
+    by_noise = 0.5 * (noise.expected * inverse - products.rows)
     of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step)
-    likelihood = 0.5 * float(seen @ seen) + float(np.sum(np.log(np.diag(root))))
+    likelihood = 0.5 * (float(m @ scaled) - log_det)
     likelihood -= 0.5 * float(
         products.rows @ (log_noise + np.log(2 * np.pi)) + products.square @ inverse
     )
-    gradient = np.concatenate([by_noise + slope_of_noise, slopes.T @ by_phi + slope_of_prior])
-    nats = likelihood + prior + of_noise
-    return At(nats, gradient, weighted, root * deviation, residual, log_noise, psi)
+    return At(
+        likelihood + prior.nats + of_noise,
+        np.concatenate([by_noise + slope_of_noise, prior.slopes.T @ by_phi + prior.gradient]),
+        _curvature(products, prior, noise, found, m, inverse),
+        m * deviation,
+        deviation * np.sqrt(np.diag(found)),
+        log_noise,
+        psi,
+    )
 
 
-def _laws(laws: Sequence[Law], psi: Array) -> tuple[Array, Array, float, Array]:
-    """Log variances (q,), their slopes (q, k), log prior of psi and its gradient (k,)."""
-    phi, slopes, gradients, prior, at = [], [], [], 0.0, 0
-    for law in laws:
-        mine = psi[at : at + len(law.start)]
-        at += len(mine)
-        phi.append(law.log_variance(mine))
-        slopes.append(law.slope(mine))
-        density, gradient = law.log_prior(mine)
-        prior += density
-        gradients.append(gradient)
-    flat = np.concatenate([*gradients, np.zeros(0)])
-    return np.concatenate(phi), linalg.block_diag(*slopes), prior, flat
+def _inverse(products: Products, inverse: Array, deviation: Array) -> tuple[Array, float]:
+    """A^-1 of A = I + D G D, and log |A|."""
+    A = (inverse @ products.G.reshape(len(inverse), -1)).reshape(products.G.shape[1:])
+    A *= deviation
+    A *= deviation[:, None]
+    diagonal = np.diag_indices_from(A)
+    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
+    root, broken = linalg.lapack.dpotrf(A.T, lower=0, overwrite_a=1, clean=1)
+    if broken:
+        raise np.linalg.LinAlgError("the columns of a model are alike to the last digit")
+    log_det = 2.0 * float(np.sum(np.log(np.diag(root))))
+    half, _ = linalg.lapack.dpotri(root, lower=0, overwrite_c=1)
+    own = np.diag(half).copy()
+    found = half + half.T
+    found[diagonal] = own
+    return np.asarray(found), log_det
+
+
+def _noise(products: Products, found: Array, mean: Array, deviation: Array) -> _Noise:
+    fitted = products.G @ mean
+    square = products.square - 2 * products.s @ mean + fitted @ mean
+    covariance = found * deviation
+    covariance *= deviation[:, None]
+    unsure = products.G.reshape(len(square), -1) @ covariance.ravel()
+    return _Noise(square + unsure, square, products.s - fitted)
+
+
+def _curvature(
+    products: Products, prior: _Prior, noise: _Noise, found: Array, m: Array, inverse: Array
+) -> Array:
+    """Average information of (log v, psi), its diagonal at least the expected, and the priors'."""
+    deviation, count = np.exp(0.5 * prior.phi), len(inverse)
+    turned = noise.turned * inverse[:, None] * deviation
+    seen = turned @ found
+    by_phi = prior.slopes * m[:, None]
+    unlike = -found
+    unlike[np.diag_indices_from(unlike)] += 1.0
+    H = np.zeros((count + by_phi.shape[1],) * 2)
+    H[:count, :count] = np.diag(noise.square * inverse) - seen @ turned.T
+    H[:count, count:] = seen @ by_phi
+    H[count:, :count] = H[:count, count:].T
+    H[count:, count:] = by_phi.T @ unlike @ by_phi
+    unsure = (noise.expected - noise.square) * inverse
+    expected = [
+        products.rows - unsure,
+        np.einsum("ik,ij,jk->k", prior.slopes, unlike**2, prior.slopes, optimize=True),
+    ]
+    own = np.diag_indices_from(H)
+    H[own] = np.maximum(H[own], np.concatenate(expected))
+    H *= 0.5
+    H[:count, :count] += noise_model.stiffness(count, products.step)
+    H[own] += np.concatenate([np.zeros(count), prior.stiffness])
+    return H
+
+
+def _laws(laws: Sequence[Law], psi: Array) -> _Prior:
+    """The laws together."""
+    starts = np.cumsum([0, *(len(law.start) for law in laws)])
+    mine = [psi[a:b] for a, b in itertools.pairwise(starts)]
+    phi = [law.log_variance(one) for law, one in zip(laws, mine, strict=True)]
+    rows = np.cumsum([0, *(len(one) for one in phi)])
+    slopes = np.zeros((rows[-1], starts[-1]))
+    gradient, stiffness, nats = np.zeros(starts[-1]), np.zeros(starts[-1]), 0.0
+    for k, (law, one) in enumerate(zip(laws, mine, strict=True)):
+        own = slice(starts[k], starts[k + 1])
+        slopes[rows[k] : rows[k + 1], own] = law.slope(one)
+        density, gradient[own] = law.log_prior(one)
+        stiffness[own] = law.stiffness
+        nats += density
+    return _Prior(np.concatenate(phi), slopes, nats, gradient, stiffness)
 
 
 def maximised(products: Products, laws: Sequence[Law], starts: Sequence[tuple[Array, Array]]) -> At:
@@ -131,24 +205,41 @@ def maximised(products: Products, laws: Sequence[Law], starts: Sequence[tuple[Ar
 
 
 def _climbed(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> At:
-    """Quasi-Newton, each variable in units of its own expected curvature."""
+    """Newton's steps with the average information, between the ends of what is allowed."""
     count = len(products.rows)
     low, high = noise_model.bounds(count)
     low = np.concatenate([low, *(law.low for law in laws)])
     high = np.concatenate([high, *(law.high for law in laws)])
-    unit = np.concatenate([np.sqrt(2.0 / (products.rows + 4.0)), np.full(len(psi), 0.5)])
-    best: list[At] = []
+    x = np.clip(np.concatenate([log_noise, psi]), low, high)
+    at = evaluated(products, laws, x[:count], x[count:])
+    for _ in range(_STEPS):
+        step = _newton(at, x, low, high)
+        if 0.5 * float(at.gradient @ step) < _FLAT:
+            break
+        for part in _PARTS:
+            new = np.clip(x + part * step, low, high)
+            found = evaluated(products, laws, new[:count], new[count:])
+            if found.nats > at.nats:
+                break
+        else:
+            break
+        x, at = new, found
+    return at
 
-    def cost(x: Array) -> tuple[float, Array]:
-        whole = x * unit
-        at = evaluated(products, laws, whole[:count], whole[count:])
-        if not best or at.nats > best[0].nats:
-            best[:] = [at]
-        return -at.nats, -at.gradient * unit
 
-    start = np.clip(np.concatenate([log_noise, psi]), low, high) / unit
-    box = list(zip(low / unit, high / unit, strict=True))
-    optimize.fmin_l_bfgs_b(
-        cost, start, bounds=box, factr=_FLAT, pgtol=1e-3, maxiter=_STEPS, maxfun=2 * _STEPS
-    )
-    return best[0]
+def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
+    """The step to the maximum of the quadratic that this point shows, inside of what is allowed."""
+    g = at.gradient
+    H = at.curvature + _LOOSE * np.eye(len(x))
+    step = np.zeros(len(x))
+    free = ~(((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0)))
+    while np.any(free):
+        rest = g[free] - H[np.ix_(free, ~free)] @ step[~free]
+        step[free] = linalg.solve(H[np.ix_(free, free)], rest, assume_a="pos")
+        inside = np.clip(step, low - x, high - x)
+        beyond = free & (inside != step)
+        step = inside
+        if not np.any(beyond):
+            break
+        free &= ~beyond
+    return np.asarray(step * min(1.0, _LONGEST / max(float(np.max(np.abs(step))), 1e-300)))

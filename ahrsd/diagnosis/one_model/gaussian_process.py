@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import Component, log_density
+from ahrsd.diagnosis.one_model.component import Component, log_density, stiff
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -50,6 +50,11 @@ class CourseLaw:
     def high(self) -> Array:
         """Highest psi."""
         return np.log([self.most, priors.COURSE_CORNERS[1]])
+
+    @property
+    def stiffness(self) -> Array:
+        """(k,) curvature of minus the log density of psi."""
+        return np.array([stiff(self.spread), 0.0])
 
     def _shape(self, psi: Array) -> tuple[Array, Array]:
         """Log shape (q,) before it is scaled, and its slope in the log corner (q,)."""

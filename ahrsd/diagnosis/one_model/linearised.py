@@ -7,6 +7,7 @@ whichever components hold at it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -35,6 +36,8 @@ from ahrsd.samples import Array
 
 CALIBRATION = "calibration"
 _BATCH = 96
+#: number of the readings among the batches
+_Y = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,17 +58,19 @@ class Point:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """A component's rows (3 N, q) as the noise sees them."""
+    """A component and where its rows are: columns of one of the arrays that passed together."""
 
     component: Component
-    rows: Array
+    batch: int
+    columns: slice
 
 
 @dataclass(eq=False)
 class Linearised:
     """A point, the context there, and products of components, each made once.
 
-    exact: components that are taken out of the track itself: the delay
+    batches: (3 N, p) rows of components that passed the filter together, as the noise sees them
+    exact:   components that are taken out of the track itself: the delay
     """
 
     point: Point
@@ -74,7 +79,8 @@ class Linearised:
     edges: NDArray[np.intp]
     y: Array
     seen: dict[str, Seen] = field(default_factory=dict)
-    pairs: dict[tuple[str, str], Array] = field(default_factory=dict)
+    batches: list[Array] = field(default_factory=list)
+    blocks: dict[tuple[int, int], Array] = field(default_factory=dict)
     exact: tuple[str, ...] = ()
 
     def add(self, components: Sequence[Component]) -> None:
@@ -82,46 +88,55 @@ class Linearised:
         new = [one for one in components if one.key not in self.seen]
         parts = [one.columns for one in new]
         for batch in batches(parts, _BATCH):
-            flat = self._rows(sensitivities(self.regressing, joined([parts[k] for k in batch])))
+            cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
+            self.batches.append(by_frequency(cube / self.point.amplitude[:, None, None]))
             at = 0
             for k in batch:
-                self.seen[new[k].key] = Seen(new[k], flat[:, at : at + new[k].width])
+                columns = slice(at, at + new[k].width)
+                self.seen[new[k].key] = Seen(new[k], len(self.batches) - 1, columns)
                 at += new[k].width
 
-    def _rows(self, cube: Array) -> Array:
-        """(3 N, p) of (N, 3, p): by frequency, lowest first."""
-        return by_frequency(cube / self.point.amplitude[:, None, None])
+    def rows(self, key: str) -> Array:
+        """(3 N, q) of a component, by frequency, lowest first."""
+        one = self.seen[key]
+        return self.batches[one.batch][:, one.columns]
 
     def put_back(self, values: Mapping[str, Array]) -> None:
         """Add what is taken out of the readings to y, for components that are known here."""
         for key, value in values.items():
-            self.y = self.y + self.seen[key].rows @ value
+            self.y = self.y + self.rows(key) @ value
+        self.blocks = {pair: found for pair, found in self.blocks.items() if _Y not in pair}
+
+    def block(self, left: int, right: int) -> Array:
+        """(B, p, p') products of two batches band by band; of _Y (B, p, 1) with y."""
+        if (left, right) not in self.blocks:
+            X = self.batches[left]
+            Y = self.y[:, None] if right == _Y else self.batches[right]
+            found = np.stack([X[a:b].T @ Y[a:b] for a, b in self._bands()])
+            self.blocks[left, right] = found
+            if right != _Y:
+                self.blocks[right, left] = np.swapaxes(found, 1, 2)
+        return self.blocks[left, right]
 
     def pair(self, left: str, right: str) -> Array:
         """(B, q, q') products of two components, band by band."""
-        if (left, right) not in self.pairs:
-            X, Y = self.seen[left].rows, self.seen[right].rows
-            found = np.stack([X[a:b].T @ Y[a:b] for a, b in self._bands()])
-            self.pairs[left, right] = found
-            self.pairs[right, left] = np.swapaxes(found, 1, 2)
-        return self.pairs[left, right]
+        one, other = self.seen[left], self.seen[right]
+        return self.block(one.batch, other.batch)[:, one.columns, other.columns]
 
     def cross(self, key: str) -> Array:
         """(B, q) products of a component with y."""
-        if (key, "") not in self.pairs:
-            X = self.seen[key].rows
-            self.pairs[key, ""] = np.stack([X[a:b].T @ self.y[a:b] for a, b in self._bands()])
-        return self.pairs[key, ""]
+        one = self.seen[key]
+        return self.block(one.batch, _Y)[:, one.columns, 0]
 
     def _bands(self) -> list[tuple[int, int]]:
-        return [(3 * int(a), 3 * int(b)) for a, b in zip(self.edges, self.edges[1:], strict=False)]
+        return [(3 * int(a), 3 * int(b)) for a, b in itertools.pairwise(self.edges)]
 
     def products(self, keys: Sequence[str], step: float) -> Products:
         """All that the data say of these components; step: prior of the noise's spectrum."""
         G = np.concatenate(
             [np.concatenate([self.pair(a, b) for b in keys], axis=2) for a in keys], axis=1
         )
-        s = np.concatenate([self.cross(key) for key in keys], axis=1)
+        s = self._crossed(keys)
         square = np.array([float(self.y[a:b] @ self.y[a:b]) for a, b in self._bands()])
         used = float(np.mean(self.point.filtered.used))
         rows = np.array([(b - a) * used for a, b in self._bands()])
@@ -134,40 +149,37 @@ class Linearised:
         own = done.log_likelihood + 0.5 * np.sum(done.whitened**2, axis=1) + 1.5 * np.log(2 * np.pi)
         return float(np.sum(own[used]) - 3.0 * np.sum(np.log(self.point.amplitude[used])))
 
-    def gram_of(self, keys: Sequence[str]) -> None:
-        """Fill in the pairs of many components at once, which is quicker than one by one."""
-        X = np.concatenate([self.seen[key].rows for key in keys], axis=1)
-        whole = np.stack([X[a:b].T @ X[a:b] for a, b in self._bands()])
-        edges = np.cumsum([0, *(self.seen[key].component.width for key in keys)])
-        for i, left in enumerate(keys):
-            for j, right in enumerate(keys):
-                part = whole[:, edges[i] : edges[i + 1], edges[j] : edges[j + 1]]
-                self.pairs[left, right] = part
+    def candidates(
+        self, keys: Sequence[str], others: Sequence[str], inverse: Array
+    ) -> tuple[Array, list[Array], Array]:
+        """Products of a model's components with many others, in noise of inverse powers (B,).
 
-    def gram_between(self, keys: Sequence[str], others: Sequence[str]) -> None:
-        """Fill in the pairs of some components with many others."""
-        new = [key for key in others if any((one, key) not in self.pairs for one in keys)]
-        if not new:
-            return
-        X = np.concatenate([self.seen[key].rows for key in keys], axis=1)
-        left = np.cumsum([0, *(self.seen[key].component.width for key in keys)])
-        for begin in range(0, len(new), _BATCH):
-            some = new[begin : begin + _BATCH]
-            Y = np.concatenate([self.seen[key].rows for key in some], axis=1)
-            right = np.cumsum([0, *(self.seen[key].component.width for key in some)])
-            whole = np.stack([X[a:b].T @ Y[a:b] for a, b in self._bands()])
-            for i, one in enumerate(keys):
-                for j, key in enumerate(some):
-                    part = whole[:, left[i] : left[i + 1], right[j] : right[j + 1]]
-                    self.pairs[one, key] = part
-                    self.pairs[key, one] = np.swapaxes(part, 1, 2)
+        (q, p) with the model, each other with itself, and (p,) with y
+        """
+        mean: dict[tuple[int, int], Array] = {}
+
+        def part(left: str, right: str) -> Array:
+            one, other = self.seen[left], self.seen[right]
+            pair = one.batch, other.batch
+            if pair not in mean:
+                found = self.block(*pair)
+                mean[pair] = np.tensordot(inverse, found, 1)
+            return mean[pair][one.columns, other.columns]
+
+        across = [np.concatenate([part(key, other) for other in others], axis=1) for key in keys]
+        own = [part(other, other) for other in others]
+        return np.concatenate(across), own, inverse @ self._crossed(others)
+
+    def _crossed(self, keys: Sequence[str]) -> Array:
+        """(B, q) products of components with y."""
+        return np.concatenate([self.cross(key) for key in keys], axis=1)
 
     def left_by(self, keys: Sequence[str], at: At) -> Array:
         """(N, 3) the residual of a model in time, its colour taken out and its levels left in."""
         rows, begin = self.y.copy(), 0
         for key in keys:
             width = self.seen[key].component.width
-            rows -= self.seen[key].rows @ at.mean[begin : begin + width]
+            rows -= self.rows(key) @ at.mean[begin : begin + width]
             begin += width
         for (a, b), level in zip(self._bands(), at.log_noise, strict=True):
             rows[a:b] *= np.exp(-0.5 * level)
@@ -248,6 +260,20 @@ def moved(made: Linearised, keys: Sequence[str], at: At, share: float = 1.0) -> 
     left = noise_model.amplitude(made.left_by(keys, at), made.point.filtered.used, problem.rate_hz)
     del values[CALIBRATION]
     return Point(problem, filtered, values, mag, gyro, left)
+
+
+def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array]:
+    """How far the likeliest calibration and delay are from the point, and how well known."""
+    prior = prior_of(made.point.problem.track).mean
+    before = {
+        CALIBRATION: coefficients(made.point.filtered.model) - prior,
+        **{key: made.point.values.get(key, np.zeros(1)) for key in made.exact},
+    }
+    value = by_key(made, keys, at)
+    deviation = by_key(made, keys, replace(at, mean=at.deviation))
+    asked = [key for key in keys if key in before]
+    off = [value[key] - before[key] for key in asked]
+    return np.concatenate(off), np.concatenate([deviation[key] for key in asked])
 
 
 def _no_louder(found: NullModel, before: NullModel) -> NullModel:

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky, solve_triangular
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import At, maximised
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
 from ahrsd.samples import Array
@@ -48,6 +49,7 @@ class Hypotheses:
     remainder: keys of what every real recording leaves, in or out together
     start: noise (B,) and psi by key that the richest model has
     forms: key of what a component leaves of its form, which comes and goes with it
+    beside_delay: effects of which a delay is a part: they are asked beside it, not in its place
     """
 
     made: Linearised
@@ -55,30 +57,58 @@ class Hypotheses:
     start_noise: Array
     start_psi: Mapping[str, Array]
     forms: dict[str, str] = field(default_factory=dict)
+    beside_delay: frozenset[str] = frozenset()
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
 
     def component(self, key: str) -> Component:
         """By its key."""
         return self.made.seen[key].component
 
-    def judge(self, names: Iterable[str]) -> Hypothesis:
-        """The set with these members beside the calibration."""
+    def judge(self, names: Iterable[str], near: Hypothesis | None = None) -> Hypothesis:
+        """The set with these members beside the calibration.
+
+        near: a set of the same class from whose noise and sizes the climb begins, which is short;
+        else it begins where the richest model is
+        """
         members = frozenset(names)
         if members not in self.judged:
             forms = [self.forms[key] for key in members if key in self.forms]
             keys = (CALIBRATION, *sorted(members), *sorted(forms))
-            real = any(key in members for key in self.remainder)
+            real = self.is_real(members)
             step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
             products = self.made.products(keys, step)
             laws = [self.component(key).law for key in keys]
-            psi = [self.start_psi.get(k, law.start) for k, law in zip(keys, laws, strict=True)]
-            start = (self.start_noise, np.concatenate([*psi, np.zeros(0)]))
-            at = maximised(products, laws, [start])
+            noise, known = self.start_noise, self.start_psi
+            if near is not None and real == self.is_real(near.names):
+                noise, known = near.at.log_noise, {**known, **self.psi_of(near)}
+            psi = [known.get(key, law.start) for key, law in zip(keys, laws, strict=True)]
+            at = maximised(products, laws, [(noise, np.concatenate([*psi, np.zeros(0)]))])
             score = at.nats + sum(self.component(key).prior for key in members)
             score += self._again(members)
             score += self._of_class(members)
             self.judged[members] = Hypothesis(members, keys, at, score)
         return self.judged[members]
+
+    def without(self, members: Names, key: str) -> Names:
+        """The set without a member, and without what is asked only beside it."""
+        if key != LAG:
+            return members - {key}
+        return (
+            members - {key} - {k for k in members if self.component(k).effect in self.beside_delay}
+        )
+
+    def is_real(self, members: Names) -> bool:
+        """Whether a set leaves what real recordings do."""
+        return any(key in members for key in self.remainder)
+
+    def psi_of(self, known: Hypothesis) -> dict[str, Array]:
+        """Hyperparameters of each of a set's components."""
+        out, begin = {}, 0
+        for key in known.keys:
+            width = len(self.component(key).law.start)
+            out[key] = known.at.psi[begin : begin + width]
+            begin += width
+        return out
 
     def _again(self, members: Names) -> float:
         """What was put on is taken off: a further step of one kind is no rare thing."""
@@ -87,36 +117,51 @@ class Hypotheses:
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
 
     def _of_class(self, members: Names) -> float:
-        real = any(key in members for key in self.remainder)
+        real = self.is_real(members)
         return float(np.log(priors.REAL if real else 1.0 - priors.REAL))
 
 
-def scanned(
-    made: Linearised, keys: Sequence[str], at: At, candidates: Sequence[str]
-) -> dict[str, float]:
-    """Log Bayes factor of each candidate beside a model, in its noise, sizes averaged."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Beside:
+    """A model in its noise, beside which candidates are asked.
+
+    root: lower, of the information of its coefficients with their prior;  seen: root^-1 s
+    """
+
+    made: Linearised
+    keys: Sequence[str]
+    inverse: Array
+    root: Array
+    seen: Array
+
+    def worth(self, candidates: Sequence[str]) -> dict[str, float]:
+        """Log Bayes factor of each candidate, sizes averaged."""
+        C, own, s = self.made.candidates(self.keys, candidates, self.inverse)
+        W = solve_triangular(self.root, C, lower=True, check_finite=False)
+        left = s - self.seen @ W
+        out, begin = {}, 0
+        for key, square in zip(candidates, own, strict=True):
+            part = slice(begin, begin + len(square))
+            begin += len(square)
+            G = square - W[:, part].T @ W[:, part]
+            out[key] = averaged(G, left[part], self.made.seen[key].component)
+        return out
+
+
+def beside(made: Linearised, keys: Sequence[str], at: At) -> Beside:
+    """A model beside which candidates are asked."""
     products = made.products(keys, priors.NOISE_STEP_REAL)
     inverse = np.exp(-at.log_noise)
-    laws = [made.seen[key].component.law for key in keys]
     phi, begin = [], 0
-    for law in laws:
+    for law in (made.seen[key].component.law for key in keys):
         width = len(law.start)
         phi.append(law.log_variance(at.psi[begin : begin + width]))
         begin += width
     A = np.tensordot(inverse, products.G, 1)
     A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
-    factor = cho_factor(A)
-    s = inverse @ products.s
-    solved = cho_solve(factor, s)
-    out = {}
-    made.gram_between(keys, candidates)
-    for key in candidates:
-        C = np.concatenate([np.tensordot(inverse, made.pair(one, key), 1) for one in keys], axis=0)
-        own = np.tensordot(inverse, made.pair(key, key), 1)
-        G = own - C.T @ cho_solve(factor, C)
-        left = inverse @ made.cross(key) - C.T @ solved
-        out[key] = averaged(G, left, made.seen[key].component)
-    return out
+    root = cholesky(A, lower=True, check_finite=False)
+    seen = solve_triangular(root, inverse @ products.s, lower=True, check_finite=False)
+    return Beside(made, tuple(keys), inverse, root, seen)
 
 
 def averaged(G: Array, s: Array, component: Component) -> float:
@@ -160,7 +205,7 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
             break
         here = todo[0]
         done.add(here.names)
-        reached = [all_sets.judge(names) for names in moves(all_sets, space, here)]
+        reached = [all_sets.judge(names, here) for names in moves(all_sets, space, here)]
         beam = _best([*beam, *reached])
     return beam
 
@@ -175,7 +220,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     names = here.names
     _propose_steps(all_sets, space, here)
     own = [key for key in names if key not in all_sets.remainder]
-    out = [names - {key} for key in own]
+    out = [all_sets.without(names, key) for key in own]
     courses = [key for key in space.courses if key not in names]
     out += [names | {key} for key in courses]
     rest = frozenset(all_sets.remainder)
@@ -214,7 +259,7 @@ def surprises(residual: Array, time_s: Array) -> list[float]:
 
 def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
     """The likeliest setting of each of the likeliest effects, beside a base in here's noise."""
-    model = all_sets.judge(base)
+    model = all_sets.judge(base, here)
     at = here.at_of(model)
     had = {all_sets.component(key).effect for key in base}
     steps = {name for name in had if name and name.endswith("_step")}
@@ -223,7 +268,11 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         for key in keys if key not in base
     ]  # fmt: skip
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
-    worth = scanned(all_sets.made, model.keys, at, candidates)
+    if LAG not in base:
+        part = all_sets.beside_delay
+        candidates = [key for key in candidates if all_sets.component(key).effect not in part]
+    scan = beside(all_sets.made, model.keys, at)
+    worth = scan.worth(candidates)
     best: dict[str, tuple[float, str]] = {}
     for key, nats in worth.items():
         one = all_sets.component(key)
@@ -231,7 +280,7 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         if total > best.get(one.effect or key, (-np.inf, ""))[0]:
             best[one.effect or key] = (total, key)
     ranked = sorted(best.values(), reverse=True)[:ASKED]
-    return [sought(all_sets, space, model.keys, at, key) for total, key in ranked if total > 0.0]
+    return [sought(all_sets, space, scan, key) for total, key in ranked if total > 0.0]
 
 
 def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
@@ -249,16 +298,16 @@ def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
     )
 
 
-def sought(all_sets: Hypotheses, space: Space, keys: Sequence[str], at: At, key: str) -> str:
+def sought(all_sets: Hypotheses, space: Space, scan: Beside, key: str) -> str:
     """The candidate with its onset and scale sought more and more finely."""
     made = all_sets.made
-    worth = scanned(made, keys, at, [key])[key] + all_sets.component(key).prior
+    worth = scan.worth([key])[key] + all_sets.component(key).prior
     for round_ in range(FINER):
         near = space.finer(all_sets.component(key), round_)
         if not near:
             break
         made.add(near)
-        found = scanned(made, keys, at, [one.key for one in near])
+        found = scan.worth([one.key for one in near])
         total = {one: nats + all_sets.component(one).prior for one, nats in found.items()}
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:

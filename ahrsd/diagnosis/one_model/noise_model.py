@@ -40,6 +40,14 @@ def log_prior(log_noise: Array, deviation: float) -> tuple[float, Array]:
     return -0.5 * float(step @ step + top**2) - len(step) * float(np.log(deviation)), gradient
 
 
+def stiffness(count: int, deviation: float) -> Array:
+    """(B, B) curvature of minus that log density."""
+    difference = np.diff(np.eye(count), axis=0) / deviation
+    found = difference.T @ difference
+    found[-1, -1] += 1.0 / priors.NOISE_TOP**2
+    return np.asarray(found)
+
+
 def bounds(count: int) -> tuple[Array, Array]:
     """Lowest and highest log power of each band."""
     return np.full(count, priors.NOISE_RANGE[0]), np.full(count, priors.NOISE_RANGE[1])

@@ -8,6 +8,7 @@ components of its own the library's flexible names would be told for it.
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation import TRACELESS
@@ -17,6 +18,11 @@ from ahrsd.diagnosis.one_model.gaussian_process import course
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
+#: rad/s below which a sensor stands still, and part of its ordinary rate; of all of its time, above
+#: which this is how it moves;  seconds of a spell, and how many of them, the longest
+STILL_RAD_S, STILL_PART, MOSTLY, STILL_S, MOST_SPELLS = 0.05, 0.2, 0.8, 3.0, 4
+#: s over which the rate is taken
+SMOOTHED_S = 0.5
 _GRAVITY = 9.81
 _ASIDE = np.eye(3)
 _SKEW = np.array([
@@ -33,12 +39,12 @@ def ordinary_remainder(context: Context) -> list[Component]:
         _sized(context, "by_direction", "sensor", harmonics(context.smooth_b)),
         by_change(context),
         _sized(context, "field_by_rate", "sensor", context.rate_b_rad_s),
-        bending(context),
         _sized(context, "by_rate_squared", "gyro", squares(context.rate_b_rad_s)),
         gyro_matrix(context),
     ]
     if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
         found.append(_sized(context, "by_force", "gyro", context.force_b_m_s2 / _GRAVITY))
+        found.append(bending(context))
     return found
 
 
@@ -55,6 +61,22 @@ def ordinary(size: priors.Size, scale: Array) -> Sized:
     mean = float(np.log(size.median))
     low, high = mean - 4.0 * size.spread, float(np.log(size.most))
     return Sized(scale, np.array([low]), np.array([high]), mean, size.spread)
+
+
+def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
+    """The longest spells in which a sensor hardly turns, from and to, s, in their order.
+
+    None where it hardly turns in most of its time: then that is its motion.
+    """
+    rows = max(1, round(SMOOTHED_S * len(time_s) / float(time_s[-1] - time_s[0])))
+    rate = np.linalg.norm(uniform_filter1d(gyro_rad_s, rows, axis=0), axis=1)
+    still = rate < min(STILL_RAD_S, STILL_PART * float(np.sqrt(np.mean(rate**2))))
+    if np.mean(still) > MOSTLY:
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+    spells = [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
+    long = [one for one in spells if one[1] - one[0] >= STILL_S]
+    return sorted(sorted(long, key=lambda one: one[0] - one[1])[:MOST_SPELLS])
 
 
 def by_change(context: Context) -> Component:

@@ -20,8 +20,8 @@ def answered(
     problem: Problem, start: NullFit, library: Mapping[str, Effect]
 ) -> tuple[decision.Answer, Linearised]:
     """Searched at the richest model, and again at what was found, until that stays."""
-    point = rich.richest(problem, start.filtered, library)
-    all_sets, space, best = best_at(point, library, (), was_real=True)
+    found = rich.richest(problem, start.filtered, library)
+    all_sets, space, best = best_at(found, library, (), was_real=True)
     answer = decision.decided(all_sets, space, best, library)
     for _ in range(ROUNDS - 1):
         before = decision.names_of(all_sets, answer.best)
@@ -30,8 +30,8 @@ def answered(
         if not named:
             break
         real = any(key in all_sets.remainder for key in answer.best.names)
-        point = rich.settled(all_sets.made.point, library, named, whole=True)
-        all_sets, space, best = best_at(point, library, named, real)
+        found = rich.settled(all_sets.made.point, library, named)
+        all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)
         if decision.names_of(all_sets, answer.best) == before:
             break

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
     LAG_FORM,
     STEPS,
+    beyond,
     component,
     form_of,
+    holds,
     library_components,
     neighbours,
 )
-from ahrsd.diagnosis.one_model.linearised import Point
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
+from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
 
 COURSES = ("free sensor", "free world", "free gyro")
 #: settings that an onset which was sought finely counts for at least
@@ -27,11 +28,11 @@ _ONSETS = 200
 
 
 def best_at(
-    point: Point, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
+    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
-    """The likeliest set at a point, searched from the names that are known and from nothing."""
-    base = rich.base_of(point, library, named)
-    all_sets, space = _space(base, library, named)
+    """The likeliest set at a richest model, searched from what is known and from nothing."""
+    base = rich.base
+    all_sets, space = space_at(rich, library, named)
     real = frozenset(base.remainder)
     known = frozenset(one.key for one in named)
     lag = frozenset([LAG])
@@ -43,12 +44,18 @@ def best_at(
     return all_sets, space, found[0]
 
 
-def _space(
-    base: rich.Base, library: Mapping[str, Effect], named: Sequence[Component]
+def space_at(
+    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
+    """The sets at a richest model, none judged yet, and what they may be made of."""
+    base = rich.base
     made, context = base.made, base.made.context
     found = library_components(context, library)
     effects = {name: [one.key for one in parts] for name, parts in found.items()}
+    delay = made.seen[LAG].component
+    nested = frozenset(name for name, parts in found.items() if holds(parts[0], delay))
+    for name in nested:
+        found[name] = [beyond(one, delay) for one in found[name]]
     made.add([one for parts in found.values() for one in parts])
     effects[LAG] = [LAG]
     forms = {}
@@ -62,9 +69,8 @@ def _space(
             forms[one.key] = form.key
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
-    at = rich.fitted(made, base.whole)
-    psi = rich.psi_by_key(made, base.whole, at)
-    all_sets = Hypotheses(made, base.remainder, at.log_noise, psi, forms)
+    psi = psi_by_key(made, base.whole, rich.at)
+    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, nested)
     length_s = context.track.duration_s
 
     def finer(one: Component, round_: int) -> list[Component]:

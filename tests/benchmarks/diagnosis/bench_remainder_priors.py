@@ -2,19 +2,25 @@
 
     python tests/benchmarks/diagnosis/bench_remainder_priors.py --measured SIZES.json [--only WORD]
     python tests/benchmarks/diagnosis/bench_remainder_priors.py --table SIZES.json
+    python tests/benchmarks/diagnosis/bench_remainder_priors.py --judge SIZES.json
 
 The first fits the richest model to each untouched recording beside the project and keeps, for each
-component of the ordinary remainder, how likely each size is beside all others (some five minutes of
-CPU; it goes on where it stopped).  The second finds the lognormal law of each size that makes all
-recordings together likeliest, and prints it as it stands in the module.
+component of the ordinary remainder, how likely each size is beside all others, and of each effect
+how large it comes out alone beside them (some two minutes of CPU; it goes on where it stopped).
+The second finds the lognormal law of each size that makes all recordings together likeliest, and
+prints it as it stands in the module, and the size of each effect that one in ten is beyond.  The
+third diagnoses each recording with the sizes that all others have: no recording is judged by what
+was measured on it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from bench_ordinary import AT_REST, DISTURBED, DOUBTFUL, FOLDERS, RECORDINGS
@@ -26,7 +32,12 @@ from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import priors, rich
+from ahrsd.diagnosis.one_model.decision import size_of
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import evaluated
+from ahrsd.diagnosis.one_model.model_search import beside
+from ahrsd.diagnosis.one_model.search_space import space_at
 from ahrsd.diagnosis.pauses import without_jumps
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec
@@ -34,7 +45,7 @@ from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
 
 GRID = np.arange(-4.5, 4.6, 0.5)  # of the logarithm of a size about its present median
-LEAST_SPREAD = 0.3
+LEAST_SPREAD = 0.5
 
 
 def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
@@ -46,30 +57,50 @@ def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
             yield name, path
 
 
-def profiles(path: Path) -> dict[str, list[list[float]]]:
-    """Of each component: log sizes, log likelihood at each without the size's own prior."""
+def measured(path: Path) -> dict[str, Any]:
+    """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
     track, _ = load_track(path)
     track, _ = without_jumps(roles.prepared(track)[0])
     problem, cold = problem_of(put_right(track, hygiene(track)), Spec(), {}, LIMITS)
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    base = rich.base_of(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
-    made, remainder, keys = base.made, base.remainder, base.whole
-    at = rich.fitted(made, keys)
+    found = rich.richest(problem, fit.filtered, EFFECTS)
+    return {"profiles": profiles(found), "effects": sizes(found)}
+
+
+def profiles(found: rich.Judged) -> dict[str, list[list[float]]]:
+    """Of each component: log sizes, log likelihood at each without the size's own prior."""
+    made, remainder, keys, at = found.base.made, found.base.remainder, found.base.whole, found.at
     products = made.products(keys, priors.NOISE_STEP_REAL)
     laws = [made.seen[key].component.law for key in keys]
     out, begin = {}, 0
     for key, law in zip(keys, laws, strict=True):
         if key in remainder and len(law.start):
             middle = law.start[0]
-            found = []
+            nats = []
             for step in GRID:
                 psi = at.psi.copy()
                 psi[begin] = middle + step
                 own, _ = law.log_prior(psi[begin : begin + len(law.start)])
-                found.append(evaluated(products, laws, at.log_noise, psi).nats - own)
+                nats.append(evaluated(products, laws, at.log_noise, psi).nats - own)
             unit = getattr(law, "unit", 1.0)
-            out[key] = [(middle + GRID + np.log(unit)).tolist(), found]
+            out[key] = [(middle + GRID + np.log(unit)).tolist(), nats]
         begin += len(law.start)
+    return out
+
+
+def sizes(found: rich.Judged) -> dict[str, list[float]]:
+    """Of each effect in its likeliest setting, and each course: size and nats that it gains."""
+    all_sets, space = space_at(found, EFFECTS, ())
+    base = all_sets.judge({*found.base.remainder, LAG})
+    scan = beside(all_sets.made, base.keys, base.at)
+    out = {}
+    for name, keys in {**space.effects, **{key: [key] for key in space.courses}}.items():
+        if name == LAG:
+            continue
+        worth = scan.worth(keys)
+        key = max(worth, key=lambda one: worth[one])
+        with_it = all_sets.judge(base.names | {key}, base)
+        out[name] = [size_of(all_sets, with_it, key), with_it.score - base.score]
     return out
 
 
@@ -94,31 +125,79 @@ def law_of(curves: list[list[list[float]]]) -> priors.Size:
     return priors.Size(float(np.exp(found.x[0])), LEAST_SPREAD + abs(float(found.x[1])), np.inf)
 
 
+def ordinary_effects(known: list[dict[str, Any]]) -> dict[str, float]:
+    """Of each effect the size that one in ten of all recordings is beyond; none where it is nil."""
+    out = {}
+    beyond = round(len(known) / 10)
+    for name in sorted({name for one in known for name in one["effects"]}):
+        found = [one["effects"].get(name, [0.0, 0.0]) for one in known]
+        sizes = sorted((size for size, nats in found if nats > 0.0), reverse=True)
+        if len(sizes) > beyond:
+            out[name] = float(sizes[beyond])
+    return out
+
+
+def laws_of(known: list[dict[str, Any]]) -> dict[str, priors.Size]:
+    """The law of each component of the remainder."""
+    out = {}
+    for key, now in priors.ORDINARY.items():
+        curves = [one["profiles"][key] for one in known if key in one["profiles"]]
+        found = law_of(curves)
+        out[key] = priors.Size(min(found.median, now.most / 3.0), found.spread, now.most)
+    return out
+
+
+def measure(path: Path, words: list[str]) -> None:
+    known = json.loads(path.read_text()) if path.exists() else {}
+    for name, recording in untouched(words):
+        if name in known:
+            continue
+        try:
+            known[name] = measured(recording)
+        except (RecordingError, ValueError) as why:
+            print(f"{name}: {why}")
+            continue
+        asked = {k: round(v[0], 4) for k, v in known[name]["effects"].items() if v[1] > 0.0}
+        print(name, asked, flush=True)
+        path.write_text(json.dumps(known) + "\n", encoding="utf-8")
+
+
+def table(path: Path) -> None:
+    known = list(json.loads(path.read_text()).values())
+    for key, size in laws_of(known).items():
+        print(f'    "{key}": Size({size.median:.2e}, {size.spread:.2f}, {size.most:g}),')
+    for name, most in ordinary_effects(known).items():
+        print(f'    "{name}": {most:.2g},')
+
+
+def judge(path: Path, words: list[str]) -> None:
+    known = json.loads(path.read_text())
+    laws, effects = priors.ORDINARY, priors.ORDINARY_EFFECT
+    for name, recording in untouched(words):
+        others = [one for key, one in known.items() if key != name]
+        priors.ORDINARY, priors.ORDINARY_EFFECT = laws_of(others), ordinary_effects(others)
+        begin = time.process_time()
+        said = diagnose(load_track(recording)[0])
+        names = [f"{one.effect} ({one.evidence_nats:.0f})" for one in said.findings]
+        left = said.unexplained
+        where = f"unknown {left.where.frame} {left.size:.3g}" if left.where else "nothing else"
+        print(f"{name}: {names}, {where}, {time.process_time() - begin:.1f} s", flush=True)
+        priors.ORDINARY, priors.ORDINARY_EFFECT = laws, effects
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--measured", type=Path, help="fit, and keep the profiles in this file")
+    parser.add_argument("--measured", type=Path, help="fit, and keep what is found in this file")
     parser.add_argument("--only", nargs="*", default=[""], help="parts of names")
-    parser.add_argument("--table", type=Path, help="a file of profiles")
+    parser.add_argument("--table", type=Path, help="a file of measurements")
+    parser.add_argument("--judge", type=Path, help="the same: each by what the others leave")
     given = parser.parse_args()
     if given.measured:
-        known = json.loads(given.measured.read_text()) if given.measured.exists() else {}
-        for name, path in untouched(given.only):
-            if name in known:
-                continue
-            try:
-                known[name] = profiles(path)
-            except (RecordingError, ValueError) as why:
-                print(f"{name}: {why}")
-                continue
-            best = {k: float(np.exp(at[int(np.argmax(v))])) for k, (at, v) in known[name].items()}
-            print(name, {k: f"{v:.2g}" for k, v in best.items()}, flush=True)
-            given.measured.write_text(json.dumps(known) + "\n", encoding="utf-8")
+        measure(given.measured, given.only)
     if given.table:
-        known = json.loads(given.table.read_text())
-        for key in priors.ORDINARY:
-            found = law_of([one[key] for one in known.values() if key in one])
-            most = priors.ORDINARY[key].most
-            print(f'    "{key}": Size({found.median:.2e}, {found.spread:.2f}, {most:g}),')
+        table(given.table)
+    if given.judge:
+        judge(given.judge, given.only)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
 from ahrsd.diagnosis.one_model import noise_model
@@ -93,7 +95,7 @@ def test_the_mean_and_covariance_are_those_of_bayes():
         k += len(law.start)
     precision = (B.T * weight) @ B + np.diag(1 / np.concatenate(variance))
     covariance = np.linalg.inv(precision)
-    np.testing.assert_allclose(at.covariance, covariance, atol=1e-8)
+    np.testing.assert_allclose(at.deviation, np.sqrt(np.diag(covariance)), rtol=1e-7)
     np.testing.assert_allclose(at.mean, covariance @ (B.T @ (weight * y)), atol=1e-7)
 
 
@@ -137,3 +139,52 @@ def test_what_is_not_there_is_small_and_what_is_there_is_found():
     assert np.exp(found.psi[0]) == pytest.approx(2.0, rel=0.5)
     assert np.exp(found.psi[1]) < 0.15
     np.testing.assert_allclose(np.exp(found.log_noise), 1.0, rtol=0.6)
+
+
+def test_the_curvature_is_the_average_information_and_no_less_than_the_expected():
+    B, y = design(6, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    begin, variance, slopes, stiff = 0, [], [], []
+    for law in laws():
+        mine = PSI[begin : begin + len(law.start)]
+        begin += len(mine)
+        variance.append(np.exp(law.log_variance(mine)))
+        slopes.append(law.slope(mine))
+        stiff.append(law.stiffness)
+    phi, slope = np.concatenate(variance), block_diag(*slopes)
+    noise = np.repeat(np.exp(LOG_NOISE), ROWS)
+    band = np.repeat(np.eye(len(ROWS)), ROWS, axis=0)
+    P = np.linalg.inv(np.diag(noise) + (B * phi) @ B.T)
+    changes = [np.diag(noise * part) for part in band.T]
+    changes += [(B * phi * part) @ B.T for part in slope.T]
+    Z = np.column_stack([change @ P @ y for change in changes])
+    average = 0.5 * Z.T @ P @ Z
+    k = len(ROWS)
+    found = at.curvature.copy()
+    found[:k, :k] -= noise_model.stiffness(k, STEP)
+    found[k:, k:] -= np.diag(np.concatenate(stiff))
+    off = ~np.eye(len(found), dtype=bool)
+    np.testing.assert_allclose(found[off], average[off], rtol=1e-6, atol=1e-9)
+    expected = [0.5 * np.trace(P @ change @ P @ change) for change in changes[k:]]
+    most = np.maximum(np.diag(average)[k:], expected)
+    np.testing.assert_allclose(np.diag(found)[k:], most, rtol=1e-6)
+
+
+def test_the_maximum_is_that_of_another_climb():
+    """Newton's steps against a quasi-Newton search of the same function, from far away."""
+    for seed in range(10):
+        B, y = design(20 + seed, WIDTHS)
+        found = maximised(products(B, y), laws(), [(np.full(4, 1.5), np.zeros(4))])
+
+        of_all = products(B, y)
+
+        def cost(x, known=of_all):
+            at = evaluated(known, laws(), x[:4], x[4:])
+            return -at.nats, -at.gradient
+
+        low, high = noise_model.bounds(4)
+        low = np.concatenate([low, *(law.low for law in laws())])
+        high = np.concatenate([high, *(law.high for law in laws())])
+        start = np.concatenate([found.log_noise, found.psi]) + 0.3
+        other = minimize(cost, start, jac=True, bounds=list(zip(low, high, strict=True)))
+        assert found.nats == pytest.approx(-other.fun, abs=0.05)

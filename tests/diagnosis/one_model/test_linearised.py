@@ -1,0 +1,129 @@
+"""One recording linearised: candidates beside a model, delays that hold, where nothing is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.innovation import run_filter
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.one_model import priors, rich
+from ahrsd.diagnosis.one_model.component import Component, Fixed
+from ahrsd.diagnosis.one_model.effect_components import (
+    LAG,
+    LAG_FORM,
+    beyond,
+    holds,
+    library_components,
+)
+from ahrsd.diagnosis.one_model.evidence import evaluated
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point
+from ahrsd.diagnosis.one_model.model_search import beside
+from ahrsd.diagnosis.one_model.remainder import still_spells
+from ahrsd.diagnosis.problem import problem_of
+from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.values import Columns
+
+
+def richest(track: Track) -> rich.Judged:
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    return rich.richest(problem, fit.filtered, EFFECTS)
+
+
+def delayed(track: Track, lag_s: float) -> Track:
+    """The magnetometer's readings late by so much."""
+    t, m = track.time_s, track.mag_b_gauss
+    late = [np.interp(t - lag_s, t, m[:, axis]) for axis in range(3)]
+    return replace(track, mag_b_gauss=np.column_stack(late))
+
+
+@pytest.fixture(scope="module")
+def bare() -> rich.Judged:
+    """A simulated recording without an accelerometer."""
+    return richest(replace(track_of(experiment("wam", seed=8, samples=3000)), accel_b_m_s2=None))
+
+
+def test_without_an_accelerometer_nothing_is_asked_of_it(bare):
+    assert np.isfinite(bare.nats)
+    assert {"by_force", "bending"}.isdisjoint(bare.base.remainder)
+    assert "by_direction" in bare.base.remainder
+
+
+def test_a_candidate_beside_a_model_is_worth_what_it_adds_to_the_evidence(bare):
+    made, keys = bare.base.made, (CALIBRATION, "gyro_matrix")
+    laws = [made.seen[key].component.law for key in keys]
+    noise = np.linspace(-0.3, 0.4, len(made.edges) - 1)
+    step = priors.NOISE_STEP_REAL
+    without = evaluated(made.products(keys, step), laws, noise, np.zeros(0))
+    both = (*keys, LAG)
+    laws.append(made.seen[LAG].component.law)
+    with_it = evaluated(made.products(both, step), laws, noise, np.zeros(0))
+    worth = beside(made, keys, without).worth([LAG])
+    assert worth[LAG] == pytest.approx(with_it.nats - without.nats, abs=1e-5)
+
+
+def test_a_delay_that_is_long_is_found_from_none():
+    found = richest(delayed(track_of(experiment("wam", seed=9, samples=4000)), 0.11))
+    value = by_key(found.base.made, found.base.whole, found.at)[LAG]
+    assert value[0] == pytest.approx(0.11, abs=0.006)
+
+
+def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
+    delay = bare.base.made.seen[LAG].component
+    parts = library_components(bare.base.made.context, EFFECTS)
+    assert [name for name, some in parts.items() if holds(some[0], delay)] == ["eddy_current"]
+    eddy = beyond(parts["eddy_current"][0], delay)
+    assert not holds(eddy, delay)
+    shared = np.einsum("nia,ni->a", eddy.columns.mag, delay.columns.mag[:, :, 0])
+    np.testing.assert_allclose(shared, 0.0, atol=1e-9)
+
+
+def test_columns_hold_others_that_are_a_sum_of_them():
+    rng = np.random.default_rng(1)
+    X = rng.normal(size=(50, 3, 4))
+    law = Fixed(np.ones(4))
+    whole = Component("whole", "sensor", Columns(mag=X), law)
+    part = Component("part", "sensor", Columns(mag=X @ np.array([[1.0], [2], [0], [-1]])), law)
+    other = Component("other", "sensor", Columns(mag=rng.normal(size=(50, 3, 1))), law)
+    assert holds(whole, part)
+    assert not holds(whole, other)
+    assert not holds(part, whole)
+
+
+def test_spells_at_rest_are_those_in_which_a_sensor_hardly_turns():
+    t = np.arange(0.0, 100.0, 0.1)
+    gyro = np.zeros((len(t), 3))
+    moving = (t >= 20.0) & (t < 60.0)
+    gyro[moving, 2] = 1.0
+    gyro[(t >= 80.0) & (t < 81.0), 0] = 1.0
+    found = still_spells(t, gyro)
+    expected = [(0.0, 19.7), (60.2, 79.7), (81.2, 99.9)]
+    np.testing.assert_allclose(found, expected, atol=0.31)
+
+
+def test_what_hardly_turns_in_most_of_its_time_is_never_at_rest():
+    t = np.arange(0.0, 100.0, 0.1)
+    gyro = np.zeros((len(t), 3))
+    gyro[:100, 2] = 1.0
+    assert still_spells(t, gyro) == []
+
+
+def test_a_logged_cause_is_the_same_component_at_every_point():
+    """Its reference follows the readings, and what it took out of them has to be put back."""
+    track = track_of(experiment("wam", seed=4, samples=3000))
+    warm = 15.0 + np.cumsum(np.random.default_rng(2).normal(size=len(track))) / 500.0
+    track = replace(track, covariates={"temperature_c": warm})
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    keys = []
+    for one in (problem, problem.lagging(0.03)):
+        start = first_point(one, run_filter(one.track, fit.filtered.model))
+        keys.append(rich.base_of(start, EFFECTS, (), whole=False).whole)
+    assert "gyro_bias_temperature as logged" in keys[0]
+    assert set(keys[1]) - set(keys[0]) == {LAG_FORM}
