@@ -81,8 +81,9 @@ def bent(truth: Readings, covariance: Array, seed: int) -> Readings:
     is not.
     """
     dice = np.random.default_rng([seed, 3])
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * dice.standard_normal(len(values)))
+    zero = np.zeros(len(covariance))
+    # not checked: a covariance that is an inverse may be indefinite by rounding
+    drawn = dice.multivariate_normal(zero, covariance, check_valid="ignore")
     iron = np.einsum("a,aij->ij", drawn[:5], TRACELESS)
     return replace(truth, mag_b_gauss=truth.mag_b_gauss + truth.field_b @ iron + drawn[5:8])
 

@@ -71,7 +71,7 @@ def is_table_text(start: bytes) -> bool:
         start = start.decode(encoding, "ignore").encode("utf-8")
     lines = re.split(rb"[\r\n]+", start.removeprefix(b"\xef\xbb\xbf"))[:-1]
     lines = [line for line in lines if line.strip() and not line.startswith(_COMMENTS)]
-    message = re.search(rb"(?m)\$VN|^VN[A-Z]{3},", start)
+    message = re.search(rb"(?m)^[$!]|\$VN|^VN[A-Z]{3},", start)  # of a VN-100, or NMEA
     if len(lines) < _ROWS_THAT_TELL or message or any(byte < 9 for byte in start):
         return False
     mark = _separator_of(lines[-1])
