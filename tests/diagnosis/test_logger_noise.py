@@ -71,6 +71,7 @@ def test_a_track_with_pauses_is_left_alone() -> None:
     assert cleaned(parts, ("speed_m_s",)) is None
 
 
+@pytest.mark.slow  # half a minute; what it rests on is above
 def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
     track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=12.5))
     speed = 1.2 + 0.25 * course(10, 3000)

@@ -94,9 +94,9 @@ def wobbling(gauss: float, noise: str, turn_s: float) -> Track:
         (1.0e-4, "white", 30.0, True),
         # what is red may be the noise's own, also where that is next to white
         (0.0, "red", 8.5, False),
-        (1.2e-4, "white", 8.5, False),
+        pytest.param(1.2e-4, "white", 8.5, False, marks=pytest.mark.slow),
         # and where it is slow; but nothing that forgets within two seconds is as slow as this
-        (8e-4, "white", 8.5, False),
+        pytest.param(8e-4, "white", 8.5, False, marks=pytest.mark.slow),
         (8e-4, "red", 8.5, False),
         (1.2e-3, "white", 8.5, True),
     ],

@@ -167,7 +167,9 @@ def test_a_driver_that_saves_and_resets_a_hundred_times_leaves_the_registers_as_
     assert run.kinds().count("CLIENT_SAVED") == 100
 
 
-@pytest.mark.parametrize("at", range(1, 60, 3))
+@pytest.mark.parametrize(
+    "at", [pytest.param(at, marks=[] if at % 2 else pytest.mark.slow) for at in range(1, 60, 3)]
+)
 def test_a_save_of_the_owner_at_any_command_of_a_write_saves_nothing_unproven(at):
     run, heard = shared(), []
     unit = run.cable.unit

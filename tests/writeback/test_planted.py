@@ -204,7 +204,7 @@ def holds_what_it_held(run: VirtualRun, scenario: str) -> bool:
     )
 
 
-@pytest.mark.parametrize("scenario", ["rov", "calibrated"])
+@pytest.mark.parametrize("scenario", ["rov", pytest.param("calibrated", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("bad", ROLLED_BACK, ids=lambda bad: bad.__name__)
 def test_what_got_past_the_gates_is_rolled_back_within_the_trial(bad, scenario):
     if bad is hsi_active:

@@ -47,7 +47,10 @@ def test_their_value_is_found_within_the_interval_and_stays(binary, when):
 
 
 @STREAMS
-@pytest.mark.parametrize("at", range(1, 33, 5))
+@pytest.mark.parametrize(
+    "at",
+    [pytest.param(at, marks=[] if at % 2 else pytest.mark.slow) for at in range(1, 33, 5)],
+)
 def test_just_before_the_save(binary, at):
     run, heard = CabledRun(two_units(binary=binary)), []
     run.proven()
@@ -75,7 +78,9 @@ def test_a_rollback_does_not_write_over_it():
 
 
 @STREAMS
-@pytest.mark.parametrize("nth", [1, 3, 5, 7, 9])
+@pytest.mark.parametrize(
+    "nth", [1, 5, *(pytest.param(nth, marks=pytest.mark.slow) for nth in (3, 7, 9))]
+)
 def test_a_restart_between_the_two_registers_leaves_no_half_a_calibration(binary, nth):
     """After 23 was written; its time goes on in a text stream, which carries none."""
     run = CabledRun(two_units(binary=binary))

@@ -42,9 +42,10 @@ def wrong(event: str, places: list[str], **options: object) -> list[str]:
 BEHIND_A_SAVE = range(0, 240, 16)
 
 
-@pytest.mark.parametrize("event", ["kill", "kill and other writes", "host reboots", "swap",
-    "other writes", "restart", "unsafe for a while", "disk full", "lie", "bad line",
-    "client saves", "client saves and resets", "client calibrates"])  # fmt: skip
+@pytest.mark.parametrize("event", ["kill and other writes", "swap", "restart", "disk full", "lie",
+    "client saves and resets", "client calibrates",
+    *(pytest.param(event, marks=pytest.mark.slow) for event in ("kill", "host reboots",
+        "other writes", "unsafe for a while", "bad line", "client saves"))])  # fmt: skip
 def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event):
     names = [*write_histories.NAMES, *write_histories.CLIENT_EVENTS]
     tally, does = write_histories.HistoriesTally(), write_histories.ASIDE_FOR
