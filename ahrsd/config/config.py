@@ -78,6 +78,7 @@ _LARGEST_BYTES = 1 << 20
 _NAMES = 12  # more keys than this do not fit into one line
 _WORDS = {  # where pydantic speaks of Python's types and not of TOML's
     "is_instance_of": "must be text, a path",
+    "string_type": "must be text in quotes",
     "int_type": "must be a whole number",
     "bool_type": "must be true or false",
     "float_type": "must be a number",

@@ -289,14 +289,14 @@ def stream_line(status: Status) -> str:
 def errors_line(status: Status) -> str:
     """What went wrong on the wire; ends in ": " where nothing did."""
     stream = status["stream"]
-    counts = {
-        "rejected": stream["rejected"],
-        "bytes skipped": stream["skipped_bytes"],
-        "gaps": stream["gaps"],
-        "device restarts": stream["restarts"],
-        "VNERR": stream["faults"],
-    }
-    return "errors: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    said = (
+        (stream["rejected"], f"{stream['rejected']} rejected"),
+        (stream["skipped_bytes"], f"{counted(stream['skipped_bytes'], 'byte')} skipped"),
+        (stream["gaps"], counted(stream["gaps"], "gap")),
+        (stream["restarts"], counted(stream["restarts"], "device restart")),
+        (stream["faults"], f"{stream['faults']} VNERR"),
+    )
+    return "errors: " + ", ".join(words for count, words in said if count)
 
 
 def motion_line(status: Status) -> str:

@@ -96,6 +96,7 @@ def test_values_are_frozen():
         ("[device]\nrate_hz = 0.1", "device.rate_hz = 0.1: must be greater than or equal to 1"),
         ("[device]\nrate_hz = nan", "device.rate_hz = nan: must be less than or equal to 800"),
         ('[device]\nrate_hz = "fast"', "device.rate_hz = 'fast': must be a number"),
+        ("[[share]]\ntcp = 15555", "share.0.tcp = 15555: must be text in quotes"),
         ("[device]\nserial_number = 1.5", "device.serial_number = 1.5: must be a whole number"),
         ('[device]\nconfigure_stream = "yes"', "= 'yes': must be true or false"),
         ("[device]\nconfigure_stream = 1", "device.configure_stream = 1: must be true or false"),

@@ -1,10 +1,10 @@
-"""How `ahrsd status` says a share, whole lines."""
+"""How `ahrsd status` says a share and what went wrong on the wire, whole lines."""
 
 from __future__ import annotations
 
 import pytest
 
-from ahrsd.telemetry.words import share_lines
+from ahrsd.telemetry.words import errors_line, share_lines
 
 NOTHING = dict.fromkeys(
     ("commands", "answered", "refused", "absorbed", "dropped", "unanswered", "lost_bytes",
@@ -41,3 +41,18 @@ NOTHING = dict.fromkeys(
 )  # fmt: skip
 def test_a_share_is_one_line(share, line):
     assert share_lines({"shares": [{**NOTHING, **share}]}) == [f"share: {line}"]
+
+
+@pytest.mark.parametrize(
+    ("counts", "line"),
+    [
+        ({}, "errors: "),
+        ({"gaps": 1}, "errors: 1 gap"),
+        ({"gaps": 2, "restarts": 1}, "errors: 2 gaps, 1 device restart"),
+        ({"skipped_bytes": 1, "rejected": 3}, "errors: 3 rejected, 1 byte skipped"),
+        ({"faults": 1}, "errors: 1 VNERR"),
+    ],
+)
+def test_what_went_wrong_on_the_wire_is_counted_in_english(counts, line):
+    none = dict.fromkeys(("rejected", "skipped_bytes", "gaps", "restarts", "faults"), 0)
+    assert errors_line({"stream": none | counts}) == line
