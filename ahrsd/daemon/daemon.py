@@ -30,10 +30,8 @@ from ahrsd.core.estimation import supervised
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
-from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.serial_link import Bytes, Item, Lost, SerialLink
 from ahrsd.daemon.vehicle_files import VehicleFiles
-from ahrsd.inputs import EarlierRun, EarlierSamples
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.telemetry.feeds import Outlet
 from ahrsd.telemetry.status import LinkFacts
@@ -52,10 +50,10 @@ class Recall:
     """Reads; `take` gives one input at a time, once all of them are there."""
 
     def __init__(
-        self, read: Callable[[Callable[[], bool]], list[EarlierSamples | EarlierRun]]
+        self, read: Callable[[Callable[[], bool]], list[inputs.EarlierSamples | inputs.EarlierRun]]
     ) -> None:
         self._read = read
-        self._found: deque[EarlierSamples | EarlierRun] = deque()
+        self._found: deque[inputs.EarlierSamples | inputs.EarlierRun] = deque()
         self._until_s = time.monotonic() + LONGEST_S
         self._thread = threading.Thread(target=self._run, name="earlier runs", daemon=True)
         self._thread.start()
@@ -74,13 +72,13 @@ class Recall:
         found, failure = supervised(lambda: self._read(self._go_on))
         if failure is not None:
             log.error("no warm start: %s", failure.reason, extra={"trace": failure.trace})
-            found = [EarlierRun(0, why=failure.reason)]
+            found = [inputs.EarlierRun(0, why=failure.reason)]
         self._found.extend(found or ())
 
     def _go_on(self) -> bool:
         return time.monotonic() < self._until_s
 
-    def take(self, host_ns: int) -> EarlierSamples | EarlierRun | None:
+    def take(self, host_ns: int) -> inputs.EarlierSamples | inputs.EarlierRun | None:
         """The next input, as of now; None while there is none."""
         if self._thread.is_alive() or not self._found:
             return None
@@ -139,7 +137,7 @@ class Daemon:
         config: Config,
         shell: Shell,
         port_path: Path,
-        clock: HostClock,
+        clock: host_clock.HostClock,
         files: VehicleFiles | None = None,
         *,
         baud: int | None = None,

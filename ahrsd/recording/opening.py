@@ -30,7 +30,7 @@ from ahrsd.recording.column_names import ACCEL, GYRO, MAG, NO_MAP, TIME, ColumnM
 from ahrsd.recording.foreign.formats import Format, format_of, ready
 from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.foreign.sensors import NO_CHOICE, Choice, RawBytes, merged
-from ahrsd.recording.table import PARQUET, Table, is_rows_of_numbers, read_table, table_of
+from ahrsd.recording.table import PARQUET, Table, read_table, starts_a_table, table_of
 from drivers.vn100.decode import ErrorReply, Measurement, Unused, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.messages import Reply
@@ -254,16 +254,11 @@ def _in_spite_of_its_name(
         if is_gzip(path):
             raise RecordingError(path, "is packed with gzip", f"unpack it: gunzip {path.name}")
         return RecordingKind.CAPTURE if blocks.is_mcap(start) else RecordingKind.TABLE
-    line = _as_utf8(start).lstrip().split(b"\n", 1)[0]
-    if named is not RecordingKind.TABLE and (_names_columns(line) or is_rows_of_numbers(start)):
+    if starts_a_table(start):
         return RecordingKind.TABLE
-    if named is RecordingKind.TABLE and line.startswith(b"$VN"):
+    if named is RecordingKind.TABLE and _as_utf8(start).lstrip().startswith(b"$VN"):
         return RecordingKind.BYTES
     return None
-
-
-def _names_columns(line: bytes) -> bool:
-    return b"$VN" not in line and (b"mag_x_gauss" in line or b"TimeStartup," in line)
 
 
 def _as_utf8(start: bytes) -> bytes:
@@ -272,8 +267,6 @@ def _as_utf8(start: bytes) -> bytes:
 
 
 def _by_content(path: Path, start: bytes) -> RecordingKind:
-    if b"time_s" in _as_utf8(start).split(b"\n", 1)[0]:
-        return RecordingKind.TABLE
     if b"$VN" in start or b"\xfa" in start:
         return RecordingKind.BYTES
     raise RecordingError(

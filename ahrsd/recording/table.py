@@ -145,8 +145,8 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     return _checked(rows, check_units)
 
 
-def is_rows_of_numbers(start: bytes) -> bool:
-    """Whether the first bytes of a file are a table's, whatever the file is called."""
+def starts_a_table(start: bytes) -> bool:
+    """Whether the first bytes of a file are those of a table of text, whatever it is called."""
     from ahrsd.recording.text_table import is_table_text
 
     return is_table_text(start)

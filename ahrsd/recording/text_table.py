@@ -36,6 +36,7 @@ _COMMENT_LINE = re.compile(rb"(?m)^(?:#|%|//)[^\n]*(?:\n|\Z)")
 _SEPARATOR_LINE = re.compile(rb"^\"?sep=(.)\"?\s*$", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(rb"^\s*[+-]?\d+,\d+\s*$")
 _WRONG_SHARE, _WRONG_FEW = 0.01, 3  # rows with another number of cells that are left out
+_OF_TABLES = (b"time_s", b"mag_x_gauss", b"TimeStartup,")  # names in the first line
 _ROWS_THAT_TELL = 2
 _LESS = "keep fewer of them, or cut the recording in parts"
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "N/A", "n/a", "NA", "#N/A"]
@@ -62,15 +63,18 @@ class _Text:
 
 
 def is_table_text(start: bytes) -> bool:
-    """Whether the first bytes of a file are rows of numbers beyond doubt, whatever it is called.
+    """Whether the first bytes of a file are a table's beyond doubt, whatever it is called.
 
-    Two whole lines that follow each other have as many cells, at least those that a table needs,
-    and all but the time are numbers. A message of a VN-100 is none.
+    Its first line has a name that only tables have; or two whole lines that follow each other have
+    as many cells, at least those that a table needs, and all but the time are numbers. A message
+    of a VN-100 is none.
     """
     if (encoding := utf16_of(start)) is not None:
         start = start.decode(encoding, "ignore").encode("utf-8")
-    lines = re.split(rb"[\r\n]+", start.removeprefix(b"\xef\xbb\xbf"))[:-1]
-    lines = [line for line in lines if line.strip() and not line.startswith(_COMMENTS)]
+    lines = re.split(rb"[\r\n]+", start.removeprefix(b"\xef\xbb\xbf").lstrip())
+    if b"$VN" not in lines[0] and any(name in lines[0] for name in _OF_TABLES):
+        return True
+    lines = [line for line in lines[:-1] if line.strip() and not line.startswith(_COMMENTS)]
     message = re.search(rb"(?m)^[$!]|\$VN|^VN[A-Z]{3},", start)  # of a VN-100, or NMEA
     if len(lines) < _ROWS_THAT_TELL or message or any(byte < 9 for byte in start):
         return False
