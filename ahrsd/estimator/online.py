@@ -201,7 +201,7 @@ class HeadingAdvice:
         found = {"turn through all headings": [turned]}
         for name, axis in (("roll", [1.0, 0.0, 0.0]), ("pitch", [0.0, 1.0, 0.0])):
             leant = so3.exp(lean * np.array(axis))
-            found[f"{name} by 30 deg both ways, on four headings"] = [
+            found[f"{name} by 30 deg both ways, on four headings, if the vehicle can"] = [
                 leant @ one for one in turned[::3]
             ]
         return found
