@@ -27,6 +27,12 @@ _LOOK_BYTES = 64 * 1024  # from which it is told what was done to a text
 _PIECE_BYTES = 16 * 1024
 _LONGEST_LINE = 64 * 1024
 _FEWEST_NULS = 64  # at the end; less may belong to a packet
+#: of UTF-32 first: its mark begins as that of UTF-16
+_WIDE_MARKS = (
+    (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"),
+)  # fmt: skip
+_EUROPEAN = re.compile(rb"[\t\n\r -~\xa0-\xff]+")
 _LITERAL = re.compile(rb"""b'(?:[^'\\]|\\.)*'|b"(?:[^"\\]|\\.)*\"""")
 
 
@@ -116,19 +122,31 @@ def _unzipped(file: BinaryIO, chunk_bytes: int, told: list[str]) -> Iterator[byt
         yield from (bytes(ready[k : k + chunk_bytes]) for k in range(0, len(ready), chunk_bytes))
 
 
-def utf16_of(start: bytes) -> str | None:
-    """The encoding where text begins like UTF-16, by its mark or by every other byte being 0."""
-    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"
+def wide_text_of(start: bytes) -> str | None:
+    """The encoding where text begins like UTF-16 or UTF-32.
+
+    By its mark, or by bytes that are 0 where those of European text are in between.
+    """
+    for mark, encoding in _WIDE_MARKS:
+        if start.startswith(mark):
+            return encoding
     sample = start[:400]
-    even, odd = sample[0::2], sample[1::2]
-    if len(sample) < 8 or not (set(sample) <= {0, 9, 10, 13, *range(32, 127)}):
+    if len(sample) < 8:
         return None
-    if odd.count(0) > 0.9 * len(odd) and even.count(0) < 0.1 * len(even):
-        return "utf-16-le"
-    if even.count(0) > 0.9 * len(even) and odd.count(0) < 0.1 * len(odd):
-        return "utf-16-be"
+    for width, encoding in ((4, "utf-32"), (2, "utf-16")):
+        for place, order in ((0, "le"), (width - 1, "be")):
+            letters = sample[place::width]
+            zeros = [sample[k::width] for k in range(width) if k != place]
+            if all(part.count(0) > 0.9 * len(part) for part in zeros) and _EUROPEAN.fullmatch(
+                letters
+            ):
+                return f"{encoding}-{order}"
     return None
+
+
+def wide_text_note(encoding: str) -> str:
+    """What is said of such text."""
+    return f"the text is {encoding[:6].upper()}: read as such"
 
 
 def read_stream(
@@ -144,8 +162,8 @@ def read_stream(
             break
     start = b"".join(first)
     stream: Iterable[bytes] = _chained(first, chunks)
-    if (encoding := utf16_of(start)) is not None:
-        told.append("the text is UTF-16: read as such")
+    if (encoding := wide_text_of(start)) is not None:
+        told.append(wide_text_note(encoding))
         stream = _recoded(stream, encoding)
         start = start.decode(encoding, "ignore").encode("utf-8")
     if any(mark in start for mark in (b"b'$VN", b'b"$VN', b"b'\\xfa")):

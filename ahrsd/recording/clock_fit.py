@@ -24,6 +24,13 @@ _BOUND_STEPS, _BOUND_S = 8.0, 0.1  # delays stay within so many steps, or so man
 _BOUND_STAMPS = 1.3  # so many times the usual step between different stamps
 _APART_S = 1.1  # between bunches at most; what is further apart are bursts of a sleeping logger
 _LOST = 0.6  # of a step, by which the lower envelope moves where a sample is lost
+_GAP = 1.6  # usual steps, beyond which a step is a gap
+#: seconds after which clocks begin again: 12 hours are a time of day without am and pm
+_PERIODS = (
+    (86400.0, "a day"), (43200.0, "half a day"), (604800.0, "a week (GPS time)"),
+    (2**16 * 1e-3, "16 bits of ms"), (2**32 * 1e-3, "32 bits of ms"),
+    (2**32 * 1e-6, "32 bits of us"), (2**32 * 1e-9, "32 bits of ns"),
+)  # fmt: skip
 _FEWEST_BUNCHES = 6
 _WIDTHS = 3.0  # bunches to a window of the envelope
 
@@ -51,8 +58,13 @@ def is_bunched(stamps_s: Array) -> bool:
 
 
 def _stamp_step(steps: Array) -> float:
-    """The usual step between different stamps that is not within a bunch."""
-    moved = steps[steps > 0.0]
+    """The usual step between different stamps that is not within a bunch.
+
+    However many rows a bunch has, its own steps are far below the mean one (pauses not counted).
+    """
+    near = steps[steps <= _APART_S]
+    mean_s = float(np.mean(near)) if len(near) else 0.0
+    moved = steps[steps > _SHORT * mean_s]
     return float(np.percentile(moved, 95.0)) if len(moved) else 0.0
 
 
@@ -62,18 +74,32 @@ def regular_clock(stamps_s: Array) -> RegularClock | None:
     apart = _stamp_step(steps)
     if len(stamps_s) < _FEWEST or not 0.0 < apart <= _APART_S:
         return None
-    pauses = np.flatnonzero(steps > 1.6 * apart) + 1
+    pauses = np.flatnonzero(steps > _GAP * apart) + 1
     begins = [0, *pauses.tolist()]
     ends = [*begins[1:], len(stamps_s)]
     longest = max(zip(begins, ends, strict=True), key=lambda pair: pair[1] - pair[0])
     if longest[1] - longest[0] < _FEWEST:
         return None
-    step_s, width = _step_of(stamps_s[slice(*longest)], apart)
+    # what looks like lost samples may be the pattern of a rounding: then there are none
+    fits = (_fit(stamps_s, begins, ends, longest, apart, lossy) for lossy in (True, False))
+    return next((fit for fit in fits if fit is not None), None)
+
+
+def _fit(
+    stamps_s: Array,
+    begins: list[int],
+    ends: list[int],
+    longest: tuple[int, int],
+    apart: float,
+    lossy: bool,
+) -> RegularClock | None:
+    """The clock behind stretches of stamps, with or without lost samples among them."""
+    step_s, width = _step_of(stamps_s[slice(*longest)], apart, lossy)
     if not step_s > 0.0:
         return None
     time_s, starts = np.empty_like(stamps_s), []
     for begin, end in zip(begins, ends, strict=True):
-        fitted = _stretch(stamps_s[begin:end], step_s, width)
+        fitted = _stretch(stamps_s[begin:end], step_s, width, lossy)
         time_s[begin:end] = fitted[0]
         starts += [begin + at for at in fitted[1]]
     delay = stamps_s - time_s
@@ -85,7 +111,7 @@ def regular_clock(stamps_s: Array) -> RegularClock | None:
     return RegularClock(time_s, step_s, scatter, tuple(starts))
 
 
-def _step_of(stamps_s: Array, apart: float) -> tuple[float, int]:
+def _step_of(stamps_s: Array, apart: float, lossy: bool) -> tuple[float, int]:
     """The step of a stretch, and the samples of a window that has some bunches in it."""
     rows = np.arange(len(stamps_s), dtype=np.float64)
     rough = (stamps_s[-1] - stamps_s[0]) / max(len(stamps_s) - 1, 1)
@@ -97,14 +123,14 @@ def _step_of(stamps_s: Array, apart: float) -> tuple[float, int]:
     firsts = firsts if len(firsts) >= _FEWEST_BUNCHES else np.arange(len(stamps_s))
     since_s = stamps_s[firsts] - stamps_s[0]
     slope = float(np.polyfit(rows[firsts], since_s, 1)[0])
-    for _ in range(3):
+    for _ in range(3 if lossy else 0):
         lost = np.zeros(len(stamps_s))
         for at in _losses(stamps_s - slope * rows, slope, width):
             lost[at[0] :] += at[1]
         slope = float(np.polyfit((rows + lost)[firsts], since_s, 1)[0])
         if not slope > 0.0:
             return 0.0, width
-    return slope, width
+    return max(slope, 0.0), width
 
 
 def _losses(delay: Array, step_s: float, width: int) -> list[tuple[int, int]]:
@@ -130,12 +156,12 @@ def _losses(delay: Array, step_s: float, width: int) -> list[tuple[int, int]]:
     return found
 
 
-def _stretch(stamps_s: Array, step_s: float, width: int) -> tuple[Array, list[int]]:
+def _stretch(stamps_s: Array, step_s: float, width: int, lossy: bool) -> tuple[Array, list[int]]:
     """Instants of a stretch without a pause, and where its parts begin."""
     n = len(stamps_s)
     rows = np.arange(n, dtype=np.float64)
     starts = [0]
-    for at, lost in _losses(stamps_s - step_s * rows, step_s, width):
+    for at, lost in _losses(stamps_s - step_s * rows, step_s, width) if lossy else ():
         rows[at:] += lost
         starts.append(at)
     delay = stamps_s - step_s * rows
@@ -166,6 +192,27 @@ def ties_spread(stamps_s: Array) -> Array | None:
     return np.asarray(stamps_s + place * step)
 
 
+def unwrapped(time_s: Array) -> tuple[Array, NDArray[np.intp], str]:
+    """Times (N,) that count on where a counter or a time of day began again at its end.
+
+    Then a step back is the whole period but for a usual step. The rows where it began again, and
+    what it was of.
+    """
+    steps = np.diff(time_s)
+    forward = steps[steps > 0.0]
+    back = np.flatnonzero(steps < 0.0)
+    if not len(forward) or not len(back):
+        return time_s, np.zeros(0, np.intp), ""
+    usual = _GAP * float(np.percentile(forward, 95.0))
+    for period_s, what in _PERIODS:
+        rest = steps[back] + period_s
+        if np.all((rest >= 0.0) & (rest <= usual)):
+            shift = np.zeros(len(time_s))
+            shift[back + 1] = period_s
+            return time_s + np.cumsum(shift), np.asarray(back, dtype=np.intp) + 1, what
+    return time_s, np.zeros(0, np.intp), ""
+
+
 def clock_jumps(time_s: Array, longest_s: float) -> tuple[Array, NDArray[np.intp]]:
     """Times (N,) without the jumps of the host's clock, and the rows at which it jumped.
 
@@ -177,7 +224,7 @@ def clock_jumps(time_s: Array, longest_s: float) -> tuple[Array, NDArray[np.intp
     forward = steps[steps > 0.0]
     if not len(forward):
         return time_s, np.zeros(0, np.intp)
-    usual = 1.6 * float(np.percentile(forward, 95.0))
+    usual = _GAP * float(np.percentile(forward, 95.0))
     regular = np.append((steps >= 0.0) & (steps <= usual), False)
     strange = np.flatnonzero((steps < 0.0) | (steps > longest_s))
     settled = [k for k in strange if k + 3 < len(regular) and regular[k + 1 : k + 3].all()]

@@ -9,6 +9,7 @@ another unit (tesla, mG, deg/s) with the option that names it.
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,17 +28,23 @@ DEGREE = 0.017453292519943295
 
 #: kind -> unit as people write it, lower case -> factor to the canonical unit
 UNITS: Mapping[str, Mapping[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9},
+    "time": {
+        "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
+        "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0,
+    },
     "mag": {
-        "gauss": 1.0, "ga": 1.0, "mgauss": 1e-3, "ut": 1e-2, "µt": 1e-2, "μt": 1e-2, "nt": 1e-5,
-        "tesla": 1e4,
+        "gauss": 1.0, "ga": 1.0, "gs": 1.0, "mgauss": 1e-3, "milligauss": 1e-3, "ut": 1e-2,
+        "µt": 1e-2, "μt": 1e-2, "microtesla": 1e-2, "nt": 1e-5, "nanotesla": 1e-5, "gamma": 1e-5,
+        "tesla": 1e4, "millitesla": 10.0, "a/m": 4e-3 * math.pi,
     },
     "gyro": {
         "rad/s": 1.0, "rad_s": 1.0, "rps": 1.0, "deg/s": DEGREE, "deg_s": DEGREE, "dps": DEGREE,
-        "°/s": DEGREE, "mrad/s": 1e-3, "mrad_s": 1e-3, "mdps": 1e-3 * DEGREE,
+        "°/s": DEGREE, "º/s": DEGREE, "mrad/s": 1e-3, "mrad_s": 1e-3, "mdps": 1e-3 * DEGREE,
+        "deg/sec": DEGREE, "rad/sec": 1.0, "deg/h": DEGREE / 3600.0, "°/h": DEGREE / 3600.0,
+        "rpm": math.pi / 30.0,
     },
     "accel": {
-        "m/s^2": 1.0, "m/s2": 1.0, "m_s2": 1.0, "m/s²": 1.0, "g": GRAVITY_M_S2,
+        "m/s^2": 1.0, "m/s2": 1.0, "m_s2": 1.0, "m/s²": 1.0, "m/s/s": 1.0, "g": GRAVITY_M_S2,
         "mg": 1e-3 * GRAVITY_M_S2, "ug": 1e-6 * GRAVITY_M_S2,
     },
 }  # fmt: skip
@@ -100,21 +107,49 @@ def _source(entry: str, name: str, value: str) -> Source:
     kind = _KINDS.get(name)
     if not colon:
         return Source(value)
-    factor = 1.0 if kind is None else _factor(kind, unit.strip())
+    factor = 1.0 if kind is None else _factor_or_number(kind, unit.strip())
     if kind is not None and factor is None:
-        units = ", ".join(dict.fromkeys([*_EXACT.get(kind, {}), *UNITS[kind]]))
+        units = ", ".join(_one_of_each({**_EXACT.get(kind, {}), **UNITS[kind]}))
         raise AhrsdError(
             f"--columns {printable(entry)}: {printable(unit)!r} is no unit of {name}; it may be "
-            f"{units}"
+            f"{units}, or a number: how much of ours is one of theirs"
         )
     if kind is None:  # a covariate keeps its unit, and its name may hold a colon
         return Source(value)
     return Source(column.strip(), factor or 1.0)
 
 
+def _one_of_each(units: Mapping[str, float]) -> list[str]:
+    """One way of writing each unit, the first."""
+    first = {factor: unit for unit, factor in reversed(units.items())}
+    return [unit for unit, factor in units.items() if first[factor] == unit]
+
+
 def _factor(kind: str, unit: str) -> float | None:
+    """Factor from a unit as people write it, None where it is none of this kind."""
     exact = _EXACT.get(kind, {}).get(unit)
     return exact if exact is not None else UNITS[kind].get(unit.lower())
+
+
+def _factor_or_number(kind: str, unit: str) -> float | None:
+    """The same of the option, where counts of a converter have a number for a unit."""
+    try:
+        number = float(unit)
+    except ValueError:
+        return _factor(kind, unit)
+    return number if 0.0 < number < math.inf else None
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A column's name with the unit that stands elsewhere; as it is where that is none, or its own.
+
+    The names that we write have theirs.
+    """
+    unit = unit.strip(" []()")
+    factor = next((one for kind in UNITS if (one := _factor(kind, unit)) is not None), None)
+    if factor is None or (name in _KINDS and _factor(_KINDS[name], unit) == 1.0):
+        return name
+    return f"{name} [{unit}]"
 
 
 def _program(*entries: tuple[str, str, float]) -> dict[str, Source]:
@@ -144,6 +179,8 @@ _ROS_PARTS = (
 )
 _ROS_TIMES = ("field.header.stamp", "%time")  # in ns, best first
 _WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+_NUMBER = "NUMBER"
+_COUNTS = re.compile(r"(?i)(counts?|lsb|raw|adc)$")
 _WORDS = {"time": "time|stamp", "mag": "mag|field", "gyro": "gyr|ang|rate|omega", "accel": "acc"}
 #: what stands before the axis in names of two letters: mx, b_y, w[2], a.z
 _LETTERS = {"mag": "[mbh]", "gyro": "[gw]", "accel": "a"}
@@ -320,6 +357,8 @@ def _remedy(missing: Sequence[str], names: Sequence[str], used: set[str]) -> str
     ]
     meant = next((column for _, column in alike if column is not None), None)
     hint = f" (is {printable(meant)} meant? --columns {','.join(guessed)})" if meant else ""
+    if any(one.endswith(f":{_NUMBER}") for one in guessed):
+        hint += f"; {_NUMBER}: how many gauss, rad/s, m/s^2 or s one of theirs is"
     return f"a table needs {', '.join(REQUIRED)}{hint or '; other names and units: --columns'}"
 
 
@@ -327,7 +366,8 @@ def _alike(name: str, others: Sequence[str]) -> str | None:
     folded = {other.lower(): other for other in reversed(others)}
     found = difflib.get_close_matches(name, folded, n=1, cutoff=0.5)
     if name == TIME:
-        times = [other for other in others if re.search(r"time|stamp|date|^t$", other.lower())]
+        words = ("time|stamp|^t$", "date")  # beside a date, a time of day is what tells the rows
+        times = [other for word in words for other in others if re.search(word, other.lower())]
         return times[0] if times else None
     kind, axis = name.split("_")[:2]
     return _axis_of(kind, axis, others) or (folded[found[0]] if found else None)
@@ -345,7 +385,8 @@ def _unit_of(name: str, column: str) -> str:
     for text in (two, tail):
         if _factor(kind, text) is not None and text.lower() not in ("s", name):
             return f":{text}"
-    return ""
+    unknown = _WITH_UNIT.match(column)
+    return f":{_NUMBER}" if unknown is not None or _COUNTS.search(column) else ""
 
 
 def _covariates(names: Sequence[str], used: set[str], taken: set[str]) -> dict[str, str]:
@@ -364,22 +405,33 @@ def _covariates(names: Sequence[str], used: set[str], taken: set[str]) -> dict[s
 
 @dataclass(frozen=True, slots=True)
 class VectorRange:
-    """Where the median magnitude of a vector must lie, and what it looks like elsewhere."""
+    """Where the median magnitude of a vector must lie, and what it looks like elsewhere.
+
+    impossible: no axis of any such sensor reads more
+    """
 
     columns: tuple[str, str, str]
     minimum: float
     maximum: float
+    impossible: float
     unit: str
     above: tuple[tuple[float, str], ...]  # from this magnitude on it looks like that unit
     below: tuple[float, float, str] | None = None  # between these it looks like that unit
 
 
-# Above 10 G no VN-100 reads (2.5 G full scale); 20 rad/s is a sustained 1150 deg/s.
+# Above 10 G no VN-100 reads (2.5 G full scale), above 100 G no compass; 20 rad/s is a sustained
+# 1150 deg/s, 200 rad/s is above the 4000 deg/s of the fastest gyros.
 RANGES = (
     VectorRange(
-        MAG, 0.01, 10.0, "gauss", ((5000.0, "nT"), (200.0, "mG"), (10.0, "uT")), (1e-5, 1e-3, "T")
+        MAG,
+        0.01,
+        10.0,
+        100.0,
+        "gauss",
+        ((5000.0, "nT"), (200.0, "mG"), (10.0, "uT")),
+        (1e-5, 1e-3, "T"),
     ),
-    VectorRange(GYRO, 0.0, 20.0, "rad/s", ((20.0, "deg/s"),)),
+    VectorRange(GYRO, 0.0, 20.0, 200.0, "rad/s", ((20.0, "deg/s"),)),
 )
 
 

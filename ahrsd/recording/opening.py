@@ -24,7 +24,7 @@ from ahrsd.recording.bytestream import (
     read_received,
     read_stream,
     unpacked_size,
-    utf16_of,
+    wide_text_of,
 )
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, NO_MAP, TIME, ColumnMap
 from ahrsd.recording.foreign.formats import Format, format_of, ready
@@ -262,7 +262,7 @@ def _in_spite_of_its_name(
 
 
 def _as_utf8(start: bytes) -> bytes:
-    encoding = utf16_of(start)
+    encoding = wide_text_of(start)
     return start if encoding is None else start.decode(encoding, "ignore").encode("utf-8")
 
 

@@ -30,7 +30,13 @@ from numpy.typing import NDArray
 from ahrsd import so3
 from ahrsd.errors import RecordingError
 from ahrsd.printable import counted, printable
-from ahrsd.recording.clock_fit import clock_jumps, is_bunched, regular_clock, ties_spread
+from ahrsd.recording.clock_fit import (
+    clock_jumps,
+    is_bunched,
+    regular_clock,
+    ties_spread,
+    unwrapped,
+)
 from ahrsd.recording.column_names import (
     ACCEL,
     GRAVITY_M_S2,
@@ -66,13 +72,31 @@ GAP_PERCENTILE = 95.0
 
 
 _STEP_S = (1e-4, 2.0)  # 10 kHz ... 0.5 Hz: other units of time end outside
-_TIME_UNITS = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+_TIME_UNITS = (
+    ("d", 86400.0),
+    ("h", 3600.0),
+    ("min", 60.0),
+    ("ms", 1e-3),
+    ("us", 1e-6),
+    ("ns", 1e-9),
+)
+_USUAL_STEP_S = (1e-3, 0.5)  # 2 Hz to 1 kHz, by which another unit is told
 _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
 _GRAVITY = (0.7, 1.4)  # times gravity, between which a median force is taken for it
-_TIME_OF_DAY = re.compile(r"^\d{1,2}:\d\d:\d\d(\.\d+)?$")
+#: a date in any order of its numbers, if there is one, and a time of a day
+_TIME_TEXT = re.compile(
+    r"(?:(?P<a>\d{1,4})(?P<date_mark>[-/.]?)(?P<b>\d{1,2})(?P=date_mark)(?P<c>\d{1,4})[T _,]+)?"
+    r"(?P<hour>\d{1,2}):?(?P<minute>\d\d):?(?P<second>\d\d)(?:[.,:](?P<fraction>\d+))?"
+    r" ?(?:(?P<half>[AaPp])\.?[Mm]\.?)?(?P<zone> ?(?:[Zz]|UTC|[+-]\d\d(?::?\d\d)?))?"
+)
+_YEAR, _MONTHS = 4, 12  # digits of a year; a number above is a day
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
 _SPARSE_SHARE = 0.3  # of the rows without a field: a slower magnetometer, not a fault
 _NOTES = 30  # that are repeated of a converted table
+_FEWEST_TIMES, _ROWS_A_TIME = 5, 100  # fewer times for more rows each are no stamps
+_SENSORS_LOOK, _MOST_SENSORS = 1000, 8  # rows that are asked for sensors that take turns
+_TAKE_TURNS, _APART = 0.75, 5.0  # share of rows of the same one behind another; times their step
+_IMPOSSIBLE_SHARE = 0.01  # of the rows
 _HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
@@ -133,6 +157,7 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
         text = read_text_table(path)
         table, first_row, notes = text.table, text.first_row, list(text.notes)
     found = _resolved(path, table.column_names, given)
+    table = _of_different_names(table, notes)
     _check_length(path, table.num_rows)
     refuse_beyond(path, table.num_rows, TABLE_ROWS, "rows", "cut it in parts")
     values = {
@@ -168,6 +193,8 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
     path = columns.path
     columns.hold_readings()
     columns.drop_doubles()
+    columns.refuse_several_sensors()
+    columns.drop_impossible()
     columns.set_clock()
     if check_units:
         for limits in RANGES:
@@ -229,13 +256,75 @@ class _TableRows:
             self._keep(~doubles)
             _check_length(self.path, len(self.numbers))
 
+    def refuse_several_sensors(self) -> None:
+        """Rows of several sensors that take turns, told apart by a column of few whole numbers.
+
+        What they read differs between them, and hardly from one row of a sensor to its next.
+        """
+        rows = self.vectors(MAG)
+        for name, column in self.covariates.items():
+            head = column[:_SENSORS_LOOK]
+            kinds = np.unique(head[np.isfinite(head)])
+            if not 2 <= len(kinds) <= _MOST_SENSORS or not np.all(kinds == np.rint(kinds)):
+                continue
+            same = column[1:] == column[:-1]
+            if np.mean(same) > _TAKE_TURNS:
+                continue
+            across = np.median(np.linalg.norm(np.diff(rows, axis=0)[~same], axis=1))
+            own = [np.diff(rows[column == kind], axis=0) for kind in kinds]
+            within = np.median(np.linalg.norm(np.vstack(own), axis=1))
+            if across > _APART * within:
+                shown = ", ".join(f"{kind:g}" for kind in kinds)
+                raise RecordingError(
+                    self.path,
+                    f"holds the rows of {len(kinds)} sensors in turn, by its column "
+                    f"{printable(name)} ({shown})",
+                    "keep the rows of one of them",
+                )
+
+    def drop_impossible(self) -> None:
+        """Rows with a reading that no such sensor can have among good ones: marks, damaged cells.
+
+        They are left out and make a gap, as rows do that are not there.
+        """
+        wrong = np.zeros(len(self.numbers), dtype=bool)
+        for limits in RANGES:
+            sizes = np.max(np.abs(self.vectors(limits.columns)), axis=1)
+            if np.median(sizes) <= limits.maximum:  # else all of it is in another unit
+                wrong |= sizes > limits.impossible
+        count = int(np.count_nonzero(wrong))
+        if not 0 < count <= _IMPOSSIBLE_SHARE * len(wrong):
+            return
+        row = int(np.argmax(wrong))
+        values = [
+            f"{printable(name)} {self.values[name][row]:g}"
+            for limits in RANGES
+            for name in limits.columns
+            if abs(self.values[name][row]) > limits.impossible
+        ]
+        self.notes.append(
+            f"left out for a reading that no such sensor has: {counted(count, 'row')}, first row "
+            f"{self.numbers[row]} ({values[0]})"
+        )
+        self._keep(~wrong)
+        _check_length(self.path, len(self.numbers))
+
     def set_clock(self) -> None:
         """Clocks that were set, stamps of bunches; refuses a time that is none."""
-        time_s, jumps = clock_jumps(self.values[TIME], _LONGEST_PAUSE_S)
+        self._refuse_few_times()
+        counted_on, again, period = unwrapped(self.values[TIME])
+        if len(again):
+            more = f" and {counted(len(again) - 1, 'more time')}" if len(again) > 1 else ""
+            self.notes.append(
+                f"the time began again after {period} at row {self.numbers[again[0]]}{more}: "
+                "counted on"
+            )
+        self.values[TIME] = counted_on
+        time_s, jumps = clock_jumps(counted_on, _LONGEST_PAUSE_S)
         if len(jumps):
             self._refuse_repeated(jumps)
             row = jumps[0]
-            a, b = self.values[TIME][row - 1], self.values[TIME][row]
+            a, b = counted_on[row - 1], counted_on[row]
             times = "once, " if len(jumps) == 1 else f"{len(jumps)} times, first "
             self.notes.append(
                 f"the clock was set {times}at row {self.numbers[row]} "
@@ -255,6 +344,19 @@ class _TableRows:
         )  # fmt: skip
         self.starts = tuple(sorted({*self.starts, *jumps.tolist()}))
         self.values[TIME] = time_s
+
+    def _refuse_few_times(self) -> None:
+        """A time whose digits were lost on the way into the file is no host's stamp."""
+        times = np.unique(self.values[TIME])
+        if len(times) >= _FEWEST_TIMES or len(self.numbers) < _ROWS_A_TIME * len(times):
+            return
+        shown = ", ".join(f"{value:.10g}" for value in times[:3])
+        raise RecordingError(
+            self.path,
+            f"column time_s: {counted(len(times), 'different time')} in {len(self.numbers)} rows "
+            f"({shown}): the digits that tell the rows apart were lost when it was written",
+            "write the time again with all its digits, or from 0 on",
+        )
 
     def _refuse_repeated(self, jumps: NDArray[np.intp]) -> None:
         """Time goes back where a file was appended to itself, too: the same rows count once."""
@@ -430,6 +532,19 @@ def _read_parquet(path: Path, given: ColumnMap) -> pyarrow.Table:
     return table
 
 
+def _of_different_names(table: pyarrow.Table, notes: list[str]) -> pyarrow.Table:
+    """The first of the columns that share a name; those that are needed are never among them."""
+    first = {name: k for k, name in reversed(list(enumerate(table.column_names)))}
+    if len(first) == table.num_columns:
+        return table
+    names = table.column_names
+    twice = sorted({name for name in first if names.count(name) > 1 and name.strip()})
+    if twice:
+        shown = ", ".join(printable(name) for name in twice[:3]) + ", ..." * (len(twice) > 3)
+        notes.append(f"of columns with the same name the first counts: {shown}")
+    return table.select(sorted(first.values()))
+
+
 def _noted(table: pyarrow.Table) -> list[str]:
     """What was said of the recording that `ahrsd convert` made the table of."""
     kept = (table.schema.metadata or {}).get(NOTES_KEY.encode(), b"")
@@ -516,22 +631,82 @@ def _seconds(column: pyarrow.ChunkedArray) -> Array | None:
 
 
 def _parsed_times(column: pyarrow.ChunkedArray) -> pyarrow.ChunkedArray | None:
-    """ISO 8601 with or without a zone, where all cells are that."""
+    """Dates and times of a day, with or without a zone, where all cells are that."""
+    texts = [str(text).strip() for text in column.to_pylist()]
+    iso = _in_iso_order(texts)
+    if iso is None:
+        return None
     try:
-        texts = np.array(column.to_pylist(), dtype=object)
-        plain = [str(text).strip().replace(",", ".", 1) for text in texts]
-        cut = [text[:-1] if text.endswith(("Z", "z")) else _without_zone(text) for text in plain]
-        if cut and _TIME_OF_DAY.match(cut[0]):
-            cut = [f"1970-01-01T{text.zfill(8)}" for text in cut]
-        times = np.array(cut, dtype="datetime64[ns]")
+        times = np.array([_without_zone(text) for text in iso], dtype="datetime64[ns]")
+        shift_ns = np.array([_zone_ns(text) for text in iso], dtype="timedelta64[ns]")
     except (ValueError, TypeError):
         return None
-    return pyarrow.chunked_array([pyarrow.array(times)])
+    return pyarrow.chunked_array([pyarrow.array(times - shift_ns)])
+
+
+def _in_iso_order(texts: list[str]) -> list[str] | None:
+    """The same times as YYYY-MM-DDTHH:MM:SS; None where they are none, or could be two.
+
+    The order of a date's numbers is told by the year's four digits, by dots, or by a number above
+    12. Where all rows are of one day it does not matter.
+    """
+    found = [_TIME_TEXT.fullmatch(text) for text in texts]
+    if not found or any(one is None for one in found):
+        return None
+    parts = [one.groupdict() for one in found if one is not None]
+    dates = {(one["a"], one["b"], one["c"]) for one in parts}
+    ordered = _dates_of({one["date_mark"] for one in parts}, dates)
+    if ordered is None:
+        return None
+    out = []
+    for one in parts:
+        hour = int(one["hour"])
+        if one["half"]:
+            hour = hour % 12 + (12 if one["half"].lower() == "p" else 0)
+        time = f"{hour:02d}:{one['minute']}:{one['second']}"
+        fraction = f".{one['fraction'][:9]}" if one["fraction"] else ""
+        zone = (one["zone"] or "").strip().replace("UTC", "Z")
+        out.append(f"{ordered[one['a'], one['b'], one['c']]}T{time}{fraction}{zone}")
+    return out
+
+
+def _dates_of(
+    marks: set[str | None], dates: set[tuple[str, str, str]]
+) -> dict[tuple[str, str, str], str] | None:
+    """Each date as YYYY-MM-DD; none at all is the first day of 1970."""
+    if dates == {(None, None, None)}:
+        return {(None, None, None): "1970-01-01"}  # type: ignore[dict-item]
+    if any(None in date for date in dates):
+        return None
+    if all(len(a) == _YEAR for a, _, _ in dates):
+        return {date: f"{date[0]}-{date[1].zfill(2)}-{date[2].zfill(2)}" for date in dates}
+    if not all(len(c) == _YEAR for _, _, c in dates):
+        return None
+    day_first = marks == {"."} or any(int(a) > _MONTHS for a, _, _ in dates)
+    if not day_first and len(dates) > 1 and all(int(b) <= _MONTHS for _, b, _ in dates):
+        return None
+    order = (1, 0) if day_first else (0, 1)
+    return {
+        date: f"{date[2]}-{date[order[0]].zfill(2)}-{date[order[1]].zfill(2)}" for date in dates
+    }
 
 
 def _without_zone(text: str) -> str:
-    """A zone is the same in all rows: times count from the first one."""
-    return text[:-6] if len(text) > 20 and text[-6] in "+-" and text[-3] == ":" else text
+    return text[: _zone_at(text)]
+
+
+def _zone_at(text: str) -> int:
+    """Where the zone of a time begins: Z, +02:00, +0200 or +02."""
+    clock = text.index("T")
+    return next((k for k in range(clock, len(text)) if text[k] in "Zz+-"), len(text))
+
+
+def _zone_ns(text: str) -> int:
+    digits = text[_zone_at(text) :].strip("Zz").replace(":", "")
+    if not digits:
+        return 0
+    minutes = 60 * int(digits[1:3]) + int(digits[3:5] or 0)
+    return (-1 if digits[0] == "-" else 1) * minutes * 60_000_000_000
 
 
 def _as_floats(column: pyarrow.ChunkedArray, from_first: bool = False) -> Array | None:
@@ -607,9 +782,9 @@ def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
         )
     median_s = float(np.median(step_s))
     if not _STEP_S[0] <= median_s <= _STEP_S[1]:
-        unit = next(
-            (name for name, s in reversed(_TIME_UNITS) if _STEP_S[0] <= median_s * s <= 0.5), None
-        )
+        low, high = _USUAL_STEP_S
+        units = [name for name, factor in _TIME_UNITS if low <= median_s * factor <= high]
+        unit = units[-1 if median_s > 1.0 else 0] if units else None
         hint = f"; if it is in {unit}: --columns time=NAME:{unit}" if unit else ""
         raise RecordingError(
             path,

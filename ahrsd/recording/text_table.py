@@ -17,8 +17,8 @@ import pyarrow.csv
 
 from ahrsd.errors import RecordingError
 from ahrsd.printable import counted, printable
-from ahrsd.recording.bytestream import read_chunks, utf16_of
-from ahrsd.recording.column_names import REQUIRED
+from ahrsd.recording.bytestream import read_chunks, wide_text_note, wide_text_of
+from ahrsd.recording.column_names import REQUIRED, with_unit
 from ahrsd.recording.foreign.recognised import recognised
 from ahrsd.recording.limits import (
     HEADER_BYTES,
@@ -30,16 +30,34 @@ from ahrsd.recording.limits import (
 
 _CHUNK_BYTES = 1 << 18
 csv.field_size_limit(HEADER_BYTES + 1)  # of a quoted name; 128 KiB as it comes
+_MARK = b"\xef\xbb\xbf"  # of UTF-8
+_ERASED = 16  # bytes FF at the end that no text has
 _COMMENTS = (b"#", b"%", b"//")
 _ROSTOPIC = b"%time,"  # how the names of `rostopic echo -p` begin, which are no comment
 _COMMENT_LINE = re.compile(rb"(?m)^(?:#|%|//)[^\n]*(?:\n|\Z)")
 _SEPARATOR_LINE = re.compile(rb"^\"?sep=(.)\"?\s*$", re.IGNORECASE)
-_DECIMAL_COMMA = re.compile(rb"^\s*[+-]?\d+,\d+\s*$")
+_SEPARATORS = (b",", b";", b"\t", b"|")
+_CALLED = {b";": "semicolons", b"\t": "tabs", b" ": "blanks", b"|": "bars"}
+_RULE = re.compile(rb"(?m)^[ \t]*[|+]?[ \t]*:?[-=]{3,}[-=+|: \t]*(?:\n|\Z)")  # of a drawn table
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?$")
+_QUOTED_COMMA = re.compile(rb'"(\s*[+-]?\d+),(\d+(?:[eE][+-]?\d+)?\s*)"')
+#: mark between thousands, decimal point, the cell
+_THOUSANDS = tuple(
+    (
+        mark,
+        point,
+        re.compile(rf"[-+]?\d{{1,3}}(?:{re.escape(mark)}\d{{3}})+(?:{re.escape(point)}\d*)?"),
+    )
+    for mark, point in ((",", "."), (".", ","), ("'", "."), ("\u2019", "."), ("\u00a0", ","))
+)
 _WRONG_SHARE, _WRONG_FEW = 0.01, 3  # rows with another number of cells that are left out
 _OF_TABLES = (b"time_s", b"mag_x_gauss", b"TimeStartup,")  # names in the first line
+_PREAMBLE_BYTES = 16384  # in front of the names
 _ROWS_THAT_TELL = 2
 _LESS = "keep fewer of them, or cut the recording in parts"
-_MISSING = ["", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "N/A", "n/a", "NA", "#N/A"]
+_MISSING = ["", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "N/A", "n/a", "NA", "#N/A",
+            "-nan(ind)", "nan(ind)", "-1.#IND", "1.#QNAN", "-1.#QNAN", "1.#INF", "-1.#INF",
+            "1.#IND", "--", "-"]  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -69,9 +87,9 @@ def is_table_text(start: bytes) -> bool:
     as many cells, at least those that a table needs, and all but the time are numbers. A message
     of a VN-100 is none.
     """
-    if (encoding := utf16_of(start)) is not None:
+    if (encoding := wide_text_of(start)) is not None:
         start = start.decode(encoding, "ignore").encode("utf-8")
-    lines = re.split(rb"[\r\n]+", start.removeprefix(b"\xef\xbb\xbf").lstrip())
+    lines = re.split(rb"[\r\n]+", start.removeprefix(_MARK).lstrip())
     if b"$VN" not in lines[0] and any(name in lines[0] for name in _OF_TABLES):
         return True
     lines = [line for line in lines[:-1] if line.strip() and not line.startswith(_COMMENTS)]
@@ -97,6 +115,7 @@ def read_text_table(path: Path) -> TextTable:
         raise RecordingError(path, found.what, found.remedy)
     text = _with_header(path, data, notes)
     _drop_comments(text, notes)
+    _take_units(text, notes)
     _drop_repeated_header(text, notes)
     _drop_cut_row(text, cut, notes)
     refuse_beyond(path, text.data.count(b"\n", text.at), TABLE_ROWS, "rows", _LESS)
@@ -126,11 +145,14 @@ def _has_lines(data: bytearray) -> bool:
 
 def _plain_text(path: Path, data: bytearray, notes: list[str]) -> bytearray:
     """UTF-8 without marks, NUL bytes and stray returns."""
-    if (encoding := utf16_of(bytes(data[:400]))) is not None:
-        notes.append("the text is UTF-16: read as such")
+    if (encoding := wide_text_of(bytes(data[:400]))) is not None:
+        notes.append(wide_text_note(encoding))
         data = bytearray(data.decode(encoding, "replace").encode("utf-8"))
-    if data.startswith(b"\xef\xbb\xbf"):
-        del data[:3]
+    if _MARK in data[:3] or b"\n" + _MARK in data:  # at the end of one file another may begin
+        data = bytearray(re.sub(b"(?m)^" + _MARK, b"", bytes(data)))
+    if (erased := len(data) - len(data.rstrip(b"\xff"))) >= _ERASED:
+        del data[-erased:]
+        notes.append(f"it ends in {erased} bytes of erased memory (FF): left out")
     if nuls := len(data) - len(data.rstrip(b"\0")):
         del data[-nuls:]
         notes.append(f"it ends in {nuls} NUL bytes (the recorder lost its power): left out")
@@ -170,6 +192,12 @@ def _with_header(path: Path, data: bytearray, notes: list[str]) -> _Text:
         if end < 0:
             raise RecordingError(path, "is no CSV table: it has no rows", "record again")
         at = after
+    if separator is None and (found_at := _names_behind(data, at)) > at:
+        lines = data.count(b"\n", at, found_at)
+        notes.append(f"left out in front of the names: {counted(lines, 'line')}")
+        row, at = row + lines, found_at
+        end = data.find(b"\n", at)
+        line, after = bytes(data[at:end]).strip(), end + 1
     if _is_numbers(line, separator) and comment:  # as numpy writes the names
         line, row, after = comment.lstrip(b"#%/ "), row - 1, at
     mark = separator or _separator_of(line)
@@ -182,7 +210,7 @@ def _with_header(path: Path, data: bytearray, notes: list[str]) -> _Text:
             "write their names in front: time_s,mag_x_gauss,...",
         )
     if mark != b",":
-        words = {b";": "semicolons", b"\t": "tabs", b" ": "blanks"}.get(mark, repr(mark.decode()))
+        words = _CALLED.get(mark, repr(mark.decode()))
         notes.append(f"the columns are separated by {words}: read as such")
     if mark == b" ":
         rows = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", bytes(data[after:])))
@@ -190,8 +218,56 @@ def _with_header(path: Path, data: bytearray, notes: list[str]) -> _Text:
     return _Text(data, names, mark.decode(), after, row + 1)
 
 
+def _names_behind(data: bytearray, at: int) -> int:
+    """Where the names begin below lines of another kind (a title, the device, a date), else `at`.
+
+    The names are as many as the cells of a row of numbers below them, and the first line's are not.
+    """
+    start = at
+    lines = [bytes(line) for line in data[at : at + _PREAMBLE_BYTES].split(b"\n")[:-1]]
+    mark = _separator_of(lines[0]) if lines else b","
+    if not lines or len(_cells(lines[0], mark)) >= len(REQUIRED):
+        return start
+    for line, *below in zip(lines, lines[1:], lines[2:], strict=False):
+        mark = _separator_of(line)
+        count = len(_cells(line, mark))
+        rows = (row for row in below if len(_cells(row, mark)) == count)
+        names = count >= len(REQUIRED) and not _is_numbers(line, mark)
+        if names and any(_numbers_in(row, mark) >= len(REQUIRED) - 1 for row in rows):
+            return at
+        at += len(line) + 1
+    return start
+
+
+def _cells(line: bytes, mark: bytes) -> list[bytes]:
+    return line.split() if mark == b" " else line.split(mark)
+
+
+def _numbers_in(line: bytes, mark: bytes) -> int:
+    return sum(_is_numbers(cell.strip(b' "'), mark) for cell in _cells(line, mark) if cell.strip())
+
+
+def _take_units(text: _Text, notes: list[str]) -> None:
+    """A line below the names that has no number in it, above one that has: their units."""
+    end = text.data.find(b"\n", text.at)
+    below = text.data.find(b"\n", end + 1)
+    if end < 0 or below < 0:
+        return
+    mark = text.separator.encode()
+    line, row = bytes(text.data[text.at : end]), bytes(text.data[end + 1 : below])
+    wordy = bool(line.strip()) and _numbers_in(line, mark) == 0
+    if not wordy or _numbers_in(row, mark) < len(REQUIRED) - 1:
+        return
+    units = _split(line.decode("utf-8", "replace"), text.separator)
+    if len(units) != len(text.names) or units == text.names:
+        return
+    text.names = [with_unit(name, unit) for name, unit in zip(text.names, units, strict=True)]
+    text.at, text.first_row = end + 1, text.first_row + 1
+    notes.append("the line below the names has their units: read as such")
+
+
 def _separator_of(line: bytes) -> bytes:
-    best = max((b",", b";", b"\t"), key=line.count)
+    best = max(_SEPARATORS, key=line.count)
     if line.count(best):
         return best
     return b" " if b" " in line else b","
@@ -206,7 +282,7 @@ def _split(line: str, separator: str) -> list[str]:
 def _is_numbers(line: bytes, separator: bytes | None) -> bool:
     """Whether all cells of a line are numbers, so that it names no columns."""
     mark = separator or _separator_of(line)
-    cells = line.split() if mark == b" " else line.split(mark)
+    cells = _cells(line, mark)
     try:
         for cell in cells:
             float(cell.replace(b",", b".") if mark == b";" else cell)
@@ -217,6 +293,9 @@ def _is_numbers(line: bytes, separator: bytes | None) -> bool:
 
 def _drop_comments(text: _Text, notes: list[str]) -> None:
     body = bytes(text.data[text.at :]) if any(b"\n" + c in text.data for c in _COMMENTS) else b""
+    if text.separator == "|" and _RULE.search(bytes(text.data), text.at):
+        text.data, text.at = bytearray(_RULE.sub(b"", bytes(text.data[text.at :]))), 0
+        body = body and bytes(text.data)
     if body and (count := len(_COMMENT_LINE.findall(body))):
         text.data, text.at = bytearray(_COMMENT_LINE.sub(b"", body)), 0
         notes.append(f"left out amid the rows: {counted(count, 'comment line')}")
@@ -267,7 +346,7 @@ def _parsed(path: Path, text: _Text, notes: list[str]) -> pyarrow.Table:
 
     if not bytes(memoryview(text.data)[text.at :]).strip():
         return pyarrow.Table.from_arrays([pyarrow.nulls(0) for _ in names], names=names)
-    decimal = "," if text.separator != "," and _has_decimal_comma(text) else "."
+    decimal = _decimal_of(text, notes)
     try:
         table = pyarrow.csv.read_csv(
             pyarrow.BufferReader(pyarrow.py_buffer(memoryview(text.data)[text.at :])),
@@ -313,7 +392,40 @@ def _as_wide_as_rows(text: _Text) -> list[str]:
     return names
 
 
-def _has_decimal_comma(text: _Text) -> bool:
-    lines = bytes(text.data[text.at : text.at + 8192]).split(b"\n")[:20]
-    cells = [cell for line in lines for cell in line.split(text.separator.encode())]
-    return any(_DECIMAL_COMMA.match(cell) for cell in cells)
+def _decimal_of(text: _Text, notes: list[str]) -> str:
+    """The decimal mark of the numbers; marks between their thousands are taken out.
+
+    A comma in a table whose columns it separates stands in quotes.
+    """
+    lines = bytes(text.data[text.at : text.at + 16384]).decode("utf-8", "replace").split("\n")[:40]
+    rows = csv.reader(lines[:-1], delimiter=text.separator)
+    cells = [cell.strip() for row in rows for cell in row]
+    decimal = "," if any(_DECIMAL_COMMA.match(cell) for cell in cells) else "."
+    for mark, point, grouped in _THOUSANDS:
+        if any(grouped.fullmatch(cell) and _is_told(cell, mark, point) for cell in cells):
+            decimal = point
+            _drop_thousands(text, mark, point)
+            notes.append(f"the numbers have {mark!r} between their thousands: read as such")
+            break
+    if decimal == "," and text.separator == ",":  # the reader of columns knows no such quotes
+        body = _QUOTED_COMMA.sub(rb"\1.\2", bytes(text.data[text.at :]))
+        text.data, text.at, decimal = bytearray(body), 0, "."
+        notes.append("the numbers have decimal commas: read as such")
+    return decimal
+
+
+def _is_told(cell: str, mark: str, point: str) -> bool:
+    """Whether such a cell can be nothing else: with both marks, or with two of the one."""
+    return (mark in cell and point in cell) or cell.count(mark) > 1 or mark == "'"
+
+
+def _drop_thousands(text: _Text, mark: str, point: str) -> None:
+    """In whole cells, which are quoted where the mark is also the separator."""
+    m, p, quote = re.escape(mark), re.escape(point), '"' if mark == text.separator else '"?'
+    edge = re.escape(text.separator)
+    cell = (
+        rf"(?m)(^|{edge})(\s*{quote}[-+]?\d{{1,3}}(?:{m}\d{{3}})+(?:{p}\d*)?{quote}\s*)(?=$|{edge})"
+    )
+    body = bytes(text.data[text.at :]).decode("utf-8", "replace")
+    body = re.sub(cell, lambda found: found[1] + found[2].replace(mark, ""), body)
+    text.data, text.at = bytearray(body.encode()), 0

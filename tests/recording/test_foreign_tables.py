@@ -305,7 +305,7 @@ def test_times_of_day_and_dates(tmp_path, stamp):
         ("mag_x=", "is no entry"),
         ("mag_x=MagX:furlong", "'furlong' is no unit of mag_x_gauss; it may be G, mG, T"),
         ("mag_x=A,mag_x=B", "is given twice"),
-        ("time=t:h", "'h' is no unit of time_s; it may be s, ms"),
+        ("time=t:y", "'y' is no unit of time_s; it may be s, ms"),
         ("mag_x=\x1b[2JX:q", "\\x1b[2JX"),
     ],
 )

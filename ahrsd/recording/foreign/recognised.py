@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 _TABLE = (
@@ -45,6 +46,17 @@ _STARTS: tuple[tuple[bytes, str, str], ...] = (
     (b"\xfd7zXZ\0", "is packed with xz", "unpack it with `xz -d`"),
     (b"(\xb5/\xfd", "is packed with zstd", "unpack it with `zstd -d`"),
     (b"BZh", "is packed with bzip2", "unpack it with `bzip2 -d`"),
+    (b"\x1f\x8b", "is packed with gzip twice", "unpack it once with `gunzip`"),
+    (b"\x04\x22\x4d\x18", "is packed with lz4", "unpack it with `lz4 -d`"),
+    (b"Rar!\x1a\x07", "is a RAR archive", "unpack it"),
+    (b"\xd0\xcf\x11\xe0", "is a spreadsheet or document of Microsoft Office", "save it as CSV"),
+    (b"ARROW1\0\0", "is an Arrow or Feather file", "write it as Parquet"),
+    (b"FEA1", "is a Feather file", "write it as Parquet"),
+    (b"Obj\x01", "is an Avro file", _TABLE),
+    (b"\x80\x04\x95", "is a Python pickle", _TABLE),
+    (b"\x80\x05\x95", "is a Python pickle", _TABLE),
+    (b"FMT, 128", "is an ArduPilot log as text", "give the .bin log that it was made of"),
+    (b"FMT,128", "is an ArduPilot log as text", "give the .bin log that it was made of"),
     (b"7z\xbc\xaf\x27\x1c", "is a 7z archive", "unpack it"),
     (b"\xd4\xc3\xb2\xa1", "is a network capture (pcap)", "save the payload as .vnraw"),
     (b"\n\r\r\n", "is a network capture (pcapng)", "save the payload as .vnraw"),
@@ -52,6 +64,35 @@ _STARTS: tuple[tuple[bytes, str, str], ...] = (
     (b"\x89PNG", "is a picture", "give the recording"),
 )
 _PAGES = (b"<!doctype html", b"<html")
+#: what text is: a pattern from its first byte that is no blank
+_TEXTS: tuple[tuple[re.Pattern[bytes], str, str], ...] = (
+    (
+        re.compile(rb'\{\s*"[^"\n]*"\s*:|\[\s*[\[{]'),
+        "is JSON, not a table",
+        "write a table of it, for example with pandas: read_json(FILE, lines=True).to_csv(...)",
+    ),
+    (
+        re.compile(rb"(?s)(?:---\s+)?[a-z_]+:\s.*^ *(?:magnetic_field|angular_velocity|stamp):\s*$",
+                   re.MULTILINE),
+        "is what `rostopic echo` prints",
+        "give the bag, or a table of `rostopic echo -p`",
+    ),
+    (
+        re.compile(rb"(?i)[0-9a-f]{4,16}(?:: ?|  +)(?:[0-9a-f]{2} ?){8}"),
+        "is a hex dump, not the bytes themselves",
+        "make them of it: `xxd -r FILE > FILE.vnraw`",
+    ),
+    (
+        re.compile(rb"(?i)(?=[^\n]*[a-f])(?:(?:(?:0x)?[0-9a-f]{2}[ ,:\r\n]+){24}|[0-9a-f]{48})"),
+        "is a hex dump, not the bytes themselves",
+        "make them of it: `xxd -r -p FILE > FILE.vnraw`",
+    ),
+    (
+        re.compile(rb"(?:[A-Za-z0-9+/]{76}\r?\n){3}"),
+        "is base64, not the bytes themselves",
+        "make them of it: `base64 -d FILE > FILE.vnraw`",
+    ),
+)  # fmt: skip
 
 
 def recognised(start: bytes) -> Foreign | None:
@@ -61,6 +102,10 @@ def recognised(start: bytes) -> Foreign | None:
             return Foreign(what, remedy)
     if start[257:262] == b"ustar":
         return Foreign("is a tar archive", "unpack it")
+    text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
+    for pattern, what, remedy in _TEXTS:
+        if pattern.match(text):
+            return Foreign(what, remedy)
     if start.lstrip()[:20].lower().startswith(_PAGES):
         return Foreign("is a web page, not the file behind its link", "download the file itself")
     return None
