@@ -29,6 +29,8 @@ _BETTER = 1.5  # times the cost that the frame as recorded must be worse
 _BENT = 3.0  # times, by which iron that deforms may favour another frame: it is left out here
 _NATS = 20.0  # log likelihood by which it must be worse
 _FAST_RAD_S, _NEAR = 3.0, 1.1  # rates that no vehicle has for long; a factor that is another's
+_SURE = 0.99  # of a finding that was counted and compared
+_SAME_UNIT = 1.2  # factor from a unit's own within which the gyro's scale is that unit
 _UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
 #: median readings in gauss of the Earth's field (0.2 to 0.7 G) taken in other units
 MAG_UNITS = (
@@ -88,7 +90,7 @@ def _gyro(track: Track) -> list[Fact]:
     facts = []
     if not best.is_identity:
         equal = [one for one in order if not _worse(one.cost, best.cost, found.count)]
-        facts.append(_frame_error(track, best, len(equal)))
+        facts.append(_frame_error(track, min(equal, key=_changes), len(equal)))
     if not 1 / _UNIT < best.scale < _UNIT:
         facts += _gyro_unit(track, best)
     return facts
@@ -115,16 +117,28 @@ def _worse(cost: float, best: float, count: int) -> bool:
 def _frame_error(track: Track, best: Frame, equal: int) -> Fact:
     """equal: how many frames explain the recording as well, this one among them."""
     odd = odd_magnetometer(track, best.matrix)
+    words = _frame_words(track, best) if odd is None else odd.words
+    if equal > 1:
+        words += (
+            f"; this or one of {equal - 1} other ways of axes and signs, which the motion does not "
+            "tell apart: turn it about all axes to know"
+        )
     return Fact(
         "frame_error",
-        _frame_words(track, best) if odd is None else odd.words,
+        words,
         Where(_whole(track), ("x", "y", "z"), "gyro" if odd is None else "sensor"),
-        1.0 / equal,
+        1.0 if equal == 1 else _SURE,  # that it is one of them
         (Value("present", 1.0, 0.0, "1"),),
         # the true rate is signs * reading[axes]
         {"axes": list(best.axes), "signs": list(best.signs)},
         stops=True,
     )
+
+
+def _changes(frame: Frame) -> int:
+    """How many axes and signs are not as recorded."""
+    moved = sum(axis != place for place, axis in enumerate(frame.axes))
+    return moved + sum(sign < 0 for sign in frame.signs)
 
 
 def _frame_words(track: Track, best: Frame) -> str:
@@ -150,15 +164,21 @@ def _inverse_words(frame: Frame) -> list[str]:
 
 
 def _gyro_unit(track: Track, best: Frame) -> list[Fact]:
-    """The unit whose factor is nearest, if one is near."""
+    """The unit whose factor is nearest; where none is near, that it is another one."""
     tried = [(name, f) for name, factor in GYRO_UNITS for f in (factor, 1 / factor)]
     name, factor = min(tried, key=lambda pair: abs(np.log(best.scale / pair[1])))
-    if abs(np.log(best.scale / factor)) > np.log(1.5):
-        return []
-    way = f"in {name}" if factor < 1 else f"divided by {factor:.4g} once too often"
-    words = f"the gyro's rates are {1 / best.scale:.3g} times too large: they are {way}"
-    if factor > 1:
-        words = f"the gyro's rates are {best.scale:.3g} times too small: they are {way}"
+    large = best.scale < 1
+    off = f"{1 / best.scale:.3g} times too large" if large else f"{best.scale:.3g} times too small"
+    if abs(np.log(best.scale / factor)) > np.log(_SAME_UNIT):
+        usual = 1 / factor if large else factor
+        words = (
+            f"the gyro's rates are {off} for the turns of the field: they are in another unit, or "
+            f"the time is ({name} would be {usual:.3g} times)"
+        )
+        factor, name = best.scale, "another unit"
+    else:
+        way = f"in {name}" if large else f"divided by {factor:.4g} once too often"
+        words = f"the gyro's rates are {off}: they are {way}"
     setting = {"sensor": "gyro", "unit": name}
     return [_unit_error(track, words, 1 / factor, setting, "gyro")]
 
@@ -168,7 +188,7 @@ def _unit_error(
 ) -> Fact:
     parameters = (Value("factor_less_one", too_large - 1, 0.0, "1"),)
     where = Where(_whole(track), ("x", "y", "z"), frame)
-    return Fact("unit_error", words, where, 0.99, parameters, dict(setting), stops=True)
+    return Fact("unit_error", words, where, _SURE, parameters, dict(setting), stops=True)
 
 
 def put_right(track: Track, facts: Sequence[Fact]) -> Track:

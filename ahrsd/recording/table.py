@@ -97,6 +97,8 @@ _FEWEST_TIMES, _ROWS_A_TIME = 5, 100  # fewer times for more rows each are no st
 _SENSORS_LOOK, _MOST_SENSORS = 1000, 8  # rows that are asked for sensors that take turns
 _TAKE_TURNS, _APART = 0.75, 5.0  # share of rows of the same one behind another; times their step
 _IMPOSSIBLE_SHARE = 0.01  # of the rows
+_FEWEST_HOLDS, _EVENLY = 20, 0.8  # readings, and share of them held equally long, to be a hold
+_TOGETHER = 0.98  # share of rows in which magnetometer and gyro are new together
 _HOLE_S = 10.0  # without acceleration, over which the gyro carries it from both sides
 _HOLES_SHARE = 0.2  # of the rows, which are left out where the holes are longer
 
@@ -192,7 +194,9 @@ def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
 def _checked(columns: _TableRows, check_units: bool) -> Table:
     path = columns.path
     columns.hold_readings()
+    columns.draw_rates()
     columns.drop_doubles()
+    columns.undo_repeats()
     columns.refuse_several_sensors()
     columns.drop_impossible()
     columns.set_clock()
@@ -245,6 +249,52 @@ class _TableRows:
         last = np.maximum.accumulate(np.where(known, rows, 0))
         self.values |= {name: self.values[name][last] for name in MAG}
         self._keep(rows >= np.argmax(known))
+
+    def draw_rates(self) -> None:
+        """Rates of a slower gyro, whose cells are empty in between, are drawn straight."""
+        known: NDArray[np.bool] = np.asarray(np.isfinite(self.vectors(GYRO)).all(axis=1))
+        if known.all():
+            return
+        count = int(np.count_nonzero(known))
+        _check_length(self.path, count)
+        self.notes.append(
+            f"the gyro has a reading in {count} of {len(known)} rows: between them its rates are "
+            "drawn straight"
+        )
+        self._draw(np.flatnonzero(known))
+
+    def undo_repeats(self) -> None:
+        """What a recorder wrote again and again until the next reading came, time after time.
+
+        Whole rows count once; rates of a gyro alone are drawn straight between its readings. A
+        magnetometer's are left: which of them are new is for those who use them.
+        """
+        gyro = _fresh(self.vectors(GYRO))
+        usual = _hold_of(gyro)
+        if usual is None:
+            return
+        if np.mean(gyro == _fresh(np.hstack([self.vectors(MAG), self.vectors(GYRO)]))) > _TOGETHER:
+            self.notes.append(
+                f"every reading is in {usual} rows, one after the other: each counts once, "
+                f"{int(np.count_nonzero(gyro))} of {len(gyro)} rows"
+            )
+            self._keep(gyro)
+            _check_length(self.path, len(self.numbers))
+            return
+        self.notes.append(
+            f"the gyro has a new reading only every {usual} rows: between them its rates are drawn "
+            "straight"
+        )
+        self._draw(np.flatnonzero(gyro))
+
+    def _draw(self, rows: NDArray[np.intp]) -> None:
+        """Rates between those of these rows, and no row outside of them."""
+        place = np.arange(rows[0], rows[-1] + 1)
+        drawn = {name: np.interp(place, rows, self.values[name][rows]) for name in GYRO}
+        kept = np.zeros(len(self.numbers), dtype=bool)
+        kept[place] = True
+        self._keep(kept)
+        self.values |= drawn
 
     def drop_doubles(self) -> None:
         """Rows that have the same time and readings as the row before."""
@@ -570,7 +620,7 @@ def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_
     if values is None:
         _refuse_text(path, column, source.column, first_row)
     wrong = np.flatnonzero(~np.isfinite(values))
-    sparse = name in MAG and _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
+    sparse = name in (*MAG, *GYRO) and _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
     if len(wrong) and not sparse:
         raise RecordingError(
             path,
@@ -759,6 +809,27 @@ def _doubles(columns: list[Array]) -> NDArray[np.bool]:
     for values in columns:
         same[1:] &= values[1:] == values[:-1]
     return same
+
+
+def _fresh(readings: Array) -> NDArray[np.bool]:
+    """(N,) rows whose readings (N, k) are not those of the row before."""
+    out = np.ones(len(readings), dtype=bool)
+    out[1:] = np.any(readings[1:] != readings[:-1], axis=1)
+    return out
+
+
+def _hold_of(fresh: NDArray[np.bool]) -> int | None:
+    """Rows for which readings are held, time after time; None where they are not.
+
+    Coarse readings at rest repeat as it happens, and not so evenly.
+    """
+    lengths = np.diff(np.flatnonzero(fresh))
+    if len(lengths) < _FEWEST_HOLDS:
+        return None
+    usual = round(float(np.median(lengths)))
+    even = usual >= 2 and np.mean(np.abs(lengths - usual) <= 1) > _EVENLY
+    # of two rows, one more or less is anything: then nearly all of them
+    return usual if even and (usual > 2 or np.mean(lengths == 2) > _EVENLY) else None
 
 
 def _check_time(path: Path, time_s: Array, numbers: NDArray[np.intp]) -> None:
