@@ -43,7 +43,72 @@ from ahrsd.stream.streams_without_time import (
 )
 from drivers.vn100.decode import Measurement
 from drivers.vn100.deframer import REJECTIONS, Cause, Skipped
-from drivers.vn100.messages import BinaryLayout
+from drivers.vn100.messages import BinaryLayout, Layout
+
+
+class Parts:
+    """Two outputs with a part each, the field in one and the rates in the other, as one message.
+
+    They belong together by the device's time, which both carry. There is one row for each message
+    with rates; a field that comes more seldom is the last one until the next. A row waits for the
+    next message, as the field of the same instant may come behind its rates.
+    """
+
+    def __init__(self) -> None:
+        self.layout: Layout | None = None
+        self._of: dict[str, Layout] = {}
+        self._field: Measurement | None = None
+        self._rates: tuple[Measurement, float] | None = None
+        self._taken: list[int] = []  # columns of the rates' message that the field's has not
+
+    def offer(self, layout: Layout, missing: str) -> None:
+        """A kind of message that lacks one sensor; with one that lacks the other it is whole."""
+        names = [column.name for column in layout.columns]
+        if _TIME not in names or missing in self._of:
+            return
+        self._of[missing] = layout
+        if len(self._of) < len(_PARTS):
+            return
+        field, rates = (self._of[lacking] for lacking in _PARTS)
+        held = {column.name for column in field.columns}
+        self._taken = [k for k, column in enumerate(rates.columns) if column.name not in held]
+        columns = field.columns + tuple(rates.columns[k] for k in self._taken)
+        self.layout = Layout(f"{field.name} + {rates.name}", columns)
+
+    def forget(self) -> None:
+        """What follows does not follow on."""
+        self._field = self._rates = None
+
+    def take(self, measurement: Measurement, host_s: float) -> tuple[Measurement, float] | None:
+        """One message; the row that is whole by it, and when its rates arrived."""
+        if self.layout is None:
+            return None
+        if measurement.layout is self._of[_PARTS[0]]:
+            at_once = self._rates is not None and _time(measurement) <= _time(self._rates[0])
+            row = None if at_once else self._row()
+            self._field = measurement
+            return self._row() if at_once else row
+        if measurement.layout is self._of[_PARTS[1]]:
+            row = self._row()
+            self._rates = (measurement, host_s)
+            return row
+        return None
+
+    def _row(self) -> tuple[Measurement, float] | None:
+        """The rates that wait, with the newest field."""
+        field, rates, self._rates = self._field, self._rates, None
+        if field is None or rates is None or self.layout is None:
+            return None
+        message, host_s = rates
+        place = field.layout.index(_TIME)
+        values = list(field.values) + [message.values[k] for k in self._taken]
+        values[place or 0] = _time(message)
+        return Measurement(self.layout, tuple(values), message.offset), host_s
+
+
+def _time(measurement: Measurement) -> float:
+    place = measurement.layout.index(_TIME)
+    return measurement.values[place] if place is not None else float("nan")
 
 
 @dataclass(slots=True)
@@ -93,6 +158,8 @@ class Gaps:
 
 
 FACTORY_RATE_HZ = 40.0
+_TIME = "time_startup_s"
+_PARTS = ("gyroscope", "magnetometer")  # what the message with the field lacks, and the other one
 _BLOCK_S, _LEAST_ROWS, _MOST_ROWS = 0.25, 4, 256
 _PAUSE_S, _PAUSE_STEPS = 0.5, 4.0  # arrivals apart by both: something was not sent or not heard
 _LONGEST_PAUSE_S = (
@@ -150,6 +217,7 @@ class Stream:
         self._turns = TurnWatch()
         self._turns_said = self._rate_warned = ""
         self._watch = RateWatch()
+        self._parts = Parts()
         self._given_s: float | None = None
         self._given_steps, self._given_step_s = 0, 0.0
 
@@ -221,6 +289,7 @@ class Stream:
 
     def _cut(self) -> None:
         self._timeline.forget()
+        self._parts.forget()
         self._turns.forget()
         self._watch.forget()
         self._arrived_s = 0.0
@@ -243,7 +312,11 @@ class Stream:
             self._count(layout.name)
             extractor = self._accept(measurement)
             if extractor is None:
-                return []
+                whole = self._parts.take(measurement, host_s)
+                extractor = None if whole is None else self._joined(whole[0].layout)
+                if whole is None or extractor is None:
+                    return []
+                measurement, host_s = whole
         if not extractor.has_time:
             self._look_at_arrival(host_s)
         self._rows.append(measurement.values)
@@ -315,6 +388,7 @@ class Stream:
         except MissingQuantityError as error:
             if len(self.refused) < _MOST_NAMES:
                 self.refused[layout.name] = error
+            self._parts.offer(layout, error.quantity)
             return None
         old = self._extractor
         if old is not None:
@@ -334,6 +408,19 @@ class Stream:
             self.warnings[f"{layout.name}: skipped, as no VN-100 measures it: {fields}"] = None
         self._cut()
         return new
+
+    def _joined(self, layout: Layout) -> Extractor | None:
+        """Of rows that two outputs make together, unless one output alone has all."""
+        old = self._extractor
+        if old is None:
+            self._extractor = old = Extractor(layout)
+            self.facts.layout, self._steps, self._attitude = layout.name, None, None
+            field, rates = layout.name.split(" + ")
+            self.warnings[
+                f"the field comes in {field} and the rates in {rates}: put together by their time"
+            ] = None
+            self.warnings.update(dict.fromkeys(old.warnings))
+        return old if old.layout is layout else None
 
     def _replace(self, old: Extractor, new: Extractor) -> None:
         """Other quantities begin: what the old message gave must not mix with them."""
@@ -529,6 +616,13 @@ class Stream:
         if self.facts.samples or not self.by_layout:
             return
         reasons = [str(error) for error in self.refused.values()]
+        if len({error.quantity for error in self.refused.values()}) > 1:
+            names = " and ".join(list(self.refused)[:_FEW_PLACES])
+            reasons = [
+                f"field and rates come in different messages ({names}), and no time in both tells "
+                "which belong together; configure VNYMR or VNIMU (register 6: 14 or 19), or a "
+                "binary output with both"
+            ]
         if self.not_used:
             reasons.append(f"{', '.join(self.not_used)}: nothing of it is used")
         if reasons:

@@ -10,7 +10,8 @@ whichever model. Whatever else is between messages is noise, NMEA sentences of o
 included.
 
 **Candidates.** A line ends at ``\\n``, with up to two ``\\r`` before it (a port in text mode adds
-one), or at ``\\r`` alone where the next message begins there. It dies at ``$``, at a byte that is
+one), at ``\\r`` alone where the next message begins there, or where the next line begins at once
+(programs that strip line ends). It dies at ``$``, at a byte that is
 not printable and at the length limit. A packet ends where its header says. A candidate that fails
 is left by one byte: the next start inside of it is tried.
 
@@ -60,10 +61,10 @@ from drivers.vn100.messages import (
 
 _AFTER_SYNC = 0xFA00  # from here the byte FA leads to 0: lets the CRC run over a packet with its FA
 _TEXT = rb"[ -#%-)+-~]"  # printable, neither $ nor *
-_CHECKED = rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2})" % _TEXT
-# A port in text mode makes CR CR LF of CR LF; one that edits lines may leave CR alone.
-LINE = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]))")
-LINE_AT_THE_END = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{1,2}(?=[$\xfa]|\Z))")
+_CHECKED = rb"\$(VN%b{3,})\*((?:[0-9A-Fa-f]{2}){1,2})" % _TEXT
+# A port in text mode makes CR CR LF of CR LF; one that edits lines may leave CR alone, or nothing.
+LINE = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{0,2}(?=\$)|\r{1,2}(?=\xfa))")
+LINE_AT_THE_END = re.compile(_CHECKED + rb"(?:\r{0,2}\n|\r{0,2}(?=\$)|\r{1,2}(?=\xfa|\Z))")
 COMMAND_LINE = re.compile(rb"\$(VN%b{3,})\*((?:[0-9A-F]{2}){1,2}|XX)\r?\n" % _TEXT)
 
 
