@@ -1,8 +1,12 @@
-"""Byte streams: what a port sent, in a file, plain or gzipped; no host time in it.
+"""Byte streams: what a port sent, in a file, plain or gzipped.
+
+There is no host time in them, but where a terminal program or a shell put it in front of each line
+(`stamped`): then it is the lines' arrival.
 
 `read_chunks` gives a file's bytes as they are, unzipped, never more than a chunk at a time.
 `read_stream` also undoes what terminal programs and loggers do to text on the way into a file:
-UTF-16, lines that end in CR CR LF, lines that Python printed as b'...'.  A file that ends too early
+UTF-16, lines that end in CR CR LF, lines that Python printed as b'...', packets of which a text
+mode made CR LF of each LF.  A file that ends too early
 (a gzip cut off, damaged) is read as far as it goes; `notes` says what is missing.
 """
 
@@ -10,15 +14,22 @@ from __future__ import annotations
 
 import ast
 import codecs
+import datetime
 import re
 import zlib
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
-from ahrsd.recording.limits import STREAM_BYTES, refuse_beyond
+from ahrsd.recording.clock_fit import is_bunched, regular_clock, unwrapped
+from ahrsd.recording.limits import STREAM_BYTES, TABLE_ROWS, refuse_beyond
+from drivers.vn100.deframer import Deframer
 
 CHUNK_BYTES = 4096
 _GZIP = b"\x1f\x8b"
@@ -33,6 +44,19 @@ _WIDE_MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"),
 )  # fmt: skip
 _EUROPEAN = re.compile(rb"[\t\n\r -~\xa0-\xff]+")
+#: a time in front of a line, and what stands between: 1712.5 $VN, [2024-05-01 12:00:00.123] $VN,
+#: 12:00:00.123 > $VN, 1712500000123,"$VN, May  5 12:00:00 host program: $VN
+_STAMPED = re.compile(
+    rb"""[\s\[("'<]*(?:(?P<number>\d+(?:\.\d+)?)(?=[\s\])>,;:|"'-])[^$\n\w]*|"""
+    rb"(?:(?P<date>\d{4}[-/.]\d\d?[-/.]\d\d?)[T _,]+|[A-Z][a-z]{2} [ \d]\d )?"
+    rb"(?P<h>\d\d?):(?P<m>\d\d):(?P<s>\d\d)(?:[.,:](?P<fraction>\d+))?(?!\d)[^$\n]*)(?=\$VN)"
+)
+_FEWEST_STAMPS, _STAMPED_SHARE = 20, 0.8  # lines with a time, of those that have a message
+_LONGEST_STEP_S = 5.0  # between two messages
+_FAR_FUTURE_S = 1e10  # since 1970: the year 2286
+_DAY_OF_1970 = 719163
+_FEWEST_FEEDS = 20
+_QUOTED_END = re.compile(rb"\$VN[^$\n]*\*[0-9A-Fa-f]{2,4}\"\r?\n")
 _LITERAL = re.compile(rb"""b'(?:[^'\\]|\\.)*'|b"(?:[^"\\]|\\.)*\"""")
 
 
@@ -169,9 +193,15 @@ def read_stream(
     if any(mark in start for mark in (b"b'$VN", b'b"$VN', b"b'\\xfa")):
         told.append("the lines are bytes as Python prints them (b'...'): taken out of that")
         stream = _literals(stream)
+    elif _is_translated(start):
+        told.append("a text mode made CR LF of each LF of the packets: undone")
+        stream = _untranslated(stream)
     elif b"\r\r\n" in start and start.isascii():
         told.append("the lines end in CR CR LF: read as CR LF")
         stream = _single_returns(stream)
+    elif _QUOTED_END.search(start):
+        told.append("the lines stand in quotes: taken out of them")
+        stream = (line.replace(b'"', b"") for line in _lines(stream))
     elif b"\\r\\n" in start and start.isascii():
         told.append("the lines end in the written characters \\r\\n: read as line ends")
         stream = _written_ends(stream)
@@ -179,9 +209,119 @@ def read_stream(
 
 
 def read_received(path: Path, notes: list[str] | None = None) -> Iterator[Received]:
-    """The bytes as inputs; `host_ns` is 0 throughout, the file knows no host time."""
-    for chunk in read_stream(path, notes=notes):
-        yield Received(0, chunk)
+    """The bytes as inputs; `host_ns` is 0 throughout where the file knows no host time."""
+    told = [] if notes is None else notes
+    chunks = read_stream(path, notes=told)
+    first: list[bytes] = []
+    for chunk in chunks:
+        first.append(chunk)
+        if sum(map(len, first)) >= _LOOK_BYTES:
+            break
+    unit_s = stamped(b"".join(first))
+    if unit_s is None:
+        for chunk in _chained(first, chunks):
+            yield Received(0, chunk)
+        return
+    told.append("each line begins with a time of the host: taken for its arrival")
+    yield from _arrivals(path, unit_s)
+
+
+def stamped(start: bytes) -> float | None:
+    """The unit in s of the times in front of a stream's lines; None where there are none.
+
+    A count of lines is none, and of times that go back most of the way none is left.
+    """
+    found = [_STAMPED.match(line) for line in start.split(b"\n") if b"$VN" in line]
+    times = [one for one in map(_time_in, found) if one is not None]
+    if len(times) < _FEWEST_STAMPS or len(times) < _STAMPED_SHARE * len(found):
+        return None
+    steps = sorted(b - a for a, b in pairwise(times))
+    mean = (times[-1] - times[0]) / (len(times) - 1)
+    if steps[len(steps) // 10] < 0.0 or not mean > 0.0 or (steps[0] == steps[-1] == 1.0):
+        return None
+    # since 1970 there have been 1e9 s; smaller numbers tell by how far apart they are
+    size, longest = times[0], _LONGEST_STEP_S
+    return next(
+        (
+            unit
+            for unit in (1.0, 1e-3, 1e-6, 1e-9)
+            if mean * unit <= longest and (size * unit < _FAR_FUTURE_S)
+        ),
+        None,
+    )
+
+
+def _time_in(found: re.Match[bytes] | None) -> float | None:
+    """The number of a stamp; a date and time of a day as seconds."""
+    if found is None:
+        return None
+    if found["number"] is not None:
+        return float(found["number"])
+    day = 0
+    if found["date"] is not None:
+        year, month, date = (int(part) for part in re.split(rb"[-/.]", found["date"]))
+        try:
+            day = datetime.date(year, month, date).toordinal() - _DAY_OF_1970
+        except ValueError:
+            return None
+    clock = int(found["h"]) * 3600 + int(found["m"]) * 60 + int(found["s"])
+    return day * 86400.0 + clock + float(b"0." + (found["fraction"] or b"0"))
+
+
+def _arrivals(path: Path, unit_s: float) -> Iterator[Received]:
+    """Each line without its stamp, at its time; what has none at the time of the line before."""
+    at_s = _regular_times(path, unit_s)
+    host_ns = stamps = 0
+    for line in _lines(read_stream(path)):
+        found = _STAMPED.match(line)
+        if (time := _time_in(found)) is not None and found is not None:
+            host_ns = round((time * unit_s if at_s is None else at_s[stamps]) * 1e9)
+            yield Received(host_ns, line[found.end() :])
+            stamps += 1
+        else:
+            yield Received(host_ns, line)
+
+
+def _regular_times(path: Path, unit_s: float) -> NDArray[np.float64] | None:
+    """The regular clock behind stamps that came in bunches or in whole seconds; None: as they are.
+
+    A time of a day that began again counts on.
+    """
+    found = map(_time_in, map(_STAMPED.match, _lines(read_stream(path))))
+    times = [time for time in found if time is not None]
+    if len(times) > TABLE_ROWS:
+        return None
+    stamps_s, again, _ = unwrapped(unit_s * np.array(times))
+    if is_bunched(stamps_s) and np.all(np.diff(stamps_s) >= 0.0):
+        fitted = regular_clock(stamps_s)
+        return stamps_s if fitted is None else fitted.time_s
+    return stamps_s if len(again) else None
+
+
+def _is_translated(start: bytes) -> bool:
+    """Whether a text mode put CR in front of each LF of a stream of packets.
+
+    Then hardly a packet with a byte LF is whole, and all of them are without those CR.
+    """
+    feeds = start.count(b"\n")
+    if b"\xfa" not in start or feeds < _FEWEST_FEEDS or start.count(b"\r\n") < feeds:
+        return False
+    packets = []
+    for data in (start, start.replace(b"\r\n", b"\n")):
+        deframer = Deframer()
+        deframer.feed(data)
+        packets.append(deframer.counters.packets)
+    return packets[1] > packets[0]
+
+
+def _untranslated(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    rest = b""
+    for chunk in chunks:
+        data = rest + chunk
+        rest = b"\r" if data.endswith(b"\r") else b""
+        yield data[: len(data) - len(rest)].replace(b"\r\n", b"\n")
+    if rest:
+        yield rest
 
 
 def _chained(first: list[bytes], rest: Iterator[bytes]) -> Iterator[bytes]:

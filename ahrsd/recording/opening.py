@@ -140,13 +140,15 @@ class Recording:
 
 def _byte_inputs(recording: Recording) -> Iterator[Input]:
     told: list[str] = []
+    host_ns = 0
     for item in read_received(recording.path, told):
         if told:  # as soon as it is known, and once however often the inputs are read
             recording.notes += [note for note in told if note not in recording.notes]
             told.clear()
+        host_ns = item.host_ns
         yield item
     recording.notes += [note for note in told if note not in recording.notes]
-    yield Stop(0, _END)
+    yield Stop(host_ns, _END)
 
 
 def _table_inputs(table: Table) -> Iterator[Input]:
@@ -256,7 +258,7 @@ def _in_spite_of_its_name(
         return RecordingKind.CAPTURE if blocks.is_mcap(start) else RecordingKind.TABLE
     if starts_a_table(start):
         return RecordingKind.TABLE
-    if named is RecordingKind.TABLE and _as_utf8(start).lstrip().startswith(b"$VN"):
+    if named is RecordingKind.TABLE and b"$VN" in _as_utf8(start).lstrip().partition(b"\n")[0]:
         return RecordingKind.BYTES
     return None
 
