@@ -147,6 +147,8 @@ class Means:
 
 
 def _means(done: Filtered, rate_b_rad_s: Array) -> Iterator[Means]:
+    if not done.used.any():  # no reading was used: then nothing jumps
+        return
     dt = np.nan_to_num(done.track.dt_s, nan=0.0)[:, None]
     v = np.einsum("nij,nj->ni", done.orientation, np.cross(done.predicted_b, rate_b_rad_s * dt))
     left = done.innovation @ np.linalg.inv(done.model.soft_iron).T

@@ -94,8 +94,11 @@ def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
 
 
 def faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
-    """Units, axes, signs and times that cannot be as recorded, and what is odd, in words."""
-    facts = hygiene(track_of(blocks)) if blocks else ()
+    """Units, axes, signs and times that cannot be as recorded, and what is odd, in words.
+
+    A clock that jumps where a run begins (a restart of the device) is no wrong time.
+    """
+    facts = hygiene(without_jumps(track_of(blocks))[0]) if blocks else ()
     wrong = [fact.words for fact in facts if fact.stops]
     return wrong, [fact.words for fact in facts if not fact.stops and matters(fact)]
 

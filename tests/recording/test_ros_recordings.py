@@ -244,7 +244,7 @@ def no_time(tmp_path, container):
 
 def other_clocks(tmp_path, container):
     data = sensor()
-    late = [(t, k, ns, {**f, "stamp_ns": ns + 10**15}) for t, k, ns, f in magnetic(data)]
+    late = [(t, k, ns + 10**15, f) for t, k, ns, f in magnetic(data)]
     return ros_files.save(tmp_path, container, [*imu(data), *late])
 
 

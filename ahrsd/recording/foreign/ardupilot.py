@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ahrsd.errors import RecordingError
 from ahrsd.printable import counted, printable
 from ahrsd.recording.foreign.sensors import (
+    STILL,
     Choice,
     Sensors,
     SensorSeries,
@@ -242,6 +243,7 @@ def _firmware(log: Log) -> str:
 
 
 def _suffix(number: int) -> str:
+    """What stands for a sensor in the names of its parameters: INS_GYROFFS_X, INS_GYR2OFFS_X."""
     return "" if number == 0 else str(number + 1)
 
 
@@ -276,7 +278,8 @@ def _compass(
                 found[number] = (name, np.ones(len(log.rows[name]), dtype=bool))
     if not found:
         raise RecordingError(path, "holds no magnetometer (MAG)", _SOME)
-    number = min(found) if choice.compass is None else choice.compass
+    live = [one for one, (name, rows) in sorted(found.items()) if _reads(log, name, field, rows)]
+    number = min(live or found) if choice.compass is None else choice.compass
     if number not in found:
         there = ", ".join(map(str, sorted(found)))
         raise RecordingError(path, f"holds no compass {number}", f"it has --compass {there}")
@@ -285,7 +288,32 @@ def _compass(
             f"it holds {len(found)} compasses: number {number} is used (`ahrsd convert --compass` "
             "takes another)"
         )
+        if dead := sorted(set(found) - set(live)):
+            out.notes.append(f"dead, one reading throughout: compass {', '.join(map(str, dead))}")
     return (*found[number], number)
+
+
+def _reads(log: Log, message: str, fields: tuple[str, ...], rows: NDArray[np.bool]) -> bool:
+    """Whether a sensor's readings differ at all."""
+    return bool(np.any(np.ptp(_vector(log, message, fields, rows), axis=0) > 0.0))
+
+
+def _gyro_number(log: Log, out: Sensors) -> int:
+    """The first gyro, but where another one turns with the vehicle and it does not."""
+    column = next((one for one in _INSTANCES if log.has("IMU", one)), None)
+    numbers = [0] if column is None else np.unique(log.rows["IMU"][column]).tolist()
+    fields = ("GyrX", "GyrY", "GyrZ")
+    rates = {k: _vector(log, "IMU", fields, _rows(log, "IMU", k)) for k in map(int, numbers)}
+    turning = {k: float(np.sqrt(np.mean(np.var(one, axis=0)))) for k, one in rates.items()}
+    first = min(turning)
+    most = max(turning, key=lambda k: turning[k])
+    if not turning[first] < STILL * turning[most]:
+        return first
+    out.notes.append(
+        f"the gyro of IMU {first} hardly turns ({turning[first]:.2g} rad/s), that of IMU {most} "
+        f"does ({turning[most]:.2g} rad/s): its rates were taken"
+    )
+    return most
 
 
 def _vector(log: Log, message: str, fields: tuple[str, ...], rows: NDArray[np.bool]) -> Array:
@@ -357,10 +385,13 @@ def _motor_after(log: Log, parameters: dict[str, float]) -> tuple[bool, str]:
 def _inertial(path: Path, log: Log, parameters: dict[str, float], out: Sensors) -> str:
     if not log.has("IMU", "GyrX", "GyrY", "GyrZ"):
         raise RecordingError(path, "holds no gyro (IMU)", _SOME)
-    rows = _rows(log, "IMU", 0)
+    number = _gyro_number(log, out)
+    rows = _rows(log, "IMU", number)
     at = _times(path, log, "IMU")[rows]
     rate = _vector(log, "IMU", ("GyrX", "GyrY", "GyrZ"), rows)
-    offset = np.array([parameters.get(f"INS_GYROFFS_{axis}", 0.0) for axis in "XYZ"])
+    offset = np.array(
+        [parameters.get(f"INS_GYR{_suffix(number)}OFFS_{axis}", 0.0) for axis in "XYZ"]
+    )
     words = ""
     if np.any(offset):
         if parameters.get("AHRS_ORIENTATION", 0.0) == 0.0:
@@ -368,10 +399,10 @@ def _inertial(path: Path, log: Log, parameters: dict[str, float], out: Sensors) 
             words = f"gyro offsets {np.round(1e3 * offset, 2).tolist()} mrad/s"
         else:
             words = "not the gyro's offsets (AHRS_ORIENTATION turns them)"
-    out.gyro, out.names["gyro"] = SensorSeries(at, rate), "IMU[0]"
+    out.gyro, out.names["gyro"] = SensorSeries(at, rate), f"IMU[{number}]"
     if log.has("IMU", "AccX", "AccY", "AccZ"):
         out.accel = SensorSeries(at, _vector(log, "IMU", ("AccX", "AccY", "AccZ"), rows))
-        out.names["accel"] = "IMU[0]"
+        out.names["accel"] = f"IMU[{number}]"
     for name in ("T", "Temp"):
         if log.has("IMU", name, "TimeUS"):
             out.more["temperature_c"] = SensorSeries(at, log.column("IMU", name)[rows][:, None])

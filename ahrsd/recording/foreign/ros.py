@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from enum import Enum
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,14 @@ import numpy as np
 from ahrsd.errors import RecordingError
 from ahrsd.inputs import Received
 from ahrsd.printable import counted, printable
-from ahrsd.recording.foreign.sensors import Choice, RawBytes, Sensors, SensorSeries, positions
+from ahrsd.recording.foreign.sensors import (
+    STILL,
+    Choice,
+    RawBytes,
+    Sensors,
+    SensorSeries,
+    positions,
+)
 from ahrsd.recording.limits import TABLE_BYTES, TABLE_CELLS, refuse_beyond
 from ahrsd.samples import Array
 from drivers.vn100.deframer import Deframer
@@ -101,6 +109,14 @@ _REINDEX = {
 }
 
 
+class _Clock(Enum):
+    """Whose times a recording's rows have."""
+
+    DEVICE = "the device's (TimeStartup)"
+    HEADERS = "the headers' stamps"
+    RECORDER = "the recorder's"
+
+
 @dataclass(slots=True)
 class _Series:
     """One quantity of one topic. rank: of several kinds of one sensor the lowest is the best.
@@ -119,10 +135,12 @@ class _Series:
     device_s: array[float] = field(default_factory=lambda: array("d"))
     values: array[float] = field(default_factory=lambda: array("d"))
 
-    def stream(self, shift_s: float, device: bool) -> SensorSeries:
+    def stream(self, shift_s: float, clock: _Clock) -> SensorSeries:
         """On the recording's clock; shift_s: from the host's clock to it."""
         time_s = np.array(self.device_s)
-        if not (device and np.isfinite(time_s).all()):
+        if clock is _Clock.RECORDER:
+            time_s = np.array(self.log_s)
+        elif not (clock is _Clock.DEVICE and np.isfinite(time_s).all()):
             time_s = self._host_s() + shift_s
         return SensorSeries(time_s, np.array(self.values).reshape(-1, self.width))
 
@@ -133,7 +151,20 @@ class _Series:
     @property
     def has_stamps(self) -> bool:
         """Whether the headers' stamps are times at all."""
-        return len(np.unique(np.array(self.stamp_s))) > _UNIQUE * len(self.stamp_s)
+        stamps = np.array(self.stamp_s)
+        return len(np.unique(stamps[np.isfinite(stamps)])) > _UNIQUE * len(stamps)
+
+    def overlaps(self, other: _Series) -> bool:
+        """Whether the headers' stamps of both are of one time, as the recorder's are."""
+        a, b = np.array(self.stamp_s), np.array(other.stamp_s)
+        return bool(max(np.nanmin(a), np.nanmin(b)) < min(np.nanmax(a), np.nanmax(b)))
+
+    @property
+    def turning_rad_s(self) -> float:
+        """Rms of a gyro's rates about their mean."""
+        rates = np.array(self.values).reshape(-1, self.width)
+        rates = rates[np.isfinite(rates).all(axis=1)]
+        return float(np.sqrt(np.mean(np.var(rates, axis=0)))) if len(rates) else 0.0
 
     @property
     def has_device(self) -> bool:
@@ -415,8 +446,9 @@ class _Place:
     def take(self, message: _Message, at_ns: int, found: _Found) -> int:
         """One more message; how many numbers were kept."""
         part = message if self._part is None else self._part(message)
-        stamp_ns = _ns(part) or (_ns(message) if part is not message else 0) or at_ns
-        stamp_s, log_s = (stamp_ns - found.base_ns) * 1e-9, (at_ns - found.base_ns) * 1e-9
+        stamp_ns = _ns(part) or (_ns(message) if part is not message else 0)
+        stamp_s = (stamp_ns - found.base_ns) * 1e-9 if stamp_ns else _NAN
+        log_s = (at_ns - found.base_ns) * 1e-9
         device_s = _NAN
         if self._device and int(part.group_fields) & 1:
             device_s = int(part.timestartup) * 1e-9
@@ -456,7 +488,7 @@ def _raw(path: Path, found: _Found, topics: list[str]) -> RawBytes:
     if len(topics) > 1:
         raise RecordingError(
             path, f"holds the bytes of {len(topics)} devices: {_some(sorted(topics))}",
-            _pick(path, topics),
+            _pick(path, sorted(topics)),
         )  # fmt: skip
     received = found.raw[topics[0]].received
     note = (
@@ -470,7 +502,7 @@ def _raw(path: Path, found: _Found, topics: list[str]) -> RawBytes:
 def _pick(path: Path, names: list[str]) -> str:
     return (
         f"choose one: ahrsd convert {printable(path.name)} -o OUT.parquet --topic "
-        f"{printable(sorted(names)[0])}"
+        f"{printable(names[0])}"
     )
 
 
@@ -492,27 +524,42 @@ def _sensors(path: Path, found: _Found, choice: Choice, topics: list[str]) -> Se
             path, f"holds no {missing}, it has the topics {_some(topics)}{extra}",
             "record sensor_msgs/Imu and sensor_msgs/MagneticField",
         )  # fmt: skip
-    device = mag.has_device and gyro.has_device
-    shift_s = mag.shift_s() if device else 0.0
-    out.mag, out.gyro = mag.stream(shift_s, device), gyro.stream(shift_s, device)
+    clock = _clock_of(mag, gyro, out.notes)
+    shift_s = mag.shift_s() if clock is _Clock.DEVICE else 0.0
+    out.mag, out.gyro = mag.stream(shift_s, clock), gyro.stream(shift_s, clock)
     out.units |= {"mag": mag.unit, "gyro": gyro.unit}
     out.names |= {"mag": mag.name, "gyro": gyro.name}
     accel = found.series.get(("accel", gyro.rank, gyro.name))
     if accel is not None:
-        out.accel, out.names["accel"] = accel.stream(shift_s, device), accel.name
-    _covariates(found, out, gyro, shift_s, device)
+        out.accel, out.names["accel"] = accel.stream(shift_s, clock), accel.name
+    _covariates(found, out, gyro, shift_s, clock)
     began = datetime.fromtimestamp(found.base_ns / 1e9, UTC).isoformat()
     out.facts["recorded_utc"] = began
-    clock = "the device's (TimeStartup)" if device else f"the headers' stamps, s since {began}"
-    if not device and not (mag.has_stamps and gyro.has_stamps):
-        clock = f"the recorder's, s since {began}"
-        out.notes.append("the headers have no times: those of the recorder are used")
-    out.facts |= {"clock": clock, "frame": "the axes of the messages, as the driver published them"}
+    since = "" if clock is _Clock.DEVICE else f", s since {began}"
+    out.facts |= {
+        "clock": f"{clock.value}{since}",
+        "frame": "the axes of the messages, as the driver published them",
+    }
     if mag.rank == 2 or gyro.rank == 2:
         out.facts["undone"] = "nothing (what the driver or the device corrected stays in it)"
     else:
         out.facts["undone"] = "nothing; the device's uncompensated values were taken where present"
     return out
+
+
+def _clock_of(mag: _Series, gyro: _Series, notes: list[str]) -> _Clock:
+    """The device's clock, else that of the headers, if the two sensors share one."""
+    if mag.has_device and gyro.has_device:
+        return _Clock.DEVICE
+    if not (mag.has_stamps and gyro.has_stamps):
+        notes.append("the headers have no times: those of the recorder are used")
+    elif not mag.overlaps(gyro):
+        notes.append(
+            "the headers of field and gyro are of different clocks: the recorder's times are used"
+        )
+    else:
+        return _Clock.HEADERS
+    return _Clock.RECORDER
 
 
 def _chosen(
@@ -534,9 +581,18 @@ def _chosen(
         raw = [one for one in candidates if one.topic.endswith("raw")]
         candidates = raw if len(raw) == 1 else candidates
     if len(candidates) > 1:
-        names = sorted(one.name for one in candidates)
+        candidates = sorted(candidates, key=lambda one: one.name)
+        names = [one.name for one in candidates]
         what = {"mag": "magnetometers", "gyro": "gyros"}[kind]
-        raise RecordingError(path, f"holds {len(names)} {what}: {_some(names)}", _pick(path, names))
+        most = max(one.turning_rad_s for one in candidates)
+        still = [one.name for one in candidates if one.turning_rad_s < STILL * most]
+        hint = ""
+        if kind == "gyro" and still:
+            hint = f"; {_some(still)} hardly turns beside the other"
+            names = [*(name for name in names if name not in still), *still]
+        raise RecordingError(
+            path, f"holds {len(names)} {what}: {_some(sorted(names))}{hint}", _pick(path, names)
+        )
     return candidates[0] if candidates else None
 
 
@@ -544,21 +600,21 @@ def _space(topic: str) -> str:
     return topic.rsplit("/", 1)[0]
 
 
-def _covariates(found: _Found, out: Sensors, gyro: _Series, shift_s: float, device: bool) -> None:
+def _covariates(found: _Found, out: Sensors, gyro: _Series, shift_s: float, clock: _Clock) -> None:
     for kind in ("temperature_c", "pressure_kpa", "motor_current_a", "battery_v"):
         of = [one for (key, _, _), one in found.series.items() if key == kind]
         if of:
             best = min(of, key=lambda one: (one.rank, -len(one.log_s), one.name))
-            out.more[kind] = best.stream(shift_s, device)
+            out.more[kind] = best.stream(shift_s, clock)
             if len(of) > 1:
                 out.notes.append(f"{kind} is that of {printable(best.name)}, of {len(of)} topics")
     for key, one in found.series.items():
         if key[0] == "fix":
-            fixes = one.stream(shift_s, device)
+            fixes = one.stream(shift_s, clock)
             out.more |= positions(fixes.time_s, *fixes.values.T)
             break
     for (kind, _, name), one in found.series.items():
-        stream = one.stream(shift_s, device)
+        stream = one.stream(shift_s, clock)
         if kind == "vn_attitude":
             names = ("vn_yaw_deg", "vn_pitch_deg", "vn_roll_deg")
             out.more |= {

@@ -21,6 +21,7 @@ from ahrsd.recording.limits import TABLE_ROWS, refuse_beyond
 from ahrsd.samples import Array
 
 FEWEST = 20  # readings of a sensor
+STILL = 0.1  # of another gyro's rates, below which the two did not make the same motion
 _FASTER = 1.5  # times the magnetometer's rate, from which on means over its steps are taken
 _FRESH = 0.67  # share of new readings below which the magnetometer is logged faster than it reads
 #: units of a magnetometer with their factor to gauss, and what a vector's size may be in gauss
@@ -335,6 +336,10 @@ def _check_unit(path: object, kind: str, values: Array, unit: str, found: Sensor
         ),
         None,
     )
+    if size == 0.0:
+        raise RecordingError(
+            path, f"{name} reads 0 throughout: it is dead, or was not logged", "take another one"
+        )
     words = f"it looks like {looks}" if looks else "it is another unit or a dead sensor"
     raise RecordingError(
         path, f"{name}: the median field is {size:.4g} {unit}, {words}",
