@@ -43,6 +43,9 @@ from ahrsd.samples import Array
 DRIFT_S = 20.0
 SINK = 4.0
 _NARROWEST = 0.3  # samples: what is narrower changes nothing
+#: samples of the width from which a row's neighbours say its rate well (its own part is a quarter)
+_OTHERS_FROM = 2.0
+_REACH = 8.0  # widths to either side, beyond which two such Gaussians have nothing
 #: chance with which noise alone may stand above the floor at one frequency
 BY_CHANCE = 1e-5
 _SLOWEST_HZ = 0.5  # by segments of four seconds, no motion is told to be slower
@@ -87,6 +90,7 @@ def build_context(track: Track, fit: Fit) -> Context:
         field_b=_foretold(done, smooth),
         smooth_b=smooth_b,
         rate_b_rad_s=smooth,
+        others_rate_b_rad_s=rate_by_others(rate, smooth, width),
         field_dot_b=np.cross(smooth_b, _at_the_sample(smooth, runs)),
         R_nb=R_nb,
         world_levelled=levelled,
@@ -167,6 +171,24 @@ def _low_passed(values: Array, width: float) -> Array:
     once = gaussian(values - centre, width)
     twice = gaussian(once, width)
     return np.asarray(2 * once - twice + centre)
+
+
+def rate_by_others(rate: Array, smooth: Array, width: float) -> Array:
+    """(N, 3) smoothed rates without what each row adds to itself.
+
+    For columns that are the rate, row by row: one that has its row's own noise in it, held against
+    what that very noise did to the field, is a scale that is not there (a regression on a noisy
+    regressor; a hundredth and more where the gyro is by far the louder sensor).  Its differences
+    are noise, so what is made of differences takes the smooth one.
+    """
+    if width < _OTHERS_FROM:
+        return smooth
+    impulse = np.zeros((2 * int(_REACH * width) + 3, 1))
+    middle = len(impulse) // 2
+    impulse[middle] = 1.0
+    once = gaussian(impulse, width)
+    own = float((2 * once - gaussian(once, width))[middle, 0])
+    return np.asarray((smooth - own * rate) / (1.0 - own))
 
 
 def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> float:

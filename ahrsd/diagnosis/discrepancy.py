@@ -148,7 +148,7 @@ def by_rate(context: Context) -> Columns:
 
     In proportion to them it is scale and misalignment.
     """
-    rate = context.rate_b_rad_s
+    rate = context.rowwise_rate_b_rad_s
     x, y, z = rate.T
     whole = np.linalg.norm(rate, axis=1, keepdims=True)
     values = np.column_stack([np.abs(rate), rate * whole, rate**2, x * y, x * z, y * z])

@@ -39,5 +39,5 @@ def beside_itself(basis: Base, names: Sequence[str]) -> Base:
 
 def gyro_matrix(context: Context) -> Columns:
     """Columns (N, 3, 9) of an error of the gyro by a matrix on its rate, row by row."""
-    rate = context.rate_b_rad_s
+    rate = context.rowwise_rate_b_rad_s
     return Columns(gyro=np.einsum("nj,ik->nikj", rate, np.eye(3)).reshape(len(rate), 3, -1))

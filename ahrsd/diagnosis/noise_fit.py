@@ -26,7 +26,7 @@ _WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviation
 #: where readings are too far apart to be compared with each other
 _USUAL_MAG_GAUSS = 1e-3
 #: below the magnetometer's, what the filter leaves out (it is linear) would be more than the noise
-_FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
+FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 _PIECES, _PIECE_ROWS = 6, 400
 _FINE = 0.1  # of a logarithm: where no common scale puts right by how much a coarse parabola is off
 SAME = 0.02  # relative change of a noise level that changes nothing
@@ -39,7 +39,7 @@ def first_guess(track: Track, spec: Spec) -> NullModel:
         np.eye(3),
         np.zeros(3),
         np.zeros(3),
-        spec.sigma_mag_gauss or (max(mag, _FLOOR_MAG_GAUSS) if mag else _USUAL_MAG_GAUSS),
+        spec.sigma_mag_gauss or (max(mag, FLOOR_MAG_GAUSS) if mag else _USUAL_MAG_GAUSS),
         spec.sigma_gyro_rad_s or max(gyro, _FLOOR_GYRO_RAD_S),
     )
 
@@ -80,8 +80,8 @@ def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
     if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
         return model
     mag = model.sigma_mag_gauss * factor
-    if mag < _FLOOR_MAG_GAUSS:
-        return replace(model, sigma_mag_gauss=_FLOOR_MAG_GAUSS)
+    if mag < FLOOR_MAG_GAUSS:
+        return replace(model, sigma_mag_gauss=FLOOR_MAG_GAUSS)
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
         differenced = spec.shaken_gyro_rad_s or noise_of(filtered.track)[1]
@@ -144,8 +144,8 @@ def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> Nu
     if given_mag:
         return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
     free = _by_ratio(track, base, differenced, below)
-    if free.sigma_mag_gauss < _FLOOR_MAG_GAUSS:
-        at_floor = replace(base, sigma_mag_gauss=_FLOOR_MAG_GAUSS)
+    if free.sigma_mag_gauss < FLOOR_MAG_GAUSS:
+        at_floor = replace(base, sigma_mag_gauss=FLOOR_MAG_GAUSS)
         return _gyro_alone(track, at_floor, differenced, below)
     if free.sigma_gyro_rad_s <= _cap(differenced):
         return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
@@ -158,7 +158,7 @@ def _prior(sigma_gyro: float, differenced: float, below: float) -> float:
 
 
 def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
-    most = np.log(_cap(differenced) / _FLOOR_MAG_GAUSS)
+    most = np.log(_cap(differenced) / FLOOR_MAG_GAUSS)
 
     def scaled(level: float) -> tuple[NullModel, float]:
         ratio = float(np.exp(min(level, most)))
@@ -187,7 +187,7 @@ def _mag_alone(track: Track, model: NullModel) -> NullModel:
         return _likelihood(track, replace(model, sigma_mag_gauss=float(np.exp(level))))
 
     best = _highest(of_mag, np.log(model.sigma_mag_gauss))
-    return replace(model, sigma_mag_gauss=max(float(np.exp(best)), _FLOOR_MAG_GAUSS))
+    return replace(model, sigma_mag_gauss=max(float(np.exp(best)), FLOOR_MAG_GAUSS))
 
 
 def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:

@@ -92,6 +92,8 @@ class Context:
     smooth_b:     (N, 3) the same smoothed both ways: for what is made of its differences
     rate_b_rad_s: (N, 3) true rate: gyro minus bias and terms, zero-phase smoothed: it shares
                   next to no noise with a single innovation
+    others_rate_b_rad_s: (N, 3) the same without each row's own part: for columns that are the
+                  rate row by row, which share no noise with the innovation; None: as it is
     field_dot_b:  (N, 3) gauss/s, smooth_b x rate_b_rad_s
     R_nb:         (N, 3, 3) body to a world-fixed frame.  Level with down along +z where there
                   is an accelerometer (`world_levelled`), else fixed but
@@ -108,6 +110,13 @@ class Context:
     R_nb: Array
     world_levelled: bool
     force_b_m_s2: Array | None = None
+    others_rate_b_rad_s: Array | None = None
+
+    @property
+    def rowwise_rate_b_rad_s(self) -> Array:
+        """(N, 3) rates for columns that are the rate, row by row."""
+        others = self.others_rate_b_rad_s
+        return self.rate_b_rad_s if others is None else others
 
     @property
     def heading_rad(self) -> Array:

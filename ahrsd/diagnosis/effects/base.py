@@ -243,6 +243,11 @@ def readings_of(context: Context) -> Readings:
     )
 
 
+def rowwise_readings_of(context: Context) -> Readings:
+    """The same with rates that share no noise with their row's innovation."""
+    return replace(readings_of(context), rate_b_rad_s=context.rowwise_rate_b_rad_s)
+
+
 def smooth_readings_of(context: Context) -> Readings:
     """The same with the smooth field: the differences of the foretold one are the gyro's noise."""
     model, smooth = context.model, context.smooth_b

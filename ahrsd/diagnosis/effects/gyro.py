@@ -15,6 +15,7 @@ from ahrsd.diagnosis.effects.base import (
     Readings,
     Setting,
     readings_of,
+    rowwise_readings_of,
 )
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
@@ -47,6 +48,10 @@ class GyroScale(Linear):
         """Nothing to choose."""
         return ({},)
 
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """Of rates without their own row's noise."""
+        return self.terms(rowwise_readings_of(context), setting)
+
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The rate on each axis."""
         return Columns(gyro=np.asarray(readings.rate_b_rad_s[:, :, None] * np.eye(3)))
@@ -76,6 +81,10 @@ class GyroNonorthogonality(Linear):
         """Nothing to choose."""
         return ({},)
 
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """Of rates without their own row's noise."""
+        return self.terms(rowwise_readings_of(context), setting)
+
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The off-diagonal symmetric matrices on the rate."""
         return Columns(gyro=shapes.times_symmetric(readings.rate_b_rad_s)[:, :, 3:])
@@ -100,6 +109,10 @@ class GyroNonlinearity(Linear):
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The rate of the axis, or the size of the whole rate."""
         return ({"form": "axis"}, {"form": "size"})
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """Of rates without their own row's noise."""
+        return self.terms(rowwise_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """|w| w on each axis."""

@@ -16,6 +16,7 @@ from ahrsd.diagnosis.effects.base import (
     Scatter,
     Setting,
     readings_of,
+    rowwise_readings_of,
 )
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
@@ -44,6 +45,10 @@ class ClockRate(Linear):
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Nothing to choose."""
         return ({},)
+
+    def columns(self, context: Context, setting: Setting) -> Columns:
+        """Of rates without their own row's noise."""
+        return self.terms(rowwise_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The rate."""
