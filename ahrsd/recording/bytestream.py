@@ -45,9 +45,9 @@ _WIDE_MARKS = (
 )  # fmt: skip
 _EUROPEAN = re.compile(rb"[\t\n\r -~\xa0-\xff]+")
 #: a time in front of a line, and what stands between: 1712.5 $VN, [2024-05-01 12:00:00.123] $VN,
-#: 12:00:00.123 > $VN, 1712500000123,"$VN, May  5 12:00:00 host program: $VN
+#: 12:00:00.123 > $VN, 1712500000123,"$VN, May  5 12:00:00 host program: $VN, 1712.5,0.01,imu,"$VN
 _STAMPED = re.compile(
-    rb"""[\s\[("'<]*(?:(?P<number>\d+(?:\.\d+)?)(?=[\s\])>,;:|"'-])[^$\n\w]*|"""
+    rb"""[\s\[("'<]*(?:(?P<number>\d+(?:\.\d+)?)(?=[\s\])>,;:|"'-])(?:[^$\n\w]*|[,;\t][^$\n]*)|"""
     rb"(?:(?P<date>\d{4}[-/.]\d\d?[-/.]\d\d?)[T _,]+|[A-Z][a-z]{2} [ \d]\d )?"
     rb"(?P<h>\d\d?):(?P<m>\d\d):(?P<s>\d\d)(?:[.,:](?P<fraction>\d+))?(?!\d)[^$\n]*)(?=\$VN)"
 )

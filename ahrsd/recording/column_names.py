@@ -177,7 +177,8 @@ _ROS_PARTS = (
     ("angular_velocity", GYRO, 1.0),
     ("linear_acceleration", ACCEL, 1.0),
 )
-_ROS_TIMES = ("field.header.stamp", "%time")  # in ns, best first
+#: of `rostopic echo -p`, and of bagpy; best first
+_ROS_TIMES = (("field.header.stamp", 1e-9), ("%time", 1e-9), ("Time", 1.0))
 _WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 _NUMBER = "NUMBER"
 _COUNTS = re.compile(r"(?i)(counts?|lsb|raw|adc)$")
@@ -284,14 +285,14 @@ def _of_ros(sources: dict[str, Source], names: Sequence[str]) -> list[str]:
             sources[name] = Source(f"{stems[0]}{axis}", factor)
         taken.append(f"{stems[0]}x")
     if taken and TIME not in sources:
-        clock = next((name for name in _ROS_TIMES if name in names), None)
+        clock = next(((name, unit) for name, unit in _ROS_TIMES if name in names), None)
         if clock is not None:
-            sources[TIME] = Source(clock, 1e-9)
-            taken.append(clock)
+            sources[TIME] = Source(*clock)
+            taken.append(clock[0])
     if not taken:
         return []
     shown = ", ".join(printable(name) for name in taken)
-    return [f"the columns are those of ROS messages: {shown} (T, rad/s, m/s^2, ns) were taken"]
+    return [f"the columns are those of ROS messages: {shown} (T, rad/s, m/s^2) were taken"]
 
 
 def _with_units(sources: dict[str, Source], names: Sequence[str]) -> list[str]:

@@ -23,6 +23,7 @@ from ahrsd.recording.bytestream import (
     read_chunks,
     read_received,
     read_stream,
+    stamped,
     unpacked_size,
     wide_text_of,
 )
@@ -37,6 +38,8 @@ from drivers.vn100.messages import Reply
 
 _END = "end of recording"
 _HEAD_BYTES = 4096
+_LINES_BYTES = 64 * 1024  # of a table, by which it is told whether it holds a device's lines
+_OF_SAMPLES = ("mag_", "gyro_")  # how the names begin of what a sample needs
 
 
 class RecordingKind(Enum):
@@ -189,6 +192,8 @@ def open_recording(
         raise RecordingError(path, found.what, found.remedy)
     named = _SUFFIXES.get(suffix.lower())
     kind = _in_spite_of_its_name(path, start, named) or named or _by_content(path, start)
+    if kind is RecordingKind.TABLE and not columns and b"$VN" in start and _has_lines(path):
+        kind = RecordingKind.BYTES
     unused = (
         ["--columns is not used: it is for tables"]
         if columns and kind is not RecordingKind.TABLE
@@ -261,6 +266,24 @@ def _in_spite_of_its_name(
     if named is RecordingKind.TABLE and b"$VN" in _as_utf8(start).lstrip().partition(b"\n")[0]:
         return RecordingKind.BYTES
     return None
+
+
+def _has_lines(path: Path) -> bool:
+    """Whether the rows of a table each hold a time and, in a cell, what a VN-100 sent then.
+
+    Then that is the device's own word, with its digits and its checksum. Without field and rate in
+    it the table's other columns are all there is.
+    """
+    look = b""
+    for chunk in read_stream(path):
+        look += chunk
+        if len(look) >= _LINES_BYTES:
+            break
+    deframer = Deframer()
+    told = [decode(frame) for frame in deframer.feed(look)]
+    names = {c.name for one in told if isinstance(one, Measurement) for c in one.layout.columns}
+    quantities = [any(name.startswith(word) for name in names) for word in _OF_SAMPLES]
+    return all(quantities) and stamped(look) is not None
 
 
 def _as_utf8(start: bytes) -> bytes:

@@ -54,6 +54,10 @@ _WRONG_SHARE, _WRONG_FEW = 0.01, 3  # rows with another number of cells that are
 _OF_TABLES = (b"time_s", b"mag_x_gauss", b"TimeStartup,")  # names in the first line
 _PREAMBLE_BYTES = 16384  # in front of the names
 _ROWS_THAT_TELL = 2
+#: a quoted cell of a few lines: whatever begins with a quote and has none for longer is no cell
+_LONG_CELL = re.compile(
+    rb'(?m)(?<![^,;\t\n])"(?:[^"\n]|""){0,4096}(?:\n(?:[^"\n]|""){0,4096}){1,8}"(?=[,;\t\n]|\Z)'
+)
 _LESS = "keep fewer of them, or cut the recording in parts"
 _MISSING = ["", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "N/A", "n/a", "NA", "#N/A",
             "-nan(ind)", "nan(ind)", "-1.#IND", "1.#QNAN", "-1.#QNAN", "1.#INF", "-1.#INF",
@@ -113,6 +117,7 @@ def read_text_table(path: Path) -> TextTable:
     data = _plain_text(path, data, notes)
     if (found := recognised(bytes(data[:4096]))) is not None:
         raise RecordingError(path, found.what, found.remedy)
+    data = _in_one_line(data)
     text = _with_header(path, data, notes)
     _drop_comments(text, notes)
     _take_units(text, notes)
@@ -169,6 +174,13 @@ def _plain_text(path: Path, data: bytearray, notes: list[str]) -> bytearray:
     if b"\r" in data:
         data = bytearray(re.sub(rb"\r+\n|\r", b"\n", bytes(data)))
     return data
+
+
+def _in_one_line(data: bytearray) -> bytearray:
+    """Quoted cells that go over several lines, such as a line of a device with its end, in one."""
+    if b'"' not in data:
+        return data
+    return bytearray(_LONG_CELL.sub(lambda cell: cell[0].replace(b"\n", b" "), bytes(data)))
 
 
 def _with_header(path: Path, data: bytearray, notes: list[str]) -> _Text:

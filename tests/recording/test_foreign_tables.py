@@ -13,17 +13,20 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
+import ros_files
 
 from ahrsd import so3
 from ahrsd.__main__ import main
 from ahrsd.cli import module_of
 from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
+from ahrsd.inputs import Received
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, REQUIRED, TIME, parse_columns
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.recording.text_table import is_table_text
+from drivers.vn100.messages import encode_sentence
 
 NAMES = (*REQUIRED, *ACCEL)
 COUNT, RATE_HZ = 400, 20.0
@@ -825,3 +828,88 @@ def test_a_force_of_zero_is_none(tmp_path):
     table = read_table(save(tmp_path / "imu.csv", cells))
     assert np.isnan(table.rows.accel_b_m_s2).all()
     assert "the acceleration was left out: it is 0 throughout, not even gravity" in table.notes
+
+
+def lines_of_a_device(count: int = 400) -> list[bytes]:
+    data = ros_files.sensor(count)
+    return [
+        encode_sentence("VNYMR", [0.0, 0.0, 0.0, *m, *a, *w], None, None, "xor")
+        for m, a, w in zip(data["mag"], data["accel"], data["gyro"], strict=True)
+    ]
+
+
+@pytest.mark.parametrize("cell", ['"{line}"', '"{line}\n"', '"{line}\r\n"'])
+@pytest.mark.parametrize("more", ["", "imu1_Frame,0.037773,-0.2727,2.653e-05,"])
+def test_rows_with_what_the_device_sent_are_that(tmp_path, cell, more):
+    """As drivers that students write keep them: time, values in some units, and the line."""
+    lines = [line.decode().strip() for line in lines_of_a_device()]
+    rows = [
+        f"{1763590172.75 + k / 20:.6f},{more}{cell.format(line=line)}\n"
+        for k, line in enumerate(lines)
+    ]
+    names = "t,frame_id,gyro_x,gyro_z,mag_x,raw" if more else "ros_t,raw"
+    path = tmp_path / "imu.csv"
+    path.write_text(names + "\n" + "".join(rows), newline="")
+    recording = open_recording(path)
+    heard = [one for one in recording.inputs() if isinstance(one, Received) and b"$VN" in one.data]
+    assert [one.data.decode().split("$")[1].strip('"\r\n ') for one in heard] == [
+        line[1:] for line in lines
+    ]
+    assert heard[0].host_ns == pytest.approx(1763590172.75e9, abs=1e3)
+    assert heard[100].host_ns - heard[0].host_ns == pytest.approx(5e9, abs=1e4)
+
+
+def test_lines_without_a_field_leave_the_table_a_table(tmp_path):
+    rows = foreign_rows(tmp_path).read_text().splitlines()
+    path = tmp_path / "ypr.csv"
+    line = '"$VNYPR,+010.000,+001.000,+002.000*66"'
+    path.write_text("\n".join([rows[0] + ",raw", *(f"{row},{line}" for row in rows[1:])]))
+    assert open_recording(path).table is not None
+
+
+def foreign_rows(folder):
+    data = ros_files.sensor(200)
+    path = folder / "plain.csv"
+    columns = np.column_stack([data["time_s"], data["mag"], data["gyro"]])
+    names = "time_s," + ",".join(
+        f"{kind}_{axis}_{unit}" for kind, unit in (("mag", "gauss"), ("gyro", "rad_s"))
+        for axis in "xyz"
+    )  # fmt: skip
+    np.savetxt(path, columns, delimiter=",", header=names, comments="", fmt="%.9f")
+    return path
+
+
+def test_quoted_cells_of_several_lines_are_cells(tmp_path):
+    rows = foreign_rows(tmp_path).read_text().splitlines()
+    path = tmp_path / "notes.csv"
+    said = ['"two\nlines"', '"a ""word""\nand more\n"', "plain"]
+    more = [f"{row},{said[k % 3]}" for k, row in enumerate(rows[1:])]
+    path.write_text("\n".join([rows[0] + ",note", *more]) + "\n")
+    np.testing.assert_array_equal(
+        open_recording(path).table.rows.raw_b_gauss,
+        open_recording(tmp_path / "plain.csv").table.rows.raw_b_gauss,
+    )
+
+
+def test_a_quote_that_is_never_closed_swallows_no_rows(tmp_path):
+    rows = foreign_rows(tmp_path).read_text().splitlines()
+    path = tmp_path / "inches.csv"
+    path.write_text("\n".join([rows[0] + ",note", *(f'{row},5" pipe' for row in rows[1:])]) + "\n")
+    assert len(open_recording(path).table.rows) == 200
+
+
+def test_the_table_of_bagpy_is_read(tmp_path):
+    data = ros_files.sensor(200)
+    names = (
+        "Time,header.seq,header.stamp.secs,header.stamp.nsecs,imu.angular_velocity.x,"
+        "imu.angular_velocity.y,imu.angular_velocity.z,mag_field.magnetic_field.x,"
+        "mag_field.magnetic_field.y,mag_field.magnetic_field.z"
+    )
+    stamps = 1678937272.7 + data["time_s"]
+    zero = np.zeros((200, 3))
+    columns = np.column_stack([stamps, zero, data["gyro"], 1e-4 * data["mag"]])
+    path = tmp_path / "imu.csv"
+    np.savetxt(path, columns, delimiter=",", header=names, comments="", fmt="%.9f")
+    rows = open_recording(path).table.rows
+    np.testing.assert_allclose(rows.raw_b_gauss, data["mag"], atol=1e-5)
+    np.testing.assert_allclose(np.diff(rows.time_s), 0.05, atol=1e-6)

@@ -306,6 +306,63 @@ def test_a_recording_that_is_wrong_ends_in_one_line(tmp_path, container, wrong):
     assert refused.value.exit_code == 2
 
 
+LAB = {
+    "lab/msg/Place": "string room\nfloat64[2] shelf\n",
+    "lab/msg/Reading": (
+        "std_msgs/Header header\nlab/Place place\nlab/Place[] seen\nsensor_msgs/Imu imu\n"
+        "sensor_msgs/MagneticField mag_field\nstring raw\n"
+    ),
+}
+
+
+def reading_without_definitions(folder: Path, raw: list[str]) -> Path:
+    """A recording in SQLite as ROS 2 before Iron makes it, of messages of a lab's own."""
+    data = sensor(len(raw))
+    messages = [
+        ("/lab", "lab/msg/Reading", ns_of(t), {
+            "imu": {"angular_velocity": w, "linear_acceleration": a},
+            "mag_field": {"magnetic_field": 1e-4 * m}, "raw": text})
+        for t, w, a, m, text in zip(*data_of(data), raw, strict=True)
+    ]  # fmt: skip
+    path = ros_files.save(folder, "db3", messages, definitions=LAB)
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    return path
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\r\n"])
+def test_lines_of_the_device_are_found_in_messages_that_nobody_defined(tmp_path, end):
+    sent = [one.decode().rstrip() for one in stream_of("text")]
+    path = reading_without_definitions(tmp_path, [line + end for line in sent])
+    recording = open_recording(path)
+    assert [one.data.decode().rstrip() for one in recording.sent] == sent
+    assert [one.host_ns for one in recording.sent][:2] == [ns_of(0.0), ns_of(0.05)]
+
+
+def test_a_definition_is_told_for_and_taken_from_beside_the_recording(tmp_path):
+    data = sensor(300)
+    path = reading_without_definitions(tmp_path, [""] * 300)
+    with pytest.raises(RecordingError, match=r"put Reading\.msg beside it"):
+        open_recording(path)
+    (path.parent / "Reading.msg").write_text(LAB["lab/msg/Reading"])
+    (path.parent / "msg").mkdir()
+    (path.parent / "msg" / "Place.msg").write_text(LAB["lab/msg/Place"])
+    for one in (path, path.parent):
+        rows = open_recording(one).table.rows
+        np.testing.assert_allclose(rows.raw_b_gauss, data["mag"], rtol=1e-12)
+        np.testing.assert_allclose(rows.gyro_b_rad_s, data["gyro"], rtol=1e-12)
+
+
+def test_a_definition_that_is_none_is_told(tmp_path):
+    path = reading_without_definitions(tmp_path, [""] * 30)
+    (path.parent / "Reading.msg").write_text("float64[ x\n")
+    with pytest.raises(RecordingError) as refused:
+        open_recording(path)
+    assert "Reading.msg" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_huge_gap_is_a_gap(tmp_path, container):
     data = sensor()
     data["time_s"][300:] += 40 * 86400.0

@@ -3,12 +3,14 @@
 Messages are searched for what they hold, not for their type alone: many drivers publish one of
 their own with an Imu, a MagneticField or the device's raw line inside. A MagneticField is in tesla
 and an Imu in rad/s and m/s^2 by definition; vectornav_msgs are in gauss. Axes stay as the driver
-published them. Definitions of vectornav_msgs, which recordings in SQLite do not bring
-along, are here.
+published them. Recordings in SQLite do not bring the definitions of their messages along: those of
+vectornav_msgs are here, others are read from `.msg` files beside the recording, and of messages
+without any the lines of a VN-100 in them are used all the same.
 """
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 import sys
@@ -100,6 +102,8 @@ DEFINITIONS = {
 
 
 _DEPTH = 3  # of messages within messages
+_DEFINITION_BYTES = 1 << 16  # of a .msg file
+_LINE = re.compile(rb"\$VN[A-Z]{3},[ -~]{1,400}?\*[0-9A-Fa-f]{2,4}(?![0-9A-Fa-f])")
 _LOOKED_AT = 20  # messages of a type by which it is told whether they hold the device's bytes
 _UNIQUE = 0.9  # share of the stamps that differ, or they are no times
 _REINDEX = {
@@ -312,7 +316,50 @@ def _opened(path: Path, suffix: str) -> Iterator[_Message]:
             named = Path(folder) / f"recording{suffix}"
             named.symlink_to(path.resolve())
         with AnyReader([named], default_typestore=store) as reader:
+            _define(reader, path)
             yield reader
+
+
+def _define(reader: _Message, path: Path) -> None:
+    """Definitions that the recording lacks, from `.msg` files beside it.
+
+    A message of the type PACKAGE/msg/NAME is in NAME.msg: in the folder of the recording (of one
+    that is a folder, also within it), or in `msg` there.
+    """
+    from rosbags.typesys import TypesysError, get_types_from_msg
+
+    homes = [path, path.parent] if path.is_dir() else [path.parent]
+    folders = [folder for home in homes for folder in (home, home / "msg")]
+    wanted = [connection.msgtype for connection in reader.connections]
+    asked: set[str] = set()
+    while wanted:
+        kind = wanted.pop()
+        if kind in asked or kind in reader.typestore.fielddefs:
+            continue
+        asked.add(kind)
+        name = f"{kind.rsplit('/', 1)[-1]}.msg"
+        file = next((one / name for one in folders if (one / name).is_file()), None)
+        if file is None or file.stat().st_size > _DEFINITION_BYTES:
+            continue
+        try:
+            types = get_types_from_msg(file.read_text("utf-8", "replace"), kind)
+            reader.typestore.register(types)
+        except (SyntaxError, TypesysError, OSError) as error:
+            words = printable(" ".join(str(error).split()), 100)
+            raise RecordingError(
+                file, f"does not define a message ({words})", "repair it, or take it away"
+            ) from error
+        wanted += [part for _, fields in types.values() for part in _parts(fields)]
+
+
+def _parts(fields: _Message) -> Iterator[str]:
+    """Types of the messages within a message."""
+    for _, (nodetype, argument) in fields:
+        inner = argument if int(nodetype) == 2 else argument[0]
+        if int(nodetype) == 2:
+            yield argument
+        elif isinstance(inner, tuple) and int(inner[0]) == 2:
+            yield inner[1]
 
 
 def _refused(path: Path, suffix: str, error: BaseException) -> RecordingError:
@@ -367,13 +414,15 @@ def _some(names: list[str]) -> str:
 
 
 def _gather(path: Path, reader: _Message, found: _Found) -> None:
-    plans = {}
+    plans: dict[tuple[int, str], tuple[list[_Place], list[str] | None]] = {}
     kept = []
     for connection in reader.connections:
         kind = connection.msgtype
         definition = reader.typestore.fielddefs.get(kind)
         if definition is None:
             found.unread[connection.topic] = kind
+            plans[connection.id, connection.topic] = [], None
+            kept.append(connection)
             continue
         plans[connection.id, connection.topic] = (
             [
@@ -391,8 +440,12 @@ def _gather(path: Path, reader: _Message, found: _Found) -> None:
         places, fields = plans[connection.id, connection.topic]
         if not places and (one := found.raw.get(connection.topic)) is not None and one.given_up:
             continue
-        message = reader.deserialize(data, connection.msgtype)
         found.base_ns = found.base_ns or at_ns
+        if fields is None:
+            raw = found.raw.setdefault(connection.topic, _Raw())
+            raw.take(at_ns, b"".join(line + b"\r\n" for line in _LINE.findall(data)))
+            continue
+        message = reader.deserialize(data, connection.msgtype)
         for place in places:
             taken += place.take(message, at_ns, found)
         for name in fields:
@@ -511,7 +564,7 @@ def _sensors(path: Path, found: _Found, choice: Choice, topics: list[str]) -> Se
     for topic, kind in found.unread.items():
         out.notes.append(
             f"topic {printable(topic)} is of type {printable(kind)}, whose definition is not "
-            "in the recording: left out (as MCAP it would bring it along)"
+            f"in the recording: left out; put {printable(kind.rsplit('/', 1)[-1])}.msg beside it"
         )
     mag = _chosen(path, found, "mag", choice, None)
     gyro = _chosen(path, found, "gyro", choice, mag)
