@@ -17,6 +17,10 @@ its behalf is always a command of `drivers.vn100.commands`, and nothing else can
 | VNRFS and the words of vendor tools | VNERR 09 |
 | any other read | the device's |
 | any other write, VNKMD, VNKAD | the device's for the owner; VNERR 09 for everybody else |
+| a write that would be VNERR 09, of what the register holds already | as if it had worked |
+
+The last is how VectorNav's SDK finds out what belongs into a saved configuration: it writes back
+what it has just read. The register is read instead, and only what differs is refused.
 
 Sources: UM001 "System Commands"; what drivers send at their start
 (tests/support/devices/drivers_at_start.py).
@@ -45,13 +49,21 @@ from drivers.vn100.commands import Identity, Read, Speech, Word, Write
 from drivers.vn100.deframer import Cause, Deframer
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.messages import Reply, encode
-from drivers.vn100.registers import REGISTERS, RegisterValueError, Values, format_reply, parse
+from drivers.vn100.registers import (
+    REGISTERS,
+    RegisterValueError,
+    Values,
+    format_reply,
+    parse,
+    same,
+)
 
 # -- What a client may have ------------------------------------------------------------------------
 
 
 IDENTITY: Final = (1, 2, 3, 4)
 LINE_RATE: Final = 5
+_OF_PORTS: Final = frozenset({5, 6, 7})  # which the device holds for each of its ports
 
 BAD_CHECKSUM, BAD_COMMAND, TOO_FEW, BAD_REGISTER, UNAUTHORIZED = 0x03, 0x04, 0x05, 0x08, 0x09
 
@@ -67,6 +79,7 @@ class Kind(Enum):
     READ = "read"
     WRITE = "write"
     CALIBRATE = "write what calibrates"
+    COMPARE = "read what is not to be written"
     REFUSE = "refuse"
 
 
@@ -111,11 +124,13 @@ class ClientCommand:
 
     body:    as the client wrote it, between $ and *
     command: what would go to the device
+    unless:  of a write that is only compared: what it wants, and the answer where that differs
     """
 
     kind: Kind
     body: str
     command: Speech
+    unless: tuple[Values, Refusal] | None = None
 
     @property
     def purpose(self) -> Purpose:
@@ -166,19 +181,27 @@ def _register(
     if word == "VNRRG":
         return _read(number, tokens[1:], body)
     passes = policy.passes(number)
-    if number in GUARDED and number != LINE_RATE and not passes:
+    guarded = number in GUARDED and number != LINE_RATE and not passes
+    refusal = None
+    if guarded:
         why = f"register {number} was not written for a client: what calibrates is ahrsd's"
-        return Refusal(UNAUTHORIZED, why)
+        refusal = Refusal(UNAUTHORIZED, why)
+    elif not policy.owner and number != LINE_RATE:
+        why = f"writes of register {number} are for the share with owner"
+        refusal = Refusal(UNAUTHORIZED, why)
     if not REGISTERS[number].writable:
-        return Refusal(UNAUTHORIZED)
+        return refusal if guarded and refusal is not None else Refusal(UNAUTHORIZED)
     try:
-        command = Write(number, parse(number, tokens[1:]), held=True)
+        values = parse(number, tokens[1:])
     except RegisterValueError as error:
-        return Refusal(error.code)
+        return refusal if guarded and refusal is not None else Refusal(error.code)
+    if refusal is not None:
+        if number in _OF_PORTS:
+            return refusal
+        return ClientCommand(Kind.COMPARE, body, Read(number), (values, refusal))
+    command = Write(number, values, held=True)
     if number == LINE_RATE:
         return ClientCommand(Kind.RATE, body, command)
-    if not policy.owner:
-        return Refusal(UNAUTHORIZED, f"writes of register {number} are for the share with owner")
     return ClientCommand(Kind.CALIBRATE if passes else Kind.WRITE, body, command)
 
 
@@ -190,6 +213,14 @@ def _read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:
     if number in IDENTITY:
         return ClientCommand(Kind.MEMORY, body, command)
     return ClientCommand(Kind.RATE if number == LINE_RATE else Kind.READ, body, command)
+
+
+def _holds(number: int, wanted: Values, reply: Reply) -> bool:
+    """Whether a device that replied so holds these values."""
+    try:
+        return same(number, wanted, parse(number, reply.tokens))
+    except RegisterValueError:  # a reply that is damaged says nothing
+        return False
 
 
 # -- Turns -----------------------------------------------------------------------------------------
@@ -339,7 +370,9 @@ class Arbiter:
             return None
         if done.gone:
             return done
-        if isinstance(result, Reply):
+        if done.asked.unless is not None:
+            self._compared(done.client, *done.asked.unless, result)
+        elif isinstance(result, Reply):
             self.counts[done.client, "answered"] += 1
             number = [] if result.register is None else [f"{result.register:02d}"]
             self._say(done.client, encode(",".join([result.word, *number, *result.tokens])))
@@ -348,6 +381,15 @@ class Arbiter:
         else:
             self.counts[done.client, "unanswered"] += 1
         return done
+
+    def _compared(self, name: str, wanted: Values, refusal: Refusal, result: object) -> None:
+        """A write that is not sent: as if it had worked where the register holds that already."""
+        number = result.register if isinstance(result, Reply) else None
+        if isinstance(result, Reply) and number is not None and _holds(number, wanted, result):
+            self.counts[name, "answered"] += 1
+            self._say(name, encode(",".join(["VNWRG", f"{number:02d}", *result.tokens])))
+        else:
+            self._refuse(name, refusal)
 
     def again(self) -> None:
         """What is on the wire was not sent after all: it is the first one again."""

@@ -196,6 +196,44 @@ def test_a_save_of_the_owner_at_any_command_of_a_write_saves_nothing_unproven(at
     assert run.core.device_session.phase.value == "ready"
 
 
+@pytest.mark.parametrize("mode", [Mode.PASSIVE, Mode.OBSERVE, Mode.COMMIT])
+@pytest.mark.parametrize("client", ["owner", "log"])
+def test_a_register_scan_of_the_vendors_sdk_keeps_every_register_and_changes_none(mode, client):
+    """It reads each register and writes it back: what may be written is the configuration."""
+    run = shared(planted=False, mode=mode)
+    kept = {}
+    for number in (23, 25, 26, 30, 44, 75, 84, 85):
+        (read,) = start(run, (f"VNRRG,{number}",), client)
+        tokens = read.split(",", 2)[2]
+        assert start(run, (f"VNWRG,{number},{tokens}",), client) == [f"VNWRG,{number},{tokens}"]
+        kept[number] = tokens
+    assert kept == {number: run.cable.unit.ram[number] for number in kept}
+    guarded = {number for number, _ in run.cable.unit.writes} - {30, 75, 85}
+    assert guarded == set()
+    if client == "log":
+        assert run.cable.unit.writes == []
+
+
+def test_a_write_of_something_else_behind_it_is_refused_and_told_once_more():
+    run = shared(planted=False)
+    assert start(run, (f"VNWRG,23,{ONE[0]}", f"VNWRG,23,{NEW[0]}")) == [
+        f"VNWRG,23,{ONE[0]}", "VNERR,09",
+    ]  # fmt: skip
+    assert run.told("what calibrates is ahrsd's")
+    assert run.cable.unit.held() == ONE
+
+
+def test_a_write_is_compared_with_what_the_device_holds_at_that_moment():
+    """During a trial the register holds the new values, and the old ones would undo it."""
+    run = shared()
+    run.approve()
+    assert run.until("TRIAL", 30.0), run.notes
+    assert start(run, (f"VNWRG,23,{NEW[0]}", f"VNWRG,23,{ONE[0]}")) == [
+        f"VNWRG,23,{NEW[0]}", "VNERR,09",
+    ]  # fmt: skip
+    assert run.cable.unit.held() == NEW
+
+
 @pytest.mark.parametrize("mode", [Mode.PASSIVE, Mode.OBSERVE])
 def test_no_client_changes_what_calibrates(mode):
     run = shared(planted=False, mode=mode)

@@ -28,6 +28,32 @@ from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
 from drivers.vn100.messages import encode
 
+#: VectorNav's own SDK for Python (0.99, MIT licence), built from its sources: what a program does
+#: with it, one word a line; it is in no package registry
+WITH_THE_SDK = """
+import sys, time
+from vectornav import Registers, Sensor
+sensor = Sensor()
+sensor.autoConnect(sys.argv[1])
+model, held = Registers.System.Model(), Registers.IMU.MagCal()
+sensor.readRegister(model)
+print(model.model)
+output = Registers.System.BinaryOutput1()
+output.asyncMode.serial1, output.rateDivisor, output.common.imu = 1, 40, 1
+output.asyncMode.serial2 = 0
+sensor.writeRegister(output)
+sensor.readRegister(held)
+sensor.writeRegister(held)
+held.magBiasX = 0.25
+try:
+    sensor.writeRegister(held)
+except Exception as error:
+    print(error)
+count, end_s = 0, time.time() + 3.0
+while time.time() < end_s:
+    count += sensor.getNextMeasurement() is not None
+print(count)
+"""
 ANSWER = re.compile(rb"\$(VN(?:RRG|WRG|ERR|ASY|WNV|RST)[^*\r]*)\*..\r\n")
 READ = rb"\$VNRRG,\d+(,\d)?\*[0-9A-F]{2}"
 
@@ -231,3 +257,20 @@ def test_drivers_on_shared_ports_beside_the_working_daemon(program, tmp_path):
     assert counts[0]["commands"] >= len(ROS2_DAWONN) + len(SDK)
     assert counts[1]["commands"] >= 15
     assert [one["refused"] for one in counts] == [0, 0]
+
+
+def test_the_vendors_own_library_works_on_a_shared_port(program, tmp_path):
+    pytest.importorskip("vectornav", reason="VectorNav's SDK for Python is not installed")
+    owner = tmp_path / "vn100"
+    with program(output="binary", config=f'[[share]]\npty = "{owner}"\nowner = true\n') as (one, _):
+        one.until(lambda: owner.exists() and "OBSERVING" in one.said)
+        done = subprocess.run(
+            [sys.executable, "-c", WITH_THE_SDK, str(owner)],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        one.until(lambda: "what calibrates is ahrsd's" in one.said)
+    assert done.returncode == 0, done.stderr
+    model, refused, count = done.stdout.split()
+    assert (model, refused) == ("VN-100S-CR", "UnauthorizedAccess")
+    assert 20 <= int(count) <= 80  # 20 Hz for three seconds, on a machine that may be busy
+    assert b"VNWRG,23" not in one.heard
