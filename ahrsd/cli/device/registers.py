@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 import click
 
+from ahrsd.cli import WholeGroup
 from ahrsd.cli.device.access import PORT, describe, open_device
 from ahrsd.cli.device.register_changes import (
     Changes,
@@ -200,7 +201,7 @@ def _known(_context: click.Context, _option: click.Parameter, numbers: Ids) -> I
     return numbers
 
 
-@click.group()
+@click.group(cls=WholeGroup)
 def command() -> None:
     """Read, compare, write and roll back the device's registers.
 
