@@ -59,6 +59,21 @@ def module_of(name: str) -> str:
     return f"ahrsd.cli.{package}.{name}"
 
 
+_WHOLE = 1000  # characters of a help that are shown in a list
+
+
+class WholeGroup(click.Group):
+    """A group whose list of commands has whole sentences, wrapped and never cut."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Each command with the first sentences of its help."""
+        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, one.get_short_help_str(_WHOLE)) for name, one in commands if one]
+            )
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is called, and not before."""
 

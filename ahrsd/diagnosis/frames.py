@@ -65,10 +65,14 @@ class Windows:
     count: int
 
 
+def window_rows(track: Track) -> int:
+    """Samples of a window."""
+    return max(4, round(_WINDOW_S / track.step_s))
+
+
 def windows(track: Track) -> Windows | None:
     """Normal equations of the windows that turn most; None where there is too little."""
-    step = track.step_s
-    length = max(4, round(_WINDOW_S / step))
+    length = window_rows(track)
     blocks = list(_blocks(track, length))
     if len(blocks) < 12:
         return None

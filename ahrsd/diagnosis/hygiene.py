@@ -18,7 +18,7 @@ from ahrsd.diagnosis.dead import stuck_axes, stuck_gyro
 from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.facts import Fact
-from ahrsd.diagnosis.frames import Frame, ranked, windows
+from ahrsd.diagnosis.frames import Frame, ranked, window_rows, windows
 from ahrsd.diagnosis.handedness import advice, odd_magnetometer, turns_gravity
 from ahrsd.diagnosis.repeats import repeats
 from ahrsd.diagnosis.stamps import regular, stamps
@@ -31,6 +31,7 @@ _NATS = 20.0  # log likelihood by which it must be worse
 _FAST_RAD_S, _NEAR = 3.0, 1.1  # rates that no vehicle has for long; a factor that is another's
 _SURE = 0.99  # of a finding that was counted and compared
 _SAME_UNIT = 1.2  # factor from a unit's own within which the gyro's scale is that unit
+_NOISE_SHARE = 0.05  # of the rates' variance, for a factor that is no unit's to be believed
 _UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
 #: median readings in gauss of the Earth's field (0.2 to 0.7 G) taken in other units
 MAG_UNITS = (
@@ -170,6 +171,8 @@ def _gyro_unit(track: Track, best: Frame) -> list[Fact]:
     large = best.scale < 1
     off = f"{1 / best.scale:.3g} times too large" if large else f"{best.scale:.3g} times too small"
     if abs(np.log(best.scale / factor)) > np.log(_SAME_UNIT):
+        if _hidden(track):
+            return []
         usual = 1 / factor if large else factor
         words = (
             f"the gyro's rates are {off} for the turns of the field: they are in another unit, or "
@@ -181,6 +184,20 @@ def _gyro_unit(track: Track, best: Frame) -> list[Fact]:
         words = f"the gyro's rates are {off}: they are {way}"
     setting = {"sensor": "gyro", "unit": name}
     return [_unit_error(track, words, 1 / factor, setting, "gyro")]
+
+
+def _hidden(track: Track) -> bool:
+    """Whether a fair part of the rates is noise, even as means over the frames' windows.
+
+    The scale of rates that are mostly noise is too small, whatever their unit is.
+    """
+    rows = window_rows(track)
+    whole = len(track) // rows * rows
+    if not whole:
+        return True
+    means = np.nan_to_num(track.gyro_b_rad_s[:whole]).reshape(-1, rows, 3).mean(axis=1)
+    noise = 3 * noise_of(track)[1] ** 2 / rows
+    return bool(noise > _NOISE_SHARE * np.sum(np.var(means, axis=0)))
 
 
 def _unit_error(

@@ -121,7 +121,7 @@ def _source(entry: str, name: str, value: str) -> Source:
 
 def _one_of_each(units: Mapping[str, float]) -> list[str]:
     """One way of writing each unit, the first."""
-    first = {factor: unit for unit, factor in reversed(units.items())}
+    first = {factor: unit for unit, factor in reversed(list(units.items()))}
     return [unit for unit, factor in units.items() if first[factor] == unit]
 
 

@@ -89,6 +89,8 @@ _TIME_TEXT = re.compile(
     r"(?P<hour>\d{1,2}):?(?P<minute>\d\d):?(?P<second>\d\d)(?:[.,:](?P<fraction>\d+))?"
     r" ?(?:(?P<half>[AaPp])\.?[Mm]\.?)?(?P<zone> ?(?:[Zz]|UTC|[+-]\d\d(?::?\d\d)?))?"
 )
+_Date = tuple[str, str, str]  # its three numbers as they are written
+_NO_DATE: _Date = ("", "", "")
 _YEAR, _MONTHS = 4, 12  # digits of a year; a number above is a day
 _LONGEST_PAUSE_S = 86400.0  # a longer one, and a step back, is a clock that was set
 _SPARSE_SHARE = 0.3  # of the rows without a field: a slower magnetometer, not a fault
@@ -703,7 +705,7 @@ def _in_iso_order(texts: list[str]) -> list[str] | None:
     found = [_TIME_TEXT.fullmatch(text) for text in texts]
     if not found or any(one is None for one in found):
         return None
-    parts = [one.groupdict() for one in found if one is not None]
+    parts = [one.groupdict("") for one in found if one is not None]
     dates = {(one["a"], one["b"], one["c"]) for one in parts}
     ordered = _dates_of({one["date_mark"] for one in parts}, dates)
     if ordered is None:
@@ -715,18 +717,16 @@ def _in_iso_order(texts: list[str]) -> list[str] | None:
             hour = hour % 12 + (12 if one["half"].lower() == "p" else 0)
         time = f"{hour:02d}:{one['minute']}:{one['second']}"
         fraction = f".{one['fraction'][:9]}" if one["fraction"] else ""
-        zone = (one["zone"] or "").strip().replace("UTC", "Z")
+        zone = one["zone"].strip().replace("UTC", "Z")
         out.append(f"{ordered[one['a'], one['b'], one['c']]}T{time}{fraction}{zone}")
     return out
 
 
-def _dates_of(
-    marks: set[str | None], dates: set[tuple[str, str, str]]
-) -> dict[tuple[str, str, str], str] | None:
+def _dates_of(marks: set[str], dates: set[_Date]) -> dict[_Date, str] | None:
     """Each date as YYYY-MM-DD; none at all is the first day of 1970."""
-    if dates == {(None, None, None)}:
-        return {(None, None, None): "1970-01-01"}  # type: ignore[dict-item]
-    if any(None in date for date in dates):
+    if dates == {_NO_DATE}:
+        return {_NO_DATE: "1970-01-01"}
+    if _NO_DATE in dates:
         return None
     if all(len(a) == _YEAR for a, _, _ in dates):
         return {date: f"{date[0]}-{date[1].zfill(2)}-{date[2].zfill(2)}" for date in dates}
@@ -735,10 +735,8 @@ def _dates_of(
     day_first = marks == {"."} or any(int(a) > _MONTHS for a, _, _ in dates)
     if not day_first and len(dates) > 1 and all(int(b) <= _MONTHS for _, b, _ in dates):
         return None
-    order = (1, 0) if day_first else (0, 1)
-    return {
-        date: f"{date[2]}-{date[order[0]].zfill(2)}-{date[order[1]].zfill(2)}" for date in dates
-    }
+    day, month = (0, 1) if day_first else (1, 0)
+    return {date: f"{date[2]}-{date[month].zfill(2)}-{date[day].zfill(2)}" for date in dates}
 
 
 def _without_zone(text: str) -> str:

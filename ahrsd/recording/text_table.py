@@ -121,6 +121,8 @@ def read_text_table(path: Path) -> TextTable:
     text = _with_header(path, data, notes)
     _drop_comments(text, notes)
     _take_units(text, notes)
+    if text.separator != " ":
+        _drop_empty_rows(text, notes)
     _drop_repeated_header(text, notes)
     _drop_cut_row(text, cut, notes)
     refuse_beyond(path, text.data.count(b"\n", text.at), TABLE_ROWS, "rows", _LESS)
@@ -311,6 +313,16 @@ def _drop_comments(text: _Text, notes: list[str]) -> None:
     if body and (count := len(_COMMENT_LINE.findall(body))):
         text.data, text.at = bytearray(_COMMENT_LINE.sub(b"", body)), 0
         notes.append(f"left out amid the rows: {counted(count, 'comment line')}")
+
+
+def _drop_empty_rows(text: _Text, notes: list[str]) -> None:
+    """Rows of separators alone, as spreadsheets leave them below the last one."""
+    mark = re.escape(text.separator.encode())
+    empty = re.compile(rb'(?m)^[ "]*' + mark + rb'[" ' + mark + rb"]*(?:\n|\Z)")
+    body, count = empty.subn(b"", bytes(memoryview(text.data)[text.at :]))
+    if count:
+        text.data, text.at = bytearray(body), 0
+        notes.append(f"left out, without a cell: {counted(count, 'row')}")
 
 
 def _drop_repeated_header(text: _Text, notes: list[str]) -> None:

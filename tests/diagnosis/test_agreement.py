@@ -68,6 +68,8 @@ def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
         ("wam", "slow", 0, 1e-4, 5e-2),
         ("wam", "slow", 3, 1e-4, 5e-2),
         ("mam", "rov", 1, 1e-4, 5e-2),
+        ("mam", "rov", 0, 0.0, 5e-3),
+        ("mam", "rov", 0, 1e-4, 5e-2),
     ],
 )
 def test_noise_far_from_the_usual_is_no_mismatch(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.context import bandwidth_hz, build_context, smoothed_rate
+from ahrsd.diagnosis.context import bandwidth_hz, build_context, rate_by_others, smoothed_rate
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.innovation import run_filter
 from ahrsd.diagnosis.track import Track
@@ -149,3 +149,26 @@ def test_the_field_of_the_columns_has_none_of_the_readings_own_noise() -> None:
     assert np.linalg.norm(foretold[row + 1]) > 1e-4
     assert np.linalg.norm(smooth[row]) > 5e-5
     np.testing.assert_allclose(after.field_b[0], after.smooth_b[0], atol=4e-4)  # the run opens
+
+
+def test_a_column_of_rates_has_nothing_of_its_own_rows_noise() -> None:
+    """Held against what that noise did to the field it would be a scale of its share."""
+    draw = np.random.default_rng(4)
+    t = np.arange(200_000) / 25.0
+    clean = 0.1 * np.cos(2 * np.pi * np.outer(t, [0.03, 0.05, 0.04]))
+    noise = 0.05 * draw.standard_normal(clean.shape)
+    runs = (slice(0, len(t)),)
+    smooth = smoothed_rate(clean + noise, runs, 0.04, 0.05)
+    own = np.sum(smooth * noise, axis=0) / np.sum(clean**2, axis=0)
+    assert np.all(own > 6e-3)  # sigma of each: 0.05 / 0.07 / sqrt(N) = 1.6e-3
+    width = 1.0 / (2 * np.pi * bandwidth_hz(clean + noise, runs, 0.04, 0.05) * 0.04)
+    others = rate_by_others(clean + noise, smooth, width)
+    share = np.sum(others * noise, axis=0) / np.sum(clean**2, axis=0)
+    np.testing.assert_allclose(share, 0.0, atol=5e-3)
+    inner = slice(250, -250)
+    assert np.std((others - clean)[inner]) < 0.3 * 0.05
+
+
+def test_quick_rates_are_not_taken_from_their_neighbours() -> None:
+    rate = np.random.default_rng(1).standard_normal((100, 3))
+    assert rate_by_others(rate, rate, 1.0) is rate

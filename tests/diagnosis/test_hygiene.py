@@ -9,6 +9,7 @@ import pytest
 from mismatch_trials import Trial, made
 from tracks import experiment, recorded, track_of, true_model
 
+from ahrsd import so3
 from ahrsd.diagnosis.clipping import clipping, quantisation, step_of
 from ahrsd.diagnosis.coarse import noise_of
 from ahrsd.diagnosis.diagnosis import Where
@@ -506,6 +507,41 @@ def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
     found = [fact for fact in as_recorded(degrees) if fact.effect == "unit_error"]
     assert [fact.setting for fact in found] == [{"sensor": "gyro", "unit": "deg/s"}]
     assert as_recorded(loud) == []
+
+
+@pytest.mark.parametrize("factor", [25.0, 1 / 25.0, 3.0])
+def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
+    track: Track, factor: float
+) -> None:
+    wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * factor)
+    fact = _only(tuple(hygiene(wrong)))
+    assert fact.effect == "unit_error"
+    assert "in another unit, or the time is" in fact.words
+    right = put_right(wrong, [fact]).gyro_b_rad_s
+    assert np.abs(right / track.gyro_b_rad_s - 1).max() < 0.1
+
+
+def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None:
+    """A finding all the same: that none of the axes is as recorded is sure."""
+    t = np.arange(2400) / 20.0
+    rate = np.column_stack([0 * t, 0 * t, 0.2 + 0.1 * np.sin(0.3 * t)])
+    R = so3.products(so3.exp(rate / 20.0))
+    draw = np.random.default_rng(1)
+    noise = 1e-3 * draw.standard_normal((2400, 3))
+    field = np.einsum("nji,j->ni", R, [0.25, 0.0, 0.43]) + noise
+    usual = track_of(experiment("wam", samples=2400))
+    dt_s = np.concatenate([[np.nan], np.diff(t)])
+    gyro = rate + 7e-4 * draw.standard_normal((2400, 3))
+    plain = replace(
+        usual, time_s=t, dt_s=dt_s, mag_b_gauss=field, gyro_b_rad_s=gyro, accel_b_m_s2=None,
+        covariates={}, runs=(slice(0, 2400),),
+    )  # fmt: skip
+    assert as_recorded(plain) == []
+    fact = _only(tuple(as_recorded(replace(plain, mag_b_gauss=field[:, [1, 0, 2]]))))
+    assert fact.effect == "frame_error"
+    assert fact.confidence == 0.99
+    assert fact.words.startswith("the gyro's x y z are the magnetometer's x y -z (left-handed)")
+    assert "other ways of axes and signs" in fact.words
 
 
 def test_a_limit_with_noise_behind_it(track: Track) -> None:

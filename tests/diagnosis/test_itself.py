@@ -54,7 +54,9 @@ def test_a_mount_of_a_degree_does_not_move_a_lag() -> None:
 def test_of_the_matrix_no_more_is_believed_than_sensors_have() -> None:
     """Without motion nothing is known of it but that."""
     basis = basis_of(late(0.0))
-    still = replace(basis, context=replace(basis.context, rate_b_rad_s=np.zeros((4000, 3))))
+    none = np.zeros((4000, 3))
+    at_rest = replace(basis.context, rate_b_rad_s=none, others_rate_b_rad_s=none)
+    still = replace(basis, context=at_rest)
     told = beside_itself(still, [])
     flat = told.known.reshape(-1, told.known.shape[2])[:, told.groups[ITSELF]]
     deviation = np.sqrt(told.colour / np.diag(flat.T @ flat))

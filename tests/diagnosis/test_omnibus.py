@@ -11,6 +11,7 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis.context import build_context
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.innovation import Filtered, run_filter
+from ahrsd.diagnosis.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.omnibus import Test, omnibus, variance_test
 from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
@@ -93,3 +94,15 @@ def test_scatter_that_follows_a_column_names_it() -> None:
 def test_too_few_samples_give_no_tests() -> None:
     made = experiment(samples=60)
     assert omnibus(run_filter(track_of(made), true_model(made))) == ()
+
+
+def test_noise_that_is_only_assumed_is_not_tested() -> None:
+    """A simulation without noise of the magnetometer: along the field nothing scatters."""
+    made = experiment("mam", seed=0, samples=1500, sigma_mag=0.0, sigma_gyro=5e-3)
+    model = replace(true_model(made), sigma_mag_gauss=FLOOR_MAG_GAUSS)
+    done = run_filter(track_of(made), model)
+    assert float(np.mean(done.whitened[done.used] ** 2)) < 0.75
+    assert omnibus(done, _context(done)) == ()
+    louder = experiment("mam", seed=0, samples=1500, sigma_mag=FLOOR_MAG_GAUSS, sigma_gyro=5e-3)
+    done = run_filter(track_of(louder), model)
+    assert {test.p_value > 1e-4 for test in omnibus(done, _context(done))} == {True}

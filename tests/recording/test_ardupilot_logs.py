@@ -247,3 +247,45 @@ def test_of_two_compasses_the_first_is_used_and_told_or_the_one_that_is_chosen(t
         open_recording(path, choice=Choice(compass=7))
     with pytest.raises(RecordingError, match="--topic is not for it"):
         open_recording(path, choice=Choice(topics=("/mag",)))
+
+
+def two_imus(tmp_path, first, second, parameters=None):
+    data = sensor(1200, 40.0)
+    path = df.save(
+        tmp_path / "a.bin",
+        df.parameters(parameters or {}),
+        df.mags(data["time_s"], 1e3 * data["mag"], (0, 0, 0), (0, 0, 0)),
+        df.imus(data["time_s"], first * data["gyro"], data["accel"], 0),
+        df.imus(data["time_s"], second * data["gyro"], data["accel"], 1),
+    )
+    return open_recording(path), data
+
+
+def test_a_gyro_that_does_not_turn_beside_one_that_does_is_left(tmp_path):
+    offsets = {"INS_GYROFFS_X": 0.5, "INS_GYR2OFFS_X": 0.01}
+    recording, data = two_imus(tmp_path, 1e-3, 1.0, offsets)
+    undone = data["gyro"] + [0.01, 0.0, 0.0]
+    np.testing.assert_allclose(recording.table.rows.gyro_b_rad_s, undone, atol=1e-6)
+    assert recording.facts["gyro source"] == "IMU[1]"
+    assert any("the gyro of IMU 0 hardly turns" in note for note in recording.notes)
+
+
+def test_of_two_gyros_that_turn_the_first_counts(tmp_path):
+    recording, data = two_imus(tmp_path, 1.0, 1.02)
+    np.testing.assert_allclose(recording.table.rows.gyro_b_rad_s, data["gyro"], atol=1e-6)
+    assert not any("hardly turns" in note for note in recording.notes)
+
+
+def test_a_dead_compass_is_passed_over_and_told(tmp_path):
+    data = sensor(600, 20.0)
+    field, none = 1e3 * data["mag"], np.zeros((600, 3))
+    recording = open_recording(
+        df.save(
+            tmp_path / "a.bin",
+            df.mags(data["time_s"], none, (0, 0, 0), (0, 0, 0), 0),
+            df.mags(data["time_s"], field, (0, 0, 0), (0, 0, 0), 1),
+            df.imus(data["time_s"], data["gyro"], data["accel"]),
+        )
+    )
+    np.testing.assert_allclose(1e3 * recording.table.rows.raw_b_gauss, field, atol=HALF_STEP_MG)
+    assert "dead, one reading throughout: compass 0" in recording.notes

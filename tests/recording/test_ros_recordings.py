@@ -454,3 +454,31 @@ def test_list_says_what_is_inside(tmp_path, container):
 def test_recordings_from_the_field_are_read(name, tmp_path):
     path = shutil.copy(CASES / name, tmp_path / name)
     assert len(open_recording(Path(path)).table.rows) == 80
+
+
+@pytest.mark.parametrize("stamp_ns", [0, None])
+def test_headers_without_times_or_of_two_clocks_leave_the_recorders(tmp_path, container, stamp_ns):
+    """A driver that stamps nothing, and one that stamps its Imu by the time since its start."""
+    data = sensor()
+    since = 5 * 10**9 - ros_files.BEGAN_NS
+    turned = [(t, k, ns, {**f, "stamp_ns": ns + since if stamp_ns is None else 0})
+              for t, k, ns, f in imu(data)]  # fmt: skip
+    other = magnetic(data)
+    if stamp_ns == 0:
+        other = [(t, k, ns, {**f, "stamp_ns": 0}) for t, k, ns, f in other]
+    recording = open_recording(ros_files.save(tmp_path, container, [*turned, *other]))
+    np.testing.assert_allclose(recording.table.rows.raw_b_gauss, data["mag"], atol=1e-6)
+    np.testing.assert_allclose(recording.table.rows.gyro_b_rad_s, data["gyro"], atol=1e-6)
+    assert recording.facts["clock"].startswith("the recorder's, s since")
+    words = "have no times" if stamp_ns == 0 else "are of different clocks"
+    assert any(words in note for note in recording.notes)
+
+
+def test_of_two_gyros_the_one_that_does_not_turn_is_told(tmp_path, container):
+    data = sensor()
+    still = {**data, "gyro": 7e-4 * np.random.default_rng(0).normal(size=data["gyro"].shape)}
+    messages = [*imu(data, "/b/data"), *imu(still, "/a/data"), *magnetic(data, "/mag")]
+    with pytest.raises(RecordingError) as refused:
+        open_recording(ros_files.save(tmp_path, container, messages))
+    assert "holds 2 gyros: /a/data, /b/data; /a/data hardly turns" in str(refused.value)
+    assert str(refused.value).endswith("--topic /b/data")

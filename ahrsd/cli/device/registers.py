@@ -91,7 +91,7 @@ def _with_options(function: Callable[..., None]) -> Callable[..., Any]:
     return function
 
 
-@click.command()
+@click.command(short_help="Forbid every write, but for going back to old values.")
 @_with_options
 def lock(reason: str, serial: int | None, state_directory: Path | None) -> None:
     """Forbid every write, but for going back to old values; REASON is for those who come later."""
@@ -213,7 +213,7 @@ command.add_command(lock)
 command.add_command(unlock)
 
 
-@command.command()
+@command.command(short_help="Print registers of a device.")
 @click.argument("port", type=PORT)
 @click.argument("ids", nargs=-1, type=int, callback=_known)
 @_BAUD
@@ -277,7 +277,10 @@ def diff(
     raise SystemExit(EXIT_NO if different else EXIT_DONE)
 
 
-@command.command(context_settings={"ignore_unknown_options": True})
+@command.command(
+    context_settings={"ignore_unknown_options": True},
+    short_help="Write a register: journaled, read back, RAM until --save.",
+)
 @click.argument("port", type=PORT)
 @click.argument("number", metavar="[ID]", type=int, required=False, callback=_known)
 @click.argument("values", nargs=-1)
@@ -328,7 +331,7 @@ def write(
     _change(port, baud, lambda *_: (wanted, {"reason": "write"}), state, None, yes=yes, save=save)
 
 
-@command.command()
+@command.command(short_help="Print the journal, and the lines that undo each write.")
 @_STATE
 @_JOURNAL
 @click.option("--serial", type=int, help="Only the device with this serial number.")
@@ -343,7 +346,7 @@ def history(state_directory: Path | None, journal_file: Path | None, serial: int
             _print_record(record)
 
 
-@command.command()
+@command.command(short_help="Print registers as $VNWRG lines, to type or send by hand.")
 @click.argument("source")
 @click.argument("ids", nargs=-1, type=int, callback=_known)
 @click.option("--json", "as_json", is_flag=True, help="JSON, which `diff` reads, not lines.")
@@ -378,7 +381,7 @@ def export(
         write_text(output, text)
 
 
-@command.command()
+@command.command(short_help="Write back what was there before a record of the journal.")
 @click.argument("port", type=PORT)
 @click.argument("number", metavar="[ID]", type=int, required=False)
 @_YES

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from ahrsd.cli import WholeGroup
 from ahrsd.cli.files import refuse_unwritable
 from ahrsd.cli.long_work import count_progress
 from ahrsd.errors import EXIT_DONE, EXIT_NO
@@ -28,7 +29,7 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
 _FILE = click.Path(dir_okay=False, path_type=Path)
 
 
-@click.group()
+@click.group(cls=WholeGroup)
 def command() -> None:
     """Sealed blind trials: cases with concealed physics, answers, then the key and the scores."""
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ahrsd.cli import WholeGroup
 from ahrsd.cli.files import columns_option, make_folder
 from ahrsd.cli.long_work import fleet_progress, limit_options
 from ahrsd.cli.recordings.fleet import answers
@@ -50,7 +51,7 @@ LOADS = ("ahrsd.offline.calibrate", "ahrsd.offline.diagnose")  # slow to import
 _FOLDER = click.Path(path_type=Path)
 
 
-@click.group()
+@click.group(cls=WholeGroup)
 def command() -> None:
     """Calibrate and diagnose an archive of recordings; one recording is one row, exactly once.
 
