@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -197,14 +196,9 @@ def test_a_kill_in_the_trial_leaves_a_capture_and_a_journal_that_is_followed(tmp
     with EmulatorProcess(SCENE, link=port, speed=SPEED, lossless=True):
         before = held(port)
         command = [sys.executable, __file__, str(tmp_path), str(port)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as killed:
-            said = []
-            for line in killed.stdout:
-                said.append(line.split()[:2])
-                if said[-1][1] == "TRIAL":
-                    break
-            time.sleep(0.5)  # what the kernel has is not lost
-            os.kill(killed.pid, signal.SIGKILL)
+        killed = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+        said = [line.split()[:2] for line in killed.stdout.splitlines()]
+        assert said[-1][1] == "TRIAL"
         assert killed.returncode == -signal.SIGKILL
         assert held(port) != before
         _, states = replayed_states(tmp_path / "capture.mcap", config)
@@ -221,5 +215,7 @@ if __name__ == "__main__":
     def tell(run, event):
         if isinstance(event, StateChanged):
             print(f"{event.at_s:.6f} {event.new} {event.reason}", flush=True)
+            if event.new == "TRIAL":  # what the kernel has by then is not lost
+                threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGKILL)).start()
 
     Run(config_for(sys.argv[1], mode="stage"), Path(sys.argv[1]), Path(sys.argv[2]), tell)()

@@ -235,6 +235,7 @@ def _live(
     console: Console, records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]
 ) -> None:
     """Draw until the daemon or the person ends it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started it may ignore it
     happened, pace, scroll = deque[str](maxlen=_EVENTS), Pace(), Scroll()
     status: Mapping[str, Any] | None = None
     lock = threading.Lock()
