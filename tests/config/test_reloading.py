@@ -151,9 +151,7 @@ def test_a_running_daemon_takes_it_on_sighup(emulated, tmp_path):
     with emulated(output="imu") as (_, port), log.open("wb") as stream:
         base = f'state_directory = "{tmp_path}"\n[device]\nbaud = 115200\n'
         config.write_text(base)
-        inherited = signal.signal(
-            signal.SIGHUP, signal.SIG_DFL
-        )  # ignored where nohup runs the tests
+        inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it
         process = subprocess.Popen(
             [sys.executable, "-m", "ahrsd", "-v", "run", "--config", str(config), "--port", port],
             stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
