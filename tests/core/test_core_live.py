@@ -62,7 +62,7 @@ def easy_gates():
 def config_for(folder, **tables):
     body = {
         "state_directory": str(folder),
-        "device": {"baud": BAUD, "reply_timeout_s": 0.2 * SPEED},
+        "device": {"baud": BAUD, "reply_timeout_s": 2.0 * SPEED},  # a busy machine stalls a second
         "interlock": {"max_age_s": 60.0},
         "gates": easy_gates(),
         "trial": {"duration_s": 60.0, "turns": 100.0, "worse_percent": 100.0, **EASY_TRIAL},
