@@ -29,7 +29,7 @@ from ahrsd.estimator.graph import (
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
-from ahrsd.estimator.parameters import Imperfections, instruments
+from ahrsd.estimator.parameters import Kinds, instruments
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -178,8 +178,12 @@ def place_borders(graph: Graph, begun: Sequence[WindowEpoch]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """A window's calibration c (9,), nodes by index, epochs and factors at one moment."""
+    """A window's calibration c (9,), nodes by index, epochs and factors at one moment.
 
+    damping: of the next step
+    """
+
+    damping: float
     c: Array
     nodes: dict[int, Node]
     epochs: list[WindowEpoch]
@@ -315,21 +319,23 @@ def _squares(
 
 TURN, LAG, SCALE = slice(12, 15), 15, 16
 _ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
-_SIZE = 22
+PLACE = slice(22, 28)  # of how the field differs with where the sensor heads
+_SIZE = 28
 _X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
 _OF_ANGLE = np.r_[12:15, 16:22]
-_SCALES = np.r_[SCALE:_SIZE]
-_FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
-_MOTION = np.ix_(np.r_[9:15, SCALE:23], np.r_[9:15, SCALE:23])
+_SCALES = np.r_[SCALE:22]
+_OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE, _SIZE], np.r_[9:15, SCALE:22, _SIZE]
+_FIELD, _MOTION = np.ix_(_OF_FIELD, _OF_FIELD), np.ix_(_OF_MOTION, _OF_MOTION)  # gradient last
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
-IMPERFECTIONS = ("axes", "lag", "scales", "bias")
-_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:13])  # of what is considered
+IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
+_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:16], np.r_[16:19])  # of what is considered
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
-_GYRO = np.r_[TURN, SCALE:_SIZE]  # what turns or scales the gyro's angles
+_GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
 GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
 _TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
 _WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
 _LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
+_STEEP = 0.05  # sine of an angle: less tells no heading
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
 
 
@@ -622,7 +628,7 @@ class Considered:
 
 
 def considered(
-    said: Considered, graph: Graph, kinds: Sequence[Imperfections]
+    said: Considered, graph: Graph, kinds: Kinds
 ) -> tuple[Array, dict[str, Array]]:
     """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); and what
     each of `IMPERFECTIONS` alone adds, which together may be more or less.
@@ -631,7 +637,7 @@ def considered(
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
     what they say that they are is an error of it.
     """
-    every, by_rest = np.array(instruments(kinds)), said.by_rest
+    every, by_rest = np.array(instruments(*kinds)), said.by_rest
     # what an imperfection makes the epochs disagree is no noise
     temper = said.temper(every.max(axis=0), graph.temper)
     spread, rest = said.found(every, temper)
@@ -645,40 +651,53 @@ def considered(
     return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True))
 
 
-def walk_asked(
-    said: Considered, graph: Graph, kinds: Sequence[Imperfections], span_s: float
-) -> float:
+def walk_asked(said: Considered, graph: Graph, kinds: Kinds, span_s: float) -> float:
     """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
 
     0 where an instrument that does not drift is as likely.
     """
-    every = np.array(instruments(kinds))
-    most, least = every.max(axis=0), every.min(axis=0)
-    temper = said.temper(most, graph.temper)
-    still = np.r_[most[:-3], least[-3:]]
-    if said.evidence(most, temper) - said.evidence(still, temper) < _TOLD:
+    every = np.array(instruments(*kinds))
+    temper = said.temper(every.max(axis=0), graph.temper)
+    drifts = likelier(said, every, slice(-3, None), temper)
+    if drifts is None:
         return 0.0
-    drift = said.found(most, temper)[1][-3:]
+    drift = said.found(drifts, temper)[1][-3:]
     return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
 
 
-def gyro_asked(said: Considered, graph: Graph, kinds: Sequence[Imperfections]) -> Array | None:
+def gyro_asked(said: Considered, graph: Graph, kinds: Kinds) -> Array | None:
     """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
 
     None where an instrument as its maker calibrated it is as likely, or the step is not worth it.
     """
-    every = np.array(instruments(kinds))
-    most, least = every.max(axis=0), every.min(axis=0)
-    temper = said.temper(most, graph.temper)
-    if not said.already.any():
-        plain = np.where(np.isin(np.arange(len(most)), GYRO_OF_ALL), least, most)
-        if said.evidence(most, temper) - said.evidence(plain, temper) < _TOLD:
-            return None
-    spread, rest = said.found(most, temper)
+    every = np.array(instruments(*kinds))
+    temper = said.temper(every.max(axis=0), graph.temper)
+    told = -np.inf if said.already.any() else _TOLD
+    found = likelier(said, every, GYRO_OF_ALL, temper, told)
+    if found is None:
+        return None
+    spread, rest = said.found(found, temper)
     step = rest[GYRO_OF_ALL]
     known = temper * spread[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
     worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
     return step if worth > _WORTH_SIGMAS else None
+
+
+def likelier(
+    said: Considered, every: Array, which: Array | slice, temper: float, told: float = _TOLD
+) -> Array | None:
+    """The likeliest of the instruments (K, n) in which all of `which` are as large as may be.
+
+    None where the likeliest of those in which all are as small as may be is not less likely by
+    `told` nats. Whatever else is wrong with either is free: a field that differs by place may be
+    what looks like a gyro.
+    """
+    evidence = said.evidence(every, temper)
+    sized = every[:, which]
+    most = np.flatnonzero(np.all(sized == sized.max(axis=0), axis=1))
+    least = np.flatnonzero(np.all(sized == sized.min(axis=0), axis=1))
+    best = most[np.argmax(evidence[most])]
+    return None if evidence[best] - evidence[least].max() < told else every[best]
 
 
 def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
@@ -734,8 +753,10 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
     columns[:, _OF_ANGLE] = -motion.scale * turn
     columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
     columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
+    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), graph.c)
+    columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
     _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
-    J = np.concatenate([field.by_x, late[:, None], field.r[:, None]], axis=1)
+    J = np.concatenate([field.by_x, late[:, None], place, field.r[:, None]], axis=1)
     K = np.concatenate([motion.by_bias, turn, motion.q[:, None]], axis=1)
     H = np.zeros((len(epochs), _SIZE + 1, _SIZE + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
@@ -747,6 +768,26 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
         own[_SCALES, _SIZE] -= _by_noise(epoch)
         epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+
+
+def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
+    """Residuals (3, 6, N) by a field that differs with the heading, gauss: north, east and down of
+    it, each with the heading's cosine and sine.
+
+    seen, down (N, 3): directions of the field and to the earth. Nothing where they do not tell.
+    """
+    down = np.nan_to_num(down)
+    east = np.cross(down, seen)
+    flat = np.linalg.norm(east, axis=1)[:, None]
+    told = flat > _STEEP
+    east, down = np.where(told, east / np.maximum(flat, _STEEP), 0.0), np.where(told, down, 0.0)
+    north = np.cross(east, down)
+    ahead = np.column_stack([north[:, 0], east[:, 0]])
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1), _STEEP)[:, None]
+    M = chain.symmetric(c[:6]) / np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
+    axes = np.stack([north, east, down], axis=2)  # (N, sensor, world)
+    moved = field.by_x[0, 6] * np.einsum("ij,njw,nk->iwkn", M, axes, ahead)
+    return moved.reshape(3, 6, -1)
 
 
 def _by_noise(epoch: WindowEpoch) -> Array:

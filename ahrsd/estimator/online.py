@@ -117,6 +117,7 @@ _WIDENED = {
     "the correction that `ahrsd calibrate` of a recording gives for it",
     "lag": "the field's readings may be late: turn fast and slow, both ways",
     "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
+    "place": "the field may differ with place: repeat the motion at another place, away from steel",
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
 }
 _LEAN_RAD = float(np.radians(30.0))
@@ -504,7 +505,7 @@ class Estimator:
             or (not window.folded and found.away > _AWAY)
         ):
             window.restart_at(found.c, found.bias)
-            window.track(everything=exactly, exactly=exactly, here=exactly)
+            window.track(everything=True, exactly=exactly, here=True)
         elif exactly or window.untried:
             window.track(everything=True, exactly=exactly)
         self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
@@ -531,7 +532,7 @@ class Estimator:
         return window, late
 
     def _explained(self, window: Window) -> bool:
-        most = instruments(self.parameters.imperfections)
+        most = instruments(*self.parameters.kinds)
         limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
         numbers = np.abs(window.taken.numbers)
         return bool(window.graph.temper < _EXPLAINED and np.all(numbers < limit))
@@ -588,7 +589,7 @@ class Estimator:
 
     def _gyro_out(self, window: Window) -> TakenOut:
         """What is to be taken out, with what else the gyro's axes and scales are asked for."""
-        said, kinds = self._considered(window), self.parameters.imperfections
+        said, kinds = self._considered(window), self.parameters.kinds
         if said is None:
             return window.taken
         taken, moving = window.taken, [e.data.time_s for e in window.epochs if e.turned]
@@ -632,7 +633,7 @@ class Estimator:
         said = self._considered(window)
         try:
             if said is not None:
-                return considered(said, window.graph, self.parameters.imperfections)
+                return considered(said, window.graph, self.parameters.kinds)
         except np.linalg.LinAlgError:
             pass
         return np.zeros((12, 12)), {}

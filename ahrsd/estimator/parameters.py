@@ -64,15 +64,28 @@ class Surroundings:
 ORDINARY = Surroundings(place_gauss=2e-3, coloured=1.0, knot_s=10.0)
 
 
-def instruments(kinds: Sequence[Imperfections]) -> list[tuple[float, ...]]:
-    """Sigmas of turn (3), lag, scale, shape (5), bias (3) of every instrument that may be.
+Kinds = tuple[Sequence[Imperfections], Sequence[float]]
+PLACES = (1e-6, 1e-3, 5e-3, 2e-2)
+
+
+def instruments(
+    kinds: Sequence[Imperfections], places: Sequence[float]
+) -> list[tuple[float, ...]]:
+    """Sigmas of turn (3), lag, scale, shape (5), place (6), bias (3) of every instrument that may be.
 
     Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
     whatever the others are: a sensor that was mounted askew need not be late.
     """
     return [
-        (*[axes.turn_rad] * 3, late.lag_s, gyro.scale, *[gyro.shape] * 5, *[bias.bias_rad_s] * 3)
-        for axes, late, gyro, bias in product(kinds, repeat=4)
+        (
+            *[axes.turn_rad] * 3,
+            late.lag_s,
+            gyro.scale,
+            *[gyro.shape] * 5,
+            *[place] * 6,
+            *[bias.bias_rad_s] * 3,
+        )
+        for (axes, late, gyro, bias), place in product(product(kinds, repeat=4), places)
     ]
 
 
@@ -111,12 +124,17 @@ class EstimatorParameters:
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
     imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, ASSEMBLED)
+    places: tuple[float, ...] = PLACES
+
+    @property
+    def kinds(self) -> Kinds:
+        return self.imperfections, self.places
 
     def __post_init__(self) -> None:
         """Raises ValueError naming the setting that is out of range."""
         for name in self.__slots__:
             value = getattr(self, name)
-            if name == "imperfections":
+            if name in ("imperfections", "places"):
                 continue
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}: it must be a positive number")
