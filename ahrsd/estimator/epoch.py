@@ -437,6 +437,19 @@ class InstrumentInformations:
         return kept[1]
 
 
+def of_rests(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs without motion: of the gyro's bias
+    alone, around that of their nodes."""
+    resting = [e for e in epochs if not e.turned]
+    H, g = np.zeros((len(resting), _SIZE, _SIZE)), np.zeros((len(resting), _SIZE))
+    for k, epoch in enumerate(resting):
+        factor = epoch.factor
+        H[k, _BIAS, _BIAS] = factor.H[_BIAS, _BIAS]
+        moved = graph.nodes[epoch.a].bias - factor.point.a.bias
+        g[k, _BIAS] = factor.g[_BIAS] + factor.H[_BIAS, _BIAS] @ moved
+    return H, g
+
+
 class FoldedInformation:
     """Information on iron, turn, lag and scale from epochs that left the window, as one Gaussian.
 

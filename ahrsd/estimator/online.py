@@ -29,6 +29,7 @@ from ahrsd.estimator.epoch import (
     considered,
     gyro_asked,
     instrument,
+    of_rests,
     walk_asked,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
@@ -535,7 +536,7 @@ class Estimator:
         most = instruments(*self.parameters.kinds)
         limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
         numbers = np.abs(window.taken.numbers)
-        return bool(window.graph.temper < _EXPLAINED and np.all(numbers < limit))
+        return bool(window.unexplained < _EXPLAINED and np.all(numbers < limit))
 
     def _take_out(self, window: Window, *, gyro: bool) -> bool:
         """Take out what is asked for until no more is; whether anything was.
@@ -560,7 +561,7 @@ class Estimator:
                 window.take_out(taken)
             elif not gyro or quiet:
                 break
-            window.track(everything=True)
+            window.track(everything=True, here=True)
             changed, quiet = True, window.usual.mag_gauss > _QUIETER * noise_gauss
         return changed
 
@@ -579,9 +580,11 @@ class Estimator:
             return None
         before = window.folded_information.at(window.graph.c, window.taken)
         try:
-            said = self._informations.whole(window.epochs, window.graph)
-            moving = [e.data.time_s for e in window.epochs if e.turned]
-            times_s = np.array([(float(t[0]) + float(t[-1])) / 2 for t in moving])
+            moving = self._informations.whole(window.epochs, window.graph)
+            rests = of_rests(window.epochs, window.graph)
+            said = np.concatenate([moving[0], rests[0]]), np.concatenate([moving[1], rests[1]])
+            apart = sorted(window.epochs, key=lambda e: not e.turned)
+            times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in apart])
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
             return Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
         except np.linalg.LinAlgError:
@@ -592,12 +595,11 @@ class Estimator:
         said, kinds = self._considered(window), self.parameters.kinds
         if said is None:
             return window.taken
-        taken, moving = window.taken, [e.data.time_s for e in window.epochs if e.turned]
+        taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
+        span_s = float(last.time_s[-1] - first.time_s[0])
         try:
             more = gyro_asked(said, window.graph, kinds)
-            walk = walk_asked(
-                said, window.graph, kinds, float(moving[-1][-1]) - float(moving[0][0])
-            )
+            walk = walk_asked(said, window.graph, kinds, span_s)
         except np.linalg.LinAlgError:
             return window.taken
         if more is not None:

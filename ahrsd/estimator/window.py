@@ -554,6 +554,11 @@ class Window:
         noise = self.usual.mag_gauss, self._guess.mag_gauss
         return variance_inflation(cells, *noise, smooth=smooth)
 
+    @property
+    def unexplained(self) -> float:
+        """Mean square of what the model leaves over, over that of noise; 1: nothing beyond chance."""
+        return max(self._beyond_chance, self._repeating())
+
     def covariance(self) -> Array:
         """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
 
