@@ -332,7 +332,7 @@ _EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:16], np.r_[16:19])  # of 
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
 _GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
 GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
-_TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
+TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
 _WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
 _LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
 _STEEP = 0.05  # sine of an angle: less tells no heading
@@ -678,15 +678,16 @@ def walk_asked(said: Considered, graph: Graph, kinds: Kinds, span_s: float) -> f
     return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
 
 
-def gyro_asked(said: Considered, graph: Graph, kinds: Kinds) -> Array | None:
+def gyro_asked(said: Considered, graph: Graph, kinds: Kinds, told: float) -> Array | None:
     """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
 
-    None where an instrument as its maker calibrated it is as likely, or the step is not worth it.
+    None where an instrument like that is not likelier than its maker's by `told` nats, unless some
+    of it is taken out already, or where the step is not worth it.
     """
     every = np.array(instruments(*kinds))
     temper = said.temper(every.max(axis=0), graph.temper)
-    told = -np.inf if said.already.any() else _TOLD
-    found = likelier(said, every, GYRO_OF_ALL, temper, told)
+    least = -np.inf if said.already.any() else told
+    found = likelier(said, every, GYRO_OF_ALL, temper, least)
     if found is None:
         return None
     spread, rest = said.found(found, temper)
@@ -696,10 +697,17 @@ def gyro_asked(said: Considered, graph: Graph, kinds: Kinds) -> Array | None:
     return step if worth > _WORTH_SIGMAS else None
 
 
+def gyro_told(said: Considered, graph: Graph, kinds: Kinds) -> bool:
+    """Whether a gyro with all that is wrong with this one is clearly likelier than its maker's."""
+    every = np.array(instruments(*kinds))
+    temper = said.temper(every.max(axis=0), graph.temper)
+    return likelier(said, every, GYRO_OF_ALL, temper) is not None
+
+
 def likelier(
-    said: Considered, every: Array, which: Array | slice, temper: float, told: float = _TOLD
+    said: Considered, every: Array, which: Array | slice, temper: float, told: float = TOLD
 ) -> Array | None:
-    """The likeliest of the instruments (K, n) in which all of `which` are as large as may be.
+    """The likeliest of the instruments (K, n) in which some of `which` are larger than they need be.
 
     None where the likeliest of those in which all are as small as may be is not less likely by
     `told` nats. Whatever else is wrong with either is free: a field that differs by place may be
@@ -707,10 +715,12 @@ def likelier(
     """
     evidence = said.evidence(every, temper)
     sized = every[:, which]
-    most = np.flatnonzero(np.all(sized == sized.max(axis=0), axis=1))
-    least = np.flatnonzero(np.all(sized == sized.min(axis=0), axis=1))
-    best = most[np.argmax(evidence[most])]
-    return None if evidence[best] - evidence[least].max() < told else every[best]
+    plain = np.all(sized == sized.min(axis=0), axis=1)
+    if plain.all():
+        return None
+    others = np.where(plain, -np.inf, evidence)
+    gain = others.max() - evidence[plain].max()
+    return None if gain < told else every[np.argmax(others)]
 
 
 def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:

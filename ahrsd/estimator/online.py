@@ -22,12 +22,14 @@ from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
     GYRO_OF_ALL,
+    TOLD,
     Considered,
     Instrument,
     InstrumentInformations,
     TakenOut,
     considered,
     gyro_asked,
+    gyro_told,
     instrument,
     of_rests,
     walk_asked,
@@ -307,6 +309,7 @@ _LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is on
 _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
 _PASSES, _QUIETER = 8, 0.95  # over a gyro that is wrong; while the noise falls below that of itself
 _EXPLAINED = 1.5  # misfit of data that an instrument with imperfections explains
+_DOUBTFUL = -15.0  # nats from which a gyro that is wrong is tried where something is left over
 _MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which something else is wrong
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
@@ -536,7 +539,13 @@ class Estimator:
         most = instruments(*self.parameters.kinds)
         limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
         numbers = np.abs(window.taken.numbers)
-        return bool(window.unexplained < _EXPLAINED and np.all(numbers < limit))
+        said = self._considered(window)
+        return bool(
+            window.unexplained < _EXPLAINED
+            and np.all(numbers < limit)
+            and said is not None
+            and gyro_told(said, window.graph, self.parameters.kinds)
+        )
 
     def _take_out(self, window: Window, *, gyro: bool) -> bool:
         """Take out what is asked for until no more is; whether anything was.
@@ -598,7 +607,8 @@ class Estimator:
         taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
         span_s = float(last.time_s[-1] - first.time_s[0])
         try:
-            more = gyro_asked(said, window.graph, kinds)
+            told = _DOUBTFUL if window.left_over else TOLD
+            more = gyro_asked(said, window.graph, kinds, told)
             walk = walk_asked(said, window.graph, kinds, span_s)
         except np.linalg.LinAlgError:
             return window.taken

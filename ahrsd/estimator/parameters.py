@@ -81,11 +81,12 @@ def instruments(
             *[axes.turn_rad] * 3,
             late.lag_s,
             gyro.scale,
-            *[gyro.shape] * 5,
+            *[gyro.shape] * 2,
+            *[shears.shape] * 3,
             *[place] * 6,
             *[bias.bias_rad_s] * 3,
         )
-        for (axes, late, gyro, bias), place in product(product(kinds, repeat=4), places)
+        for (axes, late, gyro, shears, bias), place in product(product(kinds, repeat=5), places)
     ]
 
 

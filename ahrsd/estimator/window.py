@@ -69,6 +69,7 @@ from ahrsd.samples import Array
 
 _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
+_LOUD_GYRO = 1.2  # of the guess: more is something else than the noise of its differences
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
 _ANOTHER_REST = 0.02  # rad between two directions at rest
 _SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
@@ -558,6 +559,12 @@ class Window:
     def unexplained(self) -> float:
         """Mean square of what the model leaves over, over that of noise; 1: nothing beyond chance."""
         return max(self._beyond_chance, self._repeating())
+
+    @property
+    def left_over(self) -> bool:
+        """Whether the model leaves over what is not noise, or calls it noise of the gyro."""
+        loud = self.usual.gyro_rad_s > _LOUD_GYRO * self._guess.gyro_rad_s
+        return loud or self.unexplained > 1.0
 
     def covariance(self) -> Array:
         """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
