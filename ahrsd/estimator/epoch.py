@@ -310,6 +310,12 @@ def _squares(
 # E) times too small, E symmetric and traceless (5). It is not asked for, only considered: what it
 # may do to the answer widens the answer.
 #
+# Place: the field in the world differs by place, and a vehicle that circles is at another place on
+# each heading: dh = G e, e the heading's cosine and sine, G (3, 2) in the world's axes. A part of
+# that is the same on all headings in the sensor and passes for hard iron, another for soft iron: no
+# fit shows them. dr/dG = -M R (axis) e / s_m / |h|, R from the field's direction and gravity. It is
+# only considered too, and of one of `parameters.PLACES`, as likely as what does show makes it.
+#
 # One Gauss-Newton step from the answer gives them beside M, b and the bias. On fast motion one
 # looks like another, so they are asked for together. Every epoch stands alone here, its borders
 # free.
@@ -328,7 +334,8 @@ _OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE, _SIZE], np.r_[9:15, SCALE:22, _SI
 _FIELD, _MOTION = np.ix_(_OF_FIELD, _OF_FIELD), np.ix_(_OF_MOTION, _OF_MOTION)  # gradient last
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
-_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:16], np.r_[16:19])  # of what is considered
+_PLACE = np.r_[10:16]
+_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], _PLACE, np.r_[16:19])  # of what is considered
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
 _GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
 GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
@@ -642,9 +649,10 @@ class Considered:
 
 def considered(
     said: Considered, graph: Graph, kinds: Kinds
-) -> tuple[Array, dict[str, Array]]:
-    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); and what
-    each of `IMPERFECTIONS` alone adds, which together may be more or less.
+) -> tuple[Array, dict[str, Array], float]:
+    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); what each
+    of `IMPERFECTIONS` alone adds, which together may be more or less; and by how much the field
+    differs with the heading, rms of what is expected of its six numbers [gauss].
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
@@ -661,7 +669,8 @@ def considered(
     mean = np.einsum("k,kij->ij", likely, spread)
     added = by_rest @ mean @ by_rest.T
     each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
-    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True))
+    place = float(np.sqrt(np.mean(np.diag(mean)[_PLACE])))
+    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True)), place
 
 
 def walk_asked(said: Considered, graph: Graph, kinds: Kinds, span_s: float) -> float:
@@ -707,7 +716,7 @@ def gyro_told(said: Considered, graph: Graph, kinds: Kinds) -> bool:
 def likelier(
     said: Considered, every: Array, which: Array | slice, temper: float, told: float = TOLD
 ) -> Array | None:
-    """The likeliest of the instruments (K, n) in which some of `which` are larger than they need be.
+    """The likeliest of the instruments (K, n) in which some of `which` are larger than need be.
 
     None where the likeliest of those in which all are as small as may be is not less likely by
     `told` nats. Whatever else is wrong with either is free: a field that differs by place may be
@@ -810,7 +819,7 @@ def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Arr
     M = chain.symmetric(c[:6]) / np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
     axes = np.stack([north, east, down], axis=2)  # (N, sensor, world)
     moved = field.by_x[0, 6] * np.einsum("ij,njw,nk->iwkn", M, axes, ahead)
-    return moved.reshape(3, 6, -1)
+    return np.asarray(moved.reshape(3, 6, -1), dtype=np.float64)
 
 
 def _by_noise(epoch: WindowEpoch) -> Array:

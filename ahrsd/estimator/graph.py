@@ -278,7 +278,8 @@ def way(c: Array, to: Array, moments: Moments) -> Array:
     With v = C m - d of each and s the scale that is restored, s^2 = 1 + mean |s v' - v|^2.
     """
     M = chain.symmetric(c[:6])
-    C, other = np.linalg.inv(M), np.linalg.inv(chain.symmetric(to[:6]))
+    C = np.asarray(np.linalg.inv(M), dtype=np.float64)
+    other = np.asarray(np.linalg.inv(chain.symmetric(to[:6])), dtype=np.float64)
     d, beyond = C @ c[6:], other @ to[6:]
     own, theirs = moments.mean_square(C, d), moments.mean_square(other, beyond)
     both = (moments.mean_square(C + other, d + beyond) - own - theirs) / 2
@@ -286,7 +287,7 @@ def way(c: Array, to: Array, moments: Moments) -> Array:
     if both <= 0.0 or inside <= 0.0:
         return np.asarray(to - c)
     scale = (1.0 + own) / (both + np.sqrt(inside))
-    dC, dd = scale * other - C, scale * beyond - d
+    dC, dd = np.asarray(scale * other - C), np.asarray(scale * beyond - d)
     return np.concatenate([chain.upper_triangle(-M @ dC @ M), M @ (dd - dC @ c[6:])])
 
 

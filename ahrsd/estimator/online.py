@@ -640,15 +640,16 @@ class Estimator:
         known = window.lag_known() if window.taken.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array]]:
-        """What an instrument that is not perfect adds to the covariance (12, 12), and each part."""
+    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array], float]:
+        """What an instrument that is not perfect adds to the covariance (12, 12), and each part;
+        by how much the field differs with the heading, gauss, nan where nobody can tell."""
         said = self._considered(window)
         try:
             if said is not None:
                 return considered(said, window.graph, self.parameters.kinds)
         except np.linalg.LinAlgError:
             pass
-        return np.zeros((12, 12)), {}
+        return np.zeros((12, 12)), {}, float("nan")
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -682,7 +683,7 @@ class Estimator:
         observed = observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        by_instrument, parts = self._by_imperfections(window)
+        by_instrument, parts, place_gauss = self._by_imperfections(window)
         tempered = window.covariance()
         divided = tempered * self._parted
         parts |= motion_and_misfit(window.explained_covariance(), divided, self._whitening)
@@ -723,4 +724,5 @@ class Estimator:
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
             widened_by=advice.widened_by(parts, covariance, turned),
+            place_gauss=place_gauss,
         )

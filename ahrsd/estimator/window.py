@@ -557,7 +557,7 @@ class Window:
 
     @property
     def unexplained(self) -> float:
-        """Mean square of what the model leaves over, over that of noise; 1: nothing beyond chance."""
+        """Mean square of what the model leaves over, over that of noise; 1: no more than chance."""
         return max(self._beyond_chance, self._repeating())
 
     @property
@@ -763,7 +763,8 @@ def search(
             break
         reached = _further(thin, reached, fields, present_bias)
     best = _best(reached)
-    away = _distance(graph.c, best, graph.moments, graph.temper * best.heard if best.heard > 1 else 1.0)
+    temper = graph.temper * best.heard if best.heard > 1.0 else 1.0
+    away = _distance(graph.c, best, graph.moments, temper)
     gain = (reached[0].cost - best.cost) / best.heard
     return SearchResult(best.c, best.bias, away, gain, _apart(reached, graph), best.heard)
 
@@ -794,9 +795,7 @@ def _further(
             out[k] = _gone_on(thin, one)
         elif not there and not one.mirrored:
             mirrored = start.mirrored(one.c, fields)
-            out[k] = replace(
-                _descend(thin, mirrored, bias, best, blind=one.blind), mirrored=True
-            )
+            out[k] = replace(_descend(thin, mirrored, bias, best, blind=one.blind), mirrored=True)
     return out
 
 
