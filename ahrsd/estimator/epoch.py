@@ -51,7 +51,7 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron and instrument (see `instrument`): H (22, 22), g (22,) at c."""
+    """Quadratic of an epoch in iron and instrument (see `instrument`): H (28, 28), g (28,) at c."""
 
     H: Array
     g: Array
@@ -433,7 +433,7 @@ class InstrumentInformations:
         return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
 
     def whole(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-        """The same with the gyro's shape: H (N, 22, 22) and gradient (N, 22)."""
+        """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28)."""
         at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
         kept = self._kept
         if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
@@ -465,7 +465,9 @@ class FoldedInformation:
 
     def __init__(self) -> None:
         self._H: Array = np.zeros((_SIZE, _SIZE))
-        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, turn, lag, scale, shape]
+        self._eta: Array = np.zeros(
+            _SIZE
+        )  # H x - gradient, x as `_place`
 
     @staticmethod
     def of_iron(graph: Graph, taken: TakenOut) -> FoldedInformation:
@@ -506,7 +508,7 @@ class FoldedInformation:
         self._eta = self._eta + H @ _place(c, taken) - g
 
     def at(self, c: Array, taken: TakenOut) -> tuple[Array, Array]:
-        """H (22, 22) and gradient (22,) there."""
+        """H (28, 28) and gradient (28,) there."""
         return self._H, self._H @ _place(c, taken) - self._eta
 
 
@@ -582,13 +584,13 @@ def instrument(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Considered:
-    """What is known of an instrument's imperfections (`_REST`, 13), and what they do to the answer.
+    """What is known of an instrument's imperfections (`_REST`, 19), and what they do to the answer.
 
-    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 13): what one of each
-    does to them; own (12,) their gradient; known (13, 13) and asked (13,): information and gradient
-    of the imperfections from the data, the answer following them; already (13,): what of them is
+    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 19): what one of each
+    does to them; own (12,) their gradient; known (19, 19) and asked (19,): information and gradient
+    of the imperfections from the data, the answer following them; already (19,): what of them is
     taken out of the data
-    disagree: how much the epochs disagree after a step (25,) of all
+    disagree: how much the epochs disagree after a step (31,) of all
     """
 
     alone: Array
@@ -625,8 +627,8 @@ class Considered:
         )
 
     def found(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
-        """Spread (..., 13, 13) over the temper, and what they are beyond what is taken out
-        (..., 13), of instruments like that (..., 13)."""
+        """Spread (..., 19, 19) over the temper, and what they are beyond what is taken out
+        (..., 19), of instruments like that (..., 19)."""
         pull = temper / sigmas**2
         spread = _inverses(self.known + pull[..., None] * np.eye(pull.shape[-1]))
         return spread, -(spread @ (self.asked + pull * self.already)[..., None])[..., 0]
@@ -637,19 +639,57 @@ class Considered:
         step = np.r_[-self.alone @ self.own + self.by_rest @ rest, rest]
         return min(most, max(1.0, self.disagree(step)))
 
-    def evidence(self, sigmas: Array, temper: float) -> Array:
-        """Log of how likely the data are of instruments like that (..., 13), up to a constant."""
+    def evidence(self, sigmas: Array, rest: Array, temper: float) -> Array:
+        """Log of how likely the data are of instruments like that (..., 19), up to a constant.
+
+        rest: what they were found to be
+        """
         sizes = sigmas[..., :, None] * sigmas[..., None, :]
         told = np.linalg.slogdet(np.eye(sigmas.shape[-1]) + self.known / temper * sizes)[1]
-        rest = self.found(sigmas, temper)[1]
         left = np.sum((rest @ self.known + 2.0 * self.asked) * rest, axis=-1) / temper
         left = left + np.sum(np.square((self.already + rest) / sigmas), axis=-1)
         return np.asarray(-0.5 * (left + told))
 
 
-def considered(
-    said: Considered, graph: Graph, kinds: Kinds
-) -> tuple[Array, dict[str, Array], float]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Weighed:
+    """All instruments that may be, at all places, against what the data say of them.
+
+    every (K, 19) their sigmas; evidence (K,); spread (K, 19, 19) and rest (K, 19) what the data
+    leave open of each and say that it is, beyond what is taken out already
+    """
+
+    said: Considered
+    every: Array
+    evidence: Array
+    spread: Array
+    rest: Array
+
+    @staticmethod
+    def of(said: Considered, graph: Graph, kinds: Kinds) -> Weighed:
+        """What an imperfection makes the epochs disagree is no noise."""
+        every = instruments(*kinds)
+        temper = said.temper(every.max(axis=0), graph.temper)
+        spread, rest = said.found(every, temper)
+        return Weighed(said, every, said.evidence(every, rest, temper), temper * spread, rest)
+
+    def likelier(self, which: Array | slice, told: float = TOLD) -> int | None:
+        """The likeliest of those in which some of `which` are larger than need be.
+
+        None where the likeliest of those in which all are as small as may be is not less likely by
+        `told` nats. Whatever else is wrong with either is free: a field that differs by place may
+        be what looks like a gyro.
+        """
+        sized = self.every[:, which]
+        plain = np.all(sized == sized.min(axis=0), axis=1)
+        if plain.all():
+            return None
+        others = np.where(plain, -np.inf, self.evidence)
+        gain = others.max() - self.evidence[plain].max()
+        return None if gain < told else int(np.argmax(others))
+
+
+def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:
     """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); what each
     of `IMPERFECTIONS` alone adds, which together may be more or less; and by how much the field
     differs with the heading, rms of what is expected of its six numbers [gauss].
@@ -658,82 +698,43 @@ def considered(
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
     what they say that they are is an error of it.
     """
-    every, by_rest = np.array(instruments(*kinds)), said.by_rest
-    # what an imperfection makes the epochs disagree is no noise
-    temper = said.temper(every.max(axis=0), graph.temper)
-    spread, rest = said.found(every, temper)
-    evidence = said.evidence(every, temper)
-    likely = np.exp(evidence - evidence.max())
+    by_rest, rest = weighed.said.by_rest, weighed.rest
+    likely = np.exp(weighed.evidence - weighed.evidence.max())
     likely /= likely.sum()
-    spread = temper * spread + rest[:, :, None] * rest[:, None, :]
-    mean = np.einsum("k,kij->ij", likely, spread)
+    mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
     added = by_rest @ mean @ by_rest.T
     each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
     place = float(np.sqrt(np.mean(np.diag(mean)[_PLACE])))
     return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True)), place
 
 
-def walk_asked(said: Considered, graph: Graph, kinds: Kinds, span_s: float) -> float:
+def walk_asked(weighed: Weighed, span_s: float) -> float:
     """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
 
     0 where an instrument that does not drift is as likely.
     """
-    every = np.array(instruments(*kinds))
-    temper = said.temper(every.max(axis=0), graph.temper)
-    drifts = likelier(said, every, slice(-3, None), temper)
-    if drifts is None:
-        return 0.0
-    drift = said.found(drifts, temper)[1][-3:]
+    found = weighed.likelier(slice(-3, None))
+    drift = np.zeros(3) if found is None else weighed.rest[found][-3:]
     return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
 
 
-def gyro_asked(said: Considered, graph: Graph, kinds: Kinds, told: float) -> Array | None:
+def gyro_asked(weighed: Weighed, told: float) -> Array | None:
     """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
 
     None where an instrument like that is not likelier than its maker's by `told` nats, unless some
     of it is taken out already, or where the step is not worth it.
     """
-    every = np.array(instruments(*kinds))
-    temper = said.temper(every.max(axis=0), graph.temper)
-    least = -np.inf if said.already.any() else told
-    found = likelier(said, every, GYRO_OF_ALL, temper, least)
+    found = weighed.likelier(GYRO_OF_ALL, -np.inf if weighed.said.already.any() else told)
     if found is None:
         return None
-    spread, rest = said.found(found, temper)
-    step = rest[GYRO_OF_ALL]
-    known = temper * spread[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
+    step = weighed.rest[found][GYRO_OF_ALL]
+    known = weighed.spread[found][np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
     worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
     return step if worth > _WORTH_SIGMAS else None
 
 
-def gyro_told(said: Considered, graph: Graph, kinds: Kinds) -> bool:
-    """Whether a gyro with all that is wrong with this one is clearly likelier than its maker's."""
-    every = np.array(instruments(*kinds))
-    temper = said.temper(every.max(axis=0), graph.temper)
-    return likelier(said, every, GYRO_OF_ALL, temper) is not None
-
-
-def likelier(
-    said: Considered, every: Array, which: Array | slice, temper: float, told: float = TOLD
-) -> Array | None:
-    """The likeliest of the instruments (K, n) in which some of `which` are larger than need be.
-
-    None where the likeliest of those in which all are as small as may be is not less likely by
-    `told` nats. Whatever else is wrong with either is free: a field that differs by place may be
-    what looks like a gyro.
-    """
-    evidence = said.evidence(every, temper)
-    sized = every[:, which]
-    plain = np.all(sized == sized.min(axis=0), axis=1)
-    if plain.all():
-        return None
-    others = np.where(plain, -np.inf, evidence)
-    gain = others.max() - evidence[plain].max()
-    return None if gain < told else every[np.argmax(others)]
-
-
 def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
-    """H (N, 25, 25) and g (N, 25): and by how much the gyro's bias came to be in all the epochs.
+    """H (N, 31, 31) and g (N, 31): and by how much the gyro's bias came to be in all the epochs.
 
     It moved at one rate; w_b is that of the newest epoch.
     """
@@ -817,9 +818,9 @@ def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Arr
     ahead = np.column_stack([north[:, 0], east[:, 0]])
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1), _STEEP)[:, None]
     M = chain.symmetric(c[:6]) / np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
-    axes = np.stack([north, east, down], axis=2)  # (N, sensor, world)
-    moved = field.by_x[0, 6] * np.einsum("ij,njw,nk->iwkn", M, axes, ahead)
-    return np.asarray(moved.reshape(3, 6, -1), dtype=np.float64)
+    ahead = (field.by_x[0, 6] * ahead.T)[None]  # by_x holds - sqrt(weight) / s_m in that place
+    moved = np.stack([M @ axis.T for axis in (north, east, down)], axis=1)
+    return np.asarray((moved[:, :, None] * ahead[:, None]).reshape(3, 6, -1), dtype=np.float64)
 
 
 def _by_noise(epoch: WindowEpoch) -> Array:

@@ -27,9 +27,9 @@ from ahrsd.estimator.epoch import (
     Instrument,
     InstrumentInformations,
     TakenOut,
+    Weighed,
     considered,
     gyro_asked,
-    gyro_told,
     instrument,
     of_rests,
     walk_asked,
@@ -298,7 +298,7 @@ _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at e
 _CHANGED = 2  # epochs one after the other that contradict the answer: the iron has changed
 _FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
-_AWAY, _AWAY_UNSETTLED = 3.0, 0.5
+_AWAY, _AWAY_UNSETTLED = 1.5, 0.5
 _LOOKS = 4  # of the first search
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
@@ -539,12 +539,12 @@ class Estimator:
         most = instruments(*self.parameters.kinds)
         limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
         numbers = np.abs(window.taken.numbers)
-        said = self._considered(window)
+        weighed = self._weighed(window)
         return bool(
             window.unexplained < _EXPLAINED
             and np.all(numbers < limit)
-            and said is not None
-            and gyro_told(said, window.graph, self.parameters.kinds)
+            and weighed is not None
+            and weighed.likelier(GYRO_OF_ALL) is not None
         )
 
     def _take_out(self, window: Window, *, gyro: bool) -> bool:
@@ -583,8 +583,8 @@ class Estimator:
         except np.linalg.LinAlgError:
             return None
 
-    def _considered(self, window: Window) -> Considered | None:
-        """What is known of the instrument's imperfections; None where they are not to be asked."""
+    def _weighed(self, window: Window) -> Weighed | None:
+        """What is known of the instrument and the place; None where they are not to be asked."""
         if not self.parameters.imperfections:
             return None
         before = window.folded_information.at(window.graph.c, window.taken)
@@ -595,25 +595,24 @@ class Estimator:
             apart = sorted(window.epochs, key=lambda e: not e.turned)
             times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in apart])
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            return Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
+            known = Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
+            return Weighed.of(known, window.graph, self.parameters.kinds)
         except np.linalg.LinAlgError:
             return None
 
     def _gyro_out(self, window: Window) -> TakenOut:
         """What is to be taken out, with what else the gyro's axes and scales are asked for."""
-        said, kinds = self._considered(window), self.parameters.kinds
-        if said is None:
+        weighed = self._weighed(window)
+        if weighed is None:
             return window.taken
         taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
-        span_s = float(last.time_s[-1] - first.time_s[0])
         try:
-            told = _DOUBTFUL if window.left_over else TOLD
-            more = gyro_asked(said, window.graph, kinds, told)
-            walk = walk_asked(said, window.graph, kinds, span_s)
+            more = gyro_asked(weighed, _DOUBTFUL if window.left_over else TOLD)
         except np.linalg.LinAlgError:
             return window.taken
         if more is not None:
             taken = taken.with_gyro(more)
+        walk = walk_asked(weighed, float(last.time_s[-1] - first.time_s[0]))
         return taken if walk == 0.0 else replace(taken, walk=float(np.hypot(taken.walk, walk)))
 
     @staticmethod
@@ -643,13 +642,10 @@ class Estimator:
     def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array], float]:
         """What an instrument that is not perfect adds to the covariance (12, 12), and each part;
         by how much the field differs with the heading, gauss, nan where nobody can tell."""
-        said = self._considered(window)
-        try:
-            if said is not None:
-                return considered(said, window.graph, self.parameters.kinds)
-        except np.linalg.LinAlgError:
-            pass
-        return np.zeros((12, 12)), {}, float("nan")
+        weighed = self._weighed(window)
+        if weighed is None:
+            return np.zeros((12, 12)), {}, float("nan")
+        return considered(weighed)
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
+
+import numpy as np
+
+from ahrsd.samples import Array
 
 MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
@@ -70,18 +74,19 @@ ORDINARY = Surroundings(place_gauss=2e-3, coloured=1.0, knot_s=10.0)
 #: is any (`diagnosis/ordinary.py: TABLE`). So that nothing was seen is no proof that nothing is
 PLACES = (1e-6, 1e-3, 5e-3, 2e-2)
 
-Kinds = tuple[Sequence[Imperfections], Sequence[float]]
+Kinds = tuple[tuple[Imperfections, ...], tuple[float, ...]]
 """Of instruments, and of places by the size of what differs there."""
 
 
-def instruments(kinds: Sequence[Imperfections], places: Sequence[float]) -> list[tuple[float, ...]]:
+@lru_cache
+def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> Array:
     """Sigmas of turn (3), lag, scale, shape (5), place (6), bias (3): all instruments that may be.
 
     Its axes are of one of the kinds, its lag is, its gyro's scales, its gyro's right angles and its
     gyro's bias are, each whatever the others are: a sensor that was mounted askew need not be late.
     And so is the place where it was driven.
     """
-    return [
+    every = [
         (
             *[axes.turn_rad] * 3,
             late.lag_s,
@@ -93,6 +98,9 @@ def instruments(kinds: Sequence[Imperfections], places: Sequence[float]) -> list
         )
         for (axes, late, gyro, shears, bias), place in product(product(kinds, repeat=5), places)
     ]
+    found = np.array(every)
+    found.flags.writeable = False
+    return found
 
 
 @dataclass(frozen=True, slots=True)
