@@ -465,9 +465,7 @@ class FoldedInformation:
 
     def __init__(self) -> None:
         self._H: Array = np.zeros((_SIZE, _SIZE))
-        self._eta: Array = np.zeros(
-            _SIZE
-        )  # H x - gradient, x as `_place`
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x as `_place`
 
     @staticmethod
     def of_iron(graph: Graph, taken: TakenOut) -> FoldedInformation:
@@ -674,19 +672,24 @@ class Weighed:
         return Weighed(said, every, said.evidence(every, rest, temper), temper * spread, rest)
 
     def likelier(self, which: Array | slice, told: float = TOLD) -> int | None:
-        """The likeliest of those in which some of `which` are larger than need be.
+        """The likeliest of those in which some of `which` are larger than need be; None where it is
+        not likelier than the others by `told` nats."""
+        found, gain = self.against_plain(which)
+        return None if gain < told else found
 
-        None where the likeliest of those in which all are as small as may be is not less likely by
-        `told` nats. Whatever else is wrong with either is free: a field that differs by place may
-        be what looks like a gyro.
+    def against_plain(self, which: Array | slice) -> tuple[int, float]:
+        """The likeliest of those in which some of `which` are larger than need be, and by how many
+        nats it is likelier than the likeliest of those in which all are as small as may be.
+
+        Whatever else is wrong with either is free: a field that differs by place may be what looks
+        like a gyro.
         """
         sized = self.every[:, which]
         plain = np.all(sized == sized.min(axis=0), axis=1)
         if plain.all():
-            return None
+            return 0, -np.inf
         others = np.where(plain, -np.inf, self.evidence)
-        gain = others.max() - self.evidence[plain].max()
-        return None if gain < told else int(np.argmax(others))
+        return int(np.argmax(others)), float(others.max() - self.evidence[plain].max())
 
 
 def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:

@@ -31,7 +31,6 @@ _FAR = 1.7  # beyond this ratio of the gyro's variance to the one assumed it is 
 # Degrees of freedom by which an epoch's noise is drawn to the usual one. The gyro has so few per
 # epoch that its noise per epoch would be mostly chance, and weighting by chance is biased.
 _STRENGTH_MAG, _STRENGTH_GYRO = 100.0, 3000.0
-_STRENGTH_GUESS = 20.0  # of all epochs' level, to the guess
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +102,6 @@ def pooled(
 ) -> chain.Noise:
     """The usual noise: all epochs together, without those three times noisier than the median.
 
-    Of the gyro's noise a short recording tells so little, and the less the quieter it is taken to
-    be, that its level would run away towards nothing: it is drawn to its first guess, as if that
-    were of _STRENGTH_GUESS degrees of freedom (of logarithms, since the guess may be far too
-    large).
     The gyro's noise may not exceed its first guess by more than half: motion between samples makes
     that guess too large already, and what a wrong calibration leaves over must not be called noise
     of the gyro.
@@ -114,10 +109,7 @@ def pooled(
     mag = np.array([(r.mag_gauss2, r.mag_freedom) for r in found])
     gyro = np.array([(r.gyro_rad2_s2, r.gyro_freedom) for r in found])
     limit = _GYRO_LIMIT * guess.gyro_rad_s
-    freedom = float(gyro[:, 1].sum())
-    share = freedom / (freedom + _STRENGTH_GUESS)
-    level = _pooled(gyro) ** share * guess.gyro_rad_s ** (1.0 - share)
-    return _floored(_pooled(mag), min(level, limit), parameters)
+    return _floored(_pooled(mag), min(_pooled(gyro), limit), parameters)
 
 
 def at_least(usual: chain.Noise, gyro_rad_s: float) -> chain.Noise:

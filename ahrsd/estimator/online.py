@@ -525,33 +525,42 @@ class Estimator:
         What is wrong with a gyro is taken out only if the data are then explained: a field that
         differs by place asks for it too, and is not.
         """
-        late = self._take_out(window, gyro=False)
+        late = self._take_out(window)
         if self.parameters.imperfections:
-            trial, misscaled = window.copy(), self._misscaled
-            if self._take_out(trial, gyro=True) and self._explained(trial):
-                window, late = trial, True
-            else:
+            for told in (TOLD, _DOUBTFUL):
+                trial, misscaled = window.copy(), self._misscaled
+                if self._take_out(trial, gyro_told=told) and self._explained(trial, window, told):
+                    window, late = trial, True
+                    break
                 self._misscaled = misscaled
+                if not window.left_over:
+                    break
         self._informations = InstrumentInformations()  # nobody else asks before they are others
         return window, late
 
-    def _explained(self, window: Window) -> bool:
+    def _explained(self, trial: Window, before: Window, told: float) -> bool:
+        """Whether the data are explained once that is taken out; and, where the gyro was not likely
+        to be wrong before, likely to be."""
         most = instruments(*self.parameters.kinds)
         limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
-        numbers = np.abs(window.taken.numbers)
-        weighed = self._weighed(window)
-        return bool(
-            window.unexplained < _EXPLAINED
-            and np.all(numbers < limit)
-            and weighed is not None
-            and weighed.likelier(GYRO_OF_ALL) is not None
-        )
+        within = bool(np.all(np.abs(trial.taken.numbers) < limit))
+        if not within or trial.unexplained >= _EXPLAINED or told == TOLD:
+            return within and trial.unexplained < _EXPLAINED
+        weighed = self._weighed(trial)
+        if weighed is None:
+            return False
+        # what it left over passed for noise of the gyro, which is less likely by this
+        quieter = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
+        gain = weighed.against_plain(GYRO_OF_ALL)[1] + trial.gyro_freedom * quieter
+        return bool(gain > TOLD)
 
-    def _take_out(self, window: Window, *, gyro: bool) -> bool:
+    def _take_out(self, window: Window, *, gyro_told: float | None = None) -> bool:
         """Take out what is asked for until no more is; whether anything was.
 
-        gyro: what is wrong with it, too; then the noise that it passed for has to settle as well.
+        gyro_told: nats by which what is wrong with it must be told to be taken out too, None: it is
+        not; then the noise that it passed for has to settle as well.
         """
+        gyro = gyro_told is not None
         least, changed, quiet = _LAG_SIGMAS if window.taken.lag_s == 0.0 else 1.0, False, False
         for _ in range(_PASSES if gyro else _LAG_PASSES):
             found = self._instrument(window)
@@ -559,7 +568,7 @@ class Estimator:
                 break
             self._misscaled = found.misscaled
             more, sigma = found.lag_s
-            taken = self._gyro_out(window) if gyro else window.taken
+            taken = window.taken if gyro_told is None else self._gyro_out(window, gyro_told)
             if gyro and taken is window.taken and not changed:
                 break
             if abs(more) >= least * sigma:
@@ -600,14 +609,14 @@ class Estimator:
         except np.linalg.LinAlgError:
             return None
 
-    def _gyro_out(self, window: Window) -> TakenOut:
+    def _gyro_out(self, window: Window, told: float) -> TakenOut:
         """What is to be taken out, with what else the gyro's axes and scales are asked for."""
         weighed = self._weighed(window)
         if weighed is None:
             return window.taken
         taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
         try:
-            more = gyro_asked(weighed, _DOUBTFUL if window.left_over else TOLD)
+            more = gyro_asked(weighed, told)
         except np.linalg.LinAlgError:
             return window.taken
         if more is not None:

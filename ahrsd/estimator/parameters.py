@@ -82,21 +82,20 @@ Kinds = tuple[tuple[Imperfections, ...], tuple[float, ...]]
 def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> Array:
     """Sigmas of turn (3), lag, scale, shape (5), place (6), bias (3): all instruments that may be.
 
-    Its axes are of one of the kinds, its lag is, its gyro's scales, its gyro's right angles and its
-    gyro's bias are, each whatever the others are: a sensor that was mounted askew need not be late.
-    And so is the place where it was driven.
+    Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
+    whatever the others are: a sensor that was mounted askew need not be late. And so is the place
+    where it was driven.
     """
     every = [
         (
             *[axes.turn_rad] * 3,
             late.lag_s,
             gyro.scale,
-            *[gyro.shape] * 2,
-            *[shears.shape] * 3,
+            *[gyro.shape] * 5,
             *[place] * 6,
             *[bias.bias_rad_s] * 3,
         )
-        for (axes, late, gyro, shears, bias), place in product(product(kinds, repeat=5), places)
+        for (axes, late, gyro, bias), place in product(product(kinds, repeat=4), places)
     ]
     found = np.array(every)
     found.flags.writeable = False

@@ -561,6 +561,11 @@ class Window:
         return max(self._beyond_chance, self._repeating())
 
     @property
+    def gyro_freedom(self) -> float:
+        """Degrees of freedom of the gyro's noise."""
+        return sum(epoch.residuals.gyro_freedom for epoch in self.epochs)
+
+    @property
     def left_over(self) -> bool:
         """Whether the model leaves over what is not noise, or calls it noise of the gyro."""
         loud = self.usual.gyro_rad_s > _LOUD_GYRO * self._guess.gyro_rad_s
