@@ -283,8 +283,17 @@ class Window:
         self._replace(which, places, outlier_sigma=p.outlier_sigma)
         found = [e.residuals for e in self.epochs]
         self.usual = noise.at_least(
-            noise.pooled(found, self._guess, self.parameters), _GYRO_LEAST * self._guess.gyro_rad_s
+            noise.pooled(found, self._guess, self.parameters, self._fitted()), _GYRO_LEAST * self._guess.gyro_rad_s
         )
+
+    def _fitted(self) -> float:
+        """Degrees of freedom of the gyro's noise that its matrix and its walking bias took away."""
+        used = 0.0 if np.array_equal(self.taken.gyro, np.eye(3)) else float(len(self.taken.numbers))
+        if self.taken.walk > 0.0:
+            for epoch, score in zip(self.epochs, scores_of(self.epochs), strict=True):
+                told = np.linalg.eigvalsh(score.information[9:, 9:]) / epoch.piece.walk
+                used += float(np.sum(told / (1.0 + told)))
+        return used
 
     def take_out(self, taken: TakenOut) -> None:
         """Take this out of every epoch of the window, and of those to come.
