@@ -282,9 +282,8 @@ class Window:
         ]
         self._replace(which, places, outlier_sigma=p.outlier_sigma)
         found = [e.residuals for e in self.epochs]
-        self.usual = noise.at_least(
-            noise.pooled(found, self._guess, self.parameters, self._fitted()), _GYRO_LEAST * self._guess.gyro_rad_s
-        )
+        found_noise = noise.pooled(found, self._guess, self.parameters, self._fitted())
+        self.usual = noise.at_least(found_noise, _GYRO_LEAST * self._guess.gyro_rad_s)
 
     def _fitted(self) -> float:
         """Degrees of freedom of the gyro's noise that its matrix and its walking bias took away."""
@@ -686,6 +685,7 @@ _EPOCHS = 6
 _STEPS = 128  # rows per epoch, at most twice that
 _DESCENT = 8  # Levenberg-Marquardt steps per start
 _FURTHER = 4  # times that those which do not agree yet go on
+_RIVAL = 8.0  # of log likelihood, by which another valley must be less likely
 _NEAR = 0.1  # sigmas from the best so far at which a descent need not go on
 _SAME = 1.0  # sigmas within which two answers are one
 _LOUD = 2.0  # residual variance over that of the fields' differences that the model left over
@@ -788,10 +788,18 @@ def _best(reached: Sequence[_Reached]) -> _Reached:
 
 
 def _apart(reached: Sequence[_Reached], graph: Graph) -> float:
-    """Sigmas from the best within which two blind ones are."""
+    """Sigmas from the best within which two blind ones are; or to the end of another valley that is
+    nearly as likely."""
     best = _best(reached)
-    temper, blind = graph.temper * best.heard, [r for r in reached if r.blind]
-    return float((*sorted(_distance(r.c, best, graph.moments, temper) for r in blind), np.inf)[1])
+    temper = graph.temper * best.heard
+    away = [(r, _distance(r.c, best, graph.moments, temper)) for r in reached]
+    near = float((*sorted(far for r, far in away if r.blind), np.inf)[1])
+    rivals = [
+        far
+        for r, far in away
+        if far >= _SAME and r.gain <= _GAIN * graph.temper and r.cost - best.cost < _RIVAL * temper
+    ]
+    return max([near, *rivals])
 
 
 def _further(
@@ -808,8 +816,9 @@ def _further(
         if one.gain > _GAIN * thin.graph.temper:
             out[k] = _gone_on(thin, one)
         elif not there and not one.mirrored:
-            mirrored = start.mirrored(one.c, fields)
-            out[k] = replace(_descend(thin, mirrored, bias, best, blind=one.blind), mirrored=True)
+            anew = _descend(thin, start.mirrored(one.c, fields), bias, best, blind=one.blind)
+            out[k] = replace(one, blind=False, mirrored=True)  # an end that stays one
+            out.append(replace(anew, mirrored=True))
     return out
 
 

@@ -95,9 +95,11 @@ def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(
     assert len(sure) >= 13
     ratio = np.concatenate([r.iron for r in sure])
     assert 0.95 < np.median(ratio) < 1.2
-    assert np.mean(ratio < 0.9) < 0.15 and ratio.min() > 0.6
-    assert np.mean(ratio > 1.5) < 0.15
+    # below it where axes and scales cannot be told apart: each is believed half, the bound has both
+    assert np.mean(ratio < 0.9) < 0.15 and ratio.min() > 0.5
+    assert np.mean(ratio > 1.5) < 0.08
     assert max(r.worst for r in sure) < 4.0
+    assert np.mean([r.nees for r in sure]) < 1.2
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
