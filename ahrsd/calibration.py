@@ -13,6 +13,7 @@ Checked by tests/vocabulary/test_calibration.py.
 from __future__ import annotations
 
 import contextlib
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,6 +110,9 @@ class Estimate:
                      another; None where it agrees
     widened_by:      what makes the most of the heading's sigma and what motion would shrink it;
                      empty where the sigma is small or nothing makes more than half of it
+    place_gauss:     by how much the field differs with the heading, as it does where it differs
+                     from place to place: rms of what is expected; it is in `covariance`. nan where
+                     nobody can tell
     """
 
     soft_iron: Array
@@ -130,6 +134,7 @@ class Estimate:
     gyro_misscaled: float = 0.0
     contradicted_s: float | None = None
     widened_by: str = ""
+    place_gauss: float = math.nan
 
     @property
     def correction(self) -> Affine:

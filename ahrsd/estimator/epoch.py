@@ -29,7 +29,7 @@ from ahrsd.estimator.graph import (
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
-from ahrsd.estimator.parameters import Imperfections, instruments
+from ahrsd.estimator.parameters import Kinds, instruments
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -51,7 +51,7 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron and instrument (see `instrument`): H (22, 22), g (22,) at c."""
+    """Quadratic of an epoch in iron and instrument (see `instrument`): H (28, 28), g (28,) at c."""
 
     H: Array
     g: Array
@@ -178,8 +178,12 @@ def place_borders(graph: Graph, begun: Sequence[WindowEpoch]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """A window's calibration c (9,), nodes by index, epochs and factors at one moment."""
+    """A window's calibration c (9,), nodes by index, epochs and factors at one moment.
 
+    damping: of the next step
+    """
+
+    damping: float
     c: Array
     nodes: dict[int, Node]
     epochs: list[WindowEpoch]
@@ -306,6 +310,12 @@ def _squares(
 # E) times too small, E symmetric and traceless (5). It is not asked for, only considered: what it
 # may do to the answer widens the answer.
 #
+# Place: the field in the world differs by place, and a vehicle that circles is at another place on
+# each heading: dh = G e, e the heading's cosine and sine, G (3, 2) in the world's axes. A part of
+# that is the same on all headings in the sensor and passes for hard iron, another for soft iron: no
+# fit shows them. dr/dG = -M R (axis) e / s_m / |h|, R from the field's direction and gravity. It is
+# only considered too, and of one of `parameters.PLACES`, as likely as what does show makes it.
+#
 # One Gauss-Newton step from the answer gives them beside M, b and the bias. On fast motion one
 # looks like another, so they are asked for together. Every epoch stands alone here, its borders
 # free.
@@ -315,21 +325,24 @@ def _squares(
 
 TURN, LAG, SCALE = slice(12, 15), 15, 16
 _ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
-_SIZE = 22
+PLACE = slice(22, 28)  # of how the field differs with where the sensor heads
+_SIZE = 28
 _X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
 _OF_ANGLE = np.r_[12:15, 16:22]
-_SCALES = np.r_[SCALE:_SIZE]
-_FIELD = np.ix_(np.r_[0:9, LAG, _SIZE], np.r_[0:9, LAG, _SIZE])  # gradient last
-_MOTION = np.ix_(np.r_[9:15, SCALE:23], np.r_[9:15, SCALE:23])
+_SCALES = np.r_[SCALE:22]
+_OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE, _SIZE], np.r_[9:15, SCALE:22, _SIZE]
+_FIELD, _MOTION = np.ix_(_OF_FIELD, _OF_FIELD), np.ix_(_OF_MOTION, _OF_MOTION)  # gradient last
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
-IMPERFECTIONS = ("axes", "lag", "scales", "bias")
-_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], np.r_[10:13])  # of what is considered
+IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
+_PLACE = np.r_[10:16]
+_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], _PLACE, np.r_[16:19])  # of what is considered
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
-_GYRO = np.r_[TURN, SCALE:_SIZE]  # what turns or scales the gyro's angles
+_GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
 GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
-_TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
+TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
 _WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
 _LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
+_STEEP = 0.05  # sine of an angle: less tells no heading
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
 
 
@@ -420,7 +433,7 @@ class InstrumentInformations:
         return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
 
     def whole(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-        """The same with the gyro's shape: H (N, 22, 22) and gradient (N, 22)."""
+        """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28)."""
         at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
         kept = self._kept
         if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
@@ -431,6 +444,19 @@ class InstrumentInformations:
         return kept[1]
 
 
+def of_rests(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs without motion: of the gyro's bias
+    alone, around that of their nodes."""
+    resting = [e for e in epochs if not e.turned]
+    H, g = np.zeros((len(resting), _SIZE, _SIZE)), np.zeros((len(resting), _SIZE))
+    for k, epoch in enumerate(resting):
+        factor = epoch.factor
+        H[k, _BIAS, _BIAS] = factor.H[_BIAS, _BIAS]
+        moved = graph.nodes[epoch.a].bias - factor.point.a.bias
+        g[k, _BIAS] = factor.g[_BIAS] + factor.H[_BIAS, _BIAS] @ moved
+    return H, g
+
+
 class FoldedInformation:
     """Information on iron, turn, lag and scale from epochs that left the window, as one Gaussian.
 
@@ -439,7 +465,7 @@ class FoldedInformation:
 
     def __init__(self) -> None:
         self._H: Array = np.zeros((_SIZE, _SIZE))
-        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x = [M, b, 0, turn, lag, scale, shape]
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x as `_place`
 
     @staticmethod
     def of_iron(graph: Graph, taken: TakenOut) -> FoldedInformation:
@@ -480,7 +506,7 @@ class FoldedInformation:
         self._eta = self._eta + H @ _place(c, taken) - g
 
     def at(self, c: Array, taken: TakenOut) -> tuple[Array, Array]:
-        """H (22, 22) and gradient (22,) there."""
+        """H (28, 28) and gradient (28,) there."""
         return self._H, self._H @ _place(c, taken) - self._eta
 
 
@@ -556,13 +582,13 @@ def instrument(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Considered:
-    """What is known of an instrument's imperfections (`_REST`, 13), and what they do to the answer.
+    """What is known of an instrument's imperfections (`_REST`, 19), and what they do to the answer.
 
-    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 13): what one of each
-    does to them; own (12,) their gradient; known (13, 13) and asked (13,): information and gradient
-    of the imperfections from the data, the answer following them; already (13,): what of them is
+    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 19): what one of each
+    does to them; own (12,) their gradient; known (19, 19) and asked (19,): information and gradient
+    of the imperfections from the data, the answer following them; already (19,): what of them is
     taken out of the data
-    disagree: how much the epochs disagree after a step (25,) of all
+    disagree: how much the epochs disagree after a step (31,) of all
     """
 
     alone: Array
@@ -599,8 +625,8 @@ class Considered:
         )
 
     def found(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
-        """Spread (..., 13, 13) over the temper, and what they are beyond what is taken out
-        (..., 13), of instruments like that (..., 13)."""
+        """Spread (..., 19, 19) over the temper, and what they are beyond what is taken out
+        (..., 19), of instruments like that (..., 19)."""
         pull = temper / sigmas**2
         spread = _inverses(self.known + pull[..., None] * np.eye(pull.shape[-1]))
         return spread, -(spread @ (self.asked + pull * self.already)[..., None])[..., 0]
@@ -611,78 +637,107 @@ class Considered:
         step = np.r_[-self.alone @ self.own + self.by_rest @ rest, rest]
         return min(most, max(1.0, self.disagree(step)))
 
-    def evidence(self, sigmas: Array, temper: float) -> Array:
-        """Log of how likely the data are of instruments like that (..., 13), up to a constant."""
+    def evidence(self, sigmas: Array, rest: Array, temper: float) -> Array:
+        """Log of how likely the data are of instruments like that (..., 19), up to a constant.
+
+        rest: what they were found to be
+        """
         sizes = sigmas[..., :, None] * sigmas[..., None, :]
         told = np.linalg.slogdet(np.eye(sigmas.shape[-1]) + self.known / temper * sizes)[1]
-        rest = self.found(sigmas, temper)[1]
         left = np.sum((rest @ self.known + 2.0 * self.asked) * rest, axis=-1) / temper
         left = left + np.sum(np.square((self.already + rest) / sigmas), axis=-1)
         return np.asarray(-0.5 * (left + told))
 
 
-def considered(
-    said: Considered, graph: Graph, kinds: Sequence[Imperfections]
-) -> tuple[Array, dict[str, Array]]:
-    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); and what
-    each of `IMPERFECTIONS` alone adds, which together may be more or less.
+@dataclass(frozen=True, slots=True, eq=False)
+class Weighed:
+    """All instruments that may be, at all places, against what the data say of them.
+
+    every (K, 19) their sigmas; evidence (K,); spread (K, 19, 19) and rest (K, 19) what the data
+    leave open of each and say that it is, beyond what is taken out already
+    """
+
+    said: Considered
+    every: Array
+    evidence: Array
+    spread: Array
+    rest: Array
+
+    @staticmethod
+    def of(said: Considered, graph: Graph, kinds: Kinds) -> Weighed:
+        """What an imperfection makes the epochs disagree is no noise."""
+        every = instruments(*kinds)
+        temper = said.temper(every.max(axis=0), graph.temper)
+        spread, rest = said.found(every, temper)
+        return Weighed(said, every, said.evidence(every, rest, temper), temper * spread, rest)
+
+    def likelier(self, which: Array | slice, told: float = TOLD) -> int | None:
+        """The likeliest of those in which some of `which` are larger than need be; None where it is
+        not likelier than the others by `told` nats."""
+        found, gain = self.against_plain(which)
+        return None if gain < told else found
+
+    def against_plain(self, which: Array | slice) -> tuple[int, float]:
+        """The likeliest of those in which some of `which` are larger than need be, and by how many
+        nats it is likelier than the likeliest of those in which all are as small as may be.
+
+        Whatever else is wrong with either is free: a field that differs by place may be what looks
+        like a gyro.
+        """
+        sized = self.every[:, which]
+        plain = np.all(sized == sized.min(axis=0), axis=1)
+        if plain.all():
+            return 0, -np.inf
+        others = np.where(plain, -np.inf, self.evidence)
+        return int(np.argmax(others)), float(others.max() - self.evidence[plain].max())
+
+
+def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:
+    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); what each
+    of `IMPERFECTIONS` alone adds, which together may be more or less; and by how much the field
+    differs with the heading, rms of what is expected of its six numbers [gauss].
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
     what they say that they are is an error of it.
     """
-    every, by_rest = np.array(instruments(kinds)), said.by_rest
-    # what an imperfection makes the epochs disagree is no noise
-    temper = said.temper(every.max(axis=0), graph.temper)
-    spread, rest = said.found(every, temper)
-    evidence = said.evidence(every, temper)
-    likely = np.exp(evidence - evidence.max())
+    by_rest, rest = weighed.said.by_rest, weighed.rest
+    likely = np.exp(weighed.evidence - weighed.evidence.max())
     likely /= likely.sum()
-    spread = temper * spread + rest[:, :, None] * rest[:, None, :]
-    mean = np.einsum("k,kij->ij", likely, spread)
+    mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
     added = by_rest @ mean @ by_rest.T
     each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
-    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True))
+    place = float(np.sqrt(np.mean(np.diag(mean)[_PLACE])))
+    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True)), place
 
 
-def walk_asked(
-    said: Considered, graph: Graph, kinds: Sequence[Imperfections], span_s: float
-) -> float:
+def walk_asked(weighed: Weighed, span_s: float) -> float:
     """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
 
     0 where an instrument that does not drift is as likely.
     """
-    every = np.array(instruments(kinds))
-    most, least = every.max(axis=0), every.min(axis=0)
-    temper = said.temper(most, graph.temper)
-    still = np.r_[most[:-3], least[-3:]]
-    if said.evidence(most, temper) - said.evidence(still, temper) < _TOLD:
-        return 0.0
-    drift = said.found(most, temper)[1][-3:]
+    found = weighed.likelier(slice(-3, None))
+    drift = np.zeros(3) if found is None else weighed.rest[found][-3:]
     return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
 
 
-def gyro_asked(said: Considered, graph: Graph, kinds: Sequence[Imperfections]) -> Array | None:
+def gyro_asked(weighed: Weighed, told: float) -> Array | None:
     """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
 
-    None where an instrument as its maker calibrated it is as likely, or the step is not worth it.
+    None where an instrument like that is not likelier than its maker's by `told` nats, unless some
+    of it is taken out already, or where the step is not worth it.
     """
-    every = np.array(instruments(kinds))
-    most, least = every.max(axis=0), every.min(axis=0)
-    temper = said.temper(most, graph.temper)
-    if not said.already.any():
-        plain = np.where(np.isin(np.arange(len(most)), GYRO_OF_ALL), least, most)
-        if said.evidence(most, temper) - said.evidence(plain, temper) < _TOLD:
-            return None
-    spread, rest = said.found(most, temper)
-    step = rest[GYRO_OF_ALL]
-    known = temper * spread[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
+    found = weighed.likelier(GYRO_OF_ALL, -np.inf if weighed.said.already.any() else told)
+    if found is None:
+        return None
+    step = weighed.rest[found][GYRO_OF_ALL]
+    known = weighed.spread[found][np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
     worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
     return step if worth > _WORTH_SIGMAS else None
 
 
 def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
-    """H (N, 25, 25) and g (N, 25): and by how much the gyro's bias came to be in all the epochs.
+    """H (N, 31, 31) and g (N, 31): and by how much the gyro's bias came to be in all the epochs.
 
     It moved at one rate; w_b is that of the newest epoch.
     """
@@ -734,8 +789,10 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
     columns[:, _OF_ANGLE] = -motion.scale * turn
     columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
     columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
+    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), graph.c)
+    columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
     _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
-    J = np.concatenate([field.by_x, late[:, None], field.r[:, None]], axis=1)
+    J = np.concatenate([field.by_x, late[:, None], place, field.r[:, None]], axis=1)
     K = np.concatenate([motion.by_bias, turn, motion.q[:, None]], axis=1)
     H = np.zeros((len(epochs), _SIZE + 1, _SIZE + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
@@ -747,6 +804,26 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
         own[_SCALES, _SIZE] -= _by_noise(epoch)
         epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
     return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+
+
+def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
+    """Residuals (3, 6, N) by a field that differs with the heading, gauss: north, east and down of
+    it, each with the heading's cosine and sine.
+
+    seen, down (N, 3): directions of the field and to the earth. Nothing where they do not tell.
+    """
+    down = np.nan_to_num(down)
+    east = np.cross(down, seen)
+    flat = np.linalg.norm(east, axis=1)[:, None]
+    told = flat > _STEEP
+    east, down = np.where(told, east / np.maximum(flat, _STEEP), 0.0), np.where(told, down, 0.0)
+    north = np.cross(east, down)
+    ahead = np.column_stack([north[:, 0], east[:, 0]])
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1), _STEEP)[:, None]
+    M = chain.symmetric(c[:6]) / np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
+    ahead = (field.by_x[0, 6] * ahead.T)[None]  # by_x holds - sqrt(weight) / s_m in that place
+    moved = np.stack([M @ axis.T for axis in (north, east, down)], axis=1)
+    return np.asarray((moved[:, :, None] * ahead[:, None]).reshape(3, 6, -1), dtype=np.float64)
 
 
 def _by_noise(epoch: WindowEpoch) -> Array:

@@ -255,15 +255,40 @@ class Moments:
 
 def retract(c: Array, dc: Array, moments: Moments) -> Array:
     """c = [M (6), b (3)] after a step dc; plainly c + dc where C would not stay positive."""
+    found = along_valley(c, dc, moments)
+    return np.asarray(c + dc) if found is None else found
+
+
+def along_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
+    """c after a step dc; None where the valley does not reach that far: C would not be positive."""
     M, dM = chain.symmetric(c[:6]), chain.symmetric(dc[:6])
     C = np.linalg.inv(M)
     dC = -C @ dM @ C
     d, dd = C @ c[6:], dC @ c[6:] + C @ dc[6:]
     if np.linalg.eigvalsh(C + dC)[0] <= 0:
-        return np.asarray(c + dc)
+        return None
     scale = np.sqrt(1.0 + moments.mean_square(dC, dd))
     new = np.linalg.inv((C + dC) / scale)
     return np.concatenate([chain.upper_triangle(new), new @ (d + dd) / scale])
+
+
+def way(c: Array, to: Array, moments: Moments) -> Array:
+    """The step dc (9,) after which `retract` is at another calibration; to - c where there is none.
+
+    With v = C m - d of each and s the scale that is restored, s^2 = 1 + mean |s v' - v|^2.
+    """
+    M = chain.symmetric(c[:6])
+    C = np.asarray(np.linalg.inv(M), dtype=np.float64)
+    other = np.asarray(np.linalg.inv(chain.symmetric(to[:6])), dtype=np.float64)
+    d, beyond = C @ c[6:], other @ to[6:]
+    own, theirs = moments.mean_square(C, d), moments.mean_square(other, beyond)
+    both = (moments.mean_square(C + other, d + beyond) - own - theirs) / 2
+    inside = both**2 + (1.0 + own) * (1.0 - theirs)
+    if both <= 0.0 or inside <= 0.0:
+        return np.asarray(to - c)
+    scale = (1.0 + own) / (both + np.sqrt(inside))
+    dC, dd = np.asarray(scale * other - C), np.asarray(scale * beyond - d)
+    return np.concatenate([chain.upper_triangle(-M @ dC @ M), M @ (dd - dC @ c[6:])])
 
 
 def curvature(c: Array, covariance: Array, moments: Moments) -> Array:

@@ -28,6 +28,7 @@ from ahrsd.samples import Array
 _MAD = 1.4826
 _GYRO_LIMIT = 1.5
 _FAR = 1.7  # beyond this ratio of the gyro's variance to the one assumed it is something else
+_LEAST_FREE = 0.2  # share of the freedom that is left at least, whatever was fitted
 # Degrees of freedom by which an epoch's noise is drawn to the usual one. The gyro has so few per
 # epoch that its noise per epoch would be mostly chance, and weighting by chance is biased.
 _STRENGTH_MAG, _STRENGTH_GYRO = 100.0, 3000.0
@@ -98,9 +99,14 @@ def residuals(
 
 
 def pooled(
-    found: Sequence[Residuals], guess: chain.Noise, parameters: EstimatorParameters
+    found: Sequence[Residuals],
+    guess: chain.Noise,
+    parameters: EstimatorParameters,
+    fitted: float = 0.0,
 ) -> chain.Noise:
     """The usual noise: all epochs together, without those three times noisier than the median.
+
+    fitted: degrees of freedom of the gyro's residuals that what was taken out of them has used up.
 
     The gyro's noise may not exceed its first guess by more than half: motion between samples makes
     that guess too large already, and what a wrong calibration leaves over must not be called noise
@@ -108,6 +114,8 @@ def pooled(
     """
     mag = np.array([(r.mag_gauss2, r.mag_freedom) for r in found])
     gyro = np.array([(r.gyro_rad2_s2, r.gyro_freedom) for r in found])
+    freedom = float(gyro[:, 1].sum())
+    gyro[:, 1] *= max(1.0 - fitted / freedom, _LEAST_FREE)
     limit = _GYRO_LIMIT * guess.gyro_rad_s
     return _floored(_pooled(mag), min(_pooled(gyro), limit), parameters)
 

@@ -22,13 +22,16 @@ from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
     GYRO_OF_ALL,
+    TOLD,
     Considered,
     Instrument,
     InstrumentInformations,
     TakenOut,
+    Weighed,
     considered,
     gyro_asked,
     instrument,
+    of_rests,
     walk_asked,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
@@ -117,6 +120,7 @@ _WIDENED = {
     "the correction that `ahrsd calibrate` of a recording gives for it",
     "lag": "the field's readings may be late: turn fast and slow, both ways",
     "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
+    "place": "the field may differ with place: repeat the motion at another place, away from steel",
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
 }
 _LEAN_RAD = float(np.radians(30.0))
@@ -294,7 +298,7 @@ _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at e
 _CHANGED = 2  # epochs one after the other that contradict the answer: the iron has changed
 _FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
-_AWAY, _AWAY_UNSETTLED = 3.0, 0.5
+_AWAY, _AWAY_UNSETTLED = 1.5, 0.5
 _LOOKS = 4  # of the first search
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
@@ -305,6 +309,7 @@ _LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is on
 _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
 _PASSES, _QUIETER = 8, 0.95  # over a gyro that is wrong; while the noise falls below that of itself
 _EXPLAINED = 1.5  # misfit of data that an instrument with imperfections explains
+_DOUBTFUL = -15.0  # nats from which a gyro that is wrong is tried where something is left over
 _MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which something else is wrong
 _SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
@@ -504,7 +509,7 @@ class Estimator:
             or (not window.folded and found.away > _AWAY)
         ):
             window.restart_at(found.c, found.bias)
-            window.track(everything=exactly, exactly=exactly, here=exactly)
+            window.track(everything=True, exactly=exactly, here=True)
         elif exactly or window.untried:
             window.track(everything=True, exactly=exactly)
         self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
@@ -520,27 +525,42 @@ class Estimator:
         What is wrong with a gyro is taken out only if the data are then explained: a field that
         differs by place asks for it too, and is not.
         """
-        late = self._take_out(window, gyro=False)
+        late = self._take_out(window)
         if self.parameters.imperfections:
-            trial, misscaled = window.copy(), self._misscaled
-            if self._take_out(trial, gyro=True) and self._explained(trial):
-                window, late = trial, True
-            else:
+            for told in (TOLD, _DOUBTFUL):
+                trial, misscaled = window.copy(), self._misscaled
+                if self._take_out(trial, gyro_told=told) and self._explained(trial, window, told):
+                    window, late = trial, True
+                    break
                 self._misscaled = misscaled
+                if not window.left_over:
+                    break
         self._informations = InstrumentInformations()  # nobody else asks before they are others
         return window, late
 
-    def _explained(self, window: Window) -> bool:
-        most = instruments(self.parameters.imperfections)
+    def _explained(self, trial: Window, before: Window, told: float) -> bool:
+        """Whether the data are explained once that is taken out; and, where the gyro was not likely
+        to be wrong before, likely to be."""
+        most = instruments(*self.parameters.kinds)
         limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
-        numbers = np.abs(window.taken.numbers)
-        return bool(window.graph.temper < _EXPLAINED and np.all(numbers < limit))
+        within = bool(np.all(np.abs(trial.taken.numbers) < limit))
+        if not within or trial.unexplained >= _EXPLAINED or told == TOLD:
+            return within and trial.unexplained < _EXPLAINED
+        weighed = self._weighed(trial)
+        if weighed is None:
+            return False
+        # what it left over passed for noise of the gyro, which is less likely by this
+        quieter = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
+        gain = weighed.against_plain(GYRO_OF_ALL)[1] + trial.gyro_freedom * quieter
+        return bool(gain > TOLD)
 
-    def _take_out(self, window: Window, *, gyro: bool) -> bool:
+    def _take_out(self, window: Window, *, gyro_told: float | None = None) -> bool:
         """Take out what is asked for until no more is; whether anything was.
 
-        gyro: what is wrong with it, too; then the noise that it passed for has to settle as well.
+        gyro_told: nats by which what is wrong with it must be told to be taken out too, None: it is
+        not; then the noise that it passed for has to settle as well.
         """
+        gyro = gyro_told is not None
         least, changed, quiet = _LAG_SIGMAS if window.taken.lag_s == 0.0 else 1.0, False, False
         for _ in range(_PASSES if gyro else _LAG_PASSES):
             found = self._instrument(window)
@@ -548,7 +568,7 @@ class Estimator:
                 break
             self._misscaled = found.misscaled
             more, sigma = found.lag_s
-            taken = self._gyro_out(window) if gyro else window.taken
+            taken = window.taken if gyro_told is None else self._gyro_out(window, gyro_told)
             if gyro and taken is window.taken and not changed:
                 break
             if abs(more) >= least * sigma:
@@ -559,7 +579,7 @@ class Estimator:
                 window.take_out(taken)
             elif not gyro or quiet:
                 break
-            window.track(everything=True)
+            window.track(everything=True, here=True)
             changed, quiet = True, window.usual.mag_gauss > _QUIETER * noise_gauss
         return changed
 
@@ -572,35 +592,36 @@ class Estimator:
         except np.linalg.LinAlgError:
             return None
 
-    def _considered(self, window: Window) -> Considered | None:
-        """What is known of the instrument's imperfections; None where they are not to be asked."""
+    def _weighed(self, window: Window) -> Weighed | None:
+        """What is known of the instrument and the place; None where they are not to be asked."""
         if not self.parameters.imperfections:
             return None
         before = window.folded_information.at(window.graph.c, window.taken)
         try:
-            said = self._informations.whole(window.epochs, window.graph)
-            moving = [e.data.time_s for e in window.epochs if e.turned]
-            times_s = np.array([(float(t[0]) + float(t[-1])) / 2 for t in moving])
+            moving = self._informations.whole(window.epochs, window.graph)
+            rests = of_rests(window.epochs, window.graph)
+            said = np.concatenate([moving[0], rests[0]]), np.concatenate([moving[1], rests[1]])
+            apart = sorted(window.epochs, key=lambda e: not e.turned)
+            times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in apart])
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            return Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
+            known = Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
+            return Weighed.of(known, window.graph, self.parameters.kinds)
         except np.linalg.LinAlgError:
             return None
 
-    def _gyro_out(self, window: Window) -> TakenOut:
+    def _gyro_out(self, window: Window, told: float) -> TakenOut:
         """What is to be taken out, with what else the gyro's axes and scales are asked for."""
-        said, kinds = self._considered(window), self.parameters.imperfections
-        if said is None:
+        weighed = self._weighed(window)
+        if weighed is None:
             return window.taken
-        taken, moving = window.taken, [e.data.time_s for e in window.epochs if e.turned]
+        taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
         try:
-            more = gyro_asked(said, window.graph, kinds)
-            walk = walk_asked(
-                said, window.graph, kinds, float(moving[-1][-1]) - float(moving[0][0])
-            )
+            more = gyro_asked(weighed, told)
         except np.linalg.LinAlgError:
             return window.taken
         if more is not None:
             taken = taken.with_gyro(more)
+        walk = walk_asked(weighed, float(last.time_s[-1] - first.time_s[0]))
         return taken if walk == 0.0 else replace(taken, walk=float(np.hypot(taken.walk, walk)))
 
     @staticmethod
@@ -627,15 +648,13 @@ class Estimator:
         known = window.lag_known() if window.taken.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array]]:
-        """What an instrument that is not perfect adds to the covariance (12, 12), and each part."""
-        said = self._considered(window)
-        try:
-            if said is not None:
-                return considered(said, window.graph, self.parameters.imperfections)
-        except np.linalg.LinAlgError:
-            pass
-        return np.zeros((12, 12)), {}
+    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array], float]:
+        """What an instrument that is not perfect adds to the covariance (12, 12), and each part;
+        by how much the field differs with the heading, gauss, nan where nobody can tell."""
+        weighed = self._weighed(window)
+        if weighed is None:
+            return np.zeros((12, 12)), {}, float("nan")
+        return considered(weighed)
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -669,7 +688,7 @@ class Estimator:
         observed = observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        by_instrument, parts = self._by_imperfections(window)
+        by_instrument, parts, place_gauss = self._by_imperfections(window)
         tempered = window.covariance()
         divided = tempered * self._parted
         parts |= motion_and_misfit(window.explained_covariance(), divided, self._whitening)
@@ -710,4 +729,5 @@ class Estimator:
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
             widened_by=advice.widened_by(parts, covariance, turned),
+            place_gauss=place_gauss,
         )

@@ -59,6 +59,16 @@ def sphere_start(field: Array) -> Array | None:
     return np.concatenate([chain.upper_triangle(np.eye(3) * np.sqrt(r2)), solution[:3] + centre])
 
 
+def mirrored(c: Array, field: Array) -> Array:
+    """c with its hard iron on the other side of the plane that lies best among fields (N, 3)."""
+    centre = field.mean(axis=0)
+    away = field - centre
+    normal = np.linalg.eigh(away.T @ away)[1][:, 0]
+    out = c.copy()
+    out[6:9] += 2.0 * normal * (normal @ (centre - c[6:9]))
+    return out
+
+
 def _orientation(data: chain.EpochData) -> Array:
     """R_0k of every step against the epoch's first, (n, 3, 3)."""
     return so3.products(so3.exp(np.vstack([np.zeros((1, 3)), data.angle_b_rad[1:]])))

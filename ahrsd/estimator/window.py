@@ -56,11 +56,12 @@ from ahrsd.estimator.graph import (
     Node,
     SingularError,
     Stack,
+    along_valley,
     bias_prior,
     chain_step,
     epoch_factor,
-    retract,
     sigmas,
+    way,
 )
 from ahrsd.estimator.noise import DirectionCells, variance_inflation
 from ahrsd.estimator.parameters import EstimatorParameters
@@ -68,6 +69,7 @@ from ahrsd.samples import Array
 
 _WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
 _GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
+_LOUD_GYRO = 1.2  # of the guess: more is something else than the noise of its differences
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
 _ANOTHER_REST = 0.02  # rad between two directions at rest
 _SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
@@ -280,9 +282,17 @@ class Window:
         ]
         self._replace(which, places, outlier_sigma=p.outlier_sigma)
         found = [e.residuals for e in self.epochs]
-        self.usual = noise.at_least(
-            noise.pooled(found, self._guess, self.parameters), _GYRO_LEAST * self._guess.gyro_rad_s
-        )
+        found_noise = noise.pooled(found, self._guess, self.parameters, self._fitted())
+        self.usual = noise.at_least(found_noise, _GYRO_LEAST * self._guess.gyro_rad_s)
+
+    def _fitted(self) -> float:
+        """Degrees of freedom of the gyro's noise that its matrix and its walking bias took away."""
+        used = 0.0 if np.array_equal(self.taken.gyro, np.eye(3)) else float(len(self.taken.numbers))
+        if self.taken.walk > 0.0:
+            for epoch, score in zip(self.epochs, scores_of(self.epochs), strict=True):
+                told = np.linalg.eigvalsh(score.information[9:, 9:]) / epoch.piece.walk
+                used += float(np.sum(told / (1.0 + told)))
+        return used
 
     def take_out(self, taken: TakenOut) -> None:
         """Take this out of every epoch of the window, and of those to come.
@@ -388,10 +398,13 @@ class Window:
     def snapshot(self) -> Snapshot:
         """The whole state; cheap, because epochs, nodes and factors are replaced, never changed."""
         graph = self.graph
-        return Snapshot(graph.c, dict(graph.nodes), list(self.epochs), list(graph.factors))
+        return Snapshot(
+            self._damping, graph.c, dict(graph.nodes), list(self.epochs), list(graph.factors)
+        )
 
     def restore(self, kept: Snapshot) -> None:
         """Back to a snapshot of the same epochs."""
+        self._damping = kept.damping
         self.graph.c, self.graph.nodes = kept.c, dict(kept.nodes)
         self.epochs, self.graph.factors = list(kept.epochs), list(kept.factors)
 
@@ -550,6 +563,22 @@ class Window:
         noise = self.usual.mag_gauss, self._guess.mag_gauss
         return variance_inflation(cells, *noise, smooth=smooth)
 
+    @property
+    def unexplained(self) -> float:
+        """Mean square of what the model leaves over, over that of noise; 1: no more than chance."""
+        return max(self._beyond_chance, self._repeating())
+
+    @property
+    def gyro_freedom(self) -> float:
+        """Degrees of freedom of the gyro's noise."""
+        return sum(epoch.residuals.gyro_freedom for epoch in self.epochs)
+
+    @property
+    def left_over(self) -> bool:
+        """Whether the model leaves over what is not noise, or calls it noise of the gyro."""
+        loud = self.usual.gyro_rad_s > _LOUD_GYRO * self._guess.gyro_rad_s
+        return loud or self.unexplained > 1.0
+
     def covariance(self) -> Array:
         """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
 
@@ -598,12 +627,16 @@ _DRIFTED = 0.3  # of the field's noise: what a bias other than assumed makes of 
 
 
 def bends(epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information: Array) -> Array:
-    """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest."""
+    """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest.
+
+    Infinite where no valley leads there: nothing is known of such a way.
+    """
     known: dict[int, float] = {}
     for epoch in epochs:
         at = epoch.factor.point.c
         if epoch.turned and id(at) not in known:
-            known[id(at)] = sigmas(retract(at, c - at, moments) - c, information)
+            there = along_valley(at, c - at, moments)
+            known[id(at)] = np.inf if there is None else sigmas(there - c, information)
     return np.array([known[id(e.factor.point.c)] if e.turned else 0.0 for e in epochs])
 
 
@@ -651,6 +684,8 @@ def outdated(
 _EPOCHS = 6
 _STEPS = 128  # rows per epoch, at most twice that
 _DESCENT = 8  # Levenberg-Marquardt steps per start
+_FURTHER = 4  # times that those which do not agree yet go on
+_RIVAL = 8.0  # of log likelihood, by which another valley must be less likely
 _NEAR = 0.1  # sigmas from the best so far at which a descent need not go on
 _SAME = 1.0  # sigmas within which two answers are one
 _LOUD = 2.0  # residual variance over that of the fields' differences that the model left over
@@ -682,11 +717,23 @@ class SearchResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reached:
+    """Where a descent is. blind: it knows nothing of the others; gain: of log likelihood in the
+    last steps; mirrored: it began at a mirror image; kept: from where it can go on."""
+
     cost: float
     c: Array
     bias: Array
     information: Array | None
     loud: float
+    blind: bool
+    gain: float
+    mirrored: bool
+    kept: Snapshot
+
+    @property
+    def heard(self) -> float:
+        """Residual variance that it leaves, where that is more than chance; else 1."""
+        return self.loud if self.loud > _LOUD else 1.0
 
 
 def search(
@@ -713,39 +760,93 @@ def search(
     )
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
-    own = _descend(thin, graph.c, graph.nodes[graph.last].bias, None)
     starts = [start.linear_start(whole), start.sphere_start(fields)]
-    best, independent = own, []
-    if np.array_equal(graph.c, present):
-        independent.append(own)
-    else:
+    first_look = bool(np.array_equal(graph.c, present))
+    if not first_look:
         starts.insert(0, present)
     known = [c for c in starts if c is not None]
     if window.loud > 1.0:
         known = [graph.with_held(c) for c in known]
+    bias = graph.nodes[graph.last].bias
+    reached = [_descend(thin, graph.c, bias, None, blind=first_look)]
     for c in known:
         if _positive(c):
-            independent.append(_descend(thin, c, present_bias, best))
-            best = min(best, independent[-1], key=lambda r: r.cost)
-    loud = best.loud if best.loud > _LOUD else 1.0
-    away = _distance(graph.c, best, graph.temper * loud if loud > 1.0 else 1.0)
-    apart = sorted(_distance(r.c, best, graph.temper * loud) for r in independent)
-    gain = (own.cost - best.cost) / loud
-    return SearchResult(best.c, best.bias, away, gain, (*apart, np.inf)[1], loud)
+            reached.append(_descend(thin, c, present_bias, _best(reached)))
+    for _ in range(_FURTHER):
+        if _apart(reached, graph) < _SAME:
+            break
+        reached = _further(thin, reached, fields, present_bias)
+    best = _best(reached)
+    temper = graph.temper * best.heard if best.heard > 1.0 else 1.0
+    away = _distance(graph.c, best, graph.moments, temper)
+    gain = (reached[0].cost - best.cost) / best.heard
+    return SearchResult(best.c, best.bias, away, gain, _apart(reached, graph), best.heard)
+
+
+def _best(reached: Sequence[_Reached]) -> _Reached:
+    return min(reached, key=lambda r: r.cost)
+
+
+def _apart(reached: Sequence[_Reached], graph: Graph) -> float:
+    """Sigmas from the best within which two blind ones are; or to the end of another valley that is
+    nearly as likely."""
+    best = _best(reached)
+    temper = graph.temper * best.heard
+    away = [(r, _distance(r.c, best, graph.moments, temper)) for r in reached]
+    near = float((*sorted(far for r, far in away if r.blind), np.inf)[1])
+    rivals = [
+        far
+        for r, far in away
+        if far >= _SAME and r.gain <= _GAIN * graph.temper and r.cost - best.cost < _RIVAL * temper
+    ]
+    return max([near, *rivals])
+
+
+def _further(
+    thin: Window, reached: Sequence[_Reached], fields: Array, bias: Array
+) -> list[_Reached]:
+    """Descents that were not at their ends or at the best go on; one that ended elsewhere begins
+    anew behind the plane of the fields.
+
+    Turns about one axis look nearly the same from both sides of the plane that they draw.
+    """
+    out, best = list(reached), _best(reached)
+    for k, one in enumerate(reached):
+        there = one is best or _distance(one.c, best, thin.graph.moments, 1.0) < _NEAR
+        if one.gain > _GAIN * thin.graph.temper:
+            out[k] = _gone_on(thin, one)
+        elif not there and not one.mirrored:
+            anew = _descend(thin, start.mirrored(one.c, fields), bias, best, blind=one.blind)
+            out[k] = replace(one, blind=False, mirrored=True)  # an end that stays one
+            out.append(replace(anew, mirrored=True))
+    return out
 
 
 def _positive(c: Array) -> bool:
     return bool(np.linalg.eigvalsh(chain.symmetric(c[:6]))[0] > 0.0)
 
 
-def _descend(thin: Window, c: Array, bias: Array, best: _Reached | None) -> _Reached:
+def _descend(
+    thin: Window, c: Array, bias: Array, best: _Reached | None, *, blind: bool = True
+) -> _Reached:
     """Downhill from c, until it is clear that this leads to the best so far."""
     thin.restart_at(c, bias)
 
     def near(at: Array) -> bool:
-        return best is not None and _distance(at, best, 1.0) < _NEAR
+        return best is not None and _distance(at, best, thin.graph.moments, 1.0) < _NEAR
 
-    cost = thin.optimise(_DESCENT, near)
+    return _reached(thin, thin.optimise(_DESCENT, near), np.inf, blind=blind)
+
+
+def _gone_on(thin: Window, before: _Reached) -> _Reached:
+    """Further downhill from where it was."""
+    thin.restore(before.kept)
+    cost = thin.optimise(_DESCENT)
+    found = _reached(thin, cost, before.cost - cost, blind=before.blind)
+    return replace(found, mirrored=before.mirrored)
+
+
+def _reached(thin: Window, cost: float, gain: float, *, blind: bool) -> _Reached:
     graph = thin.graph
     try:
         information = np.asarray(np.linalg.inv(graph.covariance()[:9, :9]), dtype=np.float64)
@@ -753,11 +854,15 @@ def _descend(thin: Window, c: Array, bias: Array, best: _Reached | None) -> _Rea
         information = None
     found = thin.epochs[0].residuals
     loud = found.mag_gauss2 / found.mag_freedom / thin.usual.mag_gauss**2
-    bias_reached = graph.nodes[graph.last].bias.copy()
-    return _Reached(cost, graph.c.copy(), bias_reached, information, loud)
+    bias = graph.nodes[graph.last].bias.copy()
+    kept = thin.snapshot()
+    return _Reached(
+        cost, graph.c.copy(), bias, information, loud, blind, gain, mirrored=False, kept=kept
+    )
 
 
-def _distance(c: Array, best: _Reached, temper: float) -> float:
+def _distance(c: Array, best: _Reached, moments: Moments, temper: float) -> float:
+    """In sigmas of the best, along the valley: straight across it a bend looks far."""
     if best.information is None:
         return float(np.inf)
-    return sigmas(c - best.c, best.information / temper)
+    return sigmas(way(best.c, c, moments), best.information / temper)

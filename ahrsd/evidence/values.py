@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Literal
@@ -52,6 +53,7 @@ class EstimateFacts:
     """What the estimator says about itself.
 
     widened_by: what makes the most of the heading's sigma and what would shrink it; empty: nothing
+    place_gauss: by how much the field differs with the heading; nan: unknown
     """
 
     converged: bool
@@ -59,6 +61,7 @@ class EstimateFacts:
     score: float
     heading_sigma_deg: float
     widened_by: str = ""
+    place_gauss: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

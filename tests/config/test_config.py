@@ -173,7 +173,8 @@ def test_the_estimators_defaults_have_one_source():
     assert Config().estimator.parameters() == EstimatorParameters()
     names = {field.name for field in dataclasses.fields(EstimatorParameters)}
     assert set(type(Config().estimator).model_fields) - {"warm_start_s"} == names - {
-        "imperfections"
+        "imperfections",
+        "places",
     }
 
 

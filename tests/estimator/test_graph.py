@@ -24,6 +24,7 @@ from ahrsd.estimator.graph import (
     epoch_factor,
     gap_factor,
     retract,
+    way,
 )
 
 SIGMA = np.r_[np.full(6, 0.3), np.full(3, 0.5)]
@@ -340,3 +341,31 @@ def test_curvature_is_what_the_straight_covariance_misses():
     added = curvature(C9, np.outer(step, step) + 1e-16 * np.eye(9), moments)
     assert np.trace(expected) > 0
     np.testing.assert_allclose(added, expected, atol=0.12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("height", [0.0, 0.3, 0.8])
+def test_the_way_to_a_calibration_is_the_step_that_leads_there(height):
+    _, moments = planar(height)
+    rng = np.random.default_rng(4)
+    for size in (1e-3, 0.05, 0.15):
+        dc = size * rng.normal(size=9)
+        there = retract(C9, dc, moments)
+        assert np.allclose(way(C9, there, moments), dc, atol=1e-10)
+
+
+def test_calibrations_along_the_valley_are_as_near_as_the_data_say():
+    """Two that explain a planar turn alike: the plain difference is far across the valley."""
+    u, moments = planar(0.3)
+    dc = np.r_[chain.upper_triangle(0.3 * 0.9 * M), -0.9 * M[:, 2]]
+    there = retract(C9, dc, moments)
+    columns = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], 2)
+    along = np.linalg.norm(columns @ way(C9, there, moments) - columns @ dc)
+    straight = np.linalg.norm(columns @ (there - C9) - columns @ dc)
+    assert along < 1e-9
+    assert straight > 0.1
+
+
+def test_no_way_leads_to_the_other_side():
+    _, moments = planar(0.3)
+    beyond = np.r_[-C9[:6], C9[6:]]
+    np.testing.assert_array_equal(way(C9, beyond, moments), beyond - C9)

@@ -13,6 +13,7 @@ import pieces
 import pytest
 
 from ahrsd import so3
+from ahrsd.diagnosis.ordinary import TABLE
 from ahrsd.estimator.epoch import with_drift
 from ahrsd.estimator.online import (
     WHOLE,
@@ -21,7 +22,9 @@ from ahrsd.estimator.online import (
     motion_and_misfit,
     turned_heading_deg,
 )
-from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, EstimatorParameters
+from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, PLACES, EstimatorParameters
+from ahrsd.montecarlo import nuisances
+from ahrsd.montecarlo.cramer_rao import Trajectory
 from ahrsd.simulation import ScenarioSettings, simulate
 
 #: rolls, pitches and turns at once, as a diver does
@@ -292,3 +295,65 @@ def test_what_left_the_window_counts():
     folded = answer(made, parameters=parameters)
     whole = answer(made)
     assert np.all(folded.sigma[6:9] < 2.0 * whole.sigma[6:9])
+
+
+def at_a_place(made, seed, size_gauss):
+    """The same drive where the field differs with the heading: six numbers of this size."""
+    G = np.random.default_rng([seed, 5]).normal(0.0, size_gauss, (3, 2))
+    attitude = nuisances.attitude(
+        Trajectory(made.field_b_gauss, made.rate_b_rad_s, made.block.dt_s)
+    )
+    heading = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
+    ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+    more = np.einsum("nji,nj->ni", attitude, ahead @ G.T) @ pieces.SOFT_IRON
+    return replace(made, block=replace(made.block, raw_b_gauss=made.block.raw_b_gauss + more))
+
+
+LEVEL_AND_LEANING = (("circles", 120.0), ("roll", 40.0), ("pitch", 40.0), ("circles", 60.0))
+CIRCLES = (("circles", 160.0),)
+
+
+@pytest.mark.parametrize("motion", [CIRCLES, LEVEL, LEVEL_AND_LEANING], ids=["c", "l", "ll"])
+def test_a_field_that_differs_with_the_heading_is_within_the_sigmas(motion):
+    """What of it is the same on all headings is taken for hard iron, and no fit shows that."""
+    off = []
+    for seed in range(8):
+        made = at_a_place(pieces.drive(motion, seed), seed, 5e-3)
+        found = answer(made)
+        off.append(beyond(made, found))
+        assert 1e-3 < found.place_gauss < 2e-2
+    assert max(off) < 3.0
+
+
+@pytest.mark.parametrize("motion", [LEVEL, LEVEL_AND_LEANING], ids=["l", "ll"])
+def test_where_the_field_is_the_same_everywhere_the_data_say_so(motion):
+    for seed in range(4):
+        found = answer(pieces.drive(motion, seed))
+        assert found.place_gauss < 2e-4
+
+
+def test_what_no_motion_tells_of_a_place_is_as_large_as_places_are():
+    """Without gravity nobody knows where the sensor heads."""
+    made = pieces.drive(LEVEL, 1)
+    nowhere = replace(made.block, accel_b_m_s2=np.full_like(made.block.accel_b_m_s2, np.nan))
+    found = answer(replace(made, block=nowhere))
+    assert found.place_gauss == pytest.approx(np.sqrt(np.mean(np.square(PLACES))), rel=1e-3)
+
+
+def test_the_price_of_places_where_the_motion_is_rich():
+    run = simulate(ScenarioSettings("wam", "rov", seed=3))
+    sigmas = []
+    for places in ((1e-6,), PLACES):
+        estimator = Estimator(EstimatorParameters(places=places), at_once=WHOLE)
+        for block in run.blocks(1000):
+            estimator.add(block)
+        sigmas.append(estimator.finish().sigma)
+    assert np.max(sigmas[1] / sigmas[0]) < 1.03
+
+
+def test_places_are_as_large_as_real_recordings_say():
+    """Of what differs by place or attitude: the middle is among them, and what is small as well."""
+    for name in ("world", "by_attitude"):
+        row = TABLE.components[name]
+        assert PLACES[1] < 2.0 * row.from_on()
+        assert PLACES[1] < row.median < PLACES[-1]

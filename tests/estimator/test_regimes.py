@@ -6,13 +6,18 @@ The long form is tests/benchmarks/estimator/bench_regimes.py.
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pieces
 import pytest
 
+from ahrsd.estimator.graph import Moments
 from ahrsd.estimator.online import Estimator
+from ahrsd.estimator.parameters import ASSEMBLED, EstimatorParameters
+from ahrsd.estimator.window import bends
 from ahrsd.samples import SampleBlock
 
 REGIMES = {
@@ -90,9 +95,11 @@ def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(
     assert len(sure) >= 13
     ratio = np.concatenate([r.iron for r in sure])
     assert 0.95 < np.median(ratio) < 1.2
-    assert np.mean(ratio < 0.9) < 0.15 and ratio.min() > 0.6
-    assert np.mean(ratio > 1.5) < 0.15
+    # below it where axes and scales cannot be told apart: each is believed half, the bound has both
+    assert np.mean(ratio < 0.9) < 0.15 and ratio.min() > 0.5
+    assert np.mean(ratio > 1.5) < 0.08
     assert max(r.worst for r in sure) < 4.0
+    assert np.mean([r.nees for r in sure]) < 1.2
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -141,3 +148,48 @@ def test_a_rest_before_the_bias_is_known_is_no_noise():
     found = pieces.answer(made)
     assert found.noise_mag_gauss == pytest.approx(pieces.MAG_GAUSS, rel=0.05)
     assert pieces.ratios(made, found)[:9].max() < 1.5
+
+
+def level(seed, seconds=240.0, mag_gauss=2e-3):
+    """Turns about one axis, nearly level, with a noisy magnetometer: (n,) heading and the drive."""
+    made = pieces.drive((("circles", seconds),), seed, rate_hz=20.0)
+    louder = mag_gauss * np.random.default_rng(seed).normal(size=made.field_b_gauss.shape)
+    return replace(made, block=replace(made.block, raw_b_gauss=made.block.raw_b_gauss + louder))
+
+
+def test_level_turns_end_in_one_answer():
+    """The likelihood has a valley there that takes many steps, and its mirror image: all starts are
+    followed until two agree, and what is announced is not that they do not."""
+    for seed in range(8):
+        made = level(seed)
+        found = pieces.answer(made, at_once=32)
+        assert found.converged
+        assert found.misfit < 1.5
+        off = np.abs(made.errors(found))[6:9] / found.sigma[6:9]
+        assert off.max() < 3.5
+        assert found.sigma[8] < 0.15
+
+
+def test_no_way_is_straight_where_the_matrix_would_not_stay_positive():
+    at = np.r_[np.array([0.4, 0.0, 0.0, 0.4, 0.0, 0.03]), np.zeros(3)]
+    there = at.copy()
+    there[5] += 0.2  # C zz would fall from 33 by more than that
+    factor = SimpleNamespace(point=SimpleNamespace(c=at))
+    epoch, resting = (SimpleNamespace(turned=t, factor=factor) for t in (True, False))
+    found = bends([epoch, resting], there, Moments(), np.eye(9))
+    assert np.isinf(found[0])
+    assert found[1] == 0.0
+
+
+def test_rests_tell_that_the_bias_drifts():
+    """Two rolls between rests: the gyro's bias at both rests is known, and it has moved."""
+    made = pieces.drive((("rest", 50.0), ("roll", 60.0), ("roll", 60.0), ("rest", 50.0)), 3)
+    time_s = made.block.time_s
+    drift = (time_s / time_s[-1] - 1.0)[:, None] * np.array([2e-3, -1e-3, 2e-3])
+    gyro = made.block.gyro_b_rad_s + drift
+    made = replace(made, block=replace(made.block, gyro_b_rad_s=gyro))
+    found = pieces.answer(made, at_once=32, parameters=EstimatorParameters())
+    assert found.misfit < 2.0
+    sigmas = np.abs(made.errors(found)) / found.sigma
+    assert sigmas.max() < 3.5
+    assert np.all(found.sigma[6:9] < 3.0 * pieces.bound_sigmas(made, kind=ASSEMBLED)[6:9])

@@ -92,3 +92,12 @@ def test_a_magnet_that_comes_while_the_gyro_rests_is_no_turn_and_a_steady_turn_i
     assert not turned(data, bias)
     steady = data.angle_b_rad + np.array([0.0, 0.0, 0.02]) * data.dt_s[:, None]
     assert turned(replace(data, angle_b_rad=steady), bias)
+
+
+def test_a_mirrored_start_is_on_the_other_side_of_the_plane_of_the_fields():
+    heading = np.linspace(0.0, 2 * np.pi, 50)
+    level = np.column_stack([0.2 * np.cos(heading), 0.2 * np.sin(heading), np.full(50, 0.4)])
+    c = np.r_[chain.upper_triangle(M), 0.1, -0.2, 0.05]
+    found = start.mirrored(c, level)
+    np.testing.assert_allclose(found[6:], [0.1, -0.2, 0.75], atol=1e-12)
+    np.testing.assert_array_equal(found[:6], c[:6])
