@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -18,12 +19,19 @@ from ahrsd.diagnosis.facts import matters, of_fact, stopped
 from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import baseline, fit_null, unusable
+from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import answered
 from ahrsd.diagnosis.pauses import without_jumps
-from ahrsd.diagnosis.problem import model_at_rate, problem_of
+from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 
 NOTE = "by the engine one-model, which is experimental"
+
+
+def begun(track: Track, spec: Spec, library: Mapping[str, Effect]) -> tuple[Problem, NullFit]:
+    """A track that hygiene has put right at its working rate, and the fit of a null to it."""
+    problem, cold = problem_of(broken_where_unsampled(track), spec, library, LIMITS)
+    return problem, fit_null(problem.track, problem.spec, cold, walk=False)
 
 
 def diagnose(
@@ -46,8 +54,7 @@ def diagnose(
     notes = (NOTE, *jumped, *notes, *(fact.words for fact in facts if not matters(fact)))
     if any(fact.stops for fact in facts):
         return stopped(recording, [fact for fact in facts if fact.stops], library, notes)
-    problem, cold = problem_of(put_right(track, facts), spec or Spec(), library, LIMITS)
-    start = fit_null(problem.track, problem.spec, cold, walk=False)
+    problem, start = begun(put_right(track, facts), spec or Spec(), library)
     answer, model = answered(problem, start, library)
     something = bool(said or answer.findings or answer.unexplained.detected)
     return Diagnosis(

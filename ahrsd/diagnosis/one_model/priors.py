@@ -44,6 +44,9 @@ ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
 
 #: of a delay between the sensors, s: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
 ORDINARY_LAG_S = 0.04
+#: turn within a step, rad, from which on its gyro's sample does not tell it: a rate that goes from
+#: nothing to twice its mean within the step leaves a sixth of it, 3 degrees
+SAMPLED_TURN_RAD = 0.3
 #: how much of a delay is a filter's, 1 all of it
 LAG_IS_FILTER = 0.5
 
