@@ -242,6 +242,22 @@ def as_columns_say(point: Point, components: Sequence[Component]) -> Point:
     return replace(point, filtered=again, values=values, terms_mag=mag, terms_gyro=gyro)
 
 
+def unread(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point:
+    """The same point without the magnetometer's readings of some spans, from and to, s.
+
+    The gyro carries the field across.
+    """
+    recorded = point.problem.recorded
+    mag = recorded.mag_b_gauss.copy()
+    for begin_s, end_s in spans_s:
+        mag[(recorded.time_s >= begin_s) & (recorded.time_s <= end_s)] = np.nan
+    problem = replace(point.problem, recorded=replace(recorded, mag_b_gauss=mag))
+    problem = problem.lagging(problem.lag_s)
+    model = point.filtered.model
+    filtered = run_filter(problem.track, model, point.terms_mag, point.terms_gyro)
+    return replace(point, problem=problem, filtered=filtered)
+
+
 def regained(point: Point) -> Point:
     """The same point with the filter's noise estimated anew, and gains of that."""
     problem, mag, gyro = point.problem, point.terms_mag, point.terms_gyro

@@ -143,7 +143,7 @@ def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
     there = rich.judged(moved(here.base.made, here.base.whole, here.at, delayed=False), EFFECTS, ())
     made, values = there.base.made, there.base.made.point.values
     known = {key: made.seen[key].component for key in values if key != LAG}
-    taken, _ = added_by(len(track), known, {key: values[key] for key in known})
+    taken, _ = added_by(len(made.context.track), known, {key: values[key] for key in known})
     assert np.max(np.abs(taken)) > 0.02
     np.testing.assert_allclose(made.point.terms_mag, taken, atol=1e-12)
     assert there.nats > here.nats
