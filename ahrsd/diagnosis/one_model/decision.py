@@ -8,18 +8,22 @@ course is as sure, or where a part of the ordinary remainder is beyond its 95 %.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.diagnosis.diagnosis import Finding, Share, Unexplained, Value, Where
+from ahrsd.diagnosis.confound import separating_manoeuvre
+from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
+from ahrsd.diagnosis.prior import prior_of
+from ahrsd.diagnosis.validate import heading_error_deg
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
@@ -96,12 +100,15 @@ def _drifting(
     mine, other = (form.gyro, course.gyro) if form.mag is None else (form.mag, course.mag)
     if mine is None or other is None:
         raise ValueError(f"{effect.identifier} and {key} are not of one sensor")
-    nearest = np.linalg.pinv(mine.reshape(-1, mine.shape[2])) @ other.reshape(-1, other.shape[2])
+    # about their means: a constant is the calibration's bias
+    X, Y = ((one - one.mean(axis=0)).reshape(-1, one.shape[2]) for one in (mine, other))
+    nearest = np.linalg.pinv(X) @ Y
     value, deviation = coefficients(all_sets, best, key)
     drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
     sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
     kept = {k: v for k, v in setting.items() if k != "searched"}
-    finding = _found(effect, sure, (), _where(all_sets, best, key), drift, unsure, kept, odds)
+    finding = _found(effect, sure, _where(all_sets, best, key), drift, unsure, kept, odds)
+    finding = replace(finding, cost_if_left_out=_cost(all_sets, best, key))
     return finding, Term(effect.identifier, drift, unsure, kept)
 
 
@@ -208,19 +215,25 @@ def _told(
     setting = {k: v for k, v in one.setting.items() if k != "searched"}
     share = float(shares.get(name, 1.0) * sure)
     where = _where(all_sets, best, key)
-    finding = _found(effect, share, others, where, value, deviation, setting, odds)
+    close = [one.effect for one in others]
+    finding = replace(
+        _found(effect, share, where, value, deviation, setting, odds),
+        alternatives=others,
+        cost_if_left_out=_cost(all_sets, best, key),
+        separate_from=separating_manoeuvre(library, name, close) if close else None,
+    )
     return finding, Term(name, value, deviation, setting)
 
 
 def _found(
-    effect: Effect, confidence: float, others: tuple[Share, ...], where: Where, value: Array,
-    deviation: Array, setting: Setting, odds: float,
+    effect: Effect, confidence: float, where: Where, value: Array, deviation: Array,
+    setting: Setting, odds: float,
 ) -> Finding:  # fmt: skip
     told = zip(effect.parameters, value, deviation, strict=True)
     return Finding(
         effect=effect.identifier,
         confidence=confidence,
-        alternatives=others,
+        alternatives=(),
         where=where,
         parameters=tuple(Value(p.name, float(v), float(d), p.unit) for p, v, d in told),
         heldout=None,
@@ -231,6 +244,19 @@ def _found(
         setting=setting,
         evidence_nats=float(odds),
     )
+
+
+def _cost(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
+    """What the calibration would be off by in the set without a member."""
+    made = all_sets.made
+    middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
+    fewer = all_sets.judge(all_sets.without(best.names, key), best)
+    left_out, known = (
+        model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
+        for one in (fewer, best)
+    )
+    shift = np.linalg.norm(left_out.hard_iron_gauss - known.hard_iron_gauss)
+    return Cost(float(shift), heading_error_deg(left_out, known, made.context.field_b))
 
 
 def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ CPU is that of the diagnosis in one process, without the start of Python.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 import time
@@ -84,13 +85,16 @@ class Case:
     truth: Json | None = None
 
 
-def real_cases() -> Iterator[Case]:
+def real_cases(words: Sequence[str]) -> Iterator[Case]:
     for name, one in KNOWN.items():
+        if not any(word in f"known: {name}" for word in words):
+            continue
         track, _ = load_track(RECORDINGS / f"{one.file}.csv.gz")
         kept = {k: v for k, v in track.covariates.items() if k not in one.hidden}
         yield Case("known", name, replace(track, covariates=kept), Spec(), one)
     for name, path in untouched([""]):
-        yield Case("untouched", name, load_track(path)[0], Spec())
+        if any(word in f"untouched: {name}" for word in words):
+            yield Case("untouched", name, load_track(path)[0], Spec())
 
 
 def blind_cases(seed: int, drawn: Sequence[str]) -> Iterator[Case]:
@@ -188,7 +192,8 @@ def main() -> None:
     given = parser.parse_args()
     known: dict[str, Json] = json.loads(given.kept.read_text()) if given.kept.exists() else {}
     done = []
-    for case in [*real_cases(), *blind_cases(given.seed, given.cases)]:
+    cases = itertools.chain(real_cases(given.only), blind_cases(given.seed, given.cases))
+    for case in cases:
         title = f"{case.part}: {case.name}"
         if not any(word in title for word in given.only):
             continue

@@ -22,7 +22,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     library_components,
 )
 from ahrsd.diagnosis.one_model.evidence import evaluated
-from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point, moved
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point, moved, unread
 from ahrsd.diagnosis.one_model.linearised import added as added_by
 from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
@@ -157,3 +157,17 @@ def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
     assert [(run.start, run.stop) for run in broken.runs] == [(0, 250), (250, 400)]
     assert np.isnan(broken.dt_s[250])
     assert broken_where_unsampled(track) is track
+
+
+def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
+    track = track_of(experiment("wam", seed=8, samples=3000))
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    point = first_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
+    middle_s = float(np.median(track.time_s))
+    silent = unread(point, [(middle_s, middle_s + 6.0)])
+    at_s = silent.filtered.track.time_s
+    inside = (at_s > middle_s + 1.0) & (at_s < middle_s + 5.0)
+    assert not silent.filtered.used[inside].any()
+    assert silent.filtered.used[at_s > middle_s + 7.0].all()
+    assert np.isfinite(silent.filtered.whitened).all()
+    assert silent.problem.recorded.mag_b_gauss.shape == track.mag_b_gauss.shape
