@@ -50,6 +50,12 @@ SAMPLED_TURN_RAD = 0.3
 #: how much of a delay is a filter's, 1 all of it
 LAG_IS_FILTER = 0.5
 
+#: rad/s below which a sensor stands still, and part of its ordinary rate;  of all of its time,
+#: above which this is how it moves;  source: hands of BROAD at rest turn by less than 0.05
+STILL_RAD_S, STILL_PART, MOSTLY = 0.05, 0.2, 0.8
+#: s over which the rate is taken;  of a spell at rest, at least;  and how many, the longest
+SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
+
 # --- what may be there besides ------------------------------------------------------------------
 #: deviations of a reading by which the way of a step's source is off a step for it to be unread
 MOVED = 10.0
@@ -115,6 +121,10 @@ ORDINARY_EFFECT: Mapping[str, float] = {
     "soft_iron_step": 11,
     "viscous_magnetisation": 7.8,
 }
+
+# --- where it is linearised --------------------------------------------------------------------
+#: deviations of calibration and delay to which a point is where its model wants it
+NEAR = 0.7
 
 # --- the decision -------------------------------------------------------------------------------
 #: log odds from which an effect is told: a false name costs more than a missed one;  from which

@@ -38,8 +38,6 @@ from ahrsd.diagnosis.problem import Problem
 
 #: linearisations in one noise, noises, and nats that a further one must gain
 ROUNDS, NOISES, SETTLED = 6, 3, 5.0
-#: a step is none where it is this part of what it is known to, and levels are alike to this part
-NEAR, SAME_LEVEL = 0.7, 0.1
 #: parts of a step that are tried, with the delay's or without
 STEPS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
 #: the sensor's course stands for all three where the remainder, with the other two, is in
@@ -236,4 +234,4 @@ def judged(
 def _is_there(here: Judged) -> bool:
     """Whether calibration and delay are where the model wants them."""
     off, deviation = step_of(here.base.made, here.base.whole, here.at)
-    return not np.any(np.abs(off) > NEAR * deviation)
+    return not np.any(np.abs(off) > priors.NEAR * deviation)
