@@ -79,6 +79,8 @@ class Effect(ABC):
     unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
                  them is the noise of its own columns, and what is known is the prior
     form_share:  part of its evidence that its columns may leave, where they are not exact
+    quick:       only the recorded rate shows it: averaged over some readings it is gone
+    course:      whether any slow course in time of its frame is it, whatever the form
     stands_for:  effects that look like it, each a further way to it where its column was not logged
     loose:       prior of its parameters in the joint fit, in their own prior deviations: next to
                  none, unless the columns themselves follow what is fitted
@@ -104,6 +106,8 @@ class Effect(ABC):
     rides: bool = False
     unseen: tuple[tuple[float, ...], ...] = ()
     form_share: float = 0.0
+    quick: bool = False
+    course: bool = False
     stands_for: tuple[str, ...] = ()
     loose: float = 30.0
 

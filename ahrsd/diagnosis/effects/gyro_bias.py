@@ -74,6 +74,7 @@ class GyroBiasDrift(Linear):
     manoeuvre = "an hour at rest, for its Allan deviation"
     size = "5 to 10 deg/h"
     source = "IEEE 952 (from memory; dossier G7)"
+    course = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The recording's own length."""

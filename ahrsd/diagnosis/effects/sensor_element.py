@@ -57,6 +57,7 @@ class AcInterference(Linear):
     manoeuvre = "two seconds at an output rate that 50 and 60 Hz are no multiples of"
     size = "0.1 to 20 mG near machinery"
     source = "Sonett 1968 on aliases in magnetometers; diydrones (dossier M7, M8)"
+    quick = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The two strongest lines."""

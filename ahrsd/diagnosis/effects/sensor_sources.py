@@ -134,6 +134,7 @@ class SyncPulses(Linear):
     manoeuvre = "switch the transmitter off for a minute"
     size = "0.2 to 5 mG"
     source = "dossier M9"
+    quick = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """One per column of pulses, and the likeliest regular train that nobody logged."""
@@ -270,6 +271,7 @@ class RotorField(Linear):
     manoeuvre = "run the shaft slowly up through its range"
     size = "0.1 to 10 mG"
     source = "dossier M25"
+    quick = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The shaft and its second harmonic, each at the speed nearby that fits best.

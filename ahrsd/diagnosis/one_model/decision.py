@@ -8,18 +8,22 @@ course is as sure, or where a part of the ordinary remainder is beyond its 95 %.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.diagnosis.diagnosis import Finding, Share, Unexplained, Value, Where
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.confound import separating_manoeuvre
+from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
+from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
+from ahrsd.diagnosis.prior import prior_of
+from ahrsd.diagnosis.validate import heading_error_deg
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
@@ -57,11 +61,55 @@ def decided(
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
-    left = _left(all_sets, space, best, odds)
+    drifts = _drifts(all_sets, space, best, library)
+    for key, row in drifts.items():
+        finding, term = _drifting(all_sets, best, key, odds[key], row)
+        found.append(finding)
+        terms.append(term)
+    left = _left(all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts})
     if switching and not left.detected:
         left = _jumping(all_sets, best, switching[0], odds)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
     return Answer(best, tuple(found), tuple(terms), left, surest)
+
+
+def _drifts(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
+) -> dict[str, Effect]:
+    """Free courses that are as slow as the library's drift of their frame, whatever their form."""
+    named = {all_sets.component(key).effect for key in best.names}
+    out = {}
+    for key in space.courses:
+        if key not in best.names or _is_ordinary(all_sets, best, key):
+            continue
+        frame, corner = all_sets.component(key).frame, float(np.exp(all_sets.psi_of(best)[key][1]))
+        rows = [one for name, one in library.items() if one.course and name not in named]
+        rows = [one for one in rows if (one.frame or one.family) == frame]
+        if rows and corner < priors.DRIFT_CORNER:
+            out[key] = rows[0]
+    return out
+
+
+def _drifting(
+    all_sets: Hypotheses, best: Hypothesis, key: str, odds: float, effect: Effect
+) -> tuple[Finding, Term]:
+    """A slow course as a finding: the drift's own coefficients that are nearest to it."""
+    context = all_sets.made.context
+    setting = effect.settings(context)[0]
+    form, course = effect.columns(context, setting), all_sets.component(key).columns
+    mine, other = (form.gyro, course.gyro) if form.mag is None else (form.mag, course.mag)
+    if mine is None or other is None:
+        raise ValueError(f"{effect.identifier} and {key} are not of one sensor")
+    # about their means: a constant is the calibration's bias
+    X, Y = ((one - one.mean(axis=0)).reshape(-1, one.shape[2]) for one in (mine, other))
+    nearest = np.linalg.pinv(X) @ Y
+    value, deviation = coefficients(all_sets, best, key)
+    drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
+    sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
+    kept = {k: v for k, v in setting.items() if k != "searched"}
+    finding = _found(effect, sure, _where(all_sets, best, key), drift, unsure, kept, odds)
+    finding = replace(finding, cost_if_left_out=_cost(all_sets, best, key))
+    return finding, Term(effect.identifier, drift, unsure, kept)
 
 
 def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
@@ -165,15 +213,29 @@ def _told(
         if other != name and share > _SMALLEST_SHARE
     )  # fmt: skip
     setting = {k: v for k, v in one.setting.items() if k != "searched"}
-    finding = Finding(
-        effect=name,
-        confidence=float(shares.get(name, 1.0) * sure),
+    share = float(shares.get(name, 1.0) * sure)
+    where = _where(all_sets, best, key)
+    close = [one.effect for one in others]
+    finding = replace(
+        _found(effect, share, where, value, deviation, setting, odds),
         alternatives=others,
-        where=_where(all_sets, best, key),
-        parameters=tuple(
-            Value(p.name, float(v), float(d), p.unit)
-            for p, v, d in zip(effect.parameters, value, deviation, strict=True)
-        ),
+        cost_if_left_out=_cost(all_sets, best, key),
+        separate_from=separating_manoeuvre(library, name, close) if close else None,
+    )
+    return finding, Term(name, value, deviation, setting)
+
+
+def _found(
+    effect: Effect, confidence: float, where: Where, value: Array, deviation: Array,
+    setting: Setting, odds: float,
+) -> Finding:  # fmt: skip
+    told = zip(effect.parameters, value, deviation, strict=True)
+    return Finding(
+        effect=effect.identifier,
+        confidence=confidence,
+        alternatives=(),
+        where=where,
+        parameters=tuple(Value(p.name, float(v), float(d), p.unit) for p, v, d in told),
         heldout=None,
         cost_if_left_out=None,
         separate_from=None,
@@ -182,7 +244,19 @@ def _told(
         setting=setting,
         evidence_nats=float(odds),
     )
-    return finding, Term(name, value, deviation, setting)
+
+
+def _cost(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
+    """What the calibration would be off by in the set without a member."""
+    made = all_sets.made
+    middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
+    fewer = all_sets.judge(all_sets.without(best.names, key), best)
+    left_out, known = (
+        model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
+        for one in (fewer, best)
+    )
+    shift = np.linalg.norm(left_out.hard_iron_gauss - known.hard_iron_gauss)
+    return Cost(float(shift), heading_error_deg(left_out, known, made.context.field_b))
 
 
 def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, Array]:
@@ -250,7 +324,7 @@ def _left(
     all_sets: Hypotheses, space: Space, best: Hypothesis, odds: Mapping[str, float]
 ) -> Unexplained:
     """What no name explains, where that is beyond the ordinary."""
-    courses = [key for key in space.courses if key in best.names]
+    courses = [key for key in space.courses if key in odds]
     courses = [key for key in courses if not _is_ordinary(all_sets, best, key)]
     if courses:
         key = max(courses, key=lambda one: odds[one])
@@ -268,11 +342,15 @@ def _left(
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """How large a member is: an effect in its usual scales, all else its deviation in its unit."""
+    """How large a member surely is: an effect in its usual scales, all else in its unit.
+
+    Of an effect what is beyond two deviations: where the motion hardly shows a coefficient, a large
+    one says nothing.
+    """
     one = all_sets.component(key)
     if one.effect is not None and isinstance(one.law, Sized):
-        value, _ = coefficients(all_sets, best, key)
-        return float(np.max(np.abs(value) / one.law.scale))
+        value, deviation = coefficients(all_sets, best, key)
+        return float(np.max(np.maximum(np.abs(value) - 2.0 * deviation, 0.0) / one.law.scale))
     psi = all_sets.psi_of(best)[key]
     return float(np.exp(psi[0])) * float(getattr(one.law, "unit", 1.0))
 

@@ -21,15 +21,12 @@ LAG = "mag_time_lag"
 LAG_FORM = "form of the delay"
 #: what jumps, and in which frame
 STEPS = {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}
-#: delays and what only the recorded rate shows are not asked
-NOT_ASKED = (
-    LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass", "ac_interference", "sync_pulses",
-    "rotor_field",
-)  # fmt: skip
+#: delays are not asked: one stands for all
+DELAYS = (LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass")
 #: part of the squares that may be left where one component's columns hold another's
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
-_PIECES = 4
+PIECES = 20
 #: parts of a recording's length, and factors, to which onsets and scales are sought
 _FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
 
@@ -40,7 +37,7 @@ def library_components(
     """Every effect's settings that can be computed here, by identifier."""
     out = {}
     for name, effect in library.items():
-        settings = () if name in NOT_ASKED else effect.settings(context)
+        settings = () if name in DELAYS or effect.quick else effect.settings(context)
         found = [component(context, effect, one, len(settings)) for one in settings]
         if found:
             out[name] = found
@@ -56,7 +53,8 @@ def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
     out = []
     for name, effect in library.items():
         logged = [need for need in effect.needs if "accel" not in need]
-        settings = effect.settings(context) if logged and name not in NOT_ASKED else ()
+        asked = logged and name not in DELAYS and not effect.quick
+        settings = effect.settings(context) if asked else ()
         if settings:
             made = component(context, effect, settings[0], len(settings))
             out.append(replace(made, key=f"{name} as logged"))
@@ -155,10 +153,10 @@ def form_of(known: Component, context: Context) -> Component | None:
     frame = STEPS.get(known.effect or "")
     if frame is None:
         return None
-    onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.TRANSITION_S / _PIECES
-    edges = onset_s - priors.TRANSITION_S + width_s * np.arange(_PIECES + 1)
+    onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.APPROACH_S / PIECES
+    edges = onset_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
     piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
-    inside = (piece[:, None] == np.arange(_PIECES)).astype(float)
+    inside = (piece[:, None] == np.arange(PIECES)).astype(float)
     axes = unit_columns(context, cast("Frame", frame))
     flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
@@ -166,4 +164,5 @@ def form_of(known: Component, context: Context) -> Component | None:
     if not isinstance(law, Sized):
         return None
     sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
-    return Component(f"form of {known.key}", frame, columns, sized)
+    setting = {"onset_s": onset_s}
+    return Component(f"form of {known.key}", frame, columns, sized, setting=setting)

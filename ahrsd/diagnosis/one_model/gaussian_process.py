@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
@@ -82,15 +83,18 @@ class CourseLaw:
         return size + corner, np.concatenate([slope, flat])
 
 
-def course(context: Context, frame: Frame, ordinary: priors.Size | None = None) -> Component:
-    """A course in one frame; of ordinary size where that is given, else of any."""
-    time_s = context.track.time_s
-    length_s = float(time_s[-1] - time_s[0])
-    order = np.arange(1, int(np.clip(length_s / MODE_S, FEWEST, MOST)) + 1)
-    phase = np.pi * (time_s - time_s[0]) / length_s
-    axes = unit_columns(context, frame)
-    matrix = np.einsum("nk,nia->nika", np.cos(phase[:, None] * order), axes)
-    flat = matrix.reshape(len(time_s), 3, -1)
+def course(
+    context: Context,
+    frame: Frame,
+    ordinary: priors.Size | None = None,
+    like: Component | None = None,
+) -> Component:
+    """A course in one frame; of ordinary size where that is given, else of any.
+
+    like: one of the same frame, whose columns it takes
+    """
+    order = np.arange(1, int(np.clip(context.track.duration_s / MODE_S, FEWEST, MOST)) + 1)
+    columns = _cosines(context, frame, order) if like is None else like.columns
     unit = priors.COURSE_UNIT[frame]
     law = CourseLaw(np.repeat(order, 3).astype(float), unit)
     key = f"free {frame}"
@@ -98,6 +102,15 @@ def course(context: Context, frame: Frame, ordinary: priors.Size | None = None) 
         middle = float(np.log(ordinary.median / unit))
         law = CourseLaw(law.order, unit, middle, ordinary.spread, ordinary.most / unit)
         key = f"{frame}_course"
-    columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     odds = 0.0 if ordinary is not None else float(np.log(priors.COURSE))
     return Component(key, frame, columns, law, odds)
+
+
+def _cosines(context: Context, frame: Frame, order: NDArray[np.int_]) -> Columns:
+    """So many half waves (k,) along each axis of a frame."""
+    time_s = context.track.time_s
+    phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
+    axes = unit_columns(context, frame)
+    waves = np.cos(phase[:, None] * order)
+    flat = (waves[:, None, :, None] * axes[:, :, None, :]).reshape(len(time_s), 3, -1)
+    return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)

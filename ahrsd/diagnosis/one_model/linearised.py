@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dct, idct
+from scipy.fft import dct, idct, next_fast_len
 
 from ahrsd.diagnosis import noise_fit
 from ahrsd.diagnosis.context import build_context
@@ -41,11 +41,22 @@ _Y = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Named:
+    """What a context is made of."""
+
+    filtered: Filtered
+    terms_gyro: Array | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Point:
     """Where everything is linearised.
 
     values: coefficients by component that are taken out of the readings
     terms_mag, terms_gyro: (N, 3) what they add;  amplitude (N,): of the noise
+    exact: components that are taken out of the track itself: the delay
+    misread: (N, 3) rad/s of terms_gyro that a name stands for.  Columns are made of rates without
+             it, but with all that has none: of rates less their own squares, squares run away
     """
 
     problem: Problem
@@ -54,6 +65,13 @@ class Point:
     terms_mag: Array | None
     terms_gyro: Array | None
     amplitude: Array
+    exact: tuple[str, ...] = ()
+    misread: Array | None = None
+
+    @property
+    def context(self) -> Context:
+        """The recording as columns are made of it."""
+        return build_context(self.problem.track, _Named(self.filtered, self.misread))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +87,7 @@ class Seen:
 class Linearised:
     """A point, the context there, and products of components, each made once.
 
-    batches: (3 N, p) rows of components that passed the filter together, as the noise sees them
-    exact:   components that are taken out of the track itself: the delay
+    batches: (3 M, p) rows of components that passed the filter together, as the noise sees them
     """
 
     point: Point
@@ -81,11 +98,15 @@ class Linearised:
     seen: dict[str, Seen] = field(default_factory=dict)
     batches: list[Array] = field(default_factory=list)
     blocks: dict[tuple[int, int], Array] = field(default_factory=dict)
-    exact: tuple[str, ...] = ()
 
     def add(self, components: Sequence[Component]) -> None:
-        """Pass components through the filter; what is known already is left out."""
-        new = [one for one in components if one.key not in self.seen]
+        """Pass components through the filter; what is known already is left out.
+
+        Components that have their columns in common pass once.
+        """
+        unknown = [one for one in components if one.key not in self.seen]
+        first = {id(one.columns): one for one in reversed(unknown)}
+        new = list(reversed(first.values()))
         parts = [one.columns for one in new]
         for batch in batches(parts, _BATCH):
             cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
@@ -95,9 +116,12 @@ class Linearised:
                 columns = slice(at, at + new[k].width)
                 self.seen[new[k].key] = Seen(new[k], len(self.batches) - 1, columns)
                 at += new[k].width
+        for one in unknown:
+            twin = self.seen[first[id(one.columns)].key]
+            self.seen[one.key] = replace(twin, component=one)
 
     def rows(self, key: str) -> Array:
-        """(3 N, q) of a component, by frequency, lowest first."""
+        """(3 M, q) of a component, by frequency, lowest first."""
         one = self.seen[key]
         return self.batches[one.batch][:, one.columns]
 
@@ -138,7 +162,7 @@ class Linearised:
         )
         s = self._crossed(keys)
         square = np.array([float(self.y[a:b] @ self.y[a:b]) for a, b in self._bands()])
-        used = float(np.mean(self.point.filtered.used))
+        used = float(np.count_nonzero(self.point.filtered.used)) / int(self.edges[-1])
         rows = np.array([(b - a) * used for a, b in self._bands()])
         return Products(G, s, square, rows, step)
 
@@ -183,20 +207,73 @@ class Linearised:
             begin += width
         for (a, b), level in zip(self._bands(), at.log_noise, strict=True):
             rows[a:b] *= np.exp(-0.5 * level)
-        white = idct(rows.reshape(-1, 3), axis=0, norm="ortho")
+        white = idct(rows.reshape(-1, 3), axis=0, norm="ortho")[: len(self.point.amplitude)]
         return np.asarray(white * self.point.amplitude[:, None])
 
 
 def by_frequency(cube: Array) -> Array:
-    """(3 N, p) orthonormal cosines over all rows of (N, 3, p), frequency by frequency."""
-    return np.asarray(dct(cube, axis=0, norm="ortho")).reshape(3 * len(cube), -1)
+    """(3 M, p) orthonormal cosines of (N, 3, p), frequency by frequency.
+
+    M: rows with none behind the last, which are not counted: a count without large factors is fast
+    """
+    count = length(len(cube))
+    return np.asarray(dct(cube, n=count, axis=0, norm="ortho")).reshape(3 * count, -1)
 
 
-def linearised(point: Point) -> Linearised:
-    """The recording at a point, the calibration known and put back."""
-    context = build_context(point.problem.track, point)
+def length(rows: int) -> int:
+    """Cosines for so many rows."""
+    return int(next_fast_len(rows, real=True))
+
+
+def as_columns_say(point: Point, components: Sequence[Component]) -> Point:
+    """The same coefficients taken out of the readings as these components' columns have them.
+
+    Columns follow the point (an attitude, a rate), and those of the point before took out another
+    field: put back by the new ones, the difference would be a mismatch of our own making.  What no
+    component stands for any more is in the readings again.
+    """
+    known = {one.key: one for one in components}
+    values = {key: value for key, value in point.values.items() if key in known}
+    out = {key: value for key, value in values.items() if key not in point.exact}
+    if not out and point.terms_mag is None and point.terms_gyro is None:
+        return point
+    mag, gyro = added(len(point.filtered.track), known, out)
+    again = run_filter(point.problem.track, point.filtered.model, mag, gyro, held=point.filtered)
+    return replace(point, filtered=again, values=values, terms_mag=mag, terms_gyro=gyro)
+
+
+def unread(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point:
+    """The same point without the magnetometer's readings of some spans, from and to, s.
+
+    The gyro carries the field across.
+    """
+    recorded = point.problem.recorded
+    mag = recorded.mag_b_gauss.copy()
+    for begin_s, end_s in spans_s:
+        mag[(recorded.time_s >= begin_s) & (recorded.time_s <= end_s)] = np.nan
+    problem = replace(point.problem, recorded=replace(recorded, mag_b_gauss=mag))
+    problem = problem.lagging(problem.lag_s)
+    model = point.filtered.model
+    filtered = run_filter(problem.track, model, point.terms_mag, point.terms_gyro)
+    return replace(point, problem=problem, filtered=filtered)
+
+
+def regained(point: Point) -> Point:
+    """The same point with the filter's noise estimated anew, and gains of that."""
+    problem, mag, gyro = point.problem, point.terms_mag, point.terms_gyro
+    model = point.filtered.model
+    filtered = run_filter(problem.track, model, mag, gyro)
+    again = _no_louder(noise_fit.estimated(filtered, problem.spec, mag, gyro, walk=False), model)
+    return replace(point, filtered=run_filter(problem.track, again, mag, gyro))
+
+
+def linearised(point: Point, context: Context) -> Linearised:
+    """The recording at a point, the calibration known and put back.
+
+    context: of which all columns are made
+    """
     smooth = regressing(point.filtered, context.rate_b_rad_s)
-    count = len(point.filtered.whitened)
+    count = length(len(point.filtered.whitened))
     white = by_frequency(point.filtered.whitened[:, :, None] / point.amplitude[:, None, None])[:, 0]
     made = Linearised(point, context, smooth, noise_model.octaves(count), white)
     prior = prior_of(point.problem.track)
@@ -223,7 +300,7 @@ def model_of(values: Array, like: NullModel) -> NullModel:
     )
 
 
-def first_point(problem: Problem, filtered: Filtered) -> Point:
+def first_point(problem: Problem, filtered: Filtered, exact: tuple[str, ...]) -> Point:
     """The null's calibration in the sensors' own noise, nothing taken out, all rows alike.
 
     Own noise is that of differences from reading to reading: the null's is the mismatch's as well.
@@ -231,35 +308,47 @@ def first_point(problem: Problem, filtered: Filtered) -> Point:
     own = noise_fit.first_guess(problem.track, problem.spec)
     quiet = _no_louder(replace(filtered.model, sigma_mag_gauss=own.sigma_mag_gauss), filtered.model)
     again = run_filter(problem.track, quiet)
-    return Point(problem, again, {}, None, None, np.ones(len(again.whitened)))
+    return Point(problem, again, {}, None, None, np.ones(len(again.whitened)), exact)
 
 
-def moved(made: Linearised, keys: Sequence[str], at: At, share: float = 1.0) -> Point:
-    """The point at a model's likeliest coefficients, in noise estimated anew.
+def moved(
+    made: Linearised, keys: Sequence[str], at: At, share: float = 1.0, *, delayed: bool = True
+) -> Point:
+    """The point at a model's likeliest coefficients, in the noise of the point before.
 
-    A delay is taken out of the track exactly, all else out of the readings.
-    share: of the way there
+    A delay is taken out of the track exactly, all else out of the readings.  Gains that followed
+    would whiten what is not yet taken out by another filter: no linear model tells that.
+    share: of the way there;  delayed: whether the delay moves too
     """
-    problem, before = made.point.problem, made.point.values
+    point, problem = made.point, made.point.problem
     values = {
-        key: value + (1.0 - share) * (before.get(key, np.zeros(len(value))) - value)
+        key: value + (1.0 - share) * (point.values.get(key, np.zeros(len(value))) - value)
         for key, value in by_key(made, keys, at).items()
+        if key != CALIBRATION
     }
-    here = coefficients(made.point.filtered.model) - prior_of(problem.track).mean
-    found = by_key(made, [keys[0]], at)[CALIBRATION]
-    values[CALIBRATION] = here + share * (found - here)
-    model = model_of(values[CALIBRATION] + prior_of(problem.track).mean, made.point.filtered.model)
-    out = {key: value for key, value in values.items() if key not in (CALIBRATION, *made.exact)}
-    mag, gyro = added(made, out)
-    lag_s = sum(float(values[key][0]) for key in made.exact if key in values)
+    if not delayed:
+        values |= {key: point.values.get(key, np.zeros(1)) for key in point.exact}
+    middle = prior_of(problem.track).mean
+    here = coefficients(point.filtered.model) - middle
+    found = here + share * (by_key(made, keys, at)[CALIBRATION] - here)
+    model = model_of(found + middle, point.filtered.model)
+    out = {key: value for key, value in values.items() if key not in point.exact}
+    known = {key: made.seen[key].component for key in out}
+    mag, gyro = added(len(made.context.track), known, out)
+    lag_s = sum(float(values[key][0]) for key in point.exact if key in values)
     if lag_s != problem.lag_s:
         problem = problem.lagging(lag_s)
-    filtered = run_filter(problem.track, model, mag, gyro)
-    again = _no_louder(noise_fit.estimated(filtered, problem.spec, mag, gyro, walk=False), model)
-    filtered = run_filter(problem.track, again, mag, gyro)
-    left = noise_model.amplitude(made.left_by(keys, at), made.point.filtered.used, problem.rate_hz)
-    del values[CALIBRATION]
-    return Point(problem, filtered, values, mag, gyro, left)
+    filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
+    named = {key: value for key, value in out.items() if known[key].effect is not None}
+    _, misread = added(len(made.context.track), known, named)
+    return Point(problem, filtered, values, mag, gyro, point.amplitude, point.exact, misread)
+
+
+def relevelled(made: Linearised, keys: Sequence[str], at: At) -> Point:
+    """The same point with the noise's level that a model leaves."""
+    left, point = made.left_by(keys, at), made.point
+    level = noise_model.amplitude(left, point.filtered.used, point.problem.rate_hz)
+    return replace(point, amplitude=level)
 
 
 def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array]:
@@ -267,7 +356,7 @@ def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array
     prior = prior_of(made.point.problem.track).mean
     before = {
         CALIBRATION: coefficients(made.point.filtered.model) - prior,
-        **{key: made.point.values.get(key, np.zeros(1)) for key in made.exact},
+        **{key: made.point.values.get(key, np.zeros(1)) for key in made.point.exact},
     }
     value = by_key(made, keys, at)
     deviation = by_key(made, keys, replace(at, mean=at.deviation))
@@ -295,12 +384,13 @@ def by_key(made: Linearised, keys: Sequence[str], at: At) -> dict[str, Array]:
     return out
 
 
-def added(made: Linearised, values: Mapping[str, Array]) -> tuple[Array, Array]:
-    """(N, 3) gauss and rad/s, what components add to the readings."""
-    count = len(made.context.track)
+def added(
+    count: int, components: Mapping[str, Component], values: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """(count, 3) gauss and rad/s, what components add to the readings."""
     mag, gyro = np.zeros((count, 3)), np.zeros((count, 3))
     for key, value in values.items():
-        columns: Columns = made.seen[key].component.columns
+        columns: Columns = components[key].columns
         if columns.mag is not None:
             mag += columns.mag @ value
         if columns.gyro is not None:

@@ -20,7 +20,7 @@ from ahrsd.diagnosis.one_model.evidence import At, maximised
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
 from ahrsd.samples import Array
 
-BEAM, ASKED, MOST_MOVES, FINER = 3, 4, 10, 3
+BEAM, ASKED, MOST_MOVES, FINER = 2, 4, 8, 3
 #: moments at which steps are proposed, and how far apart, of the recording's length
 MOMENTS, APART = 4, 0.02
 
@@ -50,6 +50,7 @@ class Hypotheses:
     start: noise (B,) and psi by key that the richest model has
     forms: key of what a component leaves of its form, which comes and goes with it
     beside_delay: effects of which a delay is a part: they are asked beside it, not in its place
+    real: whether all sets are of a recording that leaves what real ones do, whatever is in them
     """
 
     made: Linearised
@@ -59,6 +60,7 @@ class Hypotheses:
     forms: dict[str, str] = field(default_factory=dict)
     beside_delay: frozenset[str] = frozenset()
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
+    real: bool = False
 
     def component(self, key: str) -> Component:
         """By its key."""
@@ -68,7 +70,8 @@ class Hypotheses:
         """The set with these members beside the calibration.
 
         near: a set of the same class from whose noise and sizes the climb begins, which is short;
-        else it begins where the richest model is
+        else it begins where the richest model is; where either is loud, in quiet noise: from loud
+        noise what a member explains is noise still
         """
         members = frozenset(names)
         if members not in self.judged:
@@ -82,7 +85,10 @@ class Hypotheses:
             if near is not None and real == self.is_real(near.names):
                 noise, known = near.at.log_noise, {**known, **self.psi_of(near)}
             psi = [known.get(key, law.start) for key, law in zip(keys, laws, strict=True)]
-            at = maximised(products, laws, [(noise, np.concatenate([*psi, np.zeros(0)]))])
+            start = np.concatenate([*psi, np.zeros(0)])
+            if np.max(noise) > noise[-1] + priors.LOUD:
+                noise = np.minimum(noise, noise[-1])
+            at = maximised(products, laws, [(noise, start)])
             score = at.nats + sum(self.component(key).prior for key in members)
             score += self._again(members)
             score += self._of_class(members)
@@ -99,7 +105,7 @@ class Hypotheses:
 
     def is_real(self, members: Names) -> bool:
         """Whether a set leaves what real recordings do."""
-        return any(key in members for key in self.remainder)
+        return self.real or any(key in members for key in self.remainder)
 
     def psi_of(self, known: Hypothesis) -> dict[str, Array]:
         """Hyperparameters of each of a set's components."""
@@ -196,22 +202,29 @@ class Space:
 
 
 def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
-    """The likeliest sets, best first."""
-    beam = _best([all_sets.judge(one) for one in starts])
+    """The likeliest sets, best first.
+
+    Sets with the ordinary remainder and without are moved in turn, each kind with a beam of its
+    own: where a simulation has two effects, the remainder is likelier than either of them alone.
+    """
+    found = [all_sets.judge(one) for one in starts]
+    beams = {real: _best(all_sets, found, real=real) for real in (False, True)}
     done: set[Names] = set()
-    for _ in range(MOST_MOVES):
+    for k in range(2 * MOST_MOVES):
+        beam = beams[bool(k % 2)]
         todo = [one for one in beam if one.names not in done]
         if not todo or todo[0].score < beam[0].score - 10 * priors.MOVE:
-            break
+            continue
         here = todo[0]
         done.add(here.names)
         reached = [all_sets.judge(names, here) for names in moves(all_sets, space, here)]
-        beam = _best([*beam, *reached])
-    return beam
+        kept = [*beams[False], *beams[True], *reached]
+        beams = {real: _best(all_sets, kept, real=real) for real in beams}
+    return sorted((*beams[False], *beams[True]), key=lambda one: -one.score)
 
 
-def _best(found: Iterable[Hypothesis]) -> list[Hypothesis]:
-    unique = {one.names: one for one in found}
+def _best(all_sets: Hypotheses, found: Iterable[Hypothesis], *, real: bool) -> list[Hypothesis]:
+    unique = {one.names: one for one in found if all_sets.is_real(one.names) == real}
     return sorted(unique.values(), key=lambda one: -one.score)[:BEAM]
 
 
@@ -271,6 +284,8 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
     if LAG not in base:
         part = all_sets.beside_delay
         candidates = [key for key in candidates if all_sets.component(key).effect not in part]
+    if not candidates:
+        return []
     scan = beside(all_sets.made, model.keys, at)
     worth = scan.worth(candidates)
     best: dict[str, tuple[float, str]] = {}

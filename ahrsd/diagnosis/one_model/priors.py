@@ -30,30 +30,44 @@ class Size:
 # --- what every real recording leaves: measured ----------------------------------------------
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(8.98e-03, 1.33, 0.1),  # gauss
-    "gyro_course": Size(5.32e-04, 1.79, 0.05),  # rad/s
-    "by_direction": Size(1.13e-02, 2.45, 0.2),  # gauss: harmonics of degree 2 and 3
-    "by_change": Size(1.33e-03, 1.51, 0.03),  # s: axes that are late by different times
-    "bending": Size(1.11e00, 1.56, 3.0),  # of the library's usual flexible mount
-    "by_rate_squared": Size(1.20e-03, 2.24, 0.03),  # rad/s at 1 rad/s
-    "field_by_rate": Size(1.04e-03, 1.84, 0.02),  # gauss at 1 rad/s
-    "by_force": Size(2.16e-03, 1.52, 0.03),  # rad/s at 1 g
+    "world_course": Size(7.75e-03, 1.53, 0.1),  # gauss
+    "gyro_course": Size(1.28e-03, 1.73, 0.05),  # rad/s
+    "by_direction": Size(7.66e-03, 2.21, 0.2),  # gauss: harmonics of degree 2 and 3
+    "by_change": Size(1.23e-03, 1.51, 0.03),  # s: axes that are late by different times
+    "bending": Size(5.58e-01, 1.10, 3.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(1.42e-03, 2.10, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(7.40e-04, 1.72, 0.02),  # gauss at 1 rad/s
+    "by_force": Size(2.79e-03, 1.74, 0.03),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
 
 #: of a delay between the sensors, s: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
 ORDINARY_LAG_S = 0.04
+#: turn within a step, rad, from which on its gyro's sample does not tell it: a rate that goes from
+#: nothing to twice its mean within the step leaves a sixth of it, 3 degrees
+SAMPLED_TURN_RAD = 0.3
 #: how much of a delay is a filter's, 1 all of it
 LAG_IS_FILTER = 0.5
 
+#: rad/s below which a sensor stands still, and part of its ordinary rate;  of all of its time,
+#: above which this is how it moves;  source: hands of BROAD at rest turn by less than 0.05
+STILL_RAD_S, STILL_PART, MOSTLY = 0.05, 0.2, 0.8
+#: s over which the rate is taken;  of a spell at rest, at least;  and how many, the longest
+SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
+
 # --- what may be there besides ------------------------------------------------------------------
+#: deviations of a reading by which the way of a step's source is off a step for it to be unread
+MOVED = 10.0
 #: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
 EFFECT = 1.0 / 60.0
 #: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
 ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
-#: seconds round a step for which whatever makes it (a hand with a magnet) may be anywhere
+#: steps of a kind that are nearer than that are one, s
 TRANSITION_S = 2.0
+#: seconds before and after a step for which whatever makes it may be anywhere: a strong magnet is
+#: seen from half a metre on, and a hand takes its time
+APPROACH_S = 4.0
 #: of a further step of a kind that is there: what was put on is taken off
 AGAIN = 0.3
 #: steps of a kind from which on they are one source that changes, which has no name
@@ -67,6 +81,8 @@ COURSE_UNIT: Mapping[str, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
 COURSE_SIZES = (1e-2, 5e2)
 #: corner of a course's spectrum, in half waves a recording
 COURSE_CORNERS = (1.0, 40.0)
+#: corner, in half waves a recording, below which a course is a drift: a walk has one
+DRIFT_CORNER = 3.0
 #: how many times its usual scale an effect is, evenly in the logarithm
 EFFECT_SIZES = (1e-2, 10.0)
 #: the same where candidates are only ranked
@@ -78,6 +94,8 @@ FORM = 0.03
 #: deviation of a log power from that of the next octave: of a sensor's own noise, of what a real
 #: recording leaves as well, and where only a delay is sought;  of the highest from the filter's
 NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
+#: log power by which a band is louder than the highest where the noise has what a model lacks
+LOUD = 2.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
 #: deviations from which a reading that is off alone counts no more
@@ -91,23 +109,22 @@ BANDS = 7
 #: stay below, in units of the effect's usual scale (of a course gauss, rad/s); beside the remainder
 #: it is a finding only where it is larger;  source: the same command
 ORDINARY_EFFECT: Mapping[str, float] = {
-    "eddy_current": 2.6,
-    "field_anomaly": 16,
-    "field_step": 1.2,
-    "free sensor": 0.036,
-    "gyro_nonlinearity": 0.64,
-    "gyro_scale": 40,
-    "hard_iron_drift": 22,
-    "hard_iron_step": 2.2,
-    "hysteresis": 25,
-    "mag_cross_axis": 26,
-    "mag_gyro_misalignment": 16,
-    "mag_nonlinearity": 41,
-    "onboard_calibration_active": 5.6,
-    "soft_iron_step": 47,
-    "vibration_rectification": 4,
-    "viscous_magnetisation": 28,
+    "field_anomaly": 0.97,
+    "field_step": 0.46,
+    "free sensor": 0.017,
+    "hard_iron_drift": 9.5,
+    "hard_iron_step": 1.3,
+    "hysteresis": 0.4,
+    "mag_cross_axis": 4.5,
+    "mag_gyro_misalignment": 4.7,
+    "onboard_calibration_active": 1.4,
+    "soft_iron_step": 11,
+    "viscous_magnetisation": 7.8,
 }
+
+# --- where it is linearised --------------------------------------------------------------------
+#: deviations of calibration and delay to which a point is where its model wants it
+NEAR = 0.7
 
 # --- the decision -------------------------------------------------------------------------------
 #: log odds from which an effect is told: a false name costs more than a missed one;  from which

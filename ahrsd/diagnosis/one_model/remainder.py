@@ -18,11 +18,6 @@ from ahrsd.diagnosis.one_model.gaussian_process import course
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
-#: rad/s below which a sensor stands still, and part of its ordinary rate; of all of its time, above
-#: which this is how it moves;  seconds of a spell, and how many of them, the longest
-STILL_RAD_S, STILL_PART, MOSTLY, STILL_S, MOST_SPELLS = 0.05, 0.2, 0.8, 3.0, 4
-#: s over which the rate is taken
-SMOOTHED_S = 0.5
 _GRAVITY = 9.81
 _ASIDE = np.eye(3)
 _SKEW = np.array([
@@ -68,15 +63,15 @@ def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
 
     None where it hardly turns in most of its time: then that is its motion.
     """
-    rows = max(1, round(SMOOTHED_S * len(time_s) / float(time_s[-1] - time_s[0])))
+    rows = max(1, round(priors.SMOOTHED_S * len(time_s) / float(time_s[-1] - time_s[0])))
     rate = np.linalg.norm(uniform_filter1d(gyro_rad_s, rows, axis=0), axis=1)
-    still = rate < min(STILL_RAD_S, STILL_PART * float(np.sqrt(np.mean(rate**2))))
-    if np.mean(still) > MOSTLY:
+    still = rate < min(priors.STILL_RAD_S, priors.STILL_PART * float(np.sqrt(np.mean(rate**2))))
+    if np.mean(still) > priors.MOSTLY:
         return []
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
     spells = [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
-    long = [one for one in spells if one[1] - one[0] >= STILL_S]
-    return sorted(sorted(long, key=lambda one: one[0] - one[1])[:MOST_SPELLS])
+    long = [one for one in spells if one[1] - one[0] >= priors.STILL_S]
+    return sorted(sorted(long, key=lambda one: one[0] - one[1])[: priors.MOST_SPELLS])
 
 
 def by_change(context: Context) -> Component:

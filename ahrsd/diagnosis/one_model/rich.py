@@ -8,7 +8,7 @@ calibration is the one beside them, and a name has to do better than they do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation import Filtered
 from ahrsd.diagnosis.locate import FRAMES
-from ahrsd.diagnosis.one_model import noise_model, priors
+from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG, anew, causes, delay, delay_form
 from ahrsd.diagnosis.one_model.evidence import At, maximised
@@ -25,22 +25,25 @@ from ahrsd.diagnosis.one_model.linearised import (
     CALIBRATION,
     Linearised,
     Point,
+    as_columns_say,
     first_point,
     linearised,
     moved,
+    regained,
+    relevelled,
     step_of,
 )
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
 from ahrsd.diagnosis.problem import Problem
 
-#: linearisations, and nats that a further one must gain
-ROUNDS, SETTLED = 6, 2.0
-#: a step is none where it is this part of what it is known to, and levels are alike to this part
-NEAR, SAME_LEVEL = 0.7, 0.1
-#: parts of a step that are tried
-SHARES = (1.0, 0.3)
+#: linearisations in one noise, noises, and nats that a further one must gain
+ROUNDS, NOISES, SETTLED = 6, 3, 5.0
+#: parts of a step that are tried, with the delay's or without
+STEPS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
 #: the sensor's course stands for all three where the remainder, with the other two, is in
 RICH_COURSES = ("free sensor",)
+#: of the ordinary remainder, by frame
+COURSES = {frame: f"{frame}_course" for frame in FRAMES}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,32 +66,35 @@ def base_of(
 
     named: components known by name, made anew of this context;  whole: with remainder and courses
     """
-    made = linearised(point)
-    context = made.context
+    context = point.context
     rest = ordinary_remainder(context) if whole else []
-    courses = [course(context, frame) for frame in FRAMES] if whole else []
     lags = [delay(context, library)]
     if point.problem.lag_s != 0.0:
         lags.append(delay_form(context, point.problem.lag_s))
     known = [anew(one, context, library) for one in named]
     had = {one.effect for one in known}
     driven = [one for one in causes(context, library) if one.effect not in had]
-    parts = [*rest, *lags, *courses, *known, *driven]
-    made.exact = (LAG,)
+    bound = {one.key: one for one in rest if one.key in COURSES.values()}
+    free = [course(context, frame, like=bound.get(COURSES[frame])) for frame in FRAMES if whole]
+    parts = [*rest, *lags, *known, *driven, *free]
+    made = linearised(as_columns_say(point, parts), context)
     made.add(parts)
-    made.put_back({key: value for key, value in point.values.items() if key in made.seen})
+    made.put_back(made.point.values)
     remainder = tuple(one.key for one in rest)
     few = (CALIBRATION, *(one.key for one in (*lags, *known, *driven)), *remainder)
     return Base(made, remainder, (*few, *RICH_COURSES) if whole else few)
 
 
-def fitted(made: Linearised, keys: Sequence[str], step: float = priors.NOISE_STEP_REAL) -> At:
+def fitted(made: Linearised, keys: Sequence[str], step: float, near: At | None = None) -> At:
     """The likeliest hyperparameters of a model, from the highest band's power on.
 
     That is the sensor's own: from there an effect is not noise before it was asked for.
+    near: of the same components at a point nearby, from where the climb is short
     """
     products = made.products(keys, step)
     laws = [made.seen[key].component.law for key in keys]
+    if near is not None:
+        return maximised(products, laws, [(near.log_noise, near.psi)])
     psi = np.concatenate([law.start for law in laws])
     top = float(np.log(products.square[-1] / products.rows[-1]))
     starts = [(np.full(len(products.rows), top), psi)]
@@ -123,8 +129,8 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
 
     def at(lag_s: float) -> Judged:
         if lag_s == 0.0:
-            return judged(first_point(problem, filtered), library, (), whole=False)
-        start = first_point(problem.lagging(lag_s), filtered)
+            return judged(first_point(problem, filtered, (LAG,)), library, (), whole=False)
+        start = first_point(problem.lagging(lag_s), filtered, (LAG,))
         start = replace(start, values={LAG: np.array([lag_s])})
         return judged(start, library, (), whole=False)
 
@@ -146,23 +152,51 @@ def settled(point: Point, library: Mapping[str, Effect], named: Sequence[Compone
 def _settled(
     here: Judged, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool
 ) -> Judged:
-    """Moved while that makes the model likelier.
+    """Moved while that makes the model likelier, and with gains of the noise that is left there.
 
     A step that makes it less likely, linear as it is, is taken in part or not at all; none is taken
-    that is less than the calibration and the delay are known to.
+    that is less than the calibration and the delay are known to.  Coefficients move in held noise,
+    and the noise is estimated anew where they rest: what was not taken out yet is no noise.
     """
-    for _ in range(ROUNDS):
-        if _is_there(here):
-            return here
-        for share in SHARES:
-            new = moved(here.base.made, here.base.whole, here.at, share)
-            if not np.isfinite(new.filtered.whitened).all():
-                continue
-            found = judged(new, library, named, whole=whole)
-            if found.nats > here.nats:
+
+    def judge(point: Point, near: Judged) -> Judged | None:
+        seen = np.isfinite(point.filtered.whitened).all()
+        return judged(point, library, named, whole=whole, near=near) if seen else None
+
+    here = _moved_to_rest(here, judge)
+    for _ in range(NOISES):
+        for quieter in (_relevelled, _regained):
+            found = judge(quieter(here), here)
+            if found is not None and found.nats > here.nats + SETTLED:
+                here = _moved_to_rest(found, judge)
                 break
         else:
-            return here
+            break
+    return here
+
+
+def _relevelled(here: Judged) -> Point:
+    return relevelled(here.base.made, here.base.whole, here.at)
+
+
+def _regained(here: Judged) -> Point:
+    return regained(here.base.made.point)
+
+
+def _moved_to_rest(here: Judged, judge: Callable[[Point, Judged], Judged | None]) -> Judged:
+    """Moved while that makes the model likelier, gains held."""
+    ways = STEPS
+    for _ in range(ROUNDS):
+        if _is_there(here):
+            break
+        for k, (share, delayed) in enumerate(ways):
+            at = here.base.made, here.base.whole, here.at
+            found = judge(moved(*at, share, delayed=delayed), here)
+            if found is not None and found.nats > here.nats:
+                ways = ways[k:]
+                break
+        else:
+            break
         gained, here = found.nats - here.nats, found
         if gained < SETTLED:
             break
@@ -179,22 +213,25 @@ class Judged:
 
 
 def judged(
-    point: Point, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool = True
+    point: Point,
+    library: Mapping[str, Effect],
+    named: Sequence[Component],
+    *,
+    whole: bool = True,
+    near: Judged | None = None,
 ) -> Judged:
-    """The likeliest hyperparameters of the richest model at a point."""
+    """The likeliest hyperparameters of the richest model at a point.
+
+    near: the same at a point nearby
+    """
     base = base_of(point, library, named, whole=whole)
     step = priors.NOISE_STEP_REAL if whole else priors.NOISE_STEP_FREE
-    at = fitted(base.made, base.whole, step)
+    like = near is not None and near.base.whole == base.whole
+    at = fitted(base.made, base.whole, step, near.at if near is not None and like else None)
     return Judged(base, at, at.nats + base.made.log_whitening)
 
 
 def _is_there(here: Judged) -> bool:
-    """Whether calibration, delay and the noise's level are where the model wants them."""
-    made, keys = here.base.made, here.base.whole
-    off, deviation = step_of(made, keys, here.at)
-    if np.any(np.abs(off) > NEAR * deviation):
-        return False
-    level = made.left_by(keys, here.at)
-    again = noise_model.amplitude(level, made.point.filtered.used, made.point.problem.rate_hz)
-    change = np.log(again / made.point.amplitude)
-    return float(np.sqrt(np.mean(np.square(change)))) < SAME_LEVEL
+    """Whether calibration and delay are where the model wants them."""
+    off, deviation = step_of(here.base.made, here.base.whole, here.at)
+    return not np.any(np.abs(off) > priors.NEAR * deviation)

@@ -29,17 +29,14 @@ from scipy.optimize import minimize
 from ahrsd.diagnosis import roles
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.hygiene import hygiene, put_right
-from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.decision import size_of
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.one_model.diagnose import begun, diagnose
 from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.search_space import space_at
 from ahrsd.diagnosis.pauses import without_jumps
-from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -61,8 +58,7 @@ def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
     track, _ = load_track(path)
     track, _ = without_jumps(roles.prepared(track)[0])
-    problem, cold = problem_of(put_right(track, hygiene(track)), Spec(), {}, LIMITS)
-    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    problem, fit = begun(put_right(track, hygiene(track)), Spec(), {})
     found = rich.richest(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 

@@ -22,9 +22,11 @@ from ahrsd.diagnosis.one_model.effect_components import (
     library_components,
 )
 from ahrsd.diagnosis.one_model.evidence import evaluated
-from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point, moved, unread
+from ahrsd.diagnosis.one_model.linearised import added as added_by
 from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
+from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import Columns
@@ -123,7 +125,49 @@ def test_a_logged_cause_is_the_same_component_at_every_point():
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     keys = []
     for one in (problem, problem.lagging(0.03)):
-        start = first_point(one, run_filter(one.track, fit.filtered.model))
+        start = first_point(one, run_filter(one.track, fit.filtered.model), (LAG,))
         keys.append(rich.base_of(start, EFFECTS, (), whole=False).whole)
     assert "gyro_bias_temperature as logged" in keys[0]
     assert set(keys[1]) - set(keys[0]) == {LAG_FORM}
+
+
+def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
+    """A course of 40 mG on the sensor: the readings with everything in are those of before."""
+    track = track_of(experiment("wam", seed=11, samples=3000))
+    t = track.time_s - track.time_s[0]
+    added = 0.04 * np.sin(2 * np.pi * t / 31.0)[:, None] * np.array([0.6, -0.7, 0.39])
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + added)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    here = rich.judged(first_point(problem, fit.filtered, (LAG,)), EFFECTS, ())
+    there = rich.judged(moved(here.base.made, here.base.whole, here.at, delayed=False), EFFECTS, ())
+    made, values = there.base.made, there.base.made.point.values
+    known = {key: made.seen[key].component for key in values if key != LAG}
+    taken, _ = added_by(len(made.context.track), known, {key: values[key] for key in known})
+    assert np.max(np.abs(taken)) > 0.02
+    np.testing.assert_allclose(made.point.terms_mag, taken, atol=1e-12)
+    assert there.nats > here.nats
+
+
+def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
+    track = track_of(experiment("wam", seed=8, samples=400))
+    gyro = track.gyro_b_rad_s.copy()
+    gyro[250] = [0.0, 20.0, 5.0]
+    broken = broken_where_unsampled(replace(track, gyro_b_rad_s=gyro))
+    assert [(run.start, run.stop) for run in broken.runs] == [(0, 250), (250, 400)]
+    assert np.isnan(broken.dt_s[250])
+    assert broken_where_unsampled(track) is track
+
+
+def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
+    track = track_of(experiment("wam", seed=8, samples=3000))
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    point = first_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
+    middle_s = float(np.median(track.time_s))
+    silent = unread(point, [(middle_s, middle_s + 6.0)])
+    at_s = silent.filtered.track.time_s
+    inside = (at_s > middle_s + 1.0) & (at_s < middle_s + 5.0)
+    assert not silent.filtered.used[inside].any()
+    assert silent.filtered.used[at_s > middle_s + 7.0].all()
+    assert np.isfinite(silent.filtered.whitened).all()
+    assert silent.problem.recorded.mag_b_gauss.shape == track.mag_b_gauss.shape

@@ -28,6 +28,10 @@ def test_a_step_of_the_hard_iron_is_dated_and_sized():
     (one,) = found.findings
     assert one.setting["onset_s"] == pytest.approx(67.0, abs=0.5)
     np.testing.assert_allclose([p.value for p in one.parameters], step, atol=6e-4)
+    # without it the hard iron is the mean over the recording, of which it is on in 58 %
+    mean_gauss = np.linalg.norm(step) * np.mean(later)
+    assert one.cost_if_left_out.hard_iron_shift_gauss == pytest.approx(mean_gauss, rel=0.3)
+    assert one.cost_if_left_out.heading_error_deg > 0.3
     assert not found.unexplained.detected
 
 
@@ -53,3 +57,31 @@ def test_the_answer_is_the_same_again():
     track = track_of(experiment("mam", seed=6, samples=3000))
     first, again = (diagnose(track).to_json() for _ in range(2))
     assert first == again
+
+
+def test_a_gyro_bias_that_walks_is_a_drift_whatever_its_course():
+    track = track_of(experiment("wam", seed=7, samples=4000))
+    walk = np.cumsum(np.random.default_rng(3).normal(size=(len(track), 3)), axis=0)
+    walk *= 2e-3 / np.std(walk, axis=0)
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + walk))
+    assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
+    assert not found.unexplained.detected
+    (drift,) = found.findings
+    assert drift.where.frame == "gyro"
+    modes = np.array([p.value for p in drift.parameters]).reshape(-1, 3)
+    t = (track.time_s - track.time_s[0]) / track.duration_s
+    told = np.sin(np.pi * np.outer(t, np.arange(len(modes)) + 0.5)) @ modes
+    told, truth = (one - one.mean(axis=0) for one in (told, walk))
+    assert np.linalg.norm(told - truth) < 0.6 * np.linalg.norm(truth)
+
+
+def test_pulses_that_averaging_loses_are_named_at_the_recorded_rate():
+    track = track_of(experiment("wam", seed=9, samples=4000))
+    since_s = track.time_s - track.time_s[0]
+    hit = np.mod(since_s - 0.5, 2.0) < 0.06
+    pulse = np.array([3e-3, -2e-3, 1.5e-3])
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + hit[:, None] * pulse))
+    assert [one.effect for one in found.findings] == ["sync_pulses"]
+    (one,) = found.findings
+    assert one.setting["period_s"] == pytest.approx(2.0, abs=0.01)
+    np.testing.assert_allclose([p.value for p in one.parameters], pulse, atol=6e-4)
