@@ -277,7 +277,7 @@ class _TableRows:
             return
         if np.mean(gyro == _fresh(np.hstack([self.vectors(MAG), self.vectors(GYRO)]))) > _TOGETHER:
             self.notes.append(
-                f"every reading is in {usual} rows, one after the other: each counts once, "
+                f"every reading is in {counted(usual, 'row')}, one after the other: each counts once, "
                 f"{int(np.count_nonzero(gyro))} of {len(gyro)} rows"
             )
             self._keep(gyro)
@@ -405,8 +405,8 @@ class _TableRows:
         shown = ", ".join(f"{value:.10g}" for value in times[:3])
         raise RecordingError(
             self.path,
-            f"column time_s: {counted(len(times), 'different time')} in {len(self.numbers)} rows "
-            f"({shown}): the digits that tell the rows apart were lost when it was written",
+            f"column time_s: {counted(len(times), 'different time')} in "
+            f"{counted(len(self.numbers), 'row')} ({shown}): the digits that tell the rows apart were lost when it was written",
             "write the time again with all its digits, or from 0 on",
         )
 
